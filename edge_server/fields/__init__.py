@@ -1,0 +1,86 @@
+"""Radiance fields behind one small protocol: fit a view set within a budget, render a camera, save, load.
+
+Adding a representation is one file here (and its kernels in ``kernels/``) plus a line in ``registry``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from freshfield.geometry import Pinhole
+
+
+@dataclass(frozen=True)
+class View:
+    """One decoded, posed image that supervises a field.
+
+    image: uint8 (H, W, 3) RGB, or (H, W, 4) straight-alpha RGBA; matches ``intrinsics``.
+    camera_to_world: float64 (4, 4), OpenCV axes, metres. generated_ns: capture time, edge clock.
+    """
+
+    camera: str
+    image: NDArray[np.uint8]
+    camera_to_world: NDArray[np.float64]
+    intrinsics: Pinhole
+    generated_ns: int = 0
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What one fit may spend: wall seconds (live) or optimiser steps (virtual time). One of the two."""
+
+    seconds: float | None = None
+    steps: int | None = None
+
+    def __post_init__(self) -> None:
+        if (self.seconds is None) == (self.steps is None):
+            raise ValueError("a budget is either seconds or steps")
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What one fit did: optimiser steps, wall seconds, mean loss of the last steps, rays and samples."""
+
+    steps: int
+    seconds: float
+    loss: float
+    rays: int
+    samples: int
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """color float32 (H, W, 3) in [0, 1]; depth float32 (H, W), metres along the ray (0 where empty);
+    opacity float32 (H, W) in [0, 1]."""
+
+    color: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    opacity: NDArray[np.float32]
+
+
+class Field(Protocol):
+    """A radiance field. Every implementation is deterministic for one seed and one sequence of calls."""
+
+    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
+        """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""
+        ...
+
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
+
+    def state(self) -> dict[str, NDArray]:
+        """Everything needed to go on as if nothing had happened: plain arrays, no pickle."""
+        ...
+
+    def load_state(self, state: dict[str, NDArray]) -> None: ...
+
+    def reset(self) -> None:
+        """Forget the scene (4.4.4's manual reset); keep the settings and the compiled kernels."""
+        ...
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Up to ``count`` surface points (N, 3) in world metres and colours (N, 3) in [0, 1]."""
+        ...

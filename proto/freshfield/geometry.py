@@ -1,0 +1,279 @@
+"""Rigid motions, pinhole cameras and axis conventions: the one place where they are decided.
+
+Conventions used everywhere in this project (loaders convert at the door):
+
+* poses are **camera-to-world** (``T_W^C``), in metres;
+* camera axes are **OpenCV's**: x right, y down, z forward;
+* quaternions are **w first**, unit length;
+* pixel coordinates have their origin at the **corner** of the top-left pixel, so the centre of that
+  pixel is (0.5, 0.5) and a centred principal point is (width / 2, height / 2). OpenCV calibrations,
+  whose pixel centres are integers, gain 0.5 when they are read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Right-multiplying a camera-to-world matrix with this turns OpenGL axes (x right, y up, z backward)
+# into OpenCV axes and back: it is its own inverse.
+OPENGL_TO_OPENCV: Array = np.diag([1.0, -1.0, -1.0, 1.0])
+
+# Below this angle the closed forms divide by nearly nothing; their Taylor series is exact to fp64.
+_SMALL_ANGLE = 1e-4
+
+
+class GeometryError(ValueError):
+    """A pose or camera that no real camera can have; the message says which part and why."""
+
+
+# --- quaternions ------------------------------------------------------------------------------
+
+
+def quaternion_normalise(q: ArrayLike) -> Array:
+    """Unit quaternion(s) (..., 4), w >= 0. Raises GeometryError for a zero or non-finite one."""
+    q = np.asarray(q, dtype=np.float64)
+    scale = np.max(np.abs(q), axis=-1, keepdims=True)
+    if not np.all(np.isfinite(q)) or np.any(scale == 0.0):
+        raise GeometryError("quaternion has no direction: zero or non-finite")
+    q = q / scale  # first, so that squaring can neither overflow nor underflow
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def quaternion_multiply(a: ArrayLike, b: ArrayLike) -> Array:
+    """Hamilton product of (..., 4) quaternions: rotation b first, then a."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a, dtype=np.float64), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b, dtype=np.float64), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_to_matrix(q: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4); normalises first."""
+    w, x, y, z = np.moveaxis(quaternion_normalise(q), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
+
+
+def matrix_to_quaternion(rotation: ArrayLike) -> Array:
+    """Unit quaternion (4,) of one rotation matrix (3, 3), stable at every angle (Shepperd's method)."""
+    m = np.asarray(rotation, dtype=np.float64)
+    trace = np.trace(m)
+    # The largest of the four squared components is the one that can be divided by.
+    choice = int(np.argmax([trace, m[0, 0], m[1, 1], m[2, 2]]))
+    if choice == 0:
+        q = [1 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
+    else:
+        i = choice - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = [0.0] * 4
+        q[0] = m[k, j] - m[j, k]
+        q[1 + i] = 1 + m[i, i] - m[j, j] - m[k, k]
+        q[1 + j] = m[j, i] + m[i, j]
+        q[1 + k] = m[k, i] + m[i, k]
+    return quaternion_normalise(q)
+
+
+def slerp(a: ArrayLike, b: ArrayLike, fraction: float) -> Array:
+    """Quaternion (4,) at ``fraction`` of the shorter way from a to b; exact at 0 and 1."""
+    a, b = quaternion_normalise(a), quaternion_normalise(b)
+    dot = float(np.dot(a, b))
+    if dot < 0.0:
+        b, dot = -b, -dot
+    angle = np.arccos(np.clip(dot, -1.0, 1.0))
+    if angle < _SMALL_ANGLE:
+        return quaternion_normalise((1 - fraction) * a + fraction * b)
+    q = np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b
+    return quaternion_normalise(q)
+
+
+# --- SO(3) and SE(3) --------------------------------------------------------------------------
+
+
+def so3_exp(omega: ArrayLike) -> Array:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
+    w = np.asarray(omega, dtype=np.float64)
+    angle = float(np.linalg.norm(w))
+    k = _hat(w)
+    if angle < _SMALL_ANGLE:
+        a, b = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0
+    else:
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def so3_log(rotation: ArrayLike) -> Array:
+    """Rotation vector (3,) in radians, norm <= pi. Stable near 0 and near pi (through the quaternion)."""
+    q = matrix_to_quaternion(rotation)
+    s = float(np.linalg.norm(q[1:]))
+    if s < 1e-12:
+        return 2.0 * q[1:]
+    return (2.0 * np.arctan2(s, q[0]) / s) * q[1:]
+
+
+def se3_inverse(transform: ArrayLike) -> Array:
+    """Inverse of a rigid transform (4, 4)."""
+    t = np.asarray(transform, dtype=np.float64)
+    out = np.eye(4)
+    out[:3, :3] = t[:3, :3].T
+    out[:3, 3] = -t[:3, :3].T @ t[:3, 3]
+    return out
+
+
+def _hat(w: Array) -> Array:
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+# --- poses ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A camera-to-world pose: unit quaternion (4,), w first, and translation (3,) in metres."""
+
+    quaternion: tuple[float, float, float, float]
+    translation_m: tuple[float, float, float]
+
+    @staticmethod
+    def from_matrix(camera_to_world: ArrayLike) -> Pose:
+        """Pose of a rigid (4, 4) or (3, 4) matrix. Raises GeometryError unless it is finite and
+        orthonormal to 1e-3 (real calibrations are; a sheared or mirrored matrix is a mistake)."""
+        m = np.asarray(camera_to_world, dtype=np.float64)
+        if m.shape not in ((4, 4), (3, 4)) or not np.all(np.isfinite(m)):
+            raise GeometryError("pose must be a finite 3 x 4 or 4 x 4 matrix")
+        r = m[:3, :3]
+        if np.abs(r @ r.T - np.eye(3)).max() > 1e-3 or np.linalg.det(r) < 0:
+            raise GeometryError("the pose's rotation is not orthonormal and right-handed")
+        q = matrix_to_quaternion(r)
+        return Pose(tuple(map(float, q)), tuple(map(float, m[:3, 3])))  # type: ignore[arg-type]
+
+    def matrix(self) -> Array:
+        """Camera-to-world matrix (4, 4)."""
+        out = np.eye(4)
+        out[:3, :3] = quaternion_to_matrix(self.quaternion)
+        out[:3, 3] = self.translation_m
+        return out
+
+    def interpolate(self, other: Pose, fraction: float) -> Pose:
+        """Pose at ``fraction`` of the way: slerp and a straight line, on SO(3) x R^3."""
+        q = slerp(self.quaternion, other.quaternion, fraction)
+        a, b = np.array(self.translation_m), np.array(other.translation_m)
+        t = (1 - fraction) * a + fraction * b
+        return Pose(tuple(map(float, q)), tuple(map(float, t)))  # type: ignore[arg-type]
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """Camera-to-world (4, 4) at ``eye`` looking at ``target``; image-up is as near to ``up`` as can be."""
+    eye, target = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    forward = target - eye
+    distance = np.linalg.norm(forward)
+    if distance < 1e-12:
+        raise GeometryError("look_at: the eye and the target are the same point")
+    forward = forward / distance
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if np.linalg.norm(right) < 1e-9:  # looking along ``up``: any right hand will do
+        right = np.cross(forward, [1.0, 0.0, 0.0])
+        if np.linalg.norm(right) < 1e-9:
+            right = np.cross(forward, [0.0, 1.0, 0.0])
+    right = right / np.linalg.norm(right)
+    out = np.eye(4)
+    out[:3, 0], out[:3, 1], out[:3, 2] = right, np.cross(forward, right), forward
+    out[:3, 3] = eye
+    return out
+
+
+# --- pinhole cameras --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Intrinsics in pixels (corner origin) with OpenCV's (k1, k2, p1, p2) distortion."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    @staticmethod
+    def from_fov(width: int, height: int, horizontal_fov_deg: float) -> Pinhole:
+        """Centred square-pixel camera with the given horizontal field of view."""
+        f = 0.5 * width / np.tan(0.5 * np.deg2rad(horizontal_fov_deg))
+        return Pinhole(width, height, float(f), float(f), width / 2.0, height / 2.0)
+
+    @property
+    def distorted(self) -> bool:
+        return any(c != 0.0 for c in self.distortion)
+
+    def scaled(self, factor: float) -> Pinhole:
+        """The same camera with images resized by ``factor`` (sizes rounded)."""
+        w, h = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        sx, sy = w / self.width, h / self.height
+        return Pinhole(w, h, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, self.distortion)
+
+    def rays(self, pixels: ArrayLike | None = None) -> Array:
+        """Unit ray directions in camera axes, (H, W, 3), or (N, 3) for pixel coordinates (N, 2)."""
+        if pixels is None:
+            u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        else:
+            p = np.asarray(pixels, dtype=np.float64)
+            u, v = p[..., 0], p[..., 1]
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        if self.distorted:
+            x, y = self._undistort(x, y)
+        d = np.stack([x, y, np.ones_like(x)], axis=-1)
+        return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+    def project(self, points: ArrayLike) -> Array:
+        """Pixels (..., 2) of points (..., 3) in camera axes; NaN for points not in front."""
+        p = np.asarray(points, dtype=np.float64)
+        z = np.where(p[..., 2] > 1e-9, p[..., 2], np.nan)
+        x, y = p[..., 0] / z, p[..., 1] / z
+        if self.distorted:
+            x, y = self._distort(x, y)
+        return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+
+    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+        k1, k2, p1, p2 = self.distortion
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * k2)
+        return (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+
+    def _undistort(self, xd: Array, yd: Array) -> tuple[Array, Array]:
+        # Fixed-point iteration, OpenCV's way; eight rounds reach 1e-6 for lenses met in practice.
+        k1, k2, p1, p2 = self.distortion
+        x, y = xd, yd
+        for _ in range(8):
+            r2 = x * x + y * y
+            radial = 1.0 + r2 * (k1 + r2 * k2)
+            dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            x, y = (xd - dx) / radial, (yd - dy) / radial
+        return x, y
+
+
+def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Array]:
+    """Origin (3,) and unit directions (H, W, 3) in world axes of every pixel's centre."""
+    m = np.asarray(camera_to_world, dtype=np.float64)
+    return m[:3, 3].copy(), camera.rays() @ m[:3, :3].T
