@@ -1,0 +1,69 @@
+"""What a field must beat to have learned anything: the mean colour, and the nearest camera's own image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edge_server.fidelity.images import BLACK, Colour, to_unit
+from edge_server.fidelity.psnr import psnr, psnr_of_mse
+from edge_server.fields import View
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """PSNR in dB of two renderings that need no field; None where there was no training view."""
+
+    mean_colour_db: float | None
+    nearest_view_db: float | None
+    nearest_camera: str | None
+
+
+def baseline(
+    views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, background: Colour = BLACK
+) -> Baseline:
+    """Both baselines of one held-out image (H, W, 3) seen from ``camera_to_world`` (4, 4)."""
+    if not views:
+        return Baseline(None, None, None)
+    nearest = nearest_view(views, camera_to_world)
+    return Baseline(
+        mean_colour_db=mean_colour_db([v.image for v in views], truth, background),
+        nearest_view_db=view_db(nearest.image, truth, background),
+        nearest_camera=nearest.camera,
+    )
+
+
+def mean_colour_db(images: Sequence[NDArray], truth: NDArray, background: Colour = BLACK) -> float:
+    """PSNR of a flat image in the mean colour of the training images (each image weighs the same)."""
+    mean = np.mean([to_unit(i, "training view", background).mean((0, 1)) for i in images], axis=0)
+    return psnr_of_mse(float(((to_unit(truth, "truth", background) - mean) ** 2).mean()))
+
+
+def view_db(image: NDArray, truth: NDArray, background: Colour = BLACK) -> float:
+    """PSNR of a training image shown as it is; resampled where its size differs from the truth's."""
+    target = to_unit(truth, "truth", background)
+    shown = to_unit(image, "training view", background)
+    height, width = target.shape[:2]
+    if shown.shape != target.shape:
+        how = cv2.INTER_AREA if width < shown.shape[1] else cv2.INTER_LINEAR
+        shown = np.asarray(cv2.resize(shown, (width, height), interpolation=how), dtype=np.float64)
+    score = psnr(shown, target)
+    assert score is not None  # no mask was given
+    return score
+
+
+def nearest_view(views: Sequence[View], camera_to_world: ArrayLike) -> View:
+    """The view whose camera is nearest: distance of centres, in units of the rig's own size, plus the angle
+    between viewing directions in radians. The first of equals wins."""
+    pose = np.asarray(camera_to_world, dtype=np.float64)
+    centres = np.array([v.camera_to_world[:3, 3] for v in views])
+    forward = np.array([v.camera_to_world[:3, 2] for v in views])
+    # One radian of turning counts as much as one rig radius of moving.
+    radius = float(np.median(np.linalg.norm(centres - centres.mean(0), axis=1)))
+    distance = np.linalg.norm(centres - pose[:3, 3], axis=1) / (radius if radius > 1e-9 else 1.0)
+    angle = np.arccos(np.clip(forward @ pose[:3, 2], -1.0, 1.0))
+    return views[int(np.argmin(distance + angle))]

@@ -1,0 +1,54 @@
+"""The door of every metric: images become float64 in [0, 1], and what is no image is refused by name."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float64]
+Colour = tuple[float, float, float]
+
+BLACK: Colour = (0.0, 0.0, 0.0)
+
+
+class ImageError(ValueError):
+    """Not an image that can be scored; the message says which one, what is wrong and what was expected."""
+
+
+def to_unit(image: NDArray, what: str = "image", background: Colour = BLACK) -> Image:
+    """``image`` as float64 (H, W, 3) in [0, 1].
+
+    image: uint8 in 0..255 or floating in [0, 1], RGB or straight-alpha RGBA (laid over ``background``).
+    Floating values outside [0, 1] are clipped, as a screen clips them. Raises ImageError for any other
+    shape or type, for an empty image, and for NaN or infinity: a metric of those would be NaN itself.
+    """
+    array = np.asarray(image)
+    if array.ndim != 3 or array.shape[2] not in (3, 4) or 0 in array.shape:
+        raise ImageError(f"{what}: expected (height, width, 3 or 4), got shape {array.shape}")
+    if array.dtype == np.uint8:
+        unit = array.astype(np.float64) / 255.0
+    elif np.issubdtype(array.dtype, np.floating):
+        unit = array.astype(np.float64)
+        bad = ~np.isfinite(unit)
+        if bad.any():
+            row, column, channel = np.argwhere(bad)[0]
+            raise ImageError(
+                f"{what}: {int(bad.sum())} of {unit.size} values are NaN or infinite, the first at "
+                f"row {row}, column {column}, channel {channel}; a score of it would mean nothing"
+            )
+        unit = np.clip(unit, 0.0, 1.0)
+    else:
+        raise ImageError(f"{what}: expected uint8 or floating values, got {array.dtype}")
+    if unit.shape[2] == 4:
+        alpha = unit[..., 3:]
+        unit = unit[..., :3] * alpha + np.asarray(background, dtype=np.float64) * (1.0 - alpha)
+    return unit
+
+
+def same_size(rendering: Image, truth: Image) -> None:
+    """Raise ImageError unless both have one shape: resizing one silently would change the figure."""
+    if rendering.shape != truth.shape:
+        raise ImageError(
+            f"rendering is {rendering.shape[1]} x {rendering.shape[0]} but the truth is "
+            f"{truth.shape[1]} x {truth.shape[0]}: render with the held-out camera's own intrinsics"
+        )

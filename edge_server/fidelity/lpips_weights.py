@@ -1,0 +1,55 @@
+"""Finds LPIPS weights and says what to do where there are none. Imports torch only once they are found.
+
+A weights folder holds, for each network, the backbone's convolutions and the learned channel weights as
+plain npz arrays: ``alexnet_features.npz`` with ``lin_alex_v0.1.npz``, ``squeezenet1_1_features.npz``
+with ``lin_squeeze_v0.1.npz`` (torchvision's names, without and with the prefix ``features.``).
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from edge_server.fidelity.lpips import Lpips
+
+Network = Literal["alex", "squeeze"]
+FOLDER_VARIABLE = "FRESHFIELD_LPIPS"
+FILES: dict[str, tuple[str, str]] = {
+    "alex": ("alexnet_features.npz", "lin_alex_v0.1.npz"),
+    "squeeze": ("squeezenet1_1_features.npz", "lin_squeeze_v0.1.npz"),
+}
+
+
+def open_lpips(
+    folder: str | Path | None = None, network: Network = "alex"
+) -> tuple[Lpips | None, str | None]:
+    """(metric, None), or (None, reason) where the weights are not to be had.
+
+    folder: the weights folder; else the environment variable FRESHFIELD_LPIPS. The reason is one line for
+    a person: what was looked for, where, and what to do. It is what a report prints as ``lpips_missing``.
+    """
+    if network not in FILES:
+        raise ValueError(f"no LPIPS network {network!r}: choose one of {', '.join(FILES)}")
+    place = str(folder) if folder else os.environ.get(FOLDER_VARIABLE, "")
+    if not place:
+        return None, (
+            f"no weights folder given: pass --lpips DIR or set {FOLDER_VARIABLE} to a folder with "
+            f"{' and '.join(FILES[network])}"
+        )
+    paths = [Path(place) / name for name in FILES[network]]
+    absent = [p.name for p in paths if not p.is_file()]
+    if absent:
+        return None, (
+            f"LPIPS-{network}: {' and '.join(absent)} not found in {place}: put the weights there, or point "
+            f"--lpips or {FOLDER_VARIABLE} to the folder that has them"
+        )
+    from edge_server.fidelity.lpips import Lpips
+
+    try:
+        return Lpips(network, paths[0], paths[1]), None
+    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        return None, f"LPIPS-{network}: the weights in {place} cannot be used ({error}): replace the files"

@@ -1,0 +1,114 @@
+"""Which pixels of a held-out camera move: where the age of information can be seen at all.
+
+A pixel moves where the truth at the present differs from the truth 60, 120, 200 or 300 ms earlier by more
+than a bound in some channel. On a mostly static scene the whole-image PSNR hardly notices a late field;
+on these pixels it does. On noise-free truth the bound is 0.03; for real video it is max(0.03, 4 sigma) of
+the camera's own noise, which ``NoiseEstimate`` takes from its successive frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fidelity.images import Image, to_unit
+
+LAGS_MS = (60.0, 120.0, 200.0, 300.0)
+BOUND = 0.03
+NOISE_SIGMAS = 4.0
+
+_BLOCK = 8
+# Of 192 values (8 x 8 pixels, 3 channels), the median of a mean square lies this much under its mean.
+_CHI2_MEDIAN = (1.0 - 2.0 / (9.0 * 3 * _BLOCK**2)) ** 3
+# No camera worth watching is noisier; a larger estimate means that the camera itself moves.
+_NOISE_LIMIT = 0.05
+_PAIRS_KEPT = 32
+
+
+def moving_mask(truth: NDArray, earlier: Sequence[NDArray], bound: float = BOUND) -> NDArray[np.bool_]:
+    """Mask (H, W) of the pixels of ``truth`` that differ from any of ``earlier`` by more than ``bound``.
+
+    Images are as ``images.to_unit`` takes them. Without earlier frames nothing is known to move.
+    """
+    now = to_unit(truth, "truth")
+    mask = np.zeros(now.shape[:2], dtype=bool)
+    for image in earlier:
+        then = to_unit(image, "earlier truth")
+        if then.shape == now.shape:  # a camera may change its size between sessions
+            mask |= np.abs(now - then).max(axis=2) > bound
+    return mask
+
+
+def frames_at_lags(
+    times_ns: Sequence[int],
+    present_ns: int,
+    lags_ms: Sequence[float] = LAGS_MS,
+    slack_ms: float | None = None,
+) -> list[int]:
+    """Indices into ``times_ns`` of the frames nearest to each lag before ``present_ns``, without repeats.
+
+    Only frames before the present count. slack_ms: how far a frame may lie from its lag; None takes
+    whatever exists, so that two frames a second still tell what moved.
+    """
+    past = [i for i, t in enumerate(times_ns) if t < present_ns]
+    chosen: list[int] = []
+    for lag in lags_ms:
+        if not past:
+            break
+        wanted = present_ns - round(lag * 1e6)
+        best = min(past, key=lambda i: abs(times_ns[i] - wanted))
+        close = slack_ms is None or abs(times_ns[best] - wanted) <= slack_ms * 1e6
+        if close and best not in chosen:
+            chosen.append(best)
+    return chosen
+
+
+def pair_noise(a: Image, b: Image) -> float | None:
+    """Standard deviation in [0, 1] units of one frame's noise, from two successive frames (H, W, 3).
+
+    Mean squares of the difference over 8 x 8 blocks, median over blocks: static blocks outvote moving
+    ones, and averaging sees noise far under one 8-bit step, where a median of pixels sees 0. Clipped
+    blocks (black or saturated anywhere in both frames) show no noise and have no vote. None where no
+    block is left.
+    """
+    rows, columns = a.shape[0] // _BLOCK, a.shape[1] // _BLOCK
+    if a.shape != b.shape or rows == 0 or columns == 0:
+        return None
+    crop = (slice(0, rows * _BLOCK), slice(0, columns * _BLOCK))
+
+    def blocks(x: NDArray) -> NDArray:
+        tiles = x[crop].reshape(rows, _BLOCK, columns, _BLOCK, 3).transpose(0, 2, 1, 3, 4)
+        return tiles.reshape(-1, 3 * _BLOCK**2)
+
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    votes = (blocks(low) > 0.0).all(1) & (blocks(high) < 1.0).all(1)
+    if not votes.any():
+        return None
+    mean_square = (blocks(a - b)[votes] ** 2).mean(1)
+    return float(np.sqrt(np.median(mean_square) / _CHI2_MEDIAN / 2.0))
+
+
+@dataclass
+class NoiseEstimate:
+    """A running estimate of one camera's noise: the median over its latest pairs of frames."""
+
+    pairs: list[float] = field(default_factory=list)
+
+    def add(self, a: NDArray, b: NDArray) -> None:
+        """Learn from two successive frames of one camera."""
+        sigma = pair_noise(to_unit(a, "frame"), to_unit(b, "frame"))
+        if sigma is not None:
+            self.pairs = [*self.pairs, sigma][-_PAIRS_KEPT:]
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation in [0, 1] units; 0 while nothing is known."""
+        return min(float(np.median(self.pairs)), _NOISE_LIMIT) if self.pairs else 0.0
+
+    @property
+    def bound(self) -> float:
+        """What a difference must exceed to be motion rather than noise."""
+        return max(BOUND, NOISE_SIGMAS * self.sigma)

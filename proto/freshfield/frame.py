@@ -1,0 +1,171 @@
+"""A frame as Python sees it, and its way to and from the wire, with every stateless check.
+
+What needs memory (sequence order, clocks) is checked by the edge's ingest.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import dataclass
+
+import google_crc32c
+
+from freshfield import payload
+from freshfield.geometry import GeometryError, Pinhole, Pose, quaternion_normalise
+from freshfield.v1 import frames_pb2 as pb
+
+_ID = re.compile(rf"[A-Za-z0-9._-]{{1,{payload.MAX_ID_CHARS}}}")
+_CODECS = {"jpeg": pb.CODEC_JPEG, "png": pb.CODEC_PNG, "zstd": pb.CODEC_ZSTD}
+_CODEC_NAMES = {number: name for name, number in _CODECS.items()}
+_PACKED = struct.Struct("<QqqqqIIII7d8d")
+# Translations beyond this are a wrong unit (millimetres of a kilometre) or garbage.
+_MAX_TRANSLATION_M = 1e6
+
+
+class FrameRejected(ValueError):
+    """A frame refused at the door. ``reason`` is the counted name, the message is for a person."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One captured image on its way. ``generated_ns`` is on the node's clock; ``generated_edge_ns`` adds
+    the node's estimate of the offset."""
+
+    camera: str
+    session: str
+    sequence: int
+    generated_ns: int
+    pose: Pose
+    intrinsics: Pinhole
+    codec: str
+    payload: bytes
+    held_out: bool = False
+    clock_offset_ns: int = 0
+    clock_uncertainty_ns: int = 0
+    pose_gap_ns: int = 0
+
+    @property
+    def generated_edge_ns(self) -> int:
+        return self.generated_ns + self.clock_offset_ns
+
+
+def valid_id(text: str) -> bool:
+    """Camera and session ids: 1 to 64 letters, digits, dot, underscore, hyphen."""
+    return _ID.fullmatch(text) is not None
+
+
+def checksum(header: pb.FrameHeader, data: bytes) -> int:
+    """CRC32C over the header's fields, packed in a fixed order, then the payload: a flipped bit in a pose
+    must not become a wrong pose."""
+    p, k = header.pose, header.intrinsics
+    packed = _PACKED.pack(
+        header.sequence, header.generated_ns, header.clock_offset_ns, header.clock_uncertainty_ns,
+        header.pose_gap_ns, header.codec, header.width, header.height, header.role,
+        p.qw, p.qx, p.qy, p.qz, p.tx_m, p.ty_m, p.tz_m,
+        k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2,
+    )  # fmt: skip
+    crc = google_crc32c.value(header.camera_id.encode() + b"\0" + header.session_id.encode() + packed)
+    return google_crc32c.extend(crc, data)
+
+
+def to_request(frame: Frame) -> pb.PushRequest:
+    """The wire message of a frame, checksummed."""
+    q, t, k = frame.pose.quaternion, frame.pose.translation_m, frame.intrinsics
+    header = pb.FrameHeader(
+        camera_id=frame.camera,
+        session_id=frame.session,
+        sequence=frame.sequence,
+        generated_ns=frame.generated_ns,
+        clock_offset_ns=frame.clock_offset_ns,
+        clock_uncertainty_ns=frame.clock_uncertainty_ns,
+        pose=pb.Pose(qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=t[0], ty_m=t[1], tz_m=t[2]),
+        pose_gap_ns=frame.pose_gap_ns,
+        intrinsics=pb.Intrinsics(
+            fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy,
+            k1=k.distortion[0], k2=k.distortion[1], p1=k.distortion[2], p2=k.distortion[3],
+        ),
+        codec=_CODECS[frame.codec],
+        width=k.width,
+        height=k.height,
+        role=pb.ROLE_HELD_OUT if frame.held_out else pb.ROLE_TRAIN,
+    )  # fmt: skip
+    return pb.PushRequest(header=header, payload=frame.payload, crc32c=checksum(header, frame.payload))
+
+
+def from_request(request: pb.PushRequest) -> Frame:
+    """Check everything that needs no memory and return the frame; the payload stays encoded.
+
+    Raises FrameRejected with reason bad_id, bad_header, crc_mismatch, bad_pose, bad_intrinsics, or one of
+    payload.check's (too_large, unknown_codec, bad_payload, size_mismatch).
+    """
+    h = request.header
+    if not valid_id(h.camera_id) or not valid_id(h.session_id):
+        raise FrameRejected("bad_id", "camera and session ids are 1 to 64 letters, digits, '.', '_', '-'")
+    if checksum(h, request.payload) != request.crc32c:
+        raise FrameRejected("crc_mismatch", f"frame {h.sequence} of {h.camera_id} was damaged on the way")
+    codec = _CODEC_NAMES.get(h.codec)
+    if codec is None:
+        raise FrameRejected("unknown_codec", f"codec number {h.codec} is not known here")
+    if h.role not in (pb.ROLE_TRAIN, pb.ROLE_HELD_OUT):
+        raise FrameRejected("bad_header", "role is neither train nor held-out")
+    if h.clock_uncertainty_ns < 0 or h.pose_gap_ns < 0:
+        raise FrameRejected("bad_header", "clock uncertainty and pose gap cannot be negative")
+    frame = Frame(
+        camera=h.camera_id,
+        session=h.session_id,
+        sequence=h.sequence,
+        generated_ns=h.generated_ns,
+        pose=_pose(h.pose),
+        intrinsics=_intrinsics(h),
+        codec=codec,
+        payload=request.payload,
+        held_out=h.role == pb.ROLE_HELD_OUT,
+        clock_offset_ns=h.clock_offset_ns,
+        clock_uncertainty_ns=h.clock_uncertainty_ns,
+        pose_gap_ns=h.pose_gap_ns,
+    )
+    try:
+        payload.check(frame.payload, codec, h.width, h.height)
+    except payload.PayloadError as error:
+        raise FrameRejected(error.reason, str(error)) from None
+    return frame
+
+
+def _pose(p: pb.Pose) -> Pose:
+    q, t = (p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)
+    if not all(math.isfinite(v) for v in (*q, *t)):
+        raise FrameRejected("bad_pose", "pose is not finite")
+    if abs(math.sqrt(sum(v * v for v in q)) - 1.0) > 1e-3:
+        raise FrameRejected("bad_pose", "pose quaternion is not of unit length")
+    if max(abs(v) for v in t) > _MAX_TRANSLATION_M:
+        raise FrameRejected("bad_pose", f"camera is more than {_MAX_TRANSLATION_M:g} m from the origin")
+    try:
+        unit = quaternion_normalise(q)
+    except GeometryError as error:
+        raise FrameRejected("bad_pose", str(error)) from None
+    return Pose(tuple(map(float, unit)), t)  # type: ignore[arg-type]
+
+
+def _intrinsics(h: pb.FrameHeader) -> Pinhole:
+    k = h.intrinsics
+    values = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2)
+    if not all(math.isfinite(v) for v in values):
+        raise FrameRejected("bad_intrinsics", "intrinsics are not finite")
+    if not (0 < h.width <= payload.MAX_IMAGE_SIDE and 0 < h.height <= payload.MAX_IMAGE_SIDE):
+        raise FrameRejected("too_large", f"{h.width} x {h.height} is not within 1..{payload.MAX_IMAGE_SIDE}")
+    # 1/16 of the width is a 166 degree lens, beyond what a pinhole can describe.
+    if min(k.fx, k.fy) < max(h.width, h.height) / 16 or max(k.fx, k.fy) > 1e6:
+        raise FrameRejected(
+            "bad_intrinsics", f"focal lengths {k.fx:g}, {k.fy:g} px do not fit the image size"
+        )
+    if max(abs(v) for v in (k.k1, k.k2, k.p1, k.p2)) > 100:
+        raise FrameRejected("bad_intrinsics", "distortion coefficients are beyond any lens")
+    if not (-h.width <= k.cx <= 2 * h.width and -h.height <= k.cy <= 2 * h.height):
+        raise FrameRejected("bad_intrinsics", "principal point is far outside the image")
+    return Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))

@@ -1,0 +1,153 @@
+"""Image <-> bytes, and every limit on what may cross the wire, in one place.
+
+Limits are checked on headers *before* anything is inflated: a 109 kB PNG can claim 2.7 GB of pixels, and
+a zstandard frame that declares its size ignores ``max_output_size``.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+
+MAX_MESSAGE_BYTES = 8 * 2**20
+MAX_IMAGE_SIDE = 4096
+MAX_ID_CHARS = 64
+MAX_FUTURE_NS = 250_000_000  # a capture may not lie further ahead of the edge's clock than this
+MAX_PAST_NS = 3600 * 10**9  # nor further behind: an hour-old frame is a broken clock, not a slow link
+
+# OpenCV reads this when it is first imported: a second fence behind the header checks below.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE**2))
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+import zstandard  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+
+CODECS = ("jpeg", "png", "zstd")
+
+
+class PayloadError(ValueError):
+    """A payload that is refused; ``reason`` is the short counted name, the message is for a person."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> bytes:
+    """Compress an RGB (H, W, 3) or RGBA (H, W, 4) uint8 image.
+
+    jpeg: ``quality`` 1..100, colour not subsampled from 90 up, RGB only. png: lossless, keeps alpha.
+    zstd: raw RGB, lossless. Raises PayloadError for a shape or codec that cannot be sent.
+    """
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise PayloadError("bad_image", f"expected uint8 (H, W, 3 or 4), got {image.dtype} {image.shape}")
+    if max(image.shape[:2]) > MAX_IMAGE_SIDE or min(image.shape[:2]) < 1:
+        raise PayloadError(
+            "too_large", f"{image.shape[1]} x {image.shape[0]} exceeds {MAX_IMAGE_SIDE} a side"
+        )
+    if codec == "zstd":
+        return zstandard.ZstdCompressor(level=1).compress(np.ascontiguousarray(image[..., :3]).tobytes())
+    if codec == "jpeg":
+        sampling = (
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444 if quality >= 90 else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
+        )
+        flags = [cv2.IMWRITE_JPEG_QUALITY, int(quality), cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+        ok, data = cv2.imencode(".jpg", cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2BGR), flags)
+    elif codec == "png":
+        order = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+        ok, data = cv2.imencode(".png", cv2.cvtColor(image, order), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    else:
+        raise PayloadError("unknown_codec", f"codec {codec!r} is not one of {', '.join(CODECS)}")
+    if not ok:
+        raise PayloadError("bad_image", f"OpenCV could not encode a {codec} of {image.shape}")
+    return data.tobytes()
+
+
+def check(payload: bytes, codec: str, width: int, height: int) -> None:
+    """Refuse, by headers alone, what must not be decoded. Costs microseconds.
+
+    Raises PayloadError: ``too_large``, ``unknown_codec``, ``bad_payload`` (no such format), or
+    ``size_mismatch`` (the image is not width x height as announced).
+    """
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise PayloadError("too_large", f"payload of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
+    if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE):
+        raise PayloadError("too_large", f"{width} x {height} is not within 1..{MAX_IMAGE_SIDE} a side")
+    if codec == "zstd":
+        try:
+            declared = zstandard.get_frame_parameters(payload).content_size
+        except zstandard.ZstdError as error:
+            raise PayloadError("bad_payload", f"not a zstandard frame: {error}") from None
+        if declared != width * height * 3:
+            raise PayloadError("size_mismatch", f"zstd declares {declared} bytes, not {width} x {height} x 3")
+        return
+    if codec == "jpeg":
+        found = _jpeg_size(payload)
+    elif codec == "png":
+        found = _png_size(payload)
+    else:
+        raise PayloadError("unknown_codec", f"codec {codec!r} is not one of {', '.join(CODECS)}")
+    if found is None:
+        raise PayloadError("bad_payload", f"no {codec} header found in {len(payload)} bytes")
+    if found != (width, height):
+        raise PayloadError("size_mismatch", f"image is {found[0]} x {found[1]}, announced {width} x {height}")
+
+
+def decode(payload: bytes, codec: str, width: int, height: int) -> NDArray[np.uint8]:
+    """RGB (H, W, 3) or RGBA (H, W, 4) uint8 of a payload that passed ``check`` (which is run again).
+
+    Raises PayloadError with reason ``undecodable`` for damaged data.
+    """
+    check(payload, codec, width, height)
+    if codec == "zstd":
+        try:
+            raw = zstandard.ZstdDecompressor().decompress(payload, max_output_size=width * height * 3)
+        except zstandard.ZstdError as error:
+            raise PayloadError("undecodable", f"zstandard: {error}") from None
+        if len(raw) != width * height * 3:
+            raise PayloadError("undecodable", f"zstandard gave {len(raw)} bytes")
+        return np.frombuffer(raw, np.uint8).reshape(height, width, 3)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if codec == "jpeg" else cv2.IMREAD_UNCHANGED
+    try:
+        image = cv2.imdecode(np.frombuffer(payload, np.uint8), flags)
+    except cv2.error as error:
+        raise PayloadError("undecodable", f"OpenCV: {error}") from None
+    if image is None or image.dtype != np.uint8 or image.shape[:2] != (height, width):
+        raise PayloadError("undecodable", f"the {codec} data is damaged")
+    if image.ndim == 2:
+        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+
+
+def _png_size(data: bytes) -> tuple[int, int] | None:
+    if len(data) < 33 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
+        return None
+    width, height = struct.unpack(">II", data[16:24])
+    return int(width), int(height)
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Size in the first start-of-frame segment; None unless there is exactly one before the scan."""
+    if data[:2] != b"\xff\xd8":
+        return None
+    at, size = 2, None
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker == 0xDA:  # start of scan: no more headers
+            return size
+        (length,) = struct.unpack(">H", data[at + 2 : at + 4])
+        if length < 2:
+            return None
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            if size is not None or at + 9 > len(data):
+                return None  # two frame headers: decoders disagree on which one counts
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            size = (int(width), int(height))
+        at += 2 + length
+    return None

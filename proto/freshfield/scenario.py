@@ -1,0 +1,222 @@
+"""Reads a scenario file: who takes part, the seed, and one section for each package to interpret.
+
+The file is YAML::
+
+    name: room
+    description: one line for people
+    seed: 7
+    cameras: {count: 13, held_out: [cam00]}     # or ids: [a, b, c]
+    source:  {...}     # camera_node.config reads this
+    channel: {...}     # channel_emu.config
+    edge:    {...}     # edge_server.config
+
+``read_section`` turns a mapping into a dataclass and refuses, in one line naming file, key and what was
+expected, every unknown key, wrong type or value out of range.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import yaml
+
+from freshfield.frame import valid_id
+
+T = TypeVar("T")
+SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
+MAX_CAMERAS = 1000
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot run. The message is one line: file, key, what was expected."""
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Who takes part. count: cam00, cam01, ...; ids: named instead. held_out: never trained on."""
+
+    count: int = 0
+    ids: list[str] = field(default_factory=list)
+    held_out: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A parsed scenario file; the sections stay mappings until their package reads them."""
+
+    path: Path
+    name: str
+    seed: int
+    cameras: tuple[str, ...]
+    held_out: tuple[str, ...]
+    description: str = ""
+    source: dict[str, Any] = field(default_factory=dict)
+    channel: dict[str, Any] = field(default_factory=dict)
+    edge: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def training(self) -> tuple[str, ...]:
+        return tuple(c for c in self.cameras if c not in self.held_out)
+
+    def rng(self, purpose: str, camera: str | None = None) -> np.random.Generator:
+        """An independent stream for a purpose and camera: adding a camera does not change the others'."""
+        return np.random.default_rng(self.seed_sequence(purpose, camera))
+
+    def seed_sequence(self, purpose: str, camera: str | None = None) -> np.random.SeedSequence:
+        words = [self.seed & 0xFFFFFFFF, self.seed >> 32, *_words(purpose), *_words(camera or "")]
+        return np.random.SeedSequence(words)
+
+
+def load(path: str | Path, seed: int | None = None) -> Scenario:
+    """Read and check a scenario file; a bare name like ``room`` means the shipped one.
+
+    ``seed`` overrides the file's. Raises ScenarioError.
+    """
+    file = Path(path)
+    if not file.exists() and file.suffix == "" and (SCENARIO_FOLDER / f"{file}.yaml").exists():
+        file = SCENARIO_FOLDER / f"{file}.yaml"
+    try:
+        data = yaml.safe_load(file.read_text())
+    except OSError as error:
+        shipped = ", ".join(sorted(p.stem for p in SCENARIO_FOLDER.glob("*.yaml")))
+        raise ScenarioError(f"{file}: {error.strerror}; shipped scenarios: {shipped or 'none'}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{file}: not YAML: {' '.join(str(error).split())}") from None
+    return parse(data, file, seed)
+
+
+def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
+    """Check a scenario's mapping (``file`` is named in errors). Raises ScenarioError."""
+    known = ("name", "description", "seed", "cameras", "source", "channel", "edge")
+    if not isinstance(data, dict):
+        raise ScenarioError(f"{file}: expected a mapping with the keys {', '.join(known)}")
+    _refuse_unknown(data, known, f"{file}: ")
+    for key in ("source", "channel", "edge"):
+        if not isinstance(data.get(key, {}), dict):
+            raise ScenarioError(f"{file}: {key}: expected a mapping")
+    found = read_section(Cameras, data.get("cameras", {}), f"{file}: cameras")
+    if bool(found.ids) == bool(found.count) or not 0 <= found.count <= MAX_CAMERAS:
+        raise ScenarioError(f"{file}: cameras: expected either count (1 to {MAX_CAMERAS}) or ids")
+    ids = tuple(found.ids or (f"cam{i:02d}" for i in range(found.count)))
+    for name in (*ids, *found.held_out):
+        if not valid_id(name):
+            raise ScenarioError(f"{file}: cameras: {name!r} is not an id (letters, digits, '.', '_', '-')")
+    if len(set(ids)) != len(ids):
+        raise ScenarioError(f"{file}: cameras.ids: the same id twice")
+    for name in found.held_out:
+        if name not in ids:
+            raise ScenarioError(f"{file}: cameras.held_out: {name!r} is not one of the cameras")
+    if len(set(found.held_out)) == len(ids):
+        raise ScenarioError(f"{file}: cameras.held_out: every camera is held out, none is left to train on")
+    number = data.get("seed", 0) if seed is None else seed
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**63:
+        raise ScenarioError(f"{file}: seed: expected a whole number from 0 to 2^63 - 1, got {number!r}")
+    return Scenario(
+        path=file,
+        name=str(data.get("name", file.stem)),
+        seed=number,
+        cameras=ids,
+        held_out=tuple(dict.fromkeys(found.held_out)),
+        description=str(data.get("description", "")),
+        source=dict(data.get("source", {})),
+        channel=dict(data.get("channel", {})),
+        edge=dict(data.get("edge", {})),
+    )
+
+
+def read_section(cls: type[T], mapping: Any, where: str) -> T:
+    """Build dataclass ``cls`` from a mapping, strictly: types by annotation (int, float, bool, str, list,
+    dict, tuple, unions with None, nested dataclasses). ``where`` (file and key) starts every error.
+
+    A float field takes any finite number; an int field no float; NaN and infinity are refused. Ranges are
+    the dataclass's own: a ValueError from its ``__post_init__`` is passed on with ``where`` before it.
+    """
+    if not isinstance(mapping, dict):
+        raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    _refuse_unknown(mapping, tuple(fields), f"{where}.")
+    values = {key: _convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
+    for name, spec in fields.items():
+        no_default = spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING
+        if name not in values and no_default:
+            raise ScenarioError(f"{where}.{name}: missing")
+    try:
+        return cls(**values)
+    except ScenarioError:
+        raise
+    except ValueError as error:
+        raise ScenarioError(f"{where}: {error}") from None
+
+
+def _convert(value: Any, hint: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        options = typing.get_args(hint)
+        if value is None and type(None) in options:
+            return None
+        errors = []
+        for option in options:
+            if option is type(None):
+                continue
+            try:
+                return _convert(value, option, where)
+            except ScenarioError as error:
+                errors.append(error)
+        raise errors[0]
+    if hint is Any:
+        return value
+    if origin is list or hint is list:
+        if not isinstance(value, list):
+            raise ScenarioError(f"{where}: expected a list, got {value!r}")
+        args = typing.get_args(hint)
+        return [_convert(v, args[0], f"{where}[{i}]") for i, v in enumerate(value)] if args else list(value)
+    if origin is tuple:
+        args = typing.get_args(hint)
+        if not isinstance(value, list | tuple) or (args[-1] is not Ellipsis and len(value) != len(args)):
+            count = "" if args[-1] is Ellipsis else f"{len(args)} "
+            raise ScenarioError(f"{where}: expected a list of {count}values, got {value!r}")
+        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else args
+        return tuple(_convert(v, k, f"{where}[{i}]") for i, (v, k) in enumerate(zip(value, kinds)))
+    if origin is dict or hint is dict:
+        if not isinstance(value, dict):
+            raise ScenarioError(f"{where}: expected a mapping, got {value!r}")
+        args = typing.get_args(hint)
+        return (
+            {str(k): _convert(v, args[1], f"{where}.{k}") for k, v in value.items()} if args else dict(value)
+        )
+    if dataclasses.is_dataclass(hint):
+        return read_section(typing.cast(type, hint), value, where)
+    if hint is float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ScenarioError(f"{where}: expected a number, got {value!r}")
+        return float(value)
+    if hint is Path:
+        if not isinstance(value, str):
+            raise ScenarioError(f"{where}: expected a path, got {value!r}")
+        return Path(value)
+    names = {int: "a whole number", str: "text", bool: "true or false"}
+    if type(value) is not hint:
+        raise ScenarioError(f"{where}: expected {names.get(hint, hint)}, got {value!r}")
+    return value
+
+
+def _refuse_unknown(mapping: dict[Any, Any], known: tuple[str, ...], prefix: str) -> None:
+    for key in mapping:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
+            raise ScenarioError(f"{prefix}{key}: unknown key; {hint}")
+
+
+def _words(text: str) -> list[int]:
+    data = text.encode()
+    return [len(data), *(int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4))]

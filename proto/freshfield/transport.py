@@ -1,0 +1,182 @@
+"""gRPC channels and servers as every process of the project opens them: limits, keepalive, TLS, token.
+
+``grpc.http2.bdp_probe=0``: with bandwidth probing on, a stalled reader lets a client queue megabytes of
+frames, which is age. Keepalive is set at both ends, because servers punish pings they did not agree to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hmac
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import grpc
+import grpc.aio
+
+from freshfield.payload import MAX_MESSAGE_BYTES
+
+_KEEPALIVE_MS = 10_000
+# Room for the header around the largest payload.
+_MESSAGE_LIMIT = MAX_MESSAGE_BYTES + 4096
+
+_COMMON: list[tuple[str, Any]] = [
+    ("grpc.max_receive_message_length", _MESSAGE_LIMIT),
+    ("grpc.max_send_message_length", _MESSAGE_LIMIT),
+    ("grpc.http2.bdp_probe", 0),
+    ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
+    ("grpc.keepalive_timeout_ms", 5_000),
+    ("grpc.keepalive_permit_without_calls", 1),
+    ("grpc.http2.max_pings_without_data", 0),
+]
+CLIENT_OPTIONS = [
+    *_COMMON,
+    # The nodes back off themselves; gRPC's own back-off would add up to two minutes on top.
+    ("grpc.initial_reconnect_backoff_ms", 200),
+    ("grpc.min_reconnect_backoff_ms", 200),
+    ("grpc.max_reconnect_backoff_ms", 2_000),
+    ("grpc.enable_http_proxy", 0),
+]
+SERVER_OPTIONS = [
+    *_COMMON,
+    ("grpc.http2.min_recv_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
+    ("grpc.max_concurrent_streams", 1024),
+    # Two servers silently sharing one port would split the cameras between them.
+    ("grpc.so_reuseport", 0),
+]
+
+
+class TransportError(ValueError):
+    """A security or address option that cannot work; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Transport:
+    """How this process talks: files are PEM. Without ``cert`` and ``ca`` everything is plain text.
+
+    cert, key: own certificate (a server needs both for TLS; a client for mutual TLS).
+    ca: trusted authority (a client uses TLS when given; a server then demands client certificates).
+    token: bearer token sent by clients and demanded by servers.
+    """
+
+    cert: Path | None = None
+    key: Path | None = None
+    ca: Path | None = None
+    token: str | None = None
+
+    def metadata(self) -> tuple[tuple[str, str], ...]:
+        """Per-call metadata of a client."""
+        return (("authorization", f"Bearer {self.token}"),) if self.token else ()
+
+    def aio_channel(self, target: str) -> grpc.aio.Channel:
+        """Client channel; must be called with an event loop running."""
+        if self.ca is None:
+            return grpc.aio.insecure_channel(target, options=CLIENT_OPTIONS)
+        return grpc.aio.secure_channel(target, self._client_credentials(), options=CLIENT_OPTIONS)
+
+    def channel(self, target: str) -> grpc.Channel:
+        """Blocking client channel, for tools and tests."""
+        if self.ca is None:
+            return grpc.insecure_channel(target, options=CLIENT_OPTIONS)
+        return grpc.secure_channel(target, self._client_credentials(), options=CLIENT_OPTIONS)
+
+    def aio_server(self) -> grpc.aio.Server:
+        """Server without a port; must be called with an event loop running."""
+        interceptors = [_TokenInterceptor(self.token)] if self.token else []
+        return grpc.aio.server(options=SERVER_OPTIONS, interceptors=interceptors)
+
+    def bind(self, server: grpc.aio.Server, address: str) -> int:
+        """Listen on ``host:port`` (port 0 = any) and return the port. Raises TransportError if taken."""
+        try:
+            if self.cert is None:
+                port = server.add_insecure_port(address)
+            else:
+                port = server.add_secure_port(address, self._server_credentials())
+        except RuntimeError as error:
+            raise TransportError(f"cannot listen on {address}: {error}") from None
+        if port == 0:
+            raise TransportError(f"cannot listen on {address}: is another process using the port?")
+        return port
+
+    def _client_credentials(self) -> grpc.ChannelCredentials:
+        return grpc.ssl_channel_credentials(_pem(self.ca), _pem(self.key), _pem(self.cert))
+
+    def _server_credentials(self) -> grpc.ServerCredentials:
+        if self.key is None:
+            raise TransportError("--tls-cert needs --tls-key as well")
+        pair = (_pem(self.key), _pem(self.cert))
+        return grpc.ssl_server_credentials([pair], _pem(self.ca), require_client_auth=self.ca is not None)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The security options that every process takes."""
+    group = parser.add_argument_group("security", "off unless given; the same options for every process")
+    group.add_argument("--tls-cert", type=Path, metavar="PEM", help="own certificate")
+    group.add_argument("--tls-key", type=Path, metavar="PEM", help="own private key")
+    group.add_argument(
+        "--tls-ca", type=Path, metavar="PEM",
+        help="trusted authority: a client then uses TLS, a server then demands client certificates",
+    )  # fmt: skip
+    group.add_argument("--token-file", type=Path, metavar="FILE", help="file with the shared bearer token")
+
+
+def from_arguments(args: argparse.Namespace) -> Transport:
+    """Transport of parsed ``add_arguments`` options. Raises TransportError for unreadable files."""
+    token = None
+    if args.token_file:
+        token = _read(args.token_file).decode().strip()
+        if not token:
+            raise TransportError(f"{args.token_file}: the token file is empty")
+    for path in (args.tls_cert, args.tls_key, args.tls_ca):
+        if path:
+            _read(path)
+    if (args.tls_cert is None) != (args.tls_key is None):
+        raise TransportError("--tls-cert and --tls-key go together")
+    return Transport(args.tls_cert, args.tls_key, args.tls_ca, token)
+
+
+class _TokenInterceptor(grpc.aio.ServerInterceptor):
+    """Refuses calls without the token. Compared in constant time."""
+
+    def __init__(self, token: str) -> None:
+        self._expected = f"Bearer {token}".encode()
+
+        async def refuse(request: Any, context: grpc.aio.ServicerContext) -> None:
+            await context.abort(grpc.StatusCode.UNAUTHENTICATED, "missing or wrong bearer token")
+
+        async def refuse_stream(request: Any, context: grpc.aio.ServicerContext) -> None:
+            await context.abort(grpc.StatusCode.UNAUTHENTICATED, "missing or wrong bearer token")
+
+        self._refuse = refuse
+        self._refuse_stream = refuse_stream
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[grpc.RpcMethodHandler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> grpc.RpcMethodHandler:
+        for key, value in handler_call_details.invocation_metadata or ():
+            raw = value if isinstance(value, bytes) else value.encode()
+            if key == "authorization" and hmac.compare_digest(raw, self._expected):
+                return await continuation(handler_call_details)
+        handler = await continuation(handler_call_details)
+        if handler is None or not (handler.request_streaming or handler.response_streaming):
+            return grpc.unary_unary_rpc_method_handler(self._refuse)
+        if handler.request_streaming and handler.response_streaming:
+            return grpc.stream_stream_rpc_method_handler(self._refuse_stream)
+        if handler.request_streaming:
+            return grpc.stream_unary_rpc_method_handler(self._refuse_stream)
+        return grpc.unary_stream_rpc_method_handler(self._refuse_stream)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise TransportError(f"cannot read {path}: {error.strerror}") from None
+
+
+def _pem(path: Path | None) -> bytes | None:
+    return None if path is None else _read(path)
