@@ -1,0 +1,60 @@
+"""Where frames come from. One file a source; adding one is one file here and one line in ``config``."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.config import SourceConfig
+from freshfield.geometry import Pinhole, Pose
+from freshfield.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a camera saw at one instant.
+
+    image: uint8 (H, W, 3) RGB or (H, W, 4) RGBA, or bytes already in the scenario's codec; matches
+    ``intrinsics``. pose_gap_ns: time between the exposure and the pose sample it was paired with.
+    """
+
+    image: NDArray[np.uint8] | bytes
+    pose: Pose
+    intrinsics: Pinhole
+    pose_gap_ns: int = 0
+
+
+class Source(Protocol):
+    """One camera. Tick k is the instant k / fps; tick 0 is the start of the epoch, so that cameras in
+    different processes look at the same world."""
+
+    camera: str
+    fps: Fraction
+    intrinsics: Pinhole
+    contents: int | None
+    """How many different shots there are before they repeat; None if they never do."""
+
+    def content(self, tick: int) -> int:
+        """Which shot a tick shows, 0 .. contents - 1; the tick itself where nothing repeats."""
+        ...
+
+    def read(self, content: int) -> Shot:
+        """Render, read or decode one shot. Raises ValueError (DatasetError, PoseGapError) if it cannot be
+        had; later ones may still."""
+        ...
+
+
+def open_sources(
+    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None = None
+) -> dict[str, Source]:
+    """The sources of ``cameras``, sharing what can be shared. Only the file of the kind in use is
+    imported. Raises ScenarioError or DatasetError."""
+    module = importlib.import_module(f"camera_node.sources.{config.kind}")
+    return module.open_sources(scenario, config, cameras, data)

@@ -13,7 +13,7 @@ the score says so.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -34,6 +34,9 @@ PENDING = 8
 GAP_PERIODS = 0.55
 
 Load = Callable[[], NDArray]
+# What was rendered, or a function that renders it once the truth's generation time is known: a held-out
+# camera that moves has another pose by then.
+Render = NDArray | Callable[[int], NDArray]
 
 
 class PerceptualMetric(Protocol):
@@ -69,6 +72,7 @@ class Score:
 class _Frame:
     generated_ns: int
     load: Load
+    viewpoint: Hashable = None
     image: Image | None = None
 
     def pixels(self) -> Image:
@@ -80,7 +84,7 @@ class _Frame:
 @dataclass
 class _Camera:
     frames: deque[_Frame] = field(default_factory=lambda: deque(maxlen=HISTORY_FRAMES))
-    pending: deque[tuple[int, NDArray]] = field(default_factory=lambda: deque(maxlen=PENDING))
+    pending: deque[tuple[int, Render]] = field(default_factory=lambda: deque(maxlen=PENDING))
     noise: NoiseEstimate = field(default_factory=NoiseEstimate)
 
 
@@ -106,24 +110,30 @@ class Scorer:
         self._cameras: dict[str, _Camera] = {}
         self.unscored = 0  # renderings whose truth never came within half a period
 
-    def publish(self, camera: str, rendering: NDArray[np.float32], published_ns: int) -> list[Score]:
-        """Keep a rendering (H, W, 3) in [0, 1] of held-out ``camera``; returns what is scorable already."""
+    def publish(self, camera: str, rendering: Render, published_ns: int) -> list[Score]:
+        """Keep a rendering (H, W, 3) in [0, 1] of held-out ``camera``, or a function of the truth's
+        generation time that makes it; returns what is scorable already."""
         pending = self._camera(camera).pending
         if len(pending) == PENDING:
             self.unscored += 1  # the oldest falls off the deque
         pending.append((published_ns, rendering))
         return self._settle(camera)
 
-    def held_out(self, camera: str, image: NDArray | Load, generated_ns: int) -> list[Score]:
+    def held_out(
+        self, camera: str, image: NDArray | Load, generated_ns: int, viewpoint: Hashable = None
+    ) -> list[Score]:
         """Take a held-out frame, uint8 or floating (H, W, 3 or 4), or a function that decodes it when it
         is needed; returns the scores it completes, oldest first. Frames come in order of capture; one
-        that does not is a clock's jump or a new session and starts the history afresh."""
+        that does not is a clock's jump or a new session and starts the history afresh. Moving pixels are
+        looked for among frames of the same ``viewpoint`` (a moving camera's pose), which may be None."""
         state = self._camera(camera)
         if state.frames and generated_ns <= state.frames[-1].generated_ns:
             state.frames.clear()
         load: Load = image if callable(image) else (lambda: image)
         background = self._background
-        state.frames.append(_Frame(generated_ns, lambda: to_unit(load(), "held-out frame", background)))
+        state.frames.append(
+            _Frame(generated_ns, lambda: to_unit(load(), "held-out frame", background), viewpoint)
+        )
         oldest = generated_ns - round(HISTORY_MS * 1e6)
         # A rendering may be older than the history is long: what it needs is kept while it waits.
         if state.pending:
@@ -201,7 +211,7 @@ class Scorer:
         return done
 
     def _against_nearest(
-        self, camera: str, state: _Camera, period_ms: float, published_ns: int, rendering: NDArray
+        self, camera: str, state: _Camera, period_ms: float, published_ns: int, rendering: Render
     ) -> Score | None:
         frames = list(state.frames)
         times = [f.generated_ns for f in frames]
@@ -209,12 +219,14 @@ class Scorer:
         if abs(times[nearest] - published_ns) > GAP_PERIODS * period_ms * 1e6:
             return None
         truth = frames[nearest].pixels()
-        if self._noisy_truth and nearest > 0:
+        viewpoint = frames[nearest].viewpoint
+        if self._noisy_truth and nearest > 0 and frames[nearest - 1].viewpoint == viewpoint:
             state.noise.add(frames[nearest - 1].pixels(), truth)
         lags = frames_at_lags(times, times[nearest])
-        earlier = [frames[i].pixels() for i in lags]
+        earlier = [frames[i].pixels() for i in lags if frames[i].viewpoint == viewpoint]
         bound = state.noise.bound if self._noisy_truth else BOUND
-        return self.score(camera, rendering, published_ns, truth, times[nearest], earlier, bound)
+        image = rendering(times[nearest]) if callable(rendering) else rendering
+        return self.score(camera, image, published_ns, truth, times[nearest], earlier, bound)
 
 
 def mean_score(scores: Sequence[Score]) -> Score:

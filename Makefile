@@ -1,0 +1,99 @@
+# freshfield: `make demo` and `make test` need python3 >= 3.11 (with venv) and make, nothing else.
+#
+# Everything installs into .venv beside this file. The first call takes minutes (torch is large), the
+# following ones start at once: the stamps .venv/.ok-* follow pyproject.toml.
+
+PYTHON ?= python3
+
+# Package index for torch alone. Empty: pip's own configuration decides, which on Linux means the build with
+# CUDA (several gigabytes). Without a GPU, set this to PyTorch's CPU wheel index (its address is in PyTorch's
+# installation guide), or name that index in pip's configuration:  make demo TORCH_INDEX=ADDRESS
+TORCH_INDEX ?=
+
+# Options of `make demo`.
+SCENARIO ?= deploy/scenarios/room.yaml
+# Seconds (60s, 5m) after everything is up; 0 = until Ctrl-C.
+FOR ?= 60s
+OUT ?= runs/demo
+PORT ?= 8080
+# Folder of recorded data, for scenarios that stream it (fox, lego, people, kitchen).
+DATA ?=
+
+# Options of `make test`: which marks, and more for pytest.
+SELECT ?= not slow
+PYTEST ?=
+
+PY := .venv/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check -q
+TORCH := $(shell sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml)
+PROTOC = -m grpc_tools.protoc -I . --pyi_out=$(1) --python_out=$(1) --grpc_python_out=$(1)
+BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format types bench proto proto-check clean
+
+help:  ## what there is to make
+	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
+
+demo: .venv/.ok-run  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
+	@$(PY) deploy/up.py $(SCENARIO) --for $(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
+
+test: .venv/.ok-test  ## all tests but the slow ones (the browser's too, where there is one)
+	$(PY) -m pytest -m "($(SELECT))$(if $(BROWSER),, and not browser)" $(PYTEST)
+
+lint: .venv/.ok-test  ## ruff: rules and format
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+
+format: .venv/.ok-test  ## ruff: apply the format and the safe fixes
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+types: .venv/.ok-test  ## mypy
+	$(PY) -m mypy
+	MYPYPATH=proto:deploy $(PY) -m mypy deploy/up.py deploy/healthy.py deploy/check_report.py deploy/launch
+
+bench: .venv/.ok-test  ## measure this machine: kernels, payload, emulator
+	$(PY) -m pytest tests/bench -m "" -s
+
+proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
+	cd proto && ../$(PY) $(call PROTOC,.) freshfield/v1/*.proto
+
+proto-check: .venv/.ok-test  ## fail where the generated code differs from its .proto files
+	@rm -rf .venv/proto-check && mkdir -p .venv/proto-check
+	@cd proto && ../$(PY) $(call PROTOC,../.venv/proto-check) freshfield/v1/*.proto
+	@for file in .venv/proto-check/freshfield/v1/*; do \
+	  diff -u proto/freshfield/v1/$$(basename $$file) $$file || \
+	  { echo "proto/freshfield/v1 is not what its .proto files say: run 'make proto' and commit"; exit 1; }; \
+	done
+	@echo "generated code matches the .proto files"
+
+clean:  ## remove the virtual environment and every cache (runs/ stays)
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# --- set-up ---
+
+.venv/.ok-venv:
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found: install Python 3.11 or newer, or name one with PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "$$($(PYTHON) --version) is too old: freshfield needs 3.11 or newer; name one with PYTHON=..."; exit 1; }
+	@echo "set-up 1/3: virtual environment (.venv)"
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "cannot make a virtual environment (Debian: apt-get install python3-venv)"; exit 1; }
+	@touch $@
+
+# torch first and alone, so that TORCH_INDEX decides where it comes from and nothing else does.
+.venv/.ok-torch: .venv/.ok-venv pyproject.toml
+	@echo "set-up 2/3: $(TORCH) (the large one)"
+	@$(PIP) install $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) $(TORCH)
+	@touch $@
+
+.venv/.ok-run: .venv/.ok-torch pyproject.toml
+	@echo "set-up 3/3: freshfield and what it runs on"
+	@$(PIP) install -e '.[edge,up]'
+	@touch $@
+
+.venv/.ok-test: .venv/.ok-torch pyproject.toml
+	@echo "set-up 3/3: freshfield, what it runs on, and the test tools"
+	@$(PIP) install -e '.[edge,up,test,dev]'
+	@touch .venv/.ok-run $@

@@ -1,0 +1,97 @@
+"""Shots as they go on the wire: compressed once, kept while there is room."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+from camera_node.config import SourceConfig
+from camera_node.sources import Source
+from freshfield import payload
+from freshfield.geometry import Pinhole, Pose
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A compressed shot: everything of a frame that does not depend on when it was taken."""
+
+    payload: bytes
+    pose: Pose
+    intrinsics: Pinhole
+    pose_gap_ns: int
+
+
+class EncodedCache:
+    """Compressed shots by (camera, content), up to ``max_bytes``. What is in stays in.
+
+    Shots come round in a fixed order, and then evicting the oldest would evict exactly what is needed
+    next: a full cache that keeps what it has still serves its share of every round.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self.bytes = 0
+        self._shots: dict[tuple[str, int], Encoded] = {}
+        self._lock = threading.Lock()
+
+    def get(self, camera: str, content: int) -> Encoded | None:
+        return self._shots.get((camera, content))
+
+    def put(self, camera: str, content: int, shot: Encoded) -> bool:
+        """Keep a shot; False if it would not fit."""
+        with self._lock:
+            if (camera, content) in self._shots:
+                return True
+            if self.bytes + len(shot.payload) > self.max_bytes:
+                return False
+            self._shots[camera, content] = shot
+            self.bytes += len(shot.payload)
+            return True
+
+
+class Camera:
+    """A source with the scenario's codec and the process's cache behind it."""
+
+    def __init__(self, source: Source, config: SourceConfig, cache: EncodedCache) -> None:
+        self.name = source.camera
+        self.fps = source.fps
+        self.source = source
+        self._codec, self._quality = config.codec, config.quality
+        self._cache = cache
+
+    @property
+    def codec(self) -> str:
+        return self._codec
+
+    def cached(self, tick: int) -> Encoded | None:
+        """The tick's shot if it is at hand; costs a look-up."""
+        if self.source.contents is None:
+            return None
+        return self._cache.get(self.name, self.source.content(tick))
+
+    def capture(self, tick: int) -> Encoded:
+        """The tick's shot, made if need be: milliseconds, so not on the event loop.
+
+        Raises ValueError if the source has no such shot or it cannot be sent.
+        """
+        return self.cached(tick) or self._make(self.source.content(tick))
+
+    def fill(self, content: int) -> bool:
+        """Make one shot ahead of its time; False if the cache is full. Raises as ``capture``."""
+        if self._cache.get(self.name, content) is not None:
+            return True
+        return self._cache.put(self.name, content, self._encode(content))
+
+    def _make(self, content: int) -> Encoded:
+        shot = self._encode(content)
+        if self.source.contents is not None:
+            self._cache.put(self.name, content, shot)
+        return shot
+
+    def _encode(self, content: int) -> Encoded:
+        shot = self.source.read(content)
+        data = shot.image
+        if not isinstance(data, bytes):
+            data = payload.encode(data, self._codec, self._quality)
+        payload.check(data, self._codec, shot.intrinsics.width, shot.intrinsics.height)
+        return Encoded(data, shot.pose, shot.intrinsics, shot.pose_gap_ns)

@@ -1,0 +1,156 @@
+"""One camera's stream: a frame goes out when the last one was answered, for as long as the node lives."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import grpc
+import grpc.aio
+import numpy as np
+
+from camera_node.outbox import Outbox
+from freshfield.clock import Offset
+from freshfield.frame import Frame, to_request
+from freshfield.v1 import frames_pb2 as pb
+from freshfield.v1 import frames_pb2_grpc as rpc
+
+log = logging.getLogger("camera-node")
+
+FIRST_BACKOFF_S = 0.2
+MAX_BACKOFF_S = 3.0
+# A peer that hangs or speaks nonsense must not fill the books with names of its own making.
+_MAX_REASONS = 32
+_REASON = re.compile(r"[a-z0-9_]{1,48}")
+
+_OUTCOMES = {
+    pb.OUTCOME_ACCEPTED: "accepted",
+    pb.OUTCOME_DROPPED_BUSY: "dropped_busy",
+    pb.OUTCOME_SUPERSEDED: "superseded",
+}
+
+
+class ProtocolError(RuntimeError):
+    """The peer answered something that it was not asked."""
+
+
+class Sender:
+    """Sends what waits in an outbox over one stream, one frame unacknowledged, and reconnects for ever.
+
+    offset: the node's present estimate of the peer's clock, put on each frame as it leaves.
+    response_timeout_s: an answer that takes longer means a dead stream.
+    """
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        channel: grpc.aio.Channel,
+        metadata: tuple[tuple[str, str], ...],
+        offset: Callable[[], Offset | None],
+        jitter: np.random.Generator,
+        response_timeout_s: float = 5.0,
+    ) -> None:
+        self.outbox = outbox
+        self.connected = False
+        self.connections = 0
+        self.trouble = ""
+        self._channel = channel
+        self._stub = rpc.FrameStreamServiceStub(channel)
+        self._metadata = metadata
+        self._offset = offset
+        self._jitter = jitter
+        self._timeout = response_timeout_s
+        self._reasons: dict[str, int] = {}
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        backoff = FIRST_BACKOFF_S
+        while True:
+            answered = self.outbox.counts["sent"] - self.outbox.counts["broken"]
+            try:
+                await self._session()
+            except (grpc.aio.AioRpcError, TimeoutError, ProtocolError, asyncio.InvalidStateError) as error:
+                self._report(error)
+            finally:
+                self.connected = False
+            if self.outbox.counts["sent"] - self.outbox.counts["broken"] > answered:
+                backoff = FIRST_BACKOFF_S  # it worked for a while
+            await asyncio.sleep(backoff * self._jitter.uniform(0.5, 1.0))
+            backoff = min(backoff * 2.0, MAX_BACKOFF_S)
+
+    async def _session(self) -> None:
+        """One stream, from the moment the peer can be reached until it fails."""
+        async with asyncio.timeout(2 * MAX_BACKOFF_S):
+            await self._channel.channel_ready()
+        call = self._stub.Push(metadata=self._metadata)
+        try:
+            await call.wait_for_connection()
+            self.connected = True
+            self.connections += 1
+            while True:
+                await self.outbox.wait()
+                if call.done():  # before taking a frame that could only be lost
+                    raise await _status(call)
+                await self._exchange(call, self.outbox.take())
+        finally:
+            call.cancel()
+
+    async def _exchange(self, call: grpc.aio.StreamStreamCall, frame: Frame) -> None:
+        answered = False
+        try:
+            async with asyncio.timeout(self._timeout):
+                await call.write(to_request(self._stamped(frame)))
+                response = await call.read()
+            if response is grpc.aio.EOF:
+                raise await _status(call)
+            if response.sequence != frame.sequence:
+                raise ProtocolError(f"answer to frame {response.sequence}, expected {frame.sequence}")
+            answered = True
+        except TimeoutError:
+            raise TimeoutError(f"no answer within {self._timeout:g} s") from None
+        finally:
+            if not answered:
+                self.outbox.note(frame.sequence, "broken")
+        self._account(frame, response)
+        if self.trouble:
+            log.info("%s: connected again", frame.camera)
+            self.trouble = ""
+
+    def _stamped(self, frame: Frame) -> Frame:
+        offset = self._offset()
+        if offset is None:
+            return frame
+        return replace(
+            frame, clock_offset_ns=offset.offset_ns, clock_uncertainty_ns=offset.uncertainty_ns
+        )
+
+    def _account(self, frame: Frame, response: pb.PushResponse) -> None:
+        outcome = _OUTCOMES.get(response.outcome)
+        if outcome is None:
+            reason = response.reason if _REASON.fullmatch(response.reason) else "unspecified"
+            if reason not in self._reasons:
+                if len(self._reasons) >= _MAX_REASONS:
+                    reason = "other"
+                log.warning("%s: frame refused: %s (%s)", frame.camera, reason, response.detail[:200])
+            self._reasons[reason] = self._reasons.get(reason, 0) + 1
+            outcome = f"rejected:{reason}"
+        self.outbox.note(frame.sequence, "answered", outcome)
+
+    def _report(self, error: Exception) -> None:
+        """Say what broke, once per kind of trouble and not once per attempt."""
+        if isinstance(error, grpc.aio.AioRpcError):
+            text = f"{error.code().name}: {error.details()}"
+        else:
+            text = str(error) or "peer not reachable"
+        if text != self.trouble:
+            log.warning("%s: %s; trying again", self.outbox.camera, text)
+            self.trouble = text
+
+
+async def _status(call: grpc.aio.StreamStreamCall) -> Exception:
+    """Why a stream ended, as an exception."""
+    code, details = await call.code(), await call.details()
+    return ProtocolError(f"stream ended: {code.name}{': ' + details if details else ''}")

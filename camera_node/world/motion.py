@@ -1,0 +1,110 @@
+"""Periodic analytic motion: phases, closed paths, footsteps and the two-bone limb.
+
+All motion is a function of a phase in [0, 1); nothing is integrated, so any instant can be asked for in
+any order and a run of a year is as exact as a run of a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+# Periods are whole multiples of this, so that frame sequences at the usual rates (15, 24, 25, 30 a
+# second, or one every 30 ms) repeat after a few periods at most.
+TICK_S = 0.1
+
+
+def phase_of(t_s: float, period_s: float) -> float:
+    """Phase in [0, 1) of an instant. Raises ValueError for a non-finite instant."""
+    if not math.isfinite(t_s):
+        raise ValueError(f"time must be finite, got {t_s}")
+    phase = math.fmod(t_s, period_s) / period_s
+    phase = phase + 1.0 if phase < 0.0 else phase
+    return 0.0 if phase >= 1.0 else phase
+
+
+def period_for_speed(path_m: float, speed_m_per_s: float) -> tuple[float, float]:
+    """Period (s), a multiple of TICK_S, for a loop of ``path_m`` at about ``speed_m_per_s``, and the
+    factor by which to scale the path so that the speed is exact in spite of the rounding."""
+    ticks = max(1, round(path_m / speed_m_per_s / TICK_S))
+    period = ticks * TICK_S
+    return period, speed_m_per_s * period / path_m
+
+
+def smoothstep(x: float) -> float:
+    """0 below 0, 1 above 1, smooth between."""
+    x = min(1.0, max(0.0, x))
+    return x * x * (3.0 - 2.0 * x)
+
+
+def step_phase(phase: float, cycles: int, offset: float, stance: float = 0.5) -> tuple[float, float]:
+    """Where on the path a foot stands while the body is at ``phase``, and how far through its swing it
+    is (0 while it stands). The foot rests for ``stance`` of each of ``cycles`` gait cycles a loop at the
+    path position the body passes at mid-stance, then swings smoothly to the next."""
+    x = phase * cycles + offset
+    whole = math.floor(x)
+    swing = max(0.0, (x - whole - stance) / (1.0 - stance))
+    at = whole + 0.5 * stance + smoothstep(swing)
+    return (at - offset) / cycles, swing
+
+
+def two_bone(root: Vector, tip: Vector, upper: float, lower: float, pole: Vector) -> Vector:
+    """The joint between two bones from ``root`` to ``tip`` (law of cosines), bent towards ``pole``.
+    A tip out of reach stretches the limb: the joint then lies on the straight line."""
+    dx, dy, dz = (tip[k] - root[k] for k in range(3))
+    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if distance < 1e-9:
+        return (root[0] + upper * pole[0], root[1] + upper * pole[1], root[2] + upper * pole[2])
+    ux, uy, uz = dx / distance, dy / distance, dz / distance
+    if distance >= upper + lower:
+        along, out = distance * upper / (upper + lower), 0.0
+    else:
+        reach = max(distance, abs(upper - lower))
+        along = (upper * upper - lower * lower + reach * reach) / (2.0 * reach)
+        out = math.sqrt(max(0.0, upper * upper - along * along))
+    across = pole[0] * ux + pole[1] * uy + pole[2] * uz
+    px, py, pz = pole[0] - across * ux, pole[1] - across * uy, pole[2] - across * uz
+    norm = math.sqrt(px * px + py * py + pz * pz) or 1.0
+    k = out / norm
+    return (root[0] + along * ux + k * px, root[1] + along * uy + k * py, root[2] + along * uz + k * pz)
+
+
+def bone_frames(start: Array, end: Array, side: Array) -> Array:
+    """Rigid frames (M, 4, 4) at ``start`` (M, 3): local z towards ``end`` (M, 3), local x as near to
+    ``side`` (M, 3) as can be."""
+    z = end - start
+    z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-12)
+    y = _cross(z, side)
+    norm = np.linalg.norm(y, axis=1, keepdims=True)
+    # A bone along its own side vector has no preferred roll: any perpendicular will do.
+    fallback = _cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    y = np.where(norm < 1e-6, fallback, y)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    out = np.zeros((len(start), 4, 4))
+    out[:, :3, 0], out[:, :3, 1], out[:, :3, 2], out[:, :3, 3] = _cross(y, z), y, z, start
+    out[:, 3, 3] = 1.0
+    return out
+
+
+def _cross(a: Array, b: Array) -> Array:
+    # np.cross costs more than these nine products on small arrays.
+    return np.stack(
+        [
+            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
+            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
+            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
+        ],
+        axis=1,
+    )
+
+
+def mean_path_m(points_at: Callable[[float], Array], samples: int = 240) -> float:
+    """Metres that the points (M, 3) = points_at(phase) travel in one loop, averaged over the points."""
+    p = np.stack([points_at(k / samples) for k in range(samples)])
+    return float(np.linalg.norm(np.diff(p, axis=0, append=p[:1]), axis=2).sum(axis=0).mean())

@@ -1,0 +1,46 @@
+"""Camera rigs: positions around a target, ordered so that any prefix is well spread."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from freshfield.geometry import Pinhole, look_at
+
+Array = NDArray[np.float64]
+Rig = dict[str, tuple[Pinhole, Array]]
+
+
+def on_sphere(target: ArrayLike, radius_m: float, azimuth_deg: float, elevation_deg: float) -> Array:
+    """Camera-to-world (4, 4) looking at ``target``; azimuth 0 is on its -y side, 90 on its +x side."""
+    a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
+    away = np.array([np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), np.sin(e)])
+    target = np.asarray(target, dtype=np.float64)
+    return look_at(target + radius_m * away, target)
+
+
+def spread_order(directions: Array) -> list[int]:
+    """Farthest-point order of unit directions (N, 3), starting with the first: every prefix covers the
+    whole as evenly as its size allows. Ties go to the lower number."""
+    order = [0]
+    nearest = directions @ directions[0]
+    while len(order) < len(directions):
+        nearest[order] = np.inf
+        k = int(np.argmin(np.round(nearest, 9)))
+        order.append(k)
+        nearest = np.maximum(nearest, directions @ directions[k])
+    return order
+
+
+def build_rig(
+    angles_deg: list[tuple[float, float]], target: ArrayLike, radius_m: float, count: int, camera: Pinhole
+) -> Rig:
+    """Cameras cam00, cam01, ... at (azimuth, elevation) around ``target``.
+
+    The first entry is cam00, the held-out one; the others are numbered in spread order, so that a
+    smaller ``count`` leaves out the last names and the rest keep their places.
+    """
+    poses = [on_sphere(target, radius_m, a, e) for a, e in angles_deg]
+    away = np.stack([-p[:3, 2] for p in poses])
+    order = spread_order(away)
+    return {f"cam{k:02d}": (camera, poses[i]) for k, i in enumerate(order[:count])}

@@ -1,0 +1,146 @@
+"""Scenes: a world with cameras, bounds and a period, made by name from a dictionary of parameters.
+
+A scene is one module beside this one with a dataclass ``Params`` and a function ``build``; it is
+imported only when it is asked for.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from camera_node.world.render import CameraRenderer, Image, World
+from camera_node.world.rig import Rig
+from camera_node.world.shapes import Array
+from freshfield.geometry import Pinhole
+
+SCENES = ("room", "tile")
+HELD_OUT = "cam00"
+MAX_CAMERAS = 19
+
+
+class SceneError(ValueError):
+    """A scene that cannot be made as asked; the message says what is valid."""
+
+
+@dataclass(frozen=True)
+class BaseParams:
+    """Parameters every scene has.
+
+    count: cameras including the held-out one, 1 to 19. width, height: pixels. supersample: rays per
+    pixel side. distortion: OpenCV's (k1, k2, p1, p2) of every camera's lens.
+    """
+
+    count: int = 13
+    width: int = 128
+    height: int = 128
+    horizontal_fov_deg: float = 60.0
+    supersample: int = 2
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world seen by posed cameras.
+
+    cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is the held-out one. bounds: (2, 3), lower
+    and upper corner in metres of everything that can be seen. period_s: the frames repeat after this
+    long, a multiple of 0.1 s. moving: False where every instant is the same.
+    """
+
+    name: str
+    params: BaseParams
+    cameras: Rig
+    world: World
+    bounds: Array
+    period_s: float
+    moving: bool = True
+    _renderers: dict[str, CameraRenderer] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def held_out(self) -> str:
+        return HELD_OUT
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """Colour in [0, 1] of rays that meet nothing."""
+        return self.world.background
+
+    def render(self, camera_id: str, t_s: float) -> Image:
+        """What a camera sees at an instant: uint8 RGB (height, width, 3), free of noise and exact."""
+        return self.renderer(camera_id).image(t_s)
+
+    def renderer(self, camera_id: str) -> CameraRenderer:
+        """The camera's renderer, made on first use (some tenths of a second) and kept."""
+        if camera_id not in self._renderers:
+            if camera_id not in self.cameras:
+                raise SceneError(f"scene {self.name}: no camera {camera_id!r}; it has {', '.join(self.cameras)}")
+            self._renderers[camera_id] = self.view(*self.cameras[camera_id])
+        return self._renderers[camera_id]
+
+    def view(self, camera: Pinhole, camera_to_world: Array) -> CameraRenderer:
+        """A renderer for any other camera."""
+        return CameraRenderer(self.world, camera, camera_to_world, self.params.supersample)
+
+    def with_world(self, world: World, period_s: float, moving: bool) -> Scene:
+        """The same cameras in another world (an effect adds to it)."""
+        return dataclasses.replace(self, world=world, period_s=period_s, moving=moving, _renderers={})
+
+
+def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
+    """The scene ``name`` with ``params`` over its defaults.
+
+    Raises SceneError, listing what is valid, for an unknown scene or parameter or a value out of range.
+    """
+    if name not in SCENES:
+        raise SceneError(f"unknown scene {name!r}; valid scenes: {', '.join(SCENES)}")
+    module = importlib.import_module(f"camera_node.world.{name}")
+    return module.build(_checked(name, module.Params, dict(params or {})))
+
+
+def _checked(name: str, model: type, given: dict[str, Any]) -> Any:
+    defaults = {f.name: f.default for f in dataclasses.fields(model)}
+    for key, value in given.items():
+        if key not in defaults:
+            valid = ", ".join(f"{k} ({v})" for k, v in defaults.items())
+            raise SceneError(f"scene {name}: unknown parameter {key!r}; valid (default): {valid}")
+        given[key] = _as_type(name, key, value, defaults[key])
+    made = model(**given)
+    ranges = {
+        "count": (1, MAX_CAMERAS), "width": (8, 4096), "height": (8, 4096),
+        "horizontal_fov_deg": (5.0, 150.0), "supersample": (1, 8),
+    }  # fmt: skip
+    for key, (low, high) in ranges.items():
+        if not low <= getattr(made, key) <= high:
+            raise SceneError(f"scene {name}: {key} must be within {low} to {high}, got {getattr(made, key)}")
+    return made
+
+
+def _as_type(name: str, key: str, value: Any, default: Any) -> Any:
+    problem = SceneError(f"scene {name}: {key} must be like {default!r}, got {value!r}")
+    if isinstance(default, tuple):
+        try:
+            out = tuple(float(v) for v in value)
+        except (TypeError, ValueError):
+            raise problem from None
+        if len(out) != len(default) or not np.all(np.isfinite(out)):
+            raise problem
+        return out
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise problem
+    if isinstance(default, int):
+        if value != int(value):
+            raise problem
+        return int(value)
+    return float(value)
+
+
+def pinhole(params: BaseParams) -> Pinhole:
+    """The camera that ``params`` describe."""
+    camera = Pinhole.from_fov(params.width, params.height, params.horizontal_fov_deg)
+    return dataclasses.replace(camera, distortion=params.distortion)

@@ -1,0 +1,74 @@
+"""Uniform random numbers that are looked up, not drawn: by seed, camera, purpose and number.
+
+A stateful generator would make a frame's fate depend on how many numbers other frames used. Here number
+``n`` of a stream is a pure function (Philox4x32-10, Salmon et al., "Parallel random numbers: as easy as
+1, 2, 3", SC 2011), so adding a camera changes nothing for the others, and the kernel in
+``kernels/philox.py`` finds the same numbers in any order.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+_MULTIPLY_0, _MULTIPLY_1 = 0xD2511F53, 0xCD9E8D57
+_WEYL_0, _WEYL_1 = 0x9E3779B9, 0xBB67AE85
+_WORD = 0xFFFFFFFF
+
+
+def philox4x32(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Ten rounds of Philox4x32: four 32-bit counter words and two key words to four random words."""
+    c0, c1, c2, c3 = counter
+    k0, k1 = key
+    for _ in range(10):
+        p0, p1 = _MULTIPLY_0 * c0, _MULTIPLY_1 * c2
+        c0, c1, c2, c3 = (p1 >> 32) ^ c1 ^ k0, p1 & _WORD, (p0 >> 32) ^ c3 ^ k1, p0 & _WORD
+        k0, k1 = (k0 + _WEYL_0) & _WORD, (k1 + _WEYL_1) & _WORD
+    return c0, c1, c2, c3
+
+
+def _unit(low: int, high: int) -> float:
+    # 52 bits and a half step: strictly inside (0, 1) and exact in float64, so a logarithm is always finite.
+    return (((high << 32 | low) >> 12) + 0.5) * 2.0**-52
+
+
+def stream_key(seed: int, camera: str, purpose: str) -> tuple[int, int]:
+    """The key of one camera's stream for one purpose. Seeds are whole numbers from 0 to 2^63 - 1.
+
+    The camera enters by its name, not its place in a list: that is what makes cameras independent of each
+    other's presence.
+    """
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed: expected a whole number from 0 to 2^63 - 1, got {seed}")
+    words = [seed & _WORD, seed >> 32, *_words(purpose), *_words(camera)]
+    low, high = np.random.SeedSequence(words).generate_state(2, np.uint32)
+    return int(low), int(high)
+
+
+class Uniforms:
+    """One stream: ``pair(n)`` are two independent uniforms in (0, 1) for number ``n``.
+
+    ``again`` indexes further pairs of the same number, for methods that reject.
+    """
+
+    __slots__ = ("key",)
+
+    def __init__(self, seed: int, camera: str, purpose: str) -> None:
+        self.key = stream_key(seed, camera, purpose)
+
+    def pair(self, n: int, again: int = 0) -> tuple[float, float]:
+        a, b, c, d = philox4x32((n & _WORD, n >> 32, again, 0), self.key)
+        return _unit(a, b), _unit(c, d)
+
+    def uniform(self, n: int, again: int = 0) -> float:
+        return self.pair(n, again)[0]
+
+    def exponential(self, n: int) -> float:
+        """Unit-mean exponential number ``n``."""
+        return -math.log(self.pair(n)[0])
+
+
+def _words(text: str) -> list[int]:
+    data = text.encode()
+    return [len(data), *(int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4))]

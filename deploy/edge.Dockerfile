@@ -1,0 +1,36 @@
+# The edge server: torch, kernels, page. Build from the repository's root:
+#   docker build -f deploy/edge.Dockerfile -t localhost/freshfield-edge .
+# Without a GPU, add --build-arg TORCH_INDEX=... with PyTorch's CPU wheel index: the image is 3 GB smaller.
+FROM docker.io/library/python:3.11-slim-bookworm AS build
+# One more package index for pip, where there is one; and the index that torch alone comes from.
+ARG PIP_EXTRA_INDEX_URL
+ARG TORCH_INDEX
+WORKDIR /src
+COPY pyproject.toml README.md LICENSE ./
+# torch first: its layer is large and changes only with its version.
+RUN python -m venv /opt/freshfield \
+ && torch=$(sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml) \
+ && /opt/freshfield/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q \
+      ${TORCH_INDEX:+--index-url $TORCH_INDEX} "$torch"
+COPY proto proto
+COPY camera_node camera_node
+COPY channel_emu channel_emu
+COPY edge_server edge_server
+RUN /opt/freshfield/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[edge]'
+
+FROM docker.io/library/python:3.11-slim-bookworm
+RUN useradd --system --create-home --uid 10001 freshfield \
+ && install -d -o freshfield -g freshfield /runs
+COPY --from=build /opt/freshfield /opt/freshfield
+COPY deploy/scenarios /app/deploy/scenarios
+COPY deploy/healthy.py /app/deploy/healthy.py
+# Compiled kernels are kept in the user's home: the installed packages are not theirs to write to.
+ENV PATH=/opt/freshfield/bin:$PATH PYTHONUNBUFFERED=1 \
+    NUMBA_CACHE_DIR=/home/freshfield/.cache/numba MPLCONFIGDIR=/home/freshfield/.cache/matplotlib
+WORKDIR /app
+USER freshfield
+VOLUME /runs
+EXPOSE 7000 8080
+HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 \
+  CMD ["python", "deploy/healthy.py", "--serving", "127.0.0.1:7000"]
+CMD ["edge-server", "--help"]

@@ -1,0 +1,115 @@
+"""The commands of one scenario's processes, wired together by free loopback ports.
+
+node -> emulator -> edge: the nodes are told the emulator's address and nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from freshfield.scenario import Scenario
+from launch.net import LOOPBACK, free_ports
+from launch.processes import Child
+
+# Libraries start a thread for each core unless told otherwise. Nodes and emulator have none to gain, and
+# the field brings its own pool: the others' threads would only take turns with it.
+_ONE_THREAD = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+_EDGE_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class MissingCommand(RuntimeError):
+    """A command of the project is not installed; the message says how to install it."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The processes of one scenario. ``nodes`` is never empty."""
+
+    edge: Child
+    emulator: Child
+    nodes: list[Child]
+    edge_address: str
+    emulator_address: str
+
+    @property
+    def children(self) -> list[Child]:
+        """All of them in the order in which they stop: nobody sends to what is gone."""
+        return [*self.nodes, self.emulator, self.edge]
+
+
+def plan(
+    scenario: Scenario,
+    out: Path,
+    page_port: int,
+    data: Path | None = None,
+    seed: int | None = None,
+    process_per_camera: bool = False,
+) -> Plan:
+    """Commands, addresses and log files of a run into ``out``."""
+    edge_port, emulator_port = free_ports(2)
+    edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
+    file = str(scenario.path)
+    common = ["--out", str(out), *(["--seed", str(seed)] if seed is not None else [])]
+    recorded = ["--data", str(data)] if data is not None else []
+    edge = Child(
+        "edge",
+        "the edge server",
+        [
+            *(program("edge-server"), "run", file, "--listen", edge_address),
+            *("--page-host", LOOPBACK, "--page-port", str(page_port)),
+            *(*common, *recorded),
+        ],
+        out / "log-edge.txt",
+        _threads(_EDGE_THREADS, _cores()),
+    )
+    emulator = Child(
+        "emulator",
+        "the channel emulator",
+        [
+            *(program("channel-emu"), "run", file),
+            *("--listen", emulator_address, "--to", edge_address, *common),
+        ],
+        out / "log-emulator.txt",
+        _threads(_ONE_THREAD, 1),
+    )
+    groups = [[camera] for camera in scenario.cameras] if process_per_camera else [[]]
+    nodes = []
+    for cameras in groups:
+        which = ["--camera", ",".join(cameras)] if cameras else ["--all"]
+        name = f"node-{cameras[0]}" if cameras else "node"
+        role = f"the camera node of {', '.join(cameras)}" if cameras else "the camera node"
+        command = [program("camera-node"), "run", file, *which, "--to", emulator_address, *common, *recorded]
+        nodes.append(Child(name, role, command, out / f"log-{name}.txt", _threads(_ONE_THREAD, 1)))
+    return Plan(edge, emulator, nodes, edge_address, emulator_address)
+
+
+def program(name: str) -> str:
+    """Path of one of the project's commands: that of this interpreter's environment first."""
+    beside = Path(sys.executable).parent / name
+    found = str(beside) if beside.exists() else shutil.which(name)
+    if found is None:
+        raise MissingCommand(
+            f"{name} is not installed beside {sys.executable}; use `make demo`, or install the project "
+            "there with: pip install -e '.[edge,up]'"
+        )
+    return found
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _threads(variables: tuple[str, ...], count: int) -> dict[str, str]:
+    """Limits for what the person who runs this has not set themselves."""
+    return {name: str(count) for name in variables if name not in os.environ}

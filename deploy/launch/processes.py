@@ -1,0 +1,141 @@
+"""Child processes: start them apart from the terminal, keep their logs, say how they died, stop them."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+GRACE_S = 8.0
+"""How long a process may take to end after SIGTERM before it is killed."""
+
+_TAIL_BYTES = 16_384
+_PR_SET_PDEATHSIG = 1
+# Loaded here and not in the child: between fork and exec nothing should be imported.
+_libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+
+
+@dataclass
+class Child:
+    """One process of the run. ``role`` is what a person calls it, for example ``edge-server``."""
+
+    name: str
+    role: str
+    command: Sequence[str]
+    log: Path
+    environment: Mapping[str, str] = field(default_factory=dict)
+    restarts: int = 0
+    process: subprocess.Popen[bytes] | None = None
+    started_s: float = 0.0
+    killed: bool = False
+    """True once it did not end in time and had to be killed."""
+
+    def start(self) -> None:
+        """Start it in a session of its own: Ctrl-C reaches the launcher alone, which keeps the order."""
+        with self.log.open("ab") as log:
+            log.write(f"$ {' '.join(self.command)}\n".encode())
+            log.flush()
+            self.process = subprocess.Popen(
+                list(self.command),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", **self.environment},
+                start_new_session=True,
+                preexec_fn=_die_with_parent if _libc else None,
+            )
+        self.started_s = time.monotonic()
+
+    @property
+    def running(self) -> bool:
+        return self.process is not None and self.process.poll() is None
+
+    @property
+    def pid(self) -> int | None:
+        return self.process.pid if self.process is not None else None
+
+    def obituary(self) -> str:
+        """How it ended and the last lines of its log, for a person. Only for a process that has ended."""
+        assert self.process is not None and self.process.returncode is not None
+        age_s = time.monotonic() - self.started_s
+        lines = [f"{self.role} {how_it_ended(self.process.returncode)}, {age_s:.1f} s after its start."]
+        last = tail(self.log, 12)
+        if last:
+            lines.append(f"The last lines of {self.log}:")
+            lines.extend(f"  | {line}" for line in last)
+        else:
+            lines.append(f"It wrote nothing ({self.log} is empty).")
+        return "\n".join(lines)
+
+
+def stop(children: Sequence[Child], grace_s: float = GRACE_S) -> None:
+    """SIGTERM to all of them at once, SIGKILL to those still there after ``grace_s`` seconds."""
+    for child in children:
+        if child.running:
+            child.process.send_signal(signal.SIGTERM)  # type: ignore[union-attr]
+    deadline = time.monotonic() + grace_s
+    for child in children:
+        if child.process is None:
+            continue
+        try:
+            child.process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            child.killed = True
+            kill(child)
+
+
+def kill(child: Child) -> None:
+    """End it at once, with everything it started (its process group)."""
+    if child.process is None or child.process.poll() is not None:
+        return
+    try:
+        os.killpg(child.process.pid, signal.SIGKILL)
+    except (ProcessLookupError, PermissionError):
+        child.process.kill()
+    child.process.wait()
+
+
+def how_it_ended(returncode: int) -> str:
+    """An exit status in words."""
+    if returncode >= 0:
+        return f"ended by itself with exit code {returncode}"
+    try:
+        name = signal.Signals(-returncode).name
+    except ValueError:
+        name = f"signal {-returncode}"
+    why = {
+        "SIGKILL": " (by somebody, or by the system for lack of memory)",
+        "SIGSEGV": " (a crash in native code)",
+        "SIGABRT": " (a native library gave up)",
+        "SIGILL": " (an instruction this processor does not have)",
+        "SIGBUS": " (memory or disk behind a mapped file is gone)",
+    }.get(name, "")
+    return f"was killed by {name}{why}"
+
+
+def tail(path: Path, lines: int) -> list[str]:
+    """The last lines of a text file that may be large, be missing, or end in half a character."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            size = file.tell()
+            file.seek(max(0, size - _TAIL_BYTES))
+            text = file.read().decode(errors="replace")
+    except OSError:
+        return []
+    found = [line.rstrip() for line in text.splitlines() if line.strip()]
+    if size > _TAIL_BYTES and found:
+        found = found[1:]  # the first one is cut
+    return [line for line in found if not line.startswith("$ ")][-lines:]
+
+
+def _die_with_parent() -> None:
+    """Runs in the child: a launcher that is killed outright must not leave cameras streaming for ever."""
+    assert _libc is not None
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)

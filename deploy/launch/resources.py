@@ -1,0 +1,61 @@
+"""What every process costs, over time: ``processes.jsonl``, one line every two seconds.
+
+Each line: ``{"t_s": 12.0, "edge": {"rss_mb": 512.3, "cpu": 1.42, "pid": 17}, ...}``; ``cpu`` in cores, over
+the time since the line before.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from launch.processes import Child
+
+PERIOD_S = 2.0
+
+
+@dataclass(frozen=True)
+class Use:
+    """Resident memory in MB (10^6 bytes) and processor time in cores."""
+
+    rss_mb: float
+    cpu: float
+    pid: int
+
+
+class Resources:
+    """Samples the children; ``latest`` is what the table shows."""
+
+    def __init__(self, path: Path) -> None:
+        self.latest: dict[str, Use] = {}
+        self._path = path
+        self._next_s = 0.0
+        self._known: dict[int, psutil.Process] = {}
+
+    def sample(self, now_s: float, children: Sequence[Child]) -> None:
+        """Note every running child's use, at most once a period. ``now_s``: since the run began."""
+        if now_s < self._next_s:
+            return
+        self._next_s = now_s + PERIOD_S
+        self.latest = {}
+        for child in children:
+            if child.pid is None or not child.running:
+                continue
+            try:
+                process = self._known.setdefault(child.pid, psutil.Process(child.pid))
+                with process.oneshot():
+                    use = Use(
+                        round(process.memory_info().rss / 1e6, 1),
+                        round(process.cpu_percent(None) / 100.0, 2),
+                        child.pid,
+                    )
+            except psutil.Error:
+                continue  # it ended in between
+            self.latest[child.name] = use
+        line = {"t_s": round(now_s, 1), **{name: vars(use) for name, use in self.latest.items()}}
+        with self._path.open("a") as file:
+            file.write(json.dumps(line) + "\n")

@@ -1,0 +1,204 @@
+"""One run from start to report: the order of starting, watching, stopping and telling."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from freshfield.scenario import Scenario
+from launch import folder, net, processes
+from launch.commands import Plan, plan, program
+from launch.display import Display, make_display
+from launch.processes import Child
+from launch.resources import Resources
+from launch.status import read_status
+from launch.summary import summarise
+
+TICK_S = 0.25
+READY_WITHIN_S = 240.0
+"""A first start compiles the field's kernels, which takes tens of seconds on a slow machine."""
+MAX_RESTARTS = 20
+REPORT_WITHIN_S = 300.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """out: folder of the run. duration_s: from when everything is up; 0: until told to stop."""
+
+    out: Path
+    duration_s: float = 60.0
+    port: int = 8080
+    data: Path | None = None
+    seed: int | None = None
+    restart: bool = False
+    table: bool = True
+    process_per_camera: bool = False
+
+
+class Run:
+    """Starts a scenario's processes and sees them through. Use ``main`` once."""
+
+    def __init__(self, scenario: Scenario, options: Options) -> None:
+        self.scenario = scenario
+        self.options = options
+        self.plan: Plan
+        self._display: Display
+        self._signals: list[str] = []
+        self._asked = threading.Event()
+        self._began_s = time.monotonic()
+        self._ready_s: float | None = None
+        self._page_told = False
+        self._dead: list[str] = []
+        self._restart_at: dict[str, float] = {}
+
+    def main(self) -> int:
+        """Run to the end; 0 if it ended as asked. Raises FolderError or MissingCommand before any start."""
+        options = self.options
+        self.plan = plan(
+            self.scenario,
+            options.out,
+            options.port,
+            options.data,
+            options.seed,
+            options.process_per_camera,
+        )
+        about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
+        lock = folder.prepare(options.out, about)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+                signal.signal(number, self._on_signal)
+        self._display = make_display(options.table)
+        try:
+            with self._display:
+                self._introduce()
+                try:
+                    self._watch()
+                finally:
+                    self._stop()
+            self._report()
+        finally:
+            lock.close()
+        return 1 if self._dead else 0
+
+    def _introduce(self) -> None:
+        cameras = f"{len(self.scenario.training)} cameras"
+        if self.scenario.held_out:
+            cameras += f" + {len(self.scenario.held_out)} held out"
+        self._display.say(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
+        self._display.say(f"logs and results: {self.options.out}")
+
+    def _watch(self) -> None:
+        """Start, then look around every tick until there is a reason to stop."""
+        # The nodes render ahead while the edge loads its libraries. The emulator opens its door last: no
+        # frame is offered before there is somebody to take it, and none is lost to the start.
+        self.plan.edge.start()
+        for node in self.plan.nodes:
+            node.start()
+        resources = Resources(self.options.out / "processes.jsonl")
+        while not self._asked.wait(TICK_S):
+            now_s = time.monotonic()
+            if not self._all_alive(now_s):
+                return
+            if self._ready_s is None:
+                self._get_ready(now_s)
+                if self._dead:
+                    return
+            resources.sample(now_s - self._began_s, self.plan.children)
+            self._display.show(
+                read_status(self.options.out, self.scenario.cameras), self._headline(now_s), resources.latest
+            )
+            if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
+                return
+
+    def _get_ready(self, now_s: float) -> None:
+        """One step of the start: emulator once the edge serves, and the address once the page answers."""
+        emulator = self.plan.emulator
+        if emulator.process is None and net.is_serving(self.plan.edge_address):
+            emulator.start()
+        if not self._page_told and net.page_answers(self.options.port):
+            self._page_told = True
+            port = self.options.port
+            self._display.say(f"page: http://{net.LOOPBACK}:{port}   (after {now_s - self._began_s:.0f} s)")
+            self._display.say(
+                f"      from another machine first: ssh -L {port}:{net.LOOPBACK}:{port} THIS-MACHINE"
+            )
+        if self._page_told and emulator.process is not None and net.is_serving(self.plan.emulator_address):
+            self._ready_s = now_s
+        elif now_s - self._began_s > READY_WITHIN_S:
+            waited_for = self.plan.edge if emulator.process is None or not self._page_told else emulator
+            self._mourn(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
+
+    def _all_alive(self, now_s: float) -> bool:
+        """Look for the dead; with --restart, start them again after a second. False if the run is over."""
+        for child in self.plan.children:
+            if child.process is None or child.running:
+                continue
+            due_s = self._restart_at.get(child.name)
+            if due_s is None:
+                if not self.options.restart or child.restarts >= MAX_RESTARTS:
+                    self._mourn(child.obituary())
+                    continue
+                self._display.say(f"{child.obituary()}\nIt is started again in a second (--restart).")
+                self._restart_at[child.name] = now_s + 1.0
+            elif now_s >= due_s:
+                del self._restart_at[child.name]
+                child.restarts += 1
+                child.start()
+        return not self._dead
+
+    def _mourn(self, text: str) -> None:
+        self._dead.append(text)
+        self._display.say(text)
+
+    def _headline(self, now_s: float) -> str:
+        if self._ready_s is None:
+            if self.plan.emulator.process is None:
+                return "starting: the edge server loads, the cameras prepare"
+            return "starting: the channel emulator"
+        elapsed = now_s - self._ready_s
+        end = f" of {self.options.duration_s:.0f}" if self.options.duration_s else ""
+        return (
+            f"{elapsed:.0f}{end} s   http://{net.LOOPBACK}:{self.options.port}   Ctrl-C ends it with a report"
+        )
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._signals.append(signal.Signals(number).name)
+        self._asked.set()
+
+    def _stop(self) -> None:
+        """Nodes first, edge last, so that what is on the way still arrives. A second Ctrl-C hurries."""
+        why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
+        reason = f" ({why[self._signals[0]]})" if self._signals else ""
+        self._display.say(f"stopping{reason}: cameras, channel, edge")
+        for group in (self.plan.nodes, [self.plan.emulator], [self.plan.edge]):
+            processes.stop(group, 0.0 if len(self._signals) > 1 else processes.GRACE_S)
+            for child in group:
+                if child.killed:
+                    self._display.say(f"{child.role} did not end in time and was killed; see {child.log}")
+
+    def _report(self) -> None:
+        """Join the books and write the report, whatever happened before."""
+        out = self.options.out
+        if not any(out.glob("ledger-*.tsv")):
+            self._display.say("no process got as far as its first entry in the books: there is no report")
+            return
+        report = Child(
+            "report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt"
+        )
+        report.start()
+        assert report.process is not None
+        try:
+            code = report.process.wait(REPORT_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            processes.kill(report)
+            self._mourn(f"the report was not ready after {REPORT_WITHIN_S:.0f} s; see {report.log}")
+            return
+        if code != 0:
+            self._mourn(report.obituary())
+            return
+        self._display.say(summarise(out))

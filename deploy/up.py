@@ -1,0 +1,84 @@
+"""Starts every process of one scenario on this machine, watches them, and writes the report at the end.
+
+    python deploy/up.py SCENARIO [--for 60s] [--out DIR] [--port 8080] [--data DIR] [--seed N]
+
+It only starts the three commands that are also run by hand on separate machines: camera-node, channel-emu
+and edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of --for stop them in the order of the data.
+Exit code: 0 for a run that ended as asked, 1 if a process died, 2 if it could not begin.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from pathlib import Path
+
+from freshfield import scenario as scenarios
+from launch.commands import MissingCommand
+from launch.folder import FolderError
+from launch.net import is_free
+from launch.run import Options, Run
+
+
+def main(arguments: list[str] | None = None) -> int:
+    args = _parser().parse_args(arguments)
+    try:
+        scenario = scenarios.load(args.scenario, args.seed)
+        if not is_free(args.port):
+            return _refuse(f"port {args.port} is taken by another program; choose one with --port (PORT=)")
+        if args.data is not None and not args.data.is_dir():
+            return _refuse(f"{args.data}: no such folder of recorded data (--data)")
+        options = Options(
+            out=args.out,
+            duration_s=args.duration_s,
+            port=args.port,
+            data=args.data,
+            seed=args.seed,
+            restart=args.restart,
+            table=not args.no_table,
+            process_per_camera=args.process_per_camera,
+        )
+        return Run(scenario, options).main()
+    except (scenarios.ScenarioError, FolderError, MissingCommand) as error:
+        return _refuse(str(error))
+
+
+def seconds(text: str) -> float:
+    """``90``, ``90s``, ``1.5m``, ``2h``; 0 means no end."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h|)", text.strip())
+    if not found:
+        raise argparse.ArgumentTypeError(f"expected a time such as 60s, 5m or 0 (no end), got {text!r}")
+    return float(found[1]) * {"": 1, "s": 1, "m": 60, "min": 60, "h": 3600}[found[2]]
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 65535:
+        raise argparse.ArgumentTypeError(f"expected a port from 1 to 65535, got {text!r}")
+    return int(text)
+
+
+def _refuse(message: str) -> int:
+    print(f"up: {message}", file=sys.stderr)
+    return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="up.py", description=__doc__.split("\n")[0])
+    add = parser.add_argument
+    add("scenario", help="a scenario file, or the name of a shipped one (room, tile, ideal, ...)")
+    add("--for", dest="duration_s", type=seconds, default=60.0, metavar="TIME", help="default 60s; 0: no end")
+    add("--out", type=Path, default=Path("runs/demo"), help="folder of the run; an earlier run is replaced")
+    add("--port", type=_port, default=8080, help="of the page, on 127.0.0.1 (default 8080)")
+    add("--data", type=Path, help="folder of recorded data, for scenarios that stream it")
+    add("--seed", type=int, help="instead of the scenario's own")
+    add(
+        "--restart", action="store_true", help="start a process again when it dies, instead of ending the run"
+    )
+    add("--no-table", action="store_true", help="plain lines even on a terminal")
+    add("--process-per-camera", action="store_true", help="one camera-node process for each camera")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

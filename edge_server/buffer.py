@@ -1,0 +1,73 @@
+"""What the edge knows of each camera: its newest frame by generation time, still encoded, and its age.
+
+Age of information (5.4, 5.5): now minus the generation time of the newest frame that has arrived. The set
+of newest frames is the temporally inconsistent set Omega(t) of (5.6).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from freshfield.frame import Frame
+
+
+@dataclass(frozen=True)
+class Buffered:
+    """A frame in the buffer. generated_ns is on the edge's clock (the node's offset added)."""
+
+    frame: Frame
+    generated_ns: int
+    received_ns: int
+
+    def age_ms(self, now_ns: int) -> float:
+        return (now_ns - self.generated_ns) / 1e6
+
+
+class FrameBuffer:
+    """Newest frame per training camera. Memory is one encoded frame a camera, whatever arrives.
+
+    Thread-safe; ``wait`` lets the loop sleep until something arrives.
+    """
+
+    def __init__(self, cameras: Sequence[str]) -> None:
+        self.cameras = tuple(cameras)
+        self._newest: dict[str, Buffered] = {}
+        self._arrived = threading.Condition()
+        self.arrivals = 0
+        self.stale_on_arrival = 0
+        """Frames that arrived after a younger one of the same camera; delivered, but never newest."""
+
+    def put(self, frame: Frame, received_ns: int) -> None:
+        """Keep ``frame`` if no younger one of its camera is here."""
+        item = Buffered(frame, frame.generated_edge_ns, received_ns)
+        with self._arrived:
+            known = self._newest.get(frame.camera)
+            if known is not None and known.generated_ns >= item.generated_ns:
+                self.stale_on_arrival += 1
+            else:
+                self._newest[frame.camera] = item
+            self.arrivals += 1
+            self._arrived.notify_all()
+
+    def forget(self, camera: str) -> None:
+        """Drop a camera's frame: its clock has jumped, so that age would be meaningless."""
+        with self._arrived:
+            self._newest.pop(camera, None)
+
+    def newest(self) -> dict[str, Buffered]:
+        """Omega(t): newest frame of every camera that has reported, in the cameras' order."""
+        with self._arrived:
+            return {c: self._newest[c] for c in self.cameras if c in self._newest}
+
+    def ages_ms(self, now_ns: int) -> dict[str, float | None]:
+        """Age per camera (5.4); None for a camera that never reported."""
+        newest = self.newest()
+        return {c: newest[c].age_ms(now_ns) if c in newest else None for c in self.cameras}
+
+    def wait(self, seen: int, timeout_s: float) -> int:
+        """Sleep until more than ``seen`` frames have arrived in all, or the time is up; returns the count."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: self.arrivals > seen, timeout_s)
+            return self.arrivals

@@ -1,0 +1,158 @@
+"""The ``edge-server`` command."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from freshfield import transport
+from freshfield.scenario import ScenarioError, load
+from freshfield.transport import TransportError
+
+DESCRIPTION = """\
+The edge of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
+
+  edge-server run room --listen 127.0.0.1:7001 --page-port 8080 --out runs/room
+  edge-server fit ~/data/lego --field ngp --seconds 60 --holdout 8 --scale 2 --out runs/lego
+  edge-server frontier --quick --out runs/frontier
+  edge-server report runs/room
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0, 1 (it failed while running) or 2 (bad input)."""
+    parser = argparse.ArgumentParser(
+        prog="edge-server", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(commands)
+    _add_report(commands)
+    for name in ("fit", "frontier", "bench"):
+        # Each offline command owns its options; it is imported only when it is called or asked for help.
+        sub = commands.add_parser(name, help=_OFFLINE[name], add_help=False)
+        sub.set_defaults(go=None)
+    words = list(sys.argv[1:] if argv is None else argv)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    try:
+        if words and words[0] in _OFFLINE:
+            return _offline(words[0], words[1:])
+        args = parser.parse_args(words)
+        return args.go(args)
+    except (ScenarioError, TransportError) as error:
+        print(f"edge-server: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+_OFFLINE = {
+    "fit": "fit a recorded data set without a network and report fidelity over time",
+    "frontier": "what accuracy costs in time: sweep effort, plot fidelity against seconds",
+    "bench": "measure this machine: field, ingest, fidelity",
+}
+
+
+def _offline(name: str, words: list[str]) -> int:
+    import importlib
+
+    return importlib.import_module(f"edge_server.offline.{name}").main(words)
+
+
+def _add_run(commands: argparse._SubParsersAction) -> None:
+    run = commands.add_parser(
+        "run",
+        help="serve a scenario",
+        description="Take frames on --listen, keep the field up to date, show it on the page.",
+    )
+    run.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    run.add_argument(
+        "--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="for frames [%(default)s]"
+    )
+    run.add_argument("--page-port", type=int, metavar="PORT", help="serve the live page on this port")
+    run.add_argument("--page-host", default="127.0.0.1", metavar="HOST", help="page's address [%(default)s]")
+    run.add_argument("--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port")
+    run.add_argument("--out", type=Path, default=Path("runs/edge"), metavar="DIR", help="[%(default)s]")
+    run.add_argument("--seed", type=int, help="instead of the scenario's")
+    run.add_argument("--policy", metavar="NAME[:VALUE]", help="instead of the scenario's, e.g. threshold:120")
+    run.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (its lpips/ is found)")
+    run.add_argument("--resume", type=Path, metavar="FILE", help="start from a checkpoint of an earlier run")
+    run.add_argument("--checkpoint-every", type=float, metavar="S", help="write OUT/field this often")
+    run.add_argument("--seconds", type=float, metavar="S", help="end by itself after this long")
+    transport.add_arguments(run)
+    run.set_defaults(go=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from edge_server.config import PolicyConfig, read_config
+    from edge_server.server import EdgeServer, Options
+
+    scenario = load(args.scenario, args.seed)
+    config = read_config(scenario)
+    if args.policy:
+        name, _, value = args.policy.partition(":")
+        try:
+            config = replace(config, policy=PolicyConfig(name, float(value) if value else None))
+        except ValueError:
+            raise ScenarioError(f"--policy {args.policy}: {value!r} is not a number") from None
+    lpips = args.lpips
+    if lpips is None and "FRESHFIELD_LPIPS" not in os.environ:
+        base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
+        if base is not None and (base / "lpips").is_dir():
+            lpips = base / "lpips"
+    options = Options(
+        listen=args.listen,
+        out=args.out,
+        transport=transport.from_arguments(args),
+        page_host=args.page_host,
+        page_port=args.page_port,
+        metrics_port=args.metrics_port,
+        lpips_folder=lpips,
+        resume=args.resume,
+        checkpoint_s=args.checkpoint_every,
+    )
+    try:
+        server = EdgeServer(scenario, config, options)
+    except ValueError as error:  # field options, a checkpoint that does not fit: the message says what
+        raise ScenarioError(f"{scenario.path}: {error}") from None
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: server.stop())
+    if args.seconds is not None:
+        import threading
+
+        timer = threading.Timer(args.seconds, server.stop)
+        timer.daemon = True
+        timer.start()
+    server.run()
+    return 0
+
+
+def _add_report(commands: argparse._SubParsersAction) -> None:
+    report = commands.add_parser(
+        "report",
+        help="join the ledgers of all processes and write report.json, report.html and figures",
+        description="Write DIR/report.json, DIR/report.html and figures from what a run left in DIR.",
+    )
+    report.add_argument("directory", type=Path, metavar="DIR")
+    report.set_defaults(go=_report)
+
+
+def _report(args: argparse.Namespace) -> int:
+    from edge_server.report import build_report
+
+    if not args.directory.is_dir():
+        raise ScenarioError(f"{args.directory}: no such folder")
+    build_report(args.directory)
+    print(args.directory / "report.html")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

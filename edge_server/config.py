@@ -1,0 +1,51 @@
+"""The model of a scenario's ``edge:`` section."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from freshfield.scenario import Scenario, read_section
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Which views an update uses. value: the policy's one parameter (omega_ms, k, period_ms), see
+    edge_server.scheduler; None takes the policy's default."""
+
+    name: str = "all"
+    value: float | None = None
+
+
+@dataclass(frozen=True)
+class EdgeConfig:
+    """The edge section of a scenario.
+
+    field, field_options: the representation and its settings (edge_server.fields.registry).
+    update_ms: what one update may spend fitting. grace_ms: how long the first update waits for cameras
+    that have not reported. lpips: network scored with, where its weights are installed; none turns it off.
+    noisy_truth: held-out frames are real or noisy video, so that the bound of moving pixels follows
+    their noise.
+    """
+
+    field: str = "ngp"
+    field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
+    update_ms: float = 800.0
+    grace_ms: float = 3000.0
+    lpips: str = "alex"
+    noisy_truth: bool = False
+
+    def __post_init__(self) -> None:
+        if not 10.0 <= self.update_ms <= 3_600_000.0:
+            raise ValueError(f"update_ms: expected 10 to 3600000, got {self.update_ms:g}")
+        if self.grace_ms < 0:
+            raise ValueError("grace_ms: expected zero or more")
+        if self.lpips not in ("alex", "squeeze", "none"):
+            raise ValueError(f"lpips: expected alex, squeeze or none, got {self.lpips!r}")
+
+
+def read_config(scenario: Scenario) -> EdgeConfig:
+    """The edge section of a scenario; raises freshfield.scenario.ScenarioError."""
+    return read_section(EdgeConfig, scenario.edge, f"{scenario.path}: edge")

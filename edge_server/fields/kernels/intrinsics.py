@@ -1,0 +1,126 @@
+"""What numba lacks on CPUs: an atomic counter, a float's bits, a vectorisable exp, counter-based noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+
+# No "nnan"/"ninf": the kernels test for non-finite numbers, which those flags would optimise away.
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+
+
+@intrinsic
+def fetch_add(typingctx: Any, array: Any, value: Any) -> Any:
+    """Add ``value`` to ``array[0]`` (int64) atomically; returns what was there before."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", data, args[1], "seq_cst")
+
+    return types.int64(array, types.int64), codegen
+
+
+@intrinsic
+def float_from_bits(typingctx: Any, bits: Any) -> Any:
+    """The float32 whose IEEE representation is the int32 ``bits``."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.FloatType())
+
+    return types.float32(types.int32), codegen
+
+
+_PAIR = ir.VectorType(ir.FloatType(), 2)
+
+
+def _pair_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    pairs = builder.bitcast(data, _PAIR.as_pointer())
+    return builder.gep(pairs, [builder.zext(index, ir.IntType(64))])
+
+
+def _pair_of(builder: Any, a: Any, b: Any) -> Any:
+    pair = builder.insert_element(ir.Constant(_PAIR, ir.Undefined), a, ir.IntType(32)(0))
+    return builder.insert_element(pair, b, ir.IntType(32)(1))
+
+
+@intrinsic
+def add_pair(typingctx: Any, table: Any, row: Any, weight: Any, a: Any, b: Any) -> Any:
+    """``table[row] += weight * (a, b)``; table contiguous float32 (N, 2), row uint32, the rest float32.
+
+    One load and one store where LLVM makes two of each: the scatter takes half the time.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = _pair_pointer(context, builder, signature.args[0], args[0], args[1])
+        step = builder.fmul(
+            _pair_of(builder, args[2], args[2]), _pair_of(builder, args[3], args[4]), flags=("contract",)
+        )
+        old = builder.load(pointer)
+        old.align = 4
+        builder.store(builder.fadd(old, step, flags=("contract",)), pointer).align = 4
+        return context.get_dummy_value()
+
+    f32 = types.float32
+    return types.void(table, types.uint32, f32, f32, f32), codegen
+
+
+@intrinsic
+def weighted_pairs(typingctx: Any, table: Any, rows: Any, weights: Any) -> Any:
+    """``sum_k weights[k] * table[rows[k]]`` as two float32; table contiguous float32 (N, 2), tuples of
+    equal length of uint32 rows and float32 weights."""
+    signature = types.UniTuple(types.float32, 2)(table, rows, weights)
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        total = None
+        for k in range(len(signature.args[1])):
+            row, weight = builder.extract_value(args[1], k), builder.extract_value(args[2], k)
+            pair = builder.load(_pair_pointer(context, builder, signature.args[0], args[0], row))
+            pair.align = 4
+            term = builder.fmul(pair, _pair_of(builder, weight, weight), flags=("contract",))
+            total = term if total is None else builder.fadd(total, term, flags=("contract", "reassoc"))
+        parts = [builder.extract_element(total, ir.IntType(32)(k)) for k in (0, 1)]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return signature, codegen
+
+
+_F = np.float32
+_LOG2_E, _LN2_HIGH, _LN2_LOW = _F(1.44269504), _F(0.693359375), _F(-2.12194440e-4)
+_P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
+_P3, _P4, _P5 = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1)
+_HALF, _ONE, _LOWEST, _HIGHEST = _F(0.5), _F(1.0), _F(-87.0), _F(88.0)
+
+
+@njit(inline="always")
+def exp32(x):
+    """exp in float32, argument clamped to [-87, 88], relative error below 2e-7; NaN stays NaN.
+
+    The Cephes polynomial, because a call into libm would keep LLVM from vectorising the loop around it.
+    """
+    clamped = min(max(x, _LOWEST), _HIGHEST)
+    n = np.floor(clamped * _LOG2_E + _HALF)
+    r = clamped - n * _LN2_HIGH - n * _LN2_LOW
+    p = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5
+    p = p * r * r + r + _ONE
+    power = float_from_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))
+    return p * power + (x - x)  # 0 for finite x, NaN for NaN (and for inf, which no caller means)
+
+
+@njit(inline="always")
+def random_bits(key, n):
+    """64 random bits: the n-th output (uint64) of the splitmix64 stream ``key`` (uint64)."""
+    z = np.uint64(key + np.uint64(n) * np.uint64(0x9E3779B97F4A7C15))
+    z = np.uint64((z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9))
+    z = np.uint64((z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB))
+    return np.uint64(z ^ (z >> np.uint64(31)))
+
+
+@njit(inline="always")
+def uniform(key, n):
+    """A float32 in [0, 1): the n-th number of stream ``key``."""
+    return np.float32(random_bits(key, n) >> np.uint64(40)) * np.float32(5.9604645e-08)

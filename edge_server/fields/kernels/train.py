@@ -1,0 +1,168 @@
+"""One training step's first half: chunks of rays through sampling, field, rendering, loss and back."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.composite import (
+    Weights,
+    activate,
+    add_harmonics,
+    ray_loss,
+    spread_harmonics,
+)
+from edge_server.fields.kernels.grid import encode
+from edge_server.fields.kernels.intrinsics import FAST, fetch_add, uniform
+from edge_server.fields.kernels.mlp import backward, forward
+from edge_server.fields.kernels.rays import interval, march, pixel_direction
+
+CHUNK = 4096  # samples a chunk has room for; its activations stay in the second-level cache
+CHUNK_RAYS = 1024
+
+_F0, _F1 = np.float32(0.0), np.float32(1.0)
+
+
+class Batch(NamedTuple):
+    """What the chunks of a step leave behind, C of them.
+
+    x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, inputs, CHUNK). d_params: float32 (C, P).
+    samples, rays, dropped: int64 (C,). loss: float64 (C,), squared error summed over rays and channels.
+    """
+
+    x: NDArray[np.float32]
+    d_features: NDArray[np.float32]
+    d_params: NDArray[np.float32]
+    samples: NDArray[np.int64]
+    rays: NDArray[np.int64]
+    dropped: NDArray[np.int64]
+    loss: NDArray[np.float64]
+
+
+class Scratch(NamedTuple):
+    """Memory of each worker, W of them, R = CHUNK_RAYS.
+
+    acts, d_acts: float32 (W, units, CHUNK). line: float32 (W, 3, CHUNK): distance, length and weight of
+    each sample. ray_first: int64 (W, R + 1). ray: float32 (W, R, 9): direction, target, background.
+    """
+
+    acts: NDArray[np.float32]
+    d_acts: NDArray[np.float32]
+    line: NDArray[np.float32]
+    ray_first: NDArray[np.int64]
+    ray: NDArray[np.float32]
+
+
+class Recipe(NamedTuple):
+    """How rays are drawn. key: uint64, this step's random stream. chunk_rays: at most so many a chunk.
+    levels: switched on. harmonics: 1, 4 or 9. changed_share: rays drawn from ``Views.changed``.
+    background: float32 (3,); random_background: a new one for every ray instead."""
+
+    key: np.uint64
+    chunk_rays: int
+    levels: int
+    harmonics: int
+    changed_share: np.float32
+    background: NDArray[np.float32]
+    random_background: bool
+
+
+@njit(inline="always")
+def _draw(views, recipe, n, ray):
+    """Choose the n-th ray of the step: fills ray (9,), returns its view's number."""
+    key, k = recipe.key, np.uint64(n) * np.uint64(8)
+    total = views.pixels.shape[0]
+    # 53 bits, because float32 cannot count the pixels of a hundred pictures.
+    choice = np.float64(uniform(key, k)) + np.float64(uniform(key, k + np.uint64(1))) * 5.9604644775390625e-08
+    if views.changed.size > 0 and uniform(key, k + np.uint64(2)) < recipe.changed_share:
+        pixel = views.changed[min(np.int64(choice * views.changed.size), views.changed.size - 1)]
+    else:
+        pixel = min(np.int64(choice * total), total - 1)
+    view = np.searchsorted(views.first, pixel, side="right") - 1
+    local = pixel - views.first[view]
+    width = views.size[view, 0]
+    u, v = np.float64(local % width) + 0.5, np.float64(local // width) + 0.5
+    ray[0], ray[1], ray[2] = pixel_direction(views.lens[view], views.rotation[view], u, v)
+    alpha = np.float32(1.0)
+    if views.pixels.shape[1] == 4:
+        alpha = np.float32(views.pixels[pixel, 3]) * np.float32(1.0 / 255.0)
+    for c in range(3):
+        back = recipe.background[c]
+        if recipe.random_background:
+            back = uniform(key, k + np.uint64(3 + c))
+        ray[6 + c] = back
+        ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (_F1 - alpha)
+    return view
+
+
+@njit(nogil=True, fastmath=FAST, cache=True)
+def draw_chunk(views, recipe, space, chunk, x, ts, dts, ray_first, ray):
+    """Fill a chunk with rays and their samples. Returns (rays, samples).
+
+    The chunk ends with the first ray for which there is no room: the number of rays follows the number of
+    samples they need, so that every step costs about the same.
+    """
+    n, rays = 0, 0
+    limit = min(recipe.chunk_rays, ray.shape[0])
+    ray_first[0] = 0
+    for r in range(limit):
+        index = chunk * CHUNK_RAYS + r
+        view = _draw(views, recipe, index, ray[r])
+        o = views.origin[view]
+        ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
+        dx, dy, dz = ray[r, 0], ray[r, 1], ray[r, 2]
+        enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
+        enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
+        end, t = march(space, ox, oy, oz, dx, dy, dz, enter, leave, x, ts, dts, n, CHUNK)
+        if t < leave:
+            break
+        n, rays = end, r + 1
+        ray_first[rays] = n
+    return rays, n
+
+
+@njit(nogil=True, fastmath=FAST, cache=True)
+def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batch, scratch):
+    """Tasks are chunks: everything but the table's own gradient, which ``grid.scatter`` adds up."""
+    acts, d_acts = scratch.acts[worker], scratch.d_acts[worker]
+    ts, dts, w = scratch.line[worker, 0], scratch.line[worker, 1], scratch.line[worker, 2]
+    ray_first, ray = scratch.ray_first[worker], scratch.ray[worker]
+    inputs, outputs = net.widths[0], net.widths[-1]
+    out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
+    while True:
+        chunk = fetch_add(counter, 1)
+        if chunk >= batch.samples.size:
+            return
+        x = batch.x[chunk]
+        rays, n = draw_chunk(views, recipe, space, chunk, x, ts, dts, ray_first, ray)
+        encode(grid, recipe.levels, x, n, acts)
+        acts[2 * grid.resolution.size : inputs, :n] = _F0
+        forward(net, acts, n)
+        if recipe.harmonics > 1:
+            for r in range(rays):
+                a, b = ray_first[r], ray_first[r + 1]
+                add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+        activate(out, n)
+        d_out[4:, :n] = _F0
+        loss, dropped = 0.0, 0
+        for r in range(rays):
+            a, b = ray_first[r], ray_first[r + 1]
+            error = ray_loss(out, d_out, ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], weights)
+            if error < _F0:
+                # Nothing of this ray may reach the others' sums: 0 times NaN is NaN.
+                dropped += 1
+                acts[:, a:b] = _F0
+            else:
+                loss += error
+        if recipe.harmonics > 1:
+            for r in range(rays):
+                a, b = ray_first[r], ray_first[r + 1]
+                spread_harmonics(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+        batch.d_params[chunk] = _F0
+        backward(net, acts, d_acts, n, batch.d_params[chunk])
+        batch.d_features[chunk, :, :n] = d_acts[:inputs, :n]
+        batch.samples[chunk], batch.rays[chunk] = n, rays
+        batch.dropped[chunk], batch.loss[chunk] = dropped, loss

@@ -1,0 +1,82 @@
+"""What a run leaves behind, written as it goes: edge.json, series.jsonl, ages.jsonl.
+
+edge.json is replaced atomically about twice a second (live tables read it); series.jsonl gets one line per
+publication once its scores are final; ages.jsonl samples every camera's age at a fixed rate, so that its
+mean is a time average.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from edge_server.state import Publication
+
+# A publication whose scores have not come after this many younger ones will not get any.
+_FINAL_AFTER = 8
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Replace ``path`` atomically: a reader never sees half a file."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(data, allow_nan=False))
+    os.replace(temporary, path)
+
+
+class Journal:
+    """Files of one run under ``out``. Thread-safe. ``status`` is asked for the contents of edge.json."""
+
+    def __init__(self, out: Path, status: Callable[[], dict[str, Any]], append: bool = False) -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        self._out = out
+        self._status = status
+        self._open: OrderedDict[int, Publication] = OrderedDict()
+        self._lock = threading.Lock()
+        mode = "a" if append else "w"
+        self._series = (out / "series.jsonl").open(mode, buffering=1)
+        self._ages = (out / "ages.jsonl").open(mode, buffering=1)
+
+    def published(self, publication: Publication) -> None:
+        with self._lock:
+            self._open[publication.number] = publication
+            while len(self._open) > _FINAL_AFTER:
+                self._write_oldest()
+
+    def scored(self, publication: Publication, final: bool) -> None:
+        """``publication`` carries scores; ``final``: all of its held-out cameras are in."""
+        with self._lock:
+            if publication.number not in self._open:
+                return
+            self._open[publication.number] = publication
+            # Lines stand in the order of publication: a final one waits for its elders.
+            if final and next(iter(self._open)) == publication.number:
+                self._write_oldest()
+
+    def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
+        line = {
+            "t_s": round(t_s, 4),
+            "age_ms": {c: a if a is None else round(a, 3) for c, a in ages_ms.items()},
+        }
+        with self._lock:
+            self._ages.write(json.dumps(line) + "\n")
+
+    def write_status(self) -> None:
+        write_json(self._out / "edge.json", self._status())
+
+    def close(self) -> None:
+        with self._lock:
+            while self._open:
+                self._write_oldest()
+            self._series.close()
+            self._ages.close()
+        self.write_status()
+
+    def _write_oldest(self) -> None:
+        _, publication = self._open.popitem(last=False)
+        self._series.write(json.dumps(dataclasses.asdict(publication), allow_nan=False) + "\n")

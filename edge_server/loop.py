@@ -1,0 +1,240 @@
+"""The loop at the edge: decision epoch -> views -> fit -> publish.
+
+``Updates`` holds what happens and takes every time as an argument, so that studies run it in virtual time;
+``Loop`` is the thread that runs it on the wall clock. The present is the instant an update is published: the
+time spent fitting ages the scene as surely as the network does.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, Queue
+
+import numpy as np
+
+from edge_server.buffer import Buffered, FrameBuffer
+from edge_server.fields import Budget, Field, FitReport, View
+from edge_server.scheduler import Epoch, Plan, Policy
+from edge_server.state import Publication, Renderer
+from edge_server.views import Decoder
+from freshfield.clock import Clock
+
+log = logging.getLogger(__name__)
+
+# How long the loop sleeps at most before it looks at the controls again.
+_NAP_S = 0.2
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A finished decision: which buffered frames to use, as of ``now_ns``."""
+
+    plan: Plan
+    now_ns: int
+    items: tuple[Buffered, ...]
+
+
+class Updates:
+    """Decisions and updates of one field from one buffer. Owns no thread and reads no clock."""
+
+    def __init__(self, buffer: FrameBuffer, policy: Policy, field: Field, start_ns: int) -> None:
+        self.buffer = buffer
+        self.policy = policy
+        self.field = field
+        self.decoder = Decoder()
+        self.start_ns = start_ns
+        self.number = 0
+
+    def epoch(self, now_ns: int) -> Epoch:
+        generated = {c: item.generated_ns for c, item in self.buffer.newest().items()}
+        return Epoch(now_ns, self.number, generated)
+
+    def plan(self, now_ns: int) -> Plan:
+        return self.policy.plan(self.epoch(now_ns))
+
+    def select(self, plan: Plan, now_ns: int) -> Selection | None:
+        """What the plan's policy admits of the buffer as it is at ``now_ns``; None: wait on."""
+        if now_ns < plan.wait_until_ns:
+            return None
+        newest = self.buffer.newest()
+        epoch = Epoch(now_ns, self.number, {c: item.generated_ns for c, item in newest.items()})
+        cameras = self.policy.select(epoch, plan)
+        return Selection(plan, now_ns, tuple(newest[c] for c in cameras)) if cameras else None
+
+    def fit(self, selection: Selection, budget: Budget) -> tuple[list[View], FitReport] | None:
+        """Decode and train; None if nothing of the selection could be decoded."""
+        views = self.decoder.views(selection.items)
+        return (views, self.field.fit(views, budget)) if views else None
+
+    def publication(
+        self, selection: Selection, views: Sequence[View], fit: FitReport, published_ns: int
+    ) -> Publication:
+        """The record of an update that became visible at ``published_ns``; ages are taken then (6.35)."""
+        ages = tuple((published_ns - view.generated_ns) / 1e6 for view in views)
+        publication = Publication(
+            number=self.number,
+            t_s=(published_ns - self.start_ns) / 1e9,
+            published_ns=published_ns,
+            omega_ms=selection.plan.omega_ms,
+            selected=tuple(view.camera for view in views),
+            ages_ms=ages,
+            aaoi_ms=float(np.mean(ages)),
+            update_ms=(published_ns - selection.now_ns) / 1e6,
+            steps=fit.steps,
+            loss=fit.loss if np.isfinite(fit.loss) else None,
+        )
+        self.number += 1
+        return publication
+
+
+class Loop:
+    """Runs ``updates`` on the wall clock until stopped.
+
+    on_published(publication, renderer, views) is called after each update, on the loop's thread. Policy
+    changes, pause and reset asked for from other threads take effect at the next decision.
+    """
+
+    def __init__(
+        self,
+        updates: Updates,
+        clock: Clock,
+        budget: Budget,
+        grace_ms: float,
+        on_published: Callable[[Publication, Renderer, list[View]], None],
+        on_status: Callable[[str], None],
+        on_checkpoint: Callable[[Path], None],
+    ) -> None:
+        self._updates = updates
+        self._clock = clock
+        self._budget = budget
+        self._grace_ns = round(grace_ms * 1e6)
+        self._on_published = on_published
+        self._on_status = on_status
+        self._on_checkpoint = on_checkpoint
+        self._checkpoints: Queue[tuple[Path, Future[Path]]] = Queue()
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self._next_policy: Policy | None = None
+        self._reset = False
+        self.paused = False
+        self.failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """Ask the loop to end after the update it is in, and wait for it."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def use_policy(self, policy: Policy) -> None:
+        with self._lock:
+            self._next_policy = policy
+
+    def request_reset(self) -> None:
+        with self._lock:
+            self._reset = True
+
+    def request_checkpoint(self, path: Path) -> Future[Path]:
+        """Have the field written to ``path`` between two updates; the future gives the path written."""
+        future: Future[Path] = Future()
+        self._checkpoints.put((path, future))
+        return future
+
+    def _main(self) -> None:
+        try:
+            self._on_status("compiling the field's kernels")
+            warm_up = getattr(self._updates.field, "warm_up", None)
+            if warm_up is not None:
+                warm_up()
+            self._await_cameras()
+            while not self._stop.is_set():
+                self._once()
+        except BaseException as error:  # the server reports it and ends; nothing is hidden
+            log.exception("the update loop failed")
+            self.failure = error
+
+    def _await_cameras(self) -> None:
+        """Give every camera a chance to report, so that the first fit does not see half a rig."""
+        seen, first_ns = 0, None
+        wanted = len(self._updates.buffer.cameras)
+        while not self._stop.is_set():
+            here = len(self._updates.buffer.newest())
+            now_ns = self._clock.now_ns()
+            if here and first_ns is None:
+                first_ns = now_ns
+            if here == wanted or (first_ns is not None and now_ns - first_ns > self._grace_ns):
+                return
+            self._on_status(f"waiting for cameras: {here} of {wanted} have reported")
+            seen = self._updates.buffer.wait(seen, _NAP_S)
+
+    def _once(self) -> None:
+        with self._lock:
+            policy, self._next_policy = self._next_policy, None
+            reset, self._reset = self._reset, False
+        if policy is not None:
+            self._updates.policy = policy
+        if reset:
+            self._updates.field.reset()
+            log.info("the field was reset")
+        self._write_checkpoints()
+        if self.paused:
+            self._on_status("paused")
+            self._stop.wait(_NAP_S)
+            return
+        selection = self._select()
+        if selection is None:
+            return
+        self._on_status(f"fitting {len(selection.items)} views")
+        fitted = self._updates.fit(selection, self._budget)
+        if fitted is None:
+            self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come
+            return
+        views, report = fitted
+        renderer = self._updates.field.snapshot()
+        publication = self._updates.publication(selection, views, report, self._clock.now_ns())
+        self._on_published(publication, renderer, views)
+
+    def _write_checkpoints(self) -> None:
+        while True:
+            try:
+                path, future = self._checkpoints.get_nowait()
+            except Empty:
+                return
+            try:
+                self._on_checkpoint(path)
+                future.set_result(path)
+            except OSError as error:  # a full disk must not end the updates; whoever asked is told
+                log.error("checkpoint %s not written: %s", path, error)
+                future.set_exception(error)
+
+    def _select(self) -> Selection | None:
+        """Plan, wait as the plan says, select; None if the controls changed meanwhile."""
+        plan = self._updates.plan(self._clock.now_ns())
+        seen = self._updates.buffer.arrivals
+        while not self._stop.is_set():
+            now_ns = self._clock.now_ns()
+            selection = self._updates.select(plan, now_ns)
+            if selection is not None:
+                return selection
+            asked = self._reset or self._next_policy is not None or not self._checkpoints.empty()
+            if self.paused or asked:
+                return None
+            left_s = (plan.wait_until_ns - now_ns) / 1e9
+            if left_s > 0:
+                self._stop.wait(min(left_s, _NAP_S))
+            else:
+                self._on_status("waiting for a frame that qualifies")
+                seen = self._updates.buffer.wait(seen, _NAP_S)
+        return None

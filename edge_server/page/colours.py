@@ -1,0 +1,51 @@
+"""Ages as colours: one scale for frustums, tables and the legend, readable by colour-blind people.
+
+Bluish green, yellow, vermillion of Okabe and Ito's palette, on a logarithmic axis: a network's delays
+spread over decades, and what matters is whether an age is tens, hundreds or thousands of milliseconds.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+RGB = tuple[int, int, int]
+
+FRESH_MS = 50.0
+STALE_MS = 2000.0
+FRESH: RGB = (0, 190, 140)
+MIDDLE: RGB = (240, 228, 66)
+STALE: RGB = (226, 88, 10)
+UNKNOWN: RGB = (125, 131, 143)
+"""A camera without an age: it never reported."""
+HELD_OUT: RGB = (96, 186, 240)
+"""The truth is not part of the age scale: it is never trained on."""
+# Frustums change colour in steps, so that a page at rest sends next to nothing.
+STEPS = 24
+
+
+def age_fraction(age_ms: float) -> float:
+    """Place of an age on the scale, 0 fresh to 1 stale; ages outside are clamped, NaN counts as stale."""
+    if math.isnan(age_ms):
+        return 1.0
+    place = math.log(max(age_ms, FRESH_MS) / FRESH_MS) / math.log(STALE_MS / FRESH_MS)
+    return min(1.0, place)
+
+
+def age_colour(age_ms: float | None) -> RGB:
+    """Colour of an age in milliseconds; grey for None."""
+    if age_ms is None:
+        return UNKNOWN
+    return scale_colour(round(age_fraction(age_ms) * STEPS) / STEPS)
+
+
+def scale_colour(fraction: float) -> RGB:
+    """Colour at ``fraction`` of the scale: green, yellow at the middle, vermillion."""
+    r, g, b = (np.interp(fraction, (0.0, 0.5, 1.0), stops) for stops in zip(FRESH, MIDDLE, STALE))
+    return round(float(r)), round(float(g)), round(float(b))
+
+
+def css(colour: RGB) -> str:
+    """The colour as HTML writes it."""
+    return "#{:02x}{:02x}{:02x}".format(*colour)

@@ -1,0 +1,154 @@
+"""The panel's HTML: pure functions from what the state says to text. Everything from outside is escaped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+from edge_server.page.colours import FRESH_MS, HELD_OUT, STALE_MS, age_colour, css, scale_colour
+from edge_server.state import CameraView
+
+_DIM = "color:var(--mantine-color-dimmed)"
+_CARD = "background:rgba(128,140,160,.10);border-radius:6px"
+
+INTRO = (
+    f'<div style="padding:.5em .9em 0;font-size:.82em;line-height:1.45">'
+    "Cameras send frames over a bad network. A neural field learns the scene from whatever has arrived, "
+    f'so what you see is always a little <b>old</b>. <span style="{_DIM}">Drag to turn, scroll to '
+    "approach, right-drag to shift. Click a camera to look through it.</span></div>"
+)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What the tiles show. None is drawn as a dash."""
+
+    scenario: str
+    field: str
+    doing: str
+    running: bool
+    updates: int
+    update_ms: float | None
+    psnr_db: float | None
+    scored_on: str | None
+    mean_age_ms: float | None
+    worst_age_ms: float | None
+    reporting: int
+    cameras: int
+    t_s: float
+
+
+def status(s: Summary) -> str:
+    """Status line and six tiles."""
+    dot = css(scale_colour(0.0)) if s.running else css(scale_colour(0.5))
+    word = "live" if s.running else "waiting"
+    head = (
+        f'<div style="padding:.45em .9em;font-size:.85em"><span style="color:{dot}">&#9679;</span> '
+        f"<b>{escape(s.scenario)}</b> &middot; {escape(s.field or 'no field')} &middot; "
+        f"{word} &middot; {_clock(s.t_s)}"
+        f'<div style="{_DIM};font-size:.92em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis;'
+        f'min-height:1.4em">{escape(s.doing)}</div></div>'
+    )
+    on = f"dB on {s.scored_on}" if s.scored_on else "dB held out"
+    tiles = (
+        ("PSNR", number(s.psnr_db, 1), escape(on)),
+        ("updates", str(s.updates), "of the field"),
+        ("update", number(s.update_ms), "ms each"),
+        ("mean age", number(s.mean_age_ms), "ms", s.mean_age_ms),
+        ("worst age", number(s.worst_age_ms), "ms", s.worst_age_ms),
+        ("cameras", f"{s.reporting}/{s.cameras}", "reporting"),
+    )
+    cells = "".join(_tile(*tile) for tile in tiles)
+    grid = "display:grid;grid-template-columns:repeat(3,1fr);gap:.4em;padding:0 .9em .5em"
+    return f'{head}<div style="{grid}">{cells}</div>'
+
+
+def _tile(name: str, value: str, unit: str, age_ms: float | None = None) -> str:
+    edge = f"border-left:3px solid {css(age_colour(age_ms))};" if age_ms is not None else ""
+    return (
+        f'<div style="{_CARD};{edge}padding:.3em .55em;white-space:nowrap;overflow:hidden">'
+        f'<div style="{_DIM};font-size:.7em">{name}</div>'
+        f'<div><span style="font-size:1.15em;font-weight:600;font-variant-numeric:tabular-nums">{value}</span>'
+        f'<span style="{_DIM};font-size:.7em"> {unit}</span></div></div>'
+    )
+
+
+def legend() -> str:
+    """The age scale, the held-out camera's colour."""
+    stops = ",".join(css(scale_colour(i / 8)) for i in range(9))
+    middle = (FRESH_MS * STALE_MS) ** 0.5
+    return (
+        '<div style="padding:.5em .9em .2em;font-size:.75em">'
+        f'<div style="height:7px;border-radius:4px;background:linear-gradient(90deg,{stops})"></div>'
+        f'<div style="display:flex;justify-content:space-between;{_DIM}">'
+        f"<span>fresh, {FRESH_MS:g} ms</span><span>{_rounded(middle)} ms</span>"
+        f"<span>stale, {STALE_MS / 1000:g} s</span></div>"
+        f'<div><span style="color:{css(HELD_OUT)}">&#9632;</span> held out: the truth, never trained on'
+        "</div></div>"
+    )
+
+
+def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
+    """One row a camera: age, frames delivered and rejected; those of the last update are ticked."""
+    chosen = set(selected)
+    rows = "".join(_row(c, c.camera in chosen) for c in cameras)
+    cell = "padding:.1em .35em;font-weight:400;text-align:right"
+    head = "".join(
+        f'<th style="{cell}{";text-align:left" if i == 0 else ""}">{name}</th>'
+        for i, name in enumerate(("camera", "age", "used", "delivered", "rejected"))
+    )
+    return (
+        '<div style="padding:0 .6em .5em"><table style="width:100%;border-collapse:collapse;font-size:.78em;'
+        f'font-variant-numeric:tabular-nums"><thead style="{_DIM}"><tr>{head}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _row(camera: CameraView, used: bool) -> str:
+    colour = css(HELD_OUT if camera.held_out else age_colour(camera.age_ms))
+    cell = "padding:.1em .35em;text-align:right"
+    age = "no frame yet" if camera.age_ms is None else f"{number(camera.age_ms)} ms"
+    tick = "truth" if camera.held_out else ("&#10003;" if used else "")
+    rejected = f"color:{css(scale_colour(1.0))}" if camera.rejected else _DIM
+    return (
+        f'<tr><td style="{cell};text-align:left"><span style="color:{colour}">&#9632;</span> '
+        f"{escape(camera.camera)}</td>"
+        f'<td style="{cell}">{age}</td><td style="{cell}">{tick}</td>'
+        f'<td style="{cell}">{camera.delivered}</td>'
+        f'<td style="{cell};{rejected}">{camera.rejected}</td></tr>'
+    )
+
+
+def comparison_caption(camera: str, psnr_db: float | None, number_: int) -> str:
+    """Above the pair of images."""
+    score = "" if psnr_db is None else f"{number(psnr_db, 1)} dB &middot; "
+    return (
+        f'<div style="padding:.4em .9em .25em;font-size:.78em"><b>{escape(camera)}</b>, '
+        f'<span style="{_DIM}">{score}update {number_}</span>'
+        f'<div style="display:grid;grid-template-columns:1fr 1fr;{_DIM};font-size:.95em">'
+        "<span>truth at the present</span><span>what the field renders</span></div></div>"
+    )
+
+
+def note(text: str) -> str:
+    """One dimmed line."""
+    return f'<div style="padding:.3em .9em;font-size:.78em;{_DIM}">{escape(text)}</div>'
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """A number for people: a dash for None and NaN, thousands as they are."""
+    if value is None or value != value:
+        return "&ndash;"
+    if value in (float("inf"), float("-inf")):
+        return "&infin;" if value > 0 else "-&infin;"
+    return f"{value:.{digits}f}"
+
+
+def _clock(seconds: float) -> str:
+    whole = max(0, int(seconds))
+    return f"{whole // 60}:{whole % 60:02d}"
+
+
+def _rounded(value: float) -> int:
+    return round(value / 10) * 10 if value > 100 else round(value)

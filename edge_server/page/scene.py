@@ -1,0 +1,215 @@
+"""What stands in the 3D scene: a frustum per camera, the field's points, and where visitors start."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import cv2
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from edge_server.page.colours import HELD_OUT, RGB, age_colour
+from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint, initial_viewpoint
+from edge_server.state import CameraView, EdgeState
+from freshfield import payload
+from freshfield.frame import Frame
+from freshfield.geometry import Pose
+
+log = logging.getLogger(__name__)
+
+THUMBNAIL_WIDTH = 112
+THUMBNAIL_EVERY_S = 1.0
+# Decoding for pictures may take this long per refresh; cameras take turns.
+THUMBNAIL_BUDGET_S = 0.03
+FRUSTUM_OF_RADIUS = 0.085
+# The starting place follows the cameras that report late, for so long, and only for who has not moved.
+SETTLE_S = 20.0
+
+
+@dataclass
+class _Shown:
+    """A camera as it stands in the scene, and what of it was sent last."""
+
+    handle: Any
+    pose: Pose
+    colour: RGB
+    thumbnail_of: tuple[str, int] | None = None
+    thumbnail_at: float = -1e9
+
+
+class Scene:
+    """Server-wide scene nodes. ``refresh`` is called by one thread, a few times a second."""
+
+    def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
+        self._server = server
+        self._state = state
+        self._shown: dict[str, _Shown] = {}
+        self._viewpoint: Viewpoint | None = None
+        self._placed_for = 0
+        self._first_seen: float | None = None
+        self._placed: dict[int, NDArray[np.float64]] = {}
+        self._turn = 0
+        self._points: Any = None
+        self._undecodable: set[str] = set()
+
+    def refresh(self, cameras: list[CameraView], watched: bool) -> None:
+        """Bring the scene up to date; pictures are only decoded while somebody watches."""
+        self._place_visitors(cameras)
+        if self._viewpoint is None:
+            return
+        for camera in cameras:
+            if camera.newest is not None:
+                self._frustum(camera, camera.newest)
+        if watched:
+            self._thumbnails([c for c in cameras if c.newest is not None])
+
+    def show_points(self, points: NDArray | None, colours: NDArray | None) -> None:
+        """Points (N, 3) and uint8 colours (N, 3), or None to show no points."""
+        if points is None:
+            if self._points is not None:
+                self._points.remove()
+                self._points = None
+            return
+        radius = self._viewpoint.radius_m if self._viewpoint else 1.0
+        self._points = self._server.scene.add_point_cloud(
+            "/field/points", points, colours, point_size=radius * 0.006, point_shape="circle",
+            precision="float32", point_shading="flat",
+        )  # fmt: skip
+
+    # --- frustums -------------------------------------------------------------------------------
+
+    def _frustum(self, camera: CameraView, frame: Frame) -> None:
+        colour = HELD_OUT if camera.held_out else age_colour(camera.age_ms)
+        shown = self._shown.get(camera.camera)
+        if shown is None:
+            self._shown[camera.camera] = self._add(camera, frame, colour)
+            return
+        if frame.pose != shown.pose:
+            shown.pose = frame.pose
+            shown.handle.wxyz = frame.pose.quaternion
+            shown.handle.position = frame.pose.translation_m
+        if colour != shown.colour:
+            shown.colour = colour
+            shown.handle.color = colour
+
+    def _add(self, camera: CameraView, frame: Frame, colour: RGB) -> _Shown:
+        assert self._viewpoint is not None
+        k = frame.intrinsics
+        handle = self._server.scene.add_camera_frustum(
+            f"/cameras/{camera.camera}",
+            fov=float(2 * np.arctan(0.5 * k.height / k.fy)),
+            aspect=k.width / k.height,
+            scale=self._viewpoint.radius_m * FRUSTUM_OF_RADIUS,
+            thickness=3.0 if camera.held_out else 2.0,
+            thickness_units="screen",
+            color=colour,
+            format="jpeg",
+            jpeg_quality=75,
+            wxyz=frame.pose.quaternion,
+            position=frame.pose.translation_m,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        handle.on_click(lambda event: self._look_through(event.client, camera.camera))
+        if camera.held_out:
+            self._server.scene.add_label(
+                f"/cameras/{camera.camera}/held-out", f"{camera.camera}: held out, the truth",
+                anchor="bottom-center",
+                position=(0.0, -1.6 * self._viewpoint.radius_m * FRUSTUM_OF_RADIUS, 0.0),
+            )  # fmt: skip
+        return _Shown(handle, frame.pose, colour)
+
+    def _look_through(self, client: Any, camera: str) -> None:
+        """Stand where a camera stands, with its lens."""
+        found = next((c for c in self._state.cameras() if c.camera == camera), None)
+        if found is None or found.newest is None or self._viewpoint is None:
+            return
+        frame = found.newest
+        pose = frame.pose.matrix()
+        with client.atomic():
+            client.camera.position = pose[:3, 3]
+            client.camera.look_at = pose[:3, 3] + pose[:3, 2] * self._viewpoint.radius_m
+            client.camera.up_direction = -pose[:3, 1]
+            client.camera.fov = float(2 * np.arctan(0.5 * frame.intrinsics.height / frame.intrinsics.fy))
+
+    def _thumbnails(self, cameras: list[CameraView]) -> None:
+        """Renew pictures in turn, within the budget."""
+        began = perf_counter()
+        for i in range(len(cameras)):
+            camera = cameras[(self._turn + i) % len(cameras)]
+            frame, shown = camera.newest, self._shown[camera.camera]
+            assert frame is not None
+            now = perf_counter()
+            if now - began > THUMBNAIL_BUDGET_S:
+                self._turn = (self._turn + i) % len(cameras)
+                return
+            key = (frame.session, frame.sequence)
+            if key == shown.thumbnail_of or now - shown.thumbnail_at < THUMBNAIL_EVERY_S:
+                continue
+            shown.thumbnail_of, shown.thumbnail_at = key, now
+            picture = thumbnail(frame)
+            if picture is not None:
+                shown.handle.image = picture
+            elif camera.camera not in self._undecodable:
+                self._undecodable.add(camera.camera)
+                log.warning("page: the newest frame of %s cannot be decoded", camera.camera)
+
+    # --- where visitors stand -------------------------------------------------------------------
+
+    def _place_visitors(self, cameras: list[CameraView]) -> None:
+        """Choose the starting place once cameras have reported, and again while more of them do."""
+        poses = [c.newest.pose.matrix() for c in cameras if c.newest is not None]
+        now = perf_counter()
+        if not poses:
+            return
+        if self._first_seen is None:
+            self._first_seen = now
+        if len(poses) > self._placed_for and now - self._first_seen < SETTLE_S:
+            self._placed_for = len(poses)
+            self._viewpoint = initial_viewpoint(np.stack(poses), self._state.bounds)
+            start, view = self._server.initial_camera, self._viewpoint
+            self._server.scene.set_up_direction(view.up)
+            start.position, start.look_at, start.up = view.position, view.look_at, view.up
+            start.fov = VERTICAL_FOV_RAD
+            size = view.radius_m * FRUSTUM_OF_RADIUS
+            for shown in self._shown.values():
+                shown.handle.scale = size
+        for number, client in self._server.get_clients().items():
+            self._place(number, client)
+
+    def _place(self, number: int, client: Any) -> None:
+        """Move a visitor to the starting place unless they have gone somewhere of their own choice."""
+        assert self._viewpoint is not None
+        wanted, last = self._viewpoint.position, self._placed.get(number)
+        if last is not None and np.allclose(last, wanted):
+            return
+        tolerance = 1e-3 * self._viewpoint.radius_m
+        if last is not None and not np.allclose(client.camera.position, last, atol=tolerance):
+            return
+        self._placed[number] = wanted
+        with client.atomic():
+            client.camera.position = wanted
+            client.camera.look_at = self._viewpoint.look_at
+            client.camera.up_direction = self._viewpoint.up
+            client.camera.fov = VERTICAL_FOV_RAD
+
+    def forget(self, client: Any) -> None:
+        self._placed.pop(client.client_id, None)
+
+
+def thumbnail(frame: Frame) -> NDArray[np.uint8] | None:
+    """The frame's image as RGB, THUMBNAIL_WIDTH wide; None if it does not decode."""
+    k = frame.intrinsics
+    try:
+        image = payload.decode(frame.payload, frame.codec, k.width, k.height)[..., :3]
+    except payload.PayloadError:
+        return None
+    height = max(1, round(THUMBNAIL_WIDTH * k.height / k.width))
+    if k.width <= THUMBNAIL_WIDTH:
+        return np.ascontiguousarray(image)
+    small = cv2.resize(np.ascontiguousarray(image), (THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
+    return small.astype(np.uint8)

@@ -1,0 +1,107 @@
+"""Where a visitor starts, which way is up, and the pinhole camera of a browser window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from freshfield.geometry import Pinhole, quaternion_to_matrix
+
+Array = NDArray[np.float64]
+
+VERTICAL_FOV_RAD = float(np.deg2rad(50.0))
+# Seen from this multiple of the rig's own distance the nearest cameras are in front of the visitor.
+PULL_BACK = 1.35
+RAISE = 0.22
+# Below this the mean of unit vectors says nothing: the rig surrounds the scene, or its cameras roll freely.
+_SCATTERED = 0.25
+# Smallest eigenvalue of the mean of I - d d^T at which axes are called parallel (about 3 degrees apart).
+_PARALLEL = 1e-3
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where to stand, where to look and what is up: (3,) each, world metres. radius_m: typical distance
+    of the cameras from what they look at, the unit in which the scene is drawn."""
+
+    position: Array
+    look_at: Array
+    up: Array
+    radius_m: float
+
+
+def world_up(poses: Array) -> Array:
+    """Unit vector (3,): mean of the cameras' -y axes. poses: camera-to-world (N, 4, 4), N >= 1."""
+    ups = -poses[:, :3, 1]
+    mean = ups.mean(axis=0)
+    if np.linalg.norm(mean) < _SCATTERED:
+        mean = ups[0]
+    return mean / np.linalg.norm(mean)
+
+
+def convergence(poses: Array) -> Array | None:
+    """Point (3,) nearest to all optical axes in the least-squares sense, None if they do not meet in
+    front of most cameras (parallel, diverging, or a single one)."""
+    eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    mean = across.mean(axis=0)
+    if len(poses) < 2 or np.linalg.eigvalsh(mean)[0] < _PARALLEL:
+        return None
+    point = np.linalg.solve(mean, np.einsum("nij,nj->i", across, eyes) / len(poses))
+    ahead = np.einsum("ni,ni->n", point - eyes, axes)
+    return point if np.median(ahead) > 0 else None
+
+
+def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> Viewpoint:
+    """Behind and above the rig, looking at what its cameras look at.
+
+    poses: camera-to-world (N, 4, 4), N >= 1. bounds: the field's box (2, 3), used where the optical axes
+    do not meet. Everything returned is finite.
+    """
+    poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
+    up = world_up(poses)
+    centre = convergence(poses)
+    box = None if bounds is None else np.asarray(bounds, dtype=np.float64)
+    if centre is None and box is not None and np.all(np.isfinite(box)):
+        centre = box.mean(axis=0)
+    if centre is None:
+        spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).mean())
+        ahead = axes.mean(axis=0) if np.linalg.norm(axes.mean(axis=0)) > _SCATTERED else axes[0]
+        centre = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(3.0 * spread, 1.0)
+    radius = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
+    radius = max(radius, 1e-2)
+    outward = (eyes - centre).mean(axis=0)
+    if np.linalg.norm(outward) < _SCATTERED * radius:  # a ring of cameras: stand behind the first
+        outward = eyes[0] - centre
+    if np.linalg.norm(outward) < 1e-6 * radius:
+        outward = -axes[0]
+    outward = outward / np.linalg.norm(outward)
+    position = centre + outward * radius * PULL_BACK + up * radius * RAISE
+    return Viewpoint(position, centre, up, radius)
+
+
+def visitor_camera(
+    position: ArrayLike, wxyz: ArrayLike, fov_rad: float, width: int, height: int, rows: int
+) -> tuple[Array, Pinhole]:
+    """Camera-to-world (4, 4) and intrinsics of a browser's view at ``rows`` image rows.
+
+    width, height: canvas pixels; fov_rad: vertical. The image keeps the canvas's aspect, whatever rounding
+    does to its width.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(wxyz)
+    pose[:3, 3] = np.asarray(position, dtype=np.float64)
+    rows = max(1, min(rows, height))
+    columns = max(1, round(rows * width / max(1, height)))
+    f = 0.5 * rows / np.tan(0.5 * fov_rad)
+    # fx differs from fy by that rounding: pixels are stretched over the canvas by the browser.
+    fx = f * columns / (rows * width / max(1, height))
+    return pose, Pinhole(columns, rows, float(fx), float(f), columns / 2.0, rows / 2.0)
+
+
+def band(camera: Pinhole, first_row: int, rows: int) -> Pinhole:
+    """The part of ``camera`` with image rows first_row .. first_row + rows - 1."""
+    return Pinhole(camera.width, rows, camera.fx, camera.fy, camera.cx, camera.cy - first_row)

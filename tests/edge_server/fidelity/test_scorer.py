@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_server.fidelity.images import ImageError
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.psnr import PSNR_CEILING_DB
+from edge_server.fidelity.scorer import PENDING, Scorer, mean_score
+from tests.conftest import data_dir
+
+MS = 1_000_000
+
+
+def truth_at(ms, size=48):
+    """A square that moves 1 pixel in 20 ms over a textured, static wall."""
+    rng = np.random.default_rng(0)
+    image = 0.3 + 0.2 * rng.random((size, size, 3))
+    column = round(ms / 20) % (size - 8)
+    image[10:18, column : column + 8] = 0.95
+    return np.round(image * 255).astype(np.uint8)
+
+
+def feed(scorer, until_ms, start_ms=0, period_ms=40):
+    done = []
+    for ms in range(start_ms, until_ms + 1, period_ms):
+        done += scorer.held_out("h", truth_at(ms), ms * MS)
+    return done
+
+
+def test_a_rendering_is_scored_against_the_capture_nearest_to_the_present():
+    scorer = Scorer()
+    feed(scorer, 400)
+    rendering = (truth_at(440) / 255).astype(np.float32)
+    assert scorer.publish("h", rendering, 430 * MS) == []  # its truth has not arrived
+    (score,) = scorer.held_out("h", truth_at(440), 440 * MS)
+    assert score.psnr_db == PSNR_CEILING_DB and score.psnr_moving_db == PSNR_CEILING_DB
+    assert score.ssim == pytest.approx(1.0) and score.lpips is None
+    assert score.truth_gap_ms == 10.0 and score.on == "held-out" and score.camera == "h"
+
+
+def test_the_earlier_of_two_captures_wins_when_it_is_nearer():
+    scorer = Scorer()
+    feed(scorer, 400)
+    scorer.publish("h", (truth_at(400) / 255).astype(np.float32), 410 * MS)
+    (score,) = scorer.held_out("h", truth_at(440), 440 * MS)
+    assert score.truth_gap_ms == -10.0 and score.psnr_db == PSNR_CEILING_DB
+
+
+def test_a_stale_rendering_loses_where_the_scene_moved_and_only_there():
+    scorer = Scorer()
+    feed(scorer, 800)
+    (score,) = scorer.publish("h", (truth_at(600) / 255).astype(np.float32), 795 * MS)
+    assert score.psnr_moving_db < score.psnr_db - 6.0
+    assert 0.02 < score.moving_share < 0.2
+
+
+def test_nothing_moves_in_a_static_scene():
+    scorer = Scorer()
+    for ms in range(0, 400, 40):
+        scorer.held_out("h", truth_at(0), ms * MS)
+    (score,) = scorer.publish("h", np.zeros((48, 48, 3), np.float32), 350 * MS)
+    assert score.psnr_moving_db is None and score.moving_share == 0.0
+
+
+def test_no_capture_within_half_a_period_means_no_score():
+    scorer = Scorer(period_ms=40)
+    feed(scorer, 400)
+    scorer.publish("h", np.zeros((48, 48, 3), np.float32), 500 * MS)
+    assert scorer.held_out("h", truth_at(600), 600 * MS) == []
+    assert scorer.unscored == 1
+
+
+def test_renderings_that_never_find_a_truth_do_not_pile_up():
+    scorer = Scorer(period_ms=40)
+    for i in range(100):
+        scorer.publish("h", np.zeros((48, 48, 3), np.float32), i * MS)
+    assert scorer.unscored == 100 - PENDING
+
+
+def test_a_slow_publication_still_finds_its_truth_and_its_motion():
+    scorer = Scorer(period_ms=40)
+    feed(scorer, 200)
+    assert scorer.publish("h", (truth_at(240) / 255).astype(np.float32), 240 * MS) == []
+    scores = feed(scorer, 4000, 240)
+    assert [s.truth_gap_ms for s in scores] == [0.0] and scores[0].psnr_moving_db == PSNR_CEILING_DB
+
+
+def test_the_history_stays_short():
+    decoded = []
+
+    def lazily(ms):
+        def load():
+            decoded.append(ms)
+            return truth_at(ms)
+
+        return load
+
+    scorer = Scorer()
+    for ms in range(0, 60_000, 40):
+        scorer.held_out("h", lazily(ms), ms * MS)
+    assert len(scorer._cameras["h"].frames) < 40
+    assert decoded == []  # nothing is decoded that no score needs
+    scorer.publish("h", np.zeros((48, 48, 3), np.float32), 59_960 * MS)
+    assert 2 <= len(decoded) <= 5
+
+
+def test_a_clock_that_jumps_back_starts_a_new_history():
+    scorer = Scorer(period_ms=40)
+    feed(scorer, 4000)
+    feed(scorer, 400)
+    (score,) = scorer.publish("h", (truth_at(400) / 255).astype(np.float32), 390 * MS)
+    assert score.psnr_db == PSNR_CEILING_DB and score.truth_gap_ms == 10.0
+
+
+def test_the_noise_of_real_video_is_not_motion():
+    rng = np.random.default_rng(8)
+    wall = 0.3 + 0.4 * rng.random((48, 48, 3))
+
+    def noisy(_):
+        return np.round(np.clip(wall + rng.normal(0, 0.02, wall.shape), 0, 1) * 255).astype(np.uint8)
+
+    shares = {}
+    for noisy_truth in (False, True):
+        scorer = Scorer(noisy_truth=noisy_truth, period_ms=40)
+        for ms in range(0, 801, 40):
+            scorer.held_out("h", noisy(ms), ms * MS)
+            if ms > 400:
+                (score,) = scorer.publish("h", wall.astype(np.float32), (ms - 5) * MS)
+        shares[noisy_truth] = score.moving_share
+    assert shares[False] > 0.5 and shares[True] < 0.1
+
+
+def test_selected_views_are_averaged_and_say_so():
+    grey = np.full((32, 32, 3), 128, np.uint8)
+    off = (grey / 255 + 0.1).astype(np.float32)
+    score = Scorer().score_selected([("a", grey / 255, grey), ("b", off, grey)], 5 * MS)
+    assert score.on == "selected" and score.truth_gap_ms is None and score.camera == "a,b"
+    assert score.psnr_db == pytest.approx((PSNR_CEILING_DB + 20.0) / 2, abs=1e-4)
+    assert score.psnr_moving_db is None
+    assert Scorer().score_selected([], 0) is None
+
+
+def test_lpips_is_scored_where_the_image_is_large_enough():
+    lpips, _ = open_lpips(data_dir("lpips"))
+    scorer = Scorer(lpips=lpips)
+    truth = truth_at(0)
+    assert scorer.score("h", truth / 255, 0, truth, 0).lpips == 0.0
+    small = scorer.score("h", truth[:24, :24] / 255, 0, truth[:24, :24], 0)
+    assert small.lpips is None and small.ssim == pytest.approx(1.0)
+
+
+def test_a_poisoned_rendering_is_an_error_that_says_where():
+    rendering = np.full((48, 48, 3), 0.5, np.float32)
+    rendering[3, 4, 1] = np.nan
+    scorer = Scorer()
+    feed(scorer, 400)
+    with pytest.raises(ImageError, match=r"rendering: 1 of 6912 .* row 3, column 4, channel 1"):
+        scorer.publish("h", rendering, 390 * MS)
+    # The poisoned one is gone; the next is scored.
+    assert len(scorer.publish("h", np.full((48, 48, 3), 0.5, np.float32), 391 * MS)) == 1
+
+
+def test_the_mean_over_cameras_skips_what_a_camera_lacks():
+    grey = np.full((16, 16, 3), 0.5)
+    scorer = Scorer()
+    a = scorer.score("a", grey, 0, grey + 0.1, 0, [grey])
+    b = scorer.score("b", grey[:8], 0, grey[:8] + 0.1, 0)
+    mean = mean_score([a, b])
+    assert mean.ssim == a.ssim and b.ssim is None and mean.psnr_moving_db == pytest.approx(20.0)
+    assert mean.camera == "a,b"

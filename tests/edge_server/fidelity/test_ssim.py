@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_server.fidelity.images import ImageError
+from edge_server.fidelity.ssim import ssim
+
+
+def reference_ssim(a, b):
+    """(3.33) window by window, with an explicit 11 x 11 Gaussian: slow, and nothing to get wrong."""
+    x = np.arange(-5, 6)
+    w = np.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 1.5**2))
+    w /= w.sum()
+    values = []
+    for channel in range(3):
+        for row in range(a.shape[0] - 10):
+            for column in range(a.shape[1] - 10):
+                p = a[row : row + 11, column : column + 11, channel]
+                q = b[row : row + 11, column : column + 11, channel]
+                mp, mq = (w * p).sum(), (w * q).sum()
+                vp, vq = (w * (p - mp) ** 2).sum(), (w * (q - mq) ** 2).sum()
+                cov = (w * (p - mp) * (q - mq)).sum()
+                c1, c2 = 0.01**2, 0.03**2
+                values.append((2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2)))
+    return float(np.mean(values))
+
+
+@pytest.mark.parametrize("shape", [(11, 11), (23, 17), (30, 41)])
+def test_equals_the_definition(shape):
+    rng = np.random.default_rng(shape[0])
+    a = rng.random((*shape, 3))
+    b = np.clip(a + rng.normal(0, 0.2, a.shape), 0, 1)
+    assert ssim(a, b) == pytest.approx(reference_ssim(a, b), abs=1e-9)
+
+
+def test_is_symmetric_and_one_for_equal_images():
+    rng = np.random.default_rng(1)
+    a, b = rng.random((20, 20, 3)), rng.random((20, 20, 3))
+    assert ssim(a, b) == pytest.approx(ssim(b, a), abs=1e-12)
+    assert ssim(a, a) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_an_inverted_image_scores_below_zero():
+    a = np.random.default_rng(2).random((32, 32, 3))
+    assert -1.0 <= ssim(1.0 - a, a) < -0.5
+
+
+def test_an_image_smaller_than_the_window_is_refused():
+    with pytest.raises(ImageError, match="at least 11 x 11"):
+        ssim(np.zeros((10, 40, 3)), np.zeros((10, 40, 3)))

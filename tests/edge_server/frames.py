@@ -1,0 +1,28 @@
+"""Real frames for the edge's tests: encoded, posed, checksummed, as a node would send them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from freshfield import payload
+from freshfield.frame import Frame
+from freshfield.geometry import Pinhole, Pose, look_at
+
+CAMERA = Pinhole.from_fov(32, 24, 60.0)
+
+
+def frame(camera: str = "cam01", sequence: int = 0, generated_ns: int = 0, **other) -> Frame:
+    """A 32 x 24 JPEG frame of ``camera``; ``other`` overrides any field of Frame."""
+    image = np.full((24, 32, 3), 40 + 10 * (sequence % 20), np.uint8)
+    image[4:12, 6:20, 0] = 220
+    values = {
+        "camera": camera,
+        "session": "s1",
+        "sequence": sequence,
+        "generated_ns": generated_ns,
+        "pose": Pose.from_matrix(look_at([2.0, 0.0, 1.0], [0.0, 0.0, 0.0])),
+        "intrinsics": CAMERA,
+        "codec": "jpeg",
+        "payload": payload.encode(image),
+    }
+    return Frame(**{**values, **other})

@@ -1,0 +1,265 @@
+"""A headless Chromium driven over its DevTools protocol: opens a page, reads it, clicks, takes pictures.
+
+    with Browser(url) as browser:
+        browser.wait_for_text("updates")
+        browser.click_text("Pause")
+        browser.screenshot(path)
+
+Nothing outside the machine is contacted: background services of the browser are off, and ``requests``
+lists every address that the page asked for.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import cv2
+import numpy as np
+import pytest
+import websocket
+from numpy.typing import NDArray
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-default-apps",
+    "--disable-dev-shm-usage",
+    "--disable-extensions",
+    "--disable-sync",
+    "--hide-scrollbars",
+    "--mute-audio",
+    "--no-first-run",
+    "--no-default-browser-check",
+    "--remote-debugging-port=0",
+    "--remote-allow-origins=*",
+)
+
+# The visible element with the least text that contains what is looked for: a button, not the page.
+_FIND = """
+(wanted) => {
+  const seen = (e) => { const r = e.getBoundingClientRect(); return r.width > 0 && r.height > 0; };
+  const hits = [...document.querySelectorAll('body *')].filter(
+    (e) => e.innerText && e.innerText.includes(wanted) && seen(e));
+  if (!hits.length) return null;
+  const best = hits.reduce((a, b) => (b.innerText.length <= a.innerText.length ? b : a));
+  best.scrollIntoView({block: 'center'});
+  const r = best.getBoundingClientRect();
+  return [r.x + r.width / 2, r.y + r.height / 2];
+}
+"""
+_FIND_INPUT = """
+(label) => {
+  const named = [...document.querySelectorAll('label')].find((e) => e.innerText.trim() === label);
+  const input = named && document.getElementById(named.getAttribute('for'));
+  if (!input) return null;
+  input.scrollIntoView({block: 'center'});
+  const r = input.getBoundingClientRect();
+  return [r.x + r.width / 2, r.y + r.height / 2, input.value];
+}
+"""
+
+
+def chromium() -> str:
+    """Path of an installed Chromium, or skip with the reason."""
+    found = next((path for name in NAMES if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip(f"no browser: none of {', '.join(NAMES)} is installed")
+    return found
+
+
+class Browser:
+    """One page in one fresh browser. Every wait raises AssertionError with what the page shows instead."""
+
+    def __init__(self, url: str, width: int = 1600, height: int = 900, timeout_s: float = 60.0) -> None:
+        self.timeout_s = timeout_s
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        self._ids = itertools.count(1)
+        self._profile = tempfile.mkdtemp(prefix="freshfield-browser-")
+        self._socket: websocket.WebSocket | None = None
+        self._process = subprocess.Popen(
+            [chromium(), *FLAGS, f"--window-size={width},{height}",
+             f"--user-data-dir={self._profile}", "about:blank"],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+        try:
+            self._socket = websocket.create_connection(
+                self._debugger(), timeout=timeout_s, suppress_origin=True
+            )
+            for domain in ("Page", "Runtime", "Network", "Log"):
+                self.call(f"{domain}.enable")
+            # The window's own decorations would eat into the size asked for.
+            self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
+                      deviceScaleFactor=1, mobile=False)  # fmt: skip
+            self.call("Page.navigate", url=url)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the browser and forget its profile."""
+        if self._socket is not None:
+            with contextlib.suppress(Exception):
+                self._socket.close()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait(timeout=10)
+        shutil.rmtree(self._profile, ignore_errors=True)
+
+    # --- the protocol --------------------------------------------------------------------------
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        """One DevTools command and its result; raises RuntimeError with the browser's message."""
+        assert self._socket is not None
+        number = next(self._ids)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self._socket.recv())
+            if message.get("id") == number:
+                if "error" in message:
+                    raise RuntimeError(f"{method}: {message['error'].get('message')}")
+                return message.get("result", {})
+            self._note(message)
+
+    def evaluate(self, script: str) -> Any:
+        """Value of a JavaScript expression; promises are awaited."""
+        answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in answer:
+            raise RuntimeError(f"script failed: {answer['exceptionDetails']}")
+        return answer["result"].get("value")
+
+    def _note(self, event: dict[str, Any]) -> None:
+        params = event.get("params", {})
+        if event.get("method") == "Network.requestWillBeSent":
+            self.requests.append(params["request"]["url"])
+        elif event.get("method") == "Network.webSocketCreated":
+            self.requests.append(params["url"])
+        elif event.get("method") == "Runtime.exceptionThrown":
+            self.errors.append(str(params["exceptionDetails"].get("exception", {}).get("description")))
+
+    def _debugger(self) -> str:
+        """Address of the first tab's debugger, once the browser has written its port down."""
+        file = Path(self._profile) / "DevToolsActivePort"
+        for _ in self._tries("the browser did not start"):
+            if self._process.poll() is not None:
+                raise AssertionError(f"the browser ended with status {self._process.returncode}")
+            lines = file.read_text().splitlines() if file.exists() else []
+            if lines:
+                with contextlib.suppress(OSError), urlopen(f"http://127.0.0.1:{lines[0]}/json") as reply:
+                    tabs = [t for t in json.load(reply) if t["type"] == "page"]
+                    if tabs:
+                        return tabs[0]["webSocketDebuggerUrl"]
+        raise AssertionError("unreachable")
+
+    def _tries(self, failure: str | Callable[[], str], timeout_s: float | None = None) -> Iterator[None]:
+        """Yields every 0.1 s until the time is up, then raises AssertionError."""
+        end = time.monotonic() + (timeout_s or self.timeout_s)
+        while time.monotonic() < end:
+            yield
+            time.sleep(0.1)
+        raise AssertionError(failure if isinstance(failure, str) else failure())
+
+    # --- what a visitor sees and does ----------------------------------------------------------
+
+    def text(self) -> str:
+        """All text that the page shows."""
+        return self.evaluate("document.body ? document.body.innerText : ''") or ""
+
+    def wait_for(self, wanted: Callable[[], Any], what: str, timeout_s: float | None = None) -> Any:
+        """First true value of ``wanted``; ``what`` names it in the error."""
+        for _ in self._tries(lambda: f"{what} did not happen; the page shows:\n{self.text()}", timeout_s):
+            value = wanted()
+            if value:
+                return value
+
+    def wait_for_text(self, wanted: str, timeout_s: float | None = None) -> str:
+        """The page's text, once ``wanted`` is part of it."""
+        self.wait_for(lambda: wanted in self.text(), f"the text {wanted!r}", timeout_s)
+        return self.text()
+
+    def click(self, x: float, y: float) -> None:
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left",
+                      clickCount=0 if kind == "mouseMoved" else 1)  # fmt: skip
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
+        """Press at ``start``, move to ``end``, release: turns the view."""
+        self.call("Input.dispatchMouseEvent", type="mousePressed", x=start[0], y=start[1],
+                  button="left", clickCount=1)  # fmt: skip
+        for i in range(1, steps + 1):
+            x, y = (a + (b - a) * i / steps for a, b in zip(start, end))
+            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+            time.sleep(0.03)
+        self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1],
+                  button="left", clickCount=1)  # fmt: skip
+
+    def click_text(self, wanted: str) -> None:
+        """Click in the middle of the smallest visible thing that shows ``wanted``."""
+        at = self.wait_for(lambda: self.evaluate(f"({_FIND})({json.dumps(wanted)})"), f"a {wanted!r}")
+        self.click(*at)
+
+    def input_value(self, label: str) -> str:
+        """What the input with this label holds."""
+        return self._input(label)[2]
+
+    def choose(self, label: str, option: str) -> None:
+        """Open the dropdown with this label and click an option."""
+        self.click(*self._input(label)[:2])
+        query = f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() === {option!r})"
+        self.wait_for(lambda: self.evaluate(f"!!{query}"), f"the option {option!r}")
+        time.sleep(0.3)  # the list slides in: a click on its way would miss
+        box = self.evaluate(f"(() => {{const r = {query}.getBoundingClientRect();"
+                            "return [r.x + r.width / 2, r.y + r.height / 2]})()")  # fmt: skip
+        self.click(*box)
+
+    def type_number(self, label: str, text: str) -> None:
+        """Replace what the input holds, and leave it."""
+        x, y, old = self._input(label)
+        self.click(x, y)
+        self.evaluate("document.activeElement.select && document.activeElement.select()")
+        for _ in range(len(old) + 1):
+            self._key("Backspace", 8)
+        self.call("Input.insertText", text=text)
+        self._key("Enter", 13)
+        self._key("Tab", 9)
+
+    def screenshot(self, path: str | Path | None = None) -> NDArray[np.uint8]:
+        """The window as RGB (H, W, 3), also written as PNG to ``path``."""
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        if path is not None:
+            Path(path).write_bytes(data)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8)
+
+    def _input(self, label: str) -> list[Any]:
+        find = f"({_FIND_INPUT})({json.dumps(label)})"
+        return self.wait_for(lambda: self.evaluate(find), f"an input {label!r}")
+
+    def _key(self, name: str, code: int) -> None:
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code)

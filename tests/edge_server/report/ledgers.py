@@ -1,0 +1,21 @@
+"""Writes real ledgers by hand: one call a process, one tuple a line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from freshfield.ledger import Ledger
+
+
+def write(out: Path, role: str, lines, name: str = "x", start_ns: int = 1, closed: bool = True) -> Path:
+    """lines: (sequence, event) or (sequence, event, detail) of camera "a", session "s"; or with camera and
+    session before them: (camera, session, sequence, event[, detail])."""
+    ledger = Ledger(out, role, name, start_ns)
+    for t_ns, line in enumerate(lines):
+        if isinstance(line[0], int):
+            line = ("a", "s", *line)
+        camera, session, sequence, event, *detail = line
+        ledger.write(t_ns, camera, session, sequence, event, *detail)
+    if closed:
+        ledger.close(len(lines))
+    return ledger.path

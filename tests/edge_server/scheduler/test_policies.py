@@ -1,0 +1,113 @@
+"""Each policy's exact meaning, and what all of them promise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge_server.scheduler import POLICIES, Epoch, make_policy
+
+MS = 1_000_000
+
+
+def epoch(now_ms: float, **generated_ms: float) -> Epoch:
+    return Epoch(round(now_ms * MS), 0, {c: round(g * MS) for c, g in generated_ms.items()})
+
+
+def choose(name, at, value=None, later=None):
+    """Plan at ``at`` and select at ``later`` (or at once)."""
+    policy = make_policy(name, value, np.random.default_rng(3))
+    return policy.select(later or at, policy.plan(at))
+
+
+AT = epoch(200, a=190, b=80, c=150, d=10)
+
+
+def test_all_takes_everything():
+    assert choose("all", AT) == ("a", "b", "c", "d")
+
+
+def test_threshold_includes_the_age_of_exactly_omega():
+    assert choose("threshold", AT, 50) == ("a", "c")
+    assert choose("threshold", AT, 49.999) == ("a",)
+
+
+def test_threshold_takes_the_freshest_when_none_is_young_enough():
+    assert choose("threshold", AT, 5) == ("a",)
+
+
+def test_wait_counts_only_what_was_generated_after_the_decision():
+    policy = make_policy("wait", 60, np.random.default_rng(0))
+    plan = policy.plan(AT)
+    assert (plan.wait_until_ns, plan.generated_after_ns) == (260 * MS, 200 * MS)
+    assert policy.select(epoch(260, a=200, b=201, c=259, d=10), plan) == ("b", "c")
+    assert policy.select(epoch(260, a=190, b=80), plan) == ()  # the wait goes on
+
+
+def test_wait_of_zero_uses_the_buffer_as_it_is():
+    assert choose("wait", AT, 0) == ("a", "b", "c", "d")
+
+
+def test_freshest_k_and_its_ties():
+    assert choose("freshest-k", AT, 2) == ("a", "c")
+    assert choose("freshest-k", epoch(9, a=5, b=5, c=5), 2) == ("a", "b")
+    assert choose("freshest-k", AT, 99) == ("a", "b", "c", "d")
+
+
+def test_age_driven_minimises_the_mean_age():
+    assert choose("age-driven", AT) == ("a",)
+    assert choose("age-driven", epoch(9, a=5, b=3, c=5)) == ("a", "c")
+
+
+def test_round_robin_gives_everybody_a_turn():
+    policy = make_policy("round-robin", 3, np.random.default_rng(0))
+    turns = [policy.select(AT, policy.plan(AT)) for _ in range(4)]
+    assert turns == [("a", "b", "c"), ("a", "b", "d"), ("a", "c", "d"), ("b", "c", "d")]
+
+
+def test_periodic_waits_for_the_next_multiple_and_never_catches_up():
+    policy = make_policy("periodic", 100, np.random.default_rng(0))
+    assert policy.plan(epoch(201, a=1)).wait_until_ns == 300 * MS
+    assert policy.plan(epoch(200, a=1)).wait_until_ns == 200 * MS
+    assert policy.plan(epoch(999, a=1)).wait_until_ns == 1000 * MS
+
+
+def test_random_is_uniform_over_non_empty_sets_and_repeats_with_its_seed():
+    policy = make_policy("random", None, np.random.default_rng(1))
+    at = epoch(9, a=1, b=2)
+    seen = [policy.select(at, policy.plan(at)) for _ in range(6000)]
+    shares = [seen.count(s) / 6000 for s in (("a",), ("b",), ("a", "b"))]
+    # Three equally likely sets: the standard deviation of a share is 0.0061.
+    assert np.allclose(shares, 1 / 3, atol=0.025)
+    again = make_policy("random", None, np.random.default_rng(1))
+    assert [again.select(at, again.plan(at)) for _ in range(100)] == seen[:100]
+
+
+@pytest.mark.parametrize("name", POLICIES)
+@given(ages=st.lists(st.floats(0, 1e9), max_size=40), now=st.integers(0, 2**62))
+def test_every_policy_selects_known_cameras_once_and_at_least_one(name, ages, now):
+    generated = {f"c{i}": now - round(a * MS) for i, a in enumerate(ages)}
+    policy = make_policy(name, None, np.random.default_rng(0))
+    at = Epoch(now, 0, generated)
+    plan = policy.plan(at)
+    assert plan.wait_until_ns <= now + 1000 * MS
+    chosen = policy.select(at, plan)
+    assert len(set(chosen)) == len(chosen) and set(chosen) <= set(generated)
+    # omega-wait may go on waiting: nothing was generated after the decision yet.
+    assert bool(chosen) == bool(generated) or name == "wait"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("threshold", -1), ("wait", float("nan")), ("freshest-k", 0), ("round-robin", 2.5), ("random", 0)],
+)
+def test_a_value_out_of_range_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match="expected"):
+        make_policy(name, value, np.random.default_rng(0))
+
+
+def test_an_unknown_policy_lists_the_known_ones():
+    with pytest.raises(ValueError, match="freshest-k"):
+        make_policy("best", None, np.random.default_rng(0))

@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import threading
+
+from edge_server.buffer import FrameBuffer
+from tests.edge_server.frames import frame
+
+MS = 1_000_000
+
+
+def test_age_is_now_minus_generation_on_the_edges_clock():
+    buffer = FrameBuffer(["cam01", "cam02"])
+    buffer.put(frame(generated_ns=100 * MS, clock_offset_ns=-20 * MS), received_ns=150 * MS)
+    assert buffer.ages_ms(200 * MS) == {"cam01": 120.0, "cam02": None}
+
+
+def test_a_late_older_frame_never_becomes_newest():
+    buffer = FrameBuffer(["cam01"])
+    buffer.put(frame(sequence=2, generated_ns=60 * MS), 70 * MS)
+    buffer.put(frame(sequence=1, generated_ns=30 * MS), 90 * MS)
+    assert buffer.newest()["cam01"].frame.sequence == 2
+    assert (buffer.stale_on_arrival, buffer.arrivals) == (1, 2)
+
+
+def test_memory_is_one_frame_a_camera():
+    buffer = FrameBuffer(["cam01", "cam02"])
+    for i in range(1000):
+        buffer.put(frame(sequence=i, generated_ns=i * MS), i * MS)
+    assert len(buffer.newest()) == 1
+    assert buffer.newest()["cam01"].frame.sequence == 999
+
+
+def test_order_is_the_cameras_not_the_arrivals():
+    buffer = FrameBuffer(["b", "a"])
+    buffer.put(frame("a"), 0)
+    buffer.put(frame("b"), 0)
+    assert list(buffer.newest()) == ["b", "a"]
+
+
+def test_wait_returns_on_arrival_and_on_timeout():
+    buffer = FrameBuffer(["cam01"])
+    assert buffer.wait(0, 0.01) == 0
+    threading.Timer(0.05, lambda: buffer.put(frame(), 0)).start()
+    assert buffer.wait(0, 5.0) == 1
