@@ -5,9 +5,11 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
+from camera_node.clocks import Drifting, NodeClock
 from camera_node.config import SourceConfig
 from camera_node.sources import Source
 from freshfield import payload
+from freshfield.clock import Clock
 from freshfield.geometry import Pinhole, Pose
 
 
@@ -52,12 +54,23 @@ class EncodedCache:
 class Camera:
     """A source with the scenario's codec and the process's cache behind it."""
 
-    def __init__(self, source: Source, config: SourceConfig, cache: EncodedCache) -> None:
+    def __init__(
+        self,
+        source: Source,
+        config: SourceConfig,
+        cache: EncodedCache,
+        effects: Drifting | None = None,
+    ) -> None:
         self.name = source.camera
         self.fps = source.fps
         self.source = source
         self._codec, self._quality = config.codec, config.quality
         self._cache = cache
+        self._effects = effects
+
+    def clock(self, true: Clock) -> NodeClock:
+        """The clock this camera stamps with, given the true time."""
+        return NodeClock(true, self._effects)
 
     @property
     def codec(self) -> str:
@@ -75,6 +88,18 @@ class Camera:
         Raises ValueError if the source has no such shot or it cannot be sent.
         """
         return self.cached(tick) or self._make(self.source.content(tick))
+
+    def fits(self) -> bool:
+        """Whether a whole round of shots will fit the cache, judged by the first; makes that one."""
+        contents = self.source.contents
+        if contents is None:
+            return False
+        try:
+            shot = self._cache.get(self.name, 0) or self._encode(0)
+        except ValueError:
+            return False
+        self._cache.put(self.name, 0, shot)
+        return self._cache.bytes + (contents - 1) * len(shot.payload) <= self._cache.max_bytes
 
     def fill(self, content: int) -> bool:
         """Make one shot ahead of its time; False if the cache is full. Raises as ``capture``."""

@@ -133,7 +133,7 @@ class VideoConfig(RecordedConfig):
     trajectory: TrajectoryConfig | None = None
 
 
-_MODELS: dict[str, type[SourceConfig]] = {
+MODELS: dict[str, type[SourceConfig]] = {
     "world": WorldConfig,
     "transforms": TransformsConfig,
     "video": VideoConfig,
@@ -144,9 +144,9 @@ def source_config(scenario: Scenario) -> SourceConfig:
     """The checked ``source:`` section. Raises ScenarioError."""
     where = f"{scenario.path}: source"
     kind = scenario.source.get("kind")
-    if kind not in _MODELS:
+    if kind not in MODELS:
         raise ScenarioError(f"{where}.kind: expected one of {', '.join(KINDS)}, got {kind!r}")
-    return read_section(_MODELS[kind], scenario.source, where)
+    return read_section(MODELS[kind], scenario.source, where)
 
 
 def find_data(name: str, scenario: Scenario, base: Path | None) -> Path:
@@ -162,5 +162,7 @@ def find_data(name: str, scenario: Scenario, base: Path | None) -> Path:
             )
         path = folder / path
     if not path.exists():
-        raise ScenarioError(f"{where}: {path} does not exist; --data or FRESHFIELD_DATA names the folder above")
+        raise ScenarioError(
+            f"{where}: {path} does not exist; --data or FRESHFIELD_DATA names the folder above"
+        )
     return path

@@ -15,6 +15,7 @@ import numpy as np
 from camera_node.outbox import Outbox
 from freshfield.clock import Offset
 from freshfield.frame import Frame, to_request
+from freshfield.payload import MAX_PAST_NS
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc as rpc
 
@@ -22,6 +23,8 @@ log = logging.getLogger("camera-node")
 
 FIRST_BACKOFF_S = 0.2
 MAX_BACKOFF_S = 3.0
+# An offset nobody has measured may be anything; zero with no uncertainty would be a lie.
+UNKNOWN_OFFSET = Offset(0, MAX_PAST_NS)
 # A peer that hangs or speaks nonsense must not fill the books with names of its own making.
 _MAX_REASONS = 32
 _REASON = re.compile(r"[a-z0-9_]{1,48}")
@@ -55,6 +58,7 @@ class Sender:
     ) -> None:
         self.outbox = outbox
         self.connected = False
+        self.busy = False
         self.connections = 0
         self.trouble = ""
         self._channel = channel
@@ -72,8 +76,20 @@ class Sender:
             answered = self.outbox.counts["sent"] - self.outbox.counts["broken"]
             try:
                 await self._session()
-            except (grpc.aio.AioRpcError, TimeoutError, ProtocolError, asyncio.InvalidStateError) as error:
+            except (
+                grpc.RpcError,
+                grpc.aio.BaseError,
+                TimeoutError,
+                ProtocolError,
+                asyncio.InvalidStateError,
+            ) as error:
                 self._report(error)
+            except asyncio.CancelledError:
+                # gRPC raises this too where a call was cancelled by itself; only our own ends the sender.
+                task = asyncio.current_task()
+                if task is None or task.cancelling():
+                    raise
+                self._report(ProtocolError("stream was cancelled"))
             finally:
                 self.connected = False
             if self.outbox.counts["sent"] - self.outbox.counts["broken"] > answered:
@@ -100,18 +116,22 @@ class Sender:
 
     async def _exchange(self, call: grpc.aio.StreamStreamCall, frame: Frame) -> None:
         answered = False
+        self.busy = True
         try:
             async with asyncio.timeout(self._timeout):
                 await call.write(to_request(self._stamped(frame)))
                 response = await call.read()
             if response is grpc.aio.EOF:
                 raise await _status(call)
+            if response is None:  # what gRPC makes of bytes that are no PushResponse
+                raise ProtocolError("the answer is no PushResponse")
             if response.sequence != frame.sequence:
                 raise ProtocolError(f"answer to frame {response.sequence}, expected {frame.sequence}")
             answered = True
         except TimeoutError:
             raise TimeoutError(f"no answer within {self._timeout:g} s") from None
         finally:
+            self.busy = False
             if not answered:
                 self.outbox.note(frame.sequence, "broken")
         self._account(frame, response)
@@ -120,12 +140,8 @@ class Sender:
             self.trouble = ""
 
     def _stamped(self, frame: Frame) -> Frame:
-        offset = self._offset()
-        if offset is None:
-            return frame
-        return replace(
-            frame, clock_offset_ns=offset.offset_ns, clock_uncertainty_ns=offset.uncertainty_ns
-        )
+        offset = self._offset() or UNKNOWN_OFFSET
+        return replace(frame, clock_offset_ns=offset.offset_ns, clock_uncertainty_ns=offset.uncertainty_ns)
 
     def _account(self, frame: Frame, response: pb.PushResponse) -> None:
         outcome = _OUTCOMES.get(response.outcome)

@@ -24,7 +24,8 @@ ENV PATH=/opt/freshfield/bin:$PATH PYTHONUNBUFFERED=1 \
 WORKDIR /app
 USER freshfield
 VOLUME /runs
-# A camera is healthy while it keeps its status file fresh; the emulator's own check is in compose.yaml.
+# A camera is healthy while it keeps its status file fresh; the emulator's own check is in compose.yaml. In a
+# folder that several nodes share, CAMERA says which one is this container's.
 HEALTHCHECK --interval=5s --timeout=3s --start-period=60s --retries=3 \
-  CMD ["python", "deploy/healthy.py", "--fresh", "/runs/node-*.json"]
+  CMD python deploy/healthy.py --fresh "/runs/node-${CAMERA:-*}.json"
 CMD ["camera-node", "--help"]

@@ -42,13 +42,14 @@ class _Open:
 
 
 class Scoring:
-    """Owner of the Scorer. on_scored(publication with scores, comparison or None) runs on its thread."""
+    """Owner of the Scorer. on_scored(publication with scores, comparison or None, final) runs on its thread;
+    final: every held-out camera's score is in."""
 
     def __init__(
         self,
         held_out: Sequence[str],
         scorer: Scorer,
-        on_scored: Callable[[Publication, Comparison | None], None],
+        on_scored: Callable[[Publication, Comparison | None, bool], None],
     ) -> None:
         self._held_out = tuple(held_out)
         self._scorer = scorer
@@ -156,8 +157,9 @@ class Scoring:
             comparison = None
             if image is not None:
                 comparison = self._compare(score, image, entry.publication.number)
-            self._on_scored(_with_score(entry.publication, mean_score(entry.scores)), comparison)
-            if len(entry.scores) == len(self._held_out):
+            final = len(entry.scores) == len(self._held_out)
+            self._on_scored(_with_score(entry.publication, mean_score(entry.scores)), comparison, final)
+            if final:
                 self._open.pop(entry.publication.number, None)
 
     def _compare(self, score: Score, image: NDArray[np.float32], number: int) -> Comparison | None:
@@ -182,7 +184,7 @@ class Scoring:
             return
         camera, image, truth = renderings[0]
         comparison = Comparison(camera, truth[..., :3], to_bytes(image), publication.number)
-        self._on_scored(_with_score(publication, score), comparison)
+        self._on_scored(_with_score(publication, score), comparison, True)
 
 
 def to_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -226,9 +226,9 @@ class EdgeServer:
         self.journal.published(publication)
         self.scoring.published(publication, renderer, views)
 
-    def _scored(self, publication: Publication, comparison: Comparison | None) -> None:
+    def _scored(self, publication: Publication, comparison: Comparison | None, final: bool) -> None:
         self.state.scored(publication, comparison)
-        self.journal.scored(publication, final=True)
+        self.journal.scored(publication, final)
 
     def _say(self, line: str) -> None:
         self.state.last_decision = line

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from camera_node.config import SourceConfig
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario
+
+if TYPE_CHECKING:
+    from camera_node.world.effects import Effects
 
 
 @dataclass(frozen=True)
@@ -50,11 +53,32 @@ class Source(Protocol):
         had; later ones may still."""
         ...
 
+    def prepare(self, stopped: Callable[[], bool]) -> None:
+        """Make ahead what makes ``read`` fast; takes as long as it takes, or until ``stopped()``."""
+        ...
+
+    def release(self) -> None:
+        """Let go of what making shots takes (decoders, renderers); ``read`` gets it again."""
+        ...
+
 
 def open_sources(
-    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None = None
+    scenario: Scenario,
+    config: SourceConfig,
+    cameras: Sequence[str],
+    data: Path | None = None,
+    effects: Mapping[str, Effects | None] | None = None,
 ) -> dict[str, Source]:
-    """The sources of ``cameras``, sharing what can be shared. Only the file of the kind in use is
-    imported. Raises ScenarioError or DatasetError."""
+    """The sources of ``cameras``, sharing what can be shared, with each camera's effects. Only the file of
+    the kind in use is imported. Raises ScenarioError or DatasetError."""
     module = importlib.import_module(f"camera_node.sources.{config.kind}")
-    return module.open_sources(scenario, config, cameras, data)
+    effects = effects or {}
+    if config.kind == "world":
+        return module.open_sources(scenario, config, cameras, data, effects)
+    sources: dict[str, Source] = module.open_sources(scenario, config, cameras, data)
+    for camera, made in effects.items():
+        if made is not None and made.image:
+            from camera_node.sources.affected import AffectedSource
+
+            sources[camera] = AffectedSource(sources[camera], made, config.codec)
+    return sources

@@ -7,7 +7,7 @@ steps through its images back and forth, as a moving camera.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -45,6 +45,12 @@ class RecordsSource:
         record = self._records[content]
         image = self._as_stored(record) or record.read()
         return Shot(image, Pose.from_matrix(record.camera_to_world), record.intrinsics)
+
+    def prepare(self, stopped: Callable[[], bool]) -> None:
+        """Nothing beyond the shots themselves can be made ahead."""
+
+    def release(self) -> None:
+        """Nothing is held between reads."""
 
     def _as_stored(self, record: Record) -> bytes | None:
         """The file itself where it is what would be sent: compressing twice costs quality for nothing."""
@@ -91,7 +97,9 @@ def deal(count: int, training: Sequence[str], held_out: Sequence[str]) -> dict[s
     shares |= {camera: rest[k :: len(training)] for k, camera in enumerate(training)}
     empty = [camera for camera, share in shares.items() if not share]
     if empty:
-        raise DatasetError(f"{count} images are too few: none is left for {', '.join(empty)}; use fewer cameras")
+        raise DatasetError(
+            f"{count} images are too few: none is left for {', '.join(empty)}; use fewer cameras"
+        )
     return shares
 
 

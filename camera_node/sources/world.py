@@ -1,57 +1,99 @@
-"""Cameras in the synthetic world: exact at any instant, repeating where the scene repeats."""
+"""Cameras in the synthetic world: exact at any instant, rendered ahead where the scene repeats."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from fractions import Fraction
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from camera_node.config import SourceConfig, WorldConfig
 from camera_node.sources import Shot, Source
+from camera_node.sources.ahead import fill_in_child
 from camera_node.sources.playback import rate
 from camera_node.world import Scene, make_scene
+from camera_node.world.cache import FrameCache
+from camera_node.world.effects import NO_EFFECTS
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 
+if TYPE_CHECKING:
+    from camera_node.world.effects import Effects
+
+Stopped = Callable[[], bool]
+
 WORLD_FPS = 15.0
+# Casting takes some 350 bytes a ray at its peak. Beyond this many rays another process renders ahead, so that this
+# one stays small.
+_MAX_RAYS = 200_000
 
 
 class WorldSource:
-    """One camera of a scene. Where the period is a whole number of ticks, as all periods are after a few
-    rounds, the same shots come again and again."""
+    """One camera of a scene, with its frames kept by ``FrameCache``."""
 
-    def __init__(self, camera: str, scene: Scene, name: str, fps: Fraction) -> None:
+    def __init__(self, camera: str, frames: FrameCache, fill_elsewhere: Callable[[Stopped], None]) -> None:
         self.camera = camera
-        self.fps = fps
-        self.intrinsics, matrix = scene.cameras[name]
+        self.fps = frames.fps
+        self.intrinsics, matrix = frames.scene.cameras[frames.camera_id]
+        self.contents: int | None = frames.contents
         self._pose = Pose.from_matrix(matrix)
-        self._scene = scene
-        self._name = name
-        # N ticks last a whole number of periods for the smallest N that the reduced fraction names.
-        period = Fraction(scene.period_s).limit_denominator(1000)
-        self.contents: int | None = (period * fps).numerator if scene.moving else 1
+        self._frames = frames
+        self._fill_elsewhere = fill_elsewhere
 
     def content(self, tick: int) -> int:
-        return tick if self.contents is None else tick % self.contents
+        return self._frames.content(tick)
 
     def read(self, content: int) -> Shot:
-        image = self._scene.render(self._name, float(content / self.fps))
-        return Shot(image, self._pose, self.intrinsics)
+        return Shot(self._frames.read(content), self._pose, self.intrinsics)
+
+    def prepare(self, stopped: Stopped) -> None:
+        rays = self.intrinsics.width * self.intrinsics.height * self._frames.scene.params.supersample**2
+        repeats = self._frames.repeats_after is not None
+        if rays > _MAX_RAYS and repeats and self._frames.disk_error is None:
+            self._fill_elsewhere(stopped)
+        self._frames.fill(stop=stopped)
+
+    def release(self) -> None:
+        # The same scene without the renderers it has built so far.
+        scene = self._frames.scene
+        self._frames.scene = scene.with_world(scene.world, scene.period_s, scene.moving)
 
 
 def open_sources(
-    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
+    scenario: Scenario,
+    config: SourceConfig,
+    cameras: Sequence[str],
+    data: Path | None,
+    effects: Mapping[str, Effects | None],
 ) -> dict[str, Source]:
     """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
     config = cast(WorldConfig, config)
-    where = f"{scenario.path}: source"
+    return {
+        camera: WorldSource(camera, frames, partial(fill_in_child, scenario, config, camera))
+        for camera, frames in frame_caches(scenario, config, cameras, effects).items()
+    }
+
+
+def frame_caches(
+    scenario: Scenario, config: WorldConfig, cameras: Sequence[str], effects: Mapping[str, Effects | None]
+) -> dict[str, FrameCache]:
+    """The frames of each camera, none rendered yet. Raises ScenarioError."""
     try:
         scene = make_scene(config.scene, {"count": len(scenario.cameras), **config.scene_parameters()})
     except ValueError as error:
-        raise ScenarioError(f"{where}: {error}") from None
-    fps = rate(config.fps or WORLD_FPS)
-    return {c: WorldSource(c, scene, name, fps) for c, name in _names(scenario, scene).items() if c in cameras}
+        raise ScenarioError(f"{scenario.path}: source: {error}") from None
+    names = _names(scenario, scene)
+    return {
+        camera: FrameCache(
+            scene,
+            names[camera],
+            rate(config.fps or WORLD_FPS),
+            effects=effects.get(camera) or NO_EFFECTS,
+            codec=config.codec,
+            quality=config.quality,
+        )
+        for camera in cameras
+    }
 
 
 def _names(scenario: Scenario, scene: Scene) -> dict[str, str]:

@@ -27,7 +27,7 @@ _UPPER_ARM_M, _FOREARM_M = 0.29, 0.25
 
 @dataclass(frozen=True)
 class Walk:
-    """An ellipse walked in ``period_s``; ``scale`` stretches it (see motion.period_for_speed)."""
+    """An ellipse of ``radii`` times ``scale`` (metres), walked in ``period_s``."""
 
     centre: tuple[float, float]
     radii: tuple[float, float]
@@ -127,9 +127,9 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
     fx, fy = walk.heading(phase)
     forward, right = (fx, fy, 0.0), (fy, -fx, 0.0)
     gait = 2 * math.pi * _CYCLES * phase
-    swing, bob = math.sin(gait), 0.018 * math.cos(2 * gait)
+    swing, bob = math.sin(gait), -0.025 * math.cos(2 * gait)  # lowest when the legs are apart
 
-    pelvis = (x, y, 0.88 + bob)
+    pelvis = (x, y, 0.86 + bob)
     waist = _go(pelvis, (0.10, up), (0.01, forward))
     chest = _go(waist, (0.33, up), (0.035, forward))
     # Shoulders turn against the hips.
@@ -146,7 +146,7 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
     starts["hair"], ends["hair"] = crown, _go(crown, (1.0, up))
 
     # Wave with the right hand while the path faces the cameras (-y), smoothly blended in and out.
-    wave = motion.smoothstep((-fy - 0.15) / 0.5)
+    wave = motion.smoothstep((-fy + 0.05) / 0.8)
     hello = math.sin(2 * gait)
     for name, sign in (("l", -1.0), ("r", 1.0)):
         shoulder = _go(chest, (0.205 * sign, shoulder_axis), (0.05, up))
@@ -157,8 +157,10 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
         if sign > 0 and wave > 0.0:
             raised = _direction((0.25, up), (0.9, right), (0.25, forward))
             waving = _direction((1.0, up), (0.55 * hello + 0.1, right), (0.2, forward))
-            upper = _direction((1 - wave, upper), (wave, raised))
-            lower = _direction((1 - wave, lower), (wave, waving))
+            # By way of the side: straight from hanging to raised would pass through no direction at all.
+            keep, via = (1 - wave) ** 2, 2 * wave * (1 - wave)
+            upper = _direction((keep, upper), (via, right), (wave * wave, raised))
+            lower = _direction((keep, lower), (via, right), (via, forward), (wave * wave, waving))
         elbow = _go(shoulder, (_UPPER_ARM_M, upper))
         wrist = _go(elbow, (_FOREARM_M, lower))
         hand = _go(wrist, (0.05, lower))
@@ -188,6 +190,7 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
 
 _PARTS = _clothes()
 _NAMES = [name for name, _ in _PARTS]
+_ROUND = np.array([n.split("_")[0] in ("head", "hair", "hand", "foot") for n in _NAMES])
 _SCALE_ROWS = np.array([_SCALES.get(n, (1.0, 1.0, 1.0)) for n in _NAMES])
 
 
@@ -205,12 +208,24 @@ def walking_person(walk: Walk) -> Mover:
 
 
 def loop_length_m(walk: Walk) -> float:
-    """Metres that the middles of the figure's parts travel in one loop, on average."""
+    """Metres that the middles of the figure's parts travel in one loop, averaged over the parts."""
 
     def middles(phase: float) -> Array:
         start, end, _ = bones(walk, phase)
         # Heads, hands and feet are given by where they are, not by how far their axis points.
-        fixed = np.array([n.split("_")[0] in ("head", "hair", "hand", "foot") for n in _NAMES])
-        return np.where(fixed[:, None], start, 0.5 * (start + end))
+        return np.where(_ROUND[:, None], start, 0.5 * (start + end))
 
     return motion.mean_path_m(middles)
+
+
+def walk_at(centre: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float) -> Walk:
+    """The walk whose parts move at ``speed_m_per_s`` on average. The period is rounded to motion.TICK_S
+    and the ellipse stretched until the speed is right in spite of it. Zero speed stands still."""
+    if speed_m_per_s == 0.0:
+        return Walk(centre, radii, motion.TICK_S, still=True)
+    walk = Walk(centre, radii, 1.0)
+    period = motion.period_for(loop_length_m(walk), speed_m_per_s)
+    for _ in range(3):  # the length is nearly linear in the scale
+        scale = walk.scale * speed_m_per_s * period / loop_length_m(walk)
+        walk = Walk(centre, radii, period, scale)
+    return walk

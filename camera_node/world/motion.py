@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-# Periods are whole multiples of this, so that frame sequences at the usual rates (15, 24, 25, 30 a
-# second, or one every 30 ms) repeat after a few periods at most.
-TICK_S = 0.1
+# Periods are whole multiples of this, so that frame sequences at the usual rates repeat after few frames:
+# 0.6 s holds 9 frames at 15 a second, 15 at 25, 18 at 30 and 20 at one every 30 ms.
+TICK_S = 0.6
 
 
 def phase_of(t_s: float, period_s: float) -> float:
@@ -29,12 +29,9 @@ def phase_of(t_s: float, period_s: float) -> float:
     return 0.0 if phase >= 1.0 else phase
 
 
-def period_for_speed(path_m: float, speed_m_per_s: float) -> tuple[float, float]:
-    """Period (s), a multiple of TICK_S, for a loop of ``path_m`` at about ``speed_m_per_s``, and the
-    factor by which to scale the path so that the speed is exact in spite of the rounding."""
-    ticks = max(1, round(path_m / speed_m_per_s / TICK_S))
-    period = ticks * TICK_S
-    return period, speed_m_per_s * period / path_m
+def period_for(path_m: float, speed_m_per_s: float) -> float:
+    """Period (s) of a loop of about ``path_m`` at ``speed_m_per_s``, rounded to a multiple of TICK_S."""
+    return max(1, round(path_m / speed_m_per_s / TICK_S)) * TICK_S
 
 
 def smoothstep(x: float) -> float:
@@ -56,18 +53,24 @@ def step_phase(phase: float, cycles: int, offset: float, stance: float = 0.5) ->
 
 def two_bone(root: Vector, tip: Vector, upper: float, lower: float, pole: Vector) -> Vector:
     """The joint between two bones from ``root`` to ``tip`` (law of cosines), bent towards ``pole``.
-    A tip out of reach stretches the limb: the joint then lies on the straight line."""
+
+    The bones have their lengths up to 9/10 of their reach. Beyond, both stretch a little instead of
+    straightening at once (the bend goes as the square root of what is left of the reach, so the joint
+    would snap), and no distance straightens them fully.
+    """
     dx, dy, dz = (tip[k] - root[k] for k in range(3))
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
     if distance < 1e-9:
         return (root[0] + upper * pole[0], root[1] + upper * pole[1], root[2] + upper * pole[2])
     ux, uy, uz = dx / distance, dy / distance, dz / distance
-    if distance >= upper + lower:
-        along, out = distance * upper / (upper + lower), 0.0
-    else:
-        reach = max(distance, abs(upper - lower))
-        along = (upper * upper - lower * lower + reach * reach) / (2.0 * reach)
-        out = math.sqrt(max(0.0, upper * upper - along * along))
+    soft, full = 0.9 * (upper + lower), 0.995 * (upper + lower)
+    reach = max(distance, abs(upper - lower))
+    if distance > soft:
+        reach = soft + (full - soft) * math.tanh((distance - soft) / (full - soft))
+    stretch = max(1.0, distance / reach)
+    along = (upper * upper - lower * lower + reach * reach) / (2.0 * reach)
+    out = stretch * math.sqrt(max(0.0, upper * upper - along * along))
+    along *= stretch
     across = pole[0] * ux + pole[1] * uy + pole[2] * uz
     px, py, pz = pole[0] - across * ux, pole[1] - across * uy, pole[2] - across * uz
     norm = math.sqrt(px * px + py * py + pz * pz) or 1.0
@@ -79,7 +82,8 @@ def bone_frames(start: Array, end: Array, side: Array) -> Array:
     """Rigid frames (M, 4, 4) at ``start`` (M, 3): local z towards ``end`` (M, 3), local x as near to
     ``side`` (M, 3) as can be."""
     z = end - start
-    z /= np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-12)
+    length = np.linalg.norm(z, axis=1, keepdims=True)
+    z = np.where(length > 1e-12, z / np.maximum(length, 1e-12), [[0.0, 0.0, 1.0]])
     y = _cross(z, side)
     norm = np.linalg.norm(y, axis=1, keepdims=True)
     # A bone along its own side vector has no preferred roll: any perpendicular will do.
@@ -104,7 +108,7 @@ def _cross(a: Array, b: Array) -> Array:
     )
 
 
-def mean_path_m(points_at: Callable[[float], Array], samples: int = 240) -> float:
+def mean_path_m(points_at: Callable[[float], Array], samples: int = 120) -> float:
     """Metres that the points (M, 3) = points_at(phase) travel in one loop, averaged over the points."""
     p = np.stack([points_at(k / samples) for k in range(samples)])
     return float(np.linalg.norm(np.diff(p, axis=0, append=p[:1]), axis=2).sum(axis=0).mean())

@@ -1,6 +1,6 @@
 """Contact sheet: every camera of a scene at one instant.
 
-    python -m camera_node.world.preview room --out room.png --size 256 --at 1.0 --set speed_m_per_s=2
+python -m camera_node.world.preview room --out room.png --size 256 --at 1.0 --set speed_m_per_s=2
 """
 
 from __future__ import annotations

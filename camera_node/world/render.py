@@ -68,9 +68,40 @@ class World:
     background: Colour = (0.0, 0.0, 0.0)
 
 
-def cast(
-    origin: Array, directions: Array, parts: Sequence[Part], matrices: Array, limit: Array
-) -> tuple[Array, NDArray[np.int16]]:
+@dataclass(frozen=True)
+class Placed:
+    """Parts where they are at one instant: world-from-local matrices (M, 4, 4), the inverses (M, 3, 3) of
+    their linear parts, and bounding spheres in world axes, centres (M, 3) and radii (M,)."""
+
+    parts: Sequence[Part]
+    matrices: Array
+    inverse: Array
+    centres: Array
+    radii: Array
+
+
+def place(parts: Sequence[Part], matrices: Array) -> Placed:
+    """Prepare ``parts`` at ``matrices`` (M, 4, 4) for casting."""
+    linear = matrices[:, :3, :3]
+    spheres = [p.shape.bounding_sphere() for p in parts]
+    centres = np.array([c for c, _ in spheres]).reshape(-1, 3, 1)
+    # The columns of rotation times scale are orthogonal, so the longest is the largest stretch.
+    stretch = np.sqrt((linear * linear).sum(axis=1).max(axis=1, initial=0.0))
+    return Placed(
+        parts,
+        matrices,
+        np.asarray(np.linalg.inv(linear), dtype=np.float64),
+        (linear @ centres)[:, :, 0] + matrices[:, :3, 3],
+        np.array([r for _, r in spheres]) * stretch,
+    )
+
+
+def place_still(parts: Sequence[Part]) -> Placed:
+    """Prepare parts that do not move."""
+    return place(parts, np.array([p.matrix for p in parts]).reshape(-1, 4, 4))
+
+
+def cast(origin: Array, directions: Array, placed: Placed, limit: Array) -> tuple[Array, NDArray[np.int16]]:
     """Nearest hits of unit rays from one origin (3,) along directions (3, N) within ``limit`` (N,).
 
     Returns distances (N,), equal to ``limit`` where nothing nearer was met, and part numbers (N,), -1
@@ -79,47 +110,44 @@ def cast(
     """
     t = limit.copy()
     which = np.full(directions.shape[1], -1, dtype=np.int16)
-    inverse = np.linalg.inv(matrices[:, :3, :3])
-    for k, part in enumerate(parts):
-        centre, radius = _world_sphere(part.shape, matrices[k])
-        chosen = rays_within(origin, directions, centre, radius)
-        if chosen is not None and chosen.size == 0:
+    for k, part in enumerate(placed.parts):
+        chosen = rays_within(origin, directions, placed.centres[k], placed.radii[k])
+        if not chosen.size:
             continue
-        d = directions if chosen is None else directions[:, chosen]
-        local_origin = (inverse[k] @ (origin - matrices[k, :3, 3]))[:, None]
-        found = nearest_hit(part.shape, local_origin, inverse[k] @ d)
-        nearer = found < (t if chosen is None else t[chosen])
-        at = np.flatnonzero(nearer) if chosen is None else chosen[nearer]
+        inverse = placed.inverse[k]
+        local_origin = (inverse @ (origin - placed.matrices[k, :3, 3]))[:, None]
+        found = nearest_hit(part.shape, local_origin, inverse @ directions[:, chosen])
+        nearer = found < t[chosen]
+        at = chosen[nearer]
         t[at] = found[nearer]
         which[at] = k
     return t, which
 
 
-def rays_within(origin: Array, directions: Array, centre: Array, radius: float) -> NDArray[np.intp] | None:
-    """Numbers of the rays that can meet the sphere; None for all, where the origin is inside it."""
+def rays_within(origin: Array, directions: Array, centre: Array, radius: float) -> NDArray[np.intp]:
+    """Numbers of the rays that can meet the sphere: all, where the origin is inside it."""
     to = centre - origin
-    distance2, radius2 = float(to @ to), radius * radius
-    if distance2 <= radius2:
-        return None
-    return np.flatnonzero(to @ directions >= np.sqrt(distance2 - radius2))
+    tangent2 = float(to @ to) - radius * radius
+    if tangent2 <= 0.0:
+        return np.arange(directions.shape[1])
+    return np.flatnonzero(to @ directions >= np.sqrt(tangent2))
 
 
-def _world_sphere(shape: Shape, matrix: Array) -> tuple[Array, float]:
-    centre, radius = shape.bounding_sphere()
-    # The columns of rotation times scale are orthogonal, so the longest is the largest stretch.
-    stretch = float(np.sqrt((matrix[:3, :3] ** 2).sum(axis=0).max()))
-    return matrix[:3, :3] @ centre + matrix[:3, 3], radius * stretch
-
-
-def surface_at(part: Part, matrix: Array, points: Array, towards: Array) -> tuple[Array, Array]:
-    """Albedo (3, N) and unit normals (3, N), turned against ``towards`` (3, N), of world points (3, N)."""
-    inverse = np.linalg.inv(matrix[:3, :3])
-    normal, uv = part.shape.surface(inverse @ (points - matrix[:3, 3:]))
-    normal = inverse.T @ normal
-    normal *= 1.0 / np.sqrt((normal * normal).sum(axis=0))
+def surfaces(placed: Placed, which: NDArray[np.int16], points: Array, rays: Array) -> tuple[Array, Array]:
+    """Albedo (3, N) and unit normals (3, N), turned against the rays (3, N), of world points (3, N) on the
+    parts numbered ``which`` (N,)."""
+    albedo, normals = np.empty_like(points), np.empty_like(points)
+    for k in np.unique(which):
+        of = np.flatnonzero(which == k)
+        inverse = placed.inverse[k]
+        local = inverse @ (points[:, of] - placed.matrices[k, :3, 3:])
+        normal, uv = placed.parts[k].shape.surface(local)
+        normals[:, of] = inverse.T @ normal
+        albedo[:, of] = placed.parts[k].texture(uv)
+    along = (normals * rays).sum(axis=0)
     # Seen from inside (a camera within a shape), the surface faces the other way.
-    normal *= np.where((normal * towards).sum(axis=0) > 0.0, -1.0, 1.0)
-    return part.texture(uv), normal
+    normals *= np.where(along > 0.0, -1.0, 1.0) / np.sqrt((normals * normals).sum(axis=0))
+    return albedo, normals
 
 
 def shade(light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None) -> Array:
@@ -146,14 +174,13 @@ def _lambert(source: Array, reach_m: float, points: Array, normals: Array) -> Ar
 def light_visibility(world: World, points: Array) -> Array:
     """(S, N): 1 where a static surface point sees a light point, else 0. Rays start at the light, so
     that they share an origin and each part is tried on few of them."""
-    casters = [p for p in world.statics if p.casts_shadow]
-    matrices = np.stack([p.matrix for p in casters]) if casters else np.zeros((0, 4, 4))
+    casters = place_still([p for p in world.statics if p.casts_shadow])
     out = np.ones((len(world.light.points), points.shape[1]))
     for k, source in enumerate(world.light.points):
         ray = points - source[:, None]
         distance = np.sqrt((ray * ray).sum(axis=0))
         limit = distance * (1.0 - _SHADOW_BIAS)
-        _, hit = cast(source, ray / np.maximum(distance, 1e-12), casters, matrices, limit)
+        _, hit = cast(source, ray / np.maximum(distance, 1e-12), casters, limit)
         out[k] = hit < 0
     return out
 
@@ -180,10 +207,11 @@ class CameraRenderer:
             return self._still.copy()
         colour = self._colour.copy()
         depth: Array | None = None
-        for mover in self.world.movers:
-            matrices = mover.matrices(t_s)
-            self._contact(mover, matrices, colour)
-            depth = self._draw(mover, matrices, colour, depth)
+        there = [place(mover.parts, mover.matrices(t_s)) for mover in self.world.movers]
+        for mover, placed in zip(self.world.movers, there):  # before any of them hides the floor
+            self._contact(mover, placed, colour)
+        for placed in there:
+            depth = self._draw(placed, colour, depth)
         return self._to_image(colour)
 
     def distance(self) -> Array:
@@ -194,17 +222,13 @@ class CameraRenderer:
     def _bake(self) -> None:
         world, rays = self.world, self._directions
         n = rays.shape[1]
-        matrices = np.stack([p.matrix for p in world.statics]) if world.statics else np.zeros((0, 4, 4))
-        self._t, which = cast(self._origin, rays, world.statics, matrices, np.full(n, np.inf))
+        placed = place_still(world.statics)
+        self._t, which = cast(self._origin, rays, placed, np.full(n, np.inf))
         self._colour = np.empty((n, 3), dtype=np.float32)
         self._colour[:] = world.background
         hit = np.flatnonzero(which >= 0)
         points = self._origin[:, None] + self._t[hit] * rays[:, hit]
-        albedo, normals = np.empty_like(points), np.empty_like(points)
-        for k, part in enumerate(world.statics):
-            of = np.flatnonzero(which[hit] == k)
-            if of.size:
-                albedo[:, of], normals[:, of] = surface_at(part, part.matrix, points[:, of], rays[:, hit[of]])
+        albedo, normals = surfaces(placed, which[hit], points, rays[:, hit])
         visible = light_visibility(world, points)
         colour = shade(world.light, albedo, points, normals, visible)
         colour += albedo * np.array([p.glow for p in world.statics] or [0.0])[which[hit]]
@@ -214,11 +238,11 @@ class CameraRenderer:
         self._floor = hit[on_floor]
         self._floor_points = np.ascontiguousarray(points[:, on_floor])
 
-    def _contact(self, mover: Mover, matrices: Array, colour: NDArray[np.float32]) -> None:
+    def _contact(self, mover: Mover, placed: Placed, colour: NDArray[np.float32]) -> None:
         """Darken the floor by the share of its sky that each ball covers, r^2 cos / d^2."""
         if not mover.contact or not self._floor.size:
             return
-        balls = np.array([[*matrices[k, :3, 3], r] for k, r in mover.contact])
+        balls = np.array([[*placed.matrices[k, :3, 3], r] for k, r in mover.contact])
         middle, reach = balls[:, :2].mean(axis=0), 0.8
         dx, dy = self._floor_points[0] - middle[0], self._floor_points[1] - middle[1]
         away2 = (dx * dx + dy * dy) / reach**2
@@ -236,31 +260,19 @@ class CameraRenderer:
         shadow = np.minimum(covered, 0.75) * (1.0 - away2[near])
         colour[self._floor[near]] *= (1.0 - shadow).astype(np.float32)[:, None]
 
-    def _draw(
-        self, mover: Mover, matrices: Array, colour: NDArray[np.float32], depth: Array | None
-    ) -> Array | None:
-        spheres = [_world_sphere(p.shape, m) for p, m in zip(mover.parts, matrices)]
-        centre = np.mean([c for c, _ in spheres], axis=0)
-        radius = max(float(np.linalg.norm(c - centre)) + r for c, r in spheres)
+    def _draw(self, placed: Placed, colour: NDArray[np.float32], depth: Array | None) -> Array | None:
+        centre = placed.centres.mean(axis=0)
+        radius = float((np.linalg.norm(placed.centres - centre, axis=1) + placed.radii).max())
         chosen = rays_within(self._origin, self._directions, centre, radius)
-        if chosen is None:
-            chosen = np.arange(self._directions.shape[1])
         if not chosen.size:
             return depth
         rays = self._directions[:, chosen]
         limit = (self._t if depth is None else depth)[chosen]
-        t, which = cast(self._origin, rays, mover.parts, matrices, limit)
+        t, which = cast(self._origin, rays, placed, limit)
         hit = np.flatnonzero(which >= 0)
-        if not hit.size:
-            return depth
-        rays, number = rays[:, hit], which[hit]
+        rays = rays[:, hit]
         points = self._origin[:, None] + t[hit] * rays
-        albedo, normals = np.empty_like(points), np.empty_like(points)
-        for k in np.unique(number):
-            of = np.flatnonzero(number == k)
-            albedo[:, of], normals[:, of] = surface_at(
-                mover.parts[k], matrices[k], points[:, of], rays[:, of]
-            )
+        albedo, normals = surfaces(placed, which[hit], points, rays)
         at = chosen[hit]
         colour[at] = shade(self.world.light, albedo, points, normals).T
         if len(self.world.movers) > 1:  # the next mover may pass in front or behind
@@ -269,7 +281,7 @@ class CameraRenderer:
         return depth
 
     def _to_image(self, colour: NDArray[np.float32]) -> Image:
-        image = colour.reshape(*self._shape, 3)
+        image: NDArray = colour.reshape(*self._shape, 3)
         if self.supersample > 1:
             image = cv2.resize(image, (self.width, self.height), interpolation=cv2.INTER_AREA)
-        return cv2.convertScaleAbs(np.clip(image, 0.0, 1.0), alpha=255.0)
+        return np.asarray(cv2.convertScaleAbs(np.clip(image, 0.0, 1.0), alpha=255.0), dtype=np.uint8)

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.world import textures as tx
-from camera_node.world.figure import Walk, loop_length_m, walking_person
-from camera_node.world.motion import TICK_S, period_for_speed
+from camera_node.world.figure import walk_at, walking_person
 from camera_node.world.render import Light, Part, World
 from camera_node.world.rig import build_rig
-from camera_node.world.scene import BaseParams, Scene, SceneError, pinhole
+from camera_node.world.scene import BaseParams, Scene, pinhole
 from camera_node.world.shapes import Box, Cylinder, Quad, RoundCone, Sphere
 
 Array = NDArray[np.float64]
@@ -28,27 +27,25 @@ _ANGLES_DEG = [(0.0, 20.0)] + [
     (a * s, e) for e, row in ((5.0, (12, 37, 62)), (22.0, (25, 46, 66)), (38.0, (12, 37, 62))) for a in row
     for s in (-1.0, 1.0)
 ]  # fmt: skip
-_LOOP = Walk(centre=(0.0, 0.95), radii=(0.70, 0.50), period_s=1.0)
+_LOOP_CENTRE, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 
 
 @dataclass(frozen=True)
 class Params(BaseParams):
     """speed_m_per_s: mean speed of the person's parts; 0 stands still."""
 
-    speed_m_per_s: float = 1.0
     horizontal_fov_deg: float = 64.0
+    speed_m_per_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= 8.0:
+            raise ValueError(f"speed_m_per_s must be 0 or within 0.05 to 8, got {self.speed_m_per_s}")
 
 
 def build(params: Params) -> Scene:
-    """The room as a scene. Raises SceneError for a speed outside 0 or 0.05 to 8 m/s."""
-    speed = params.speed_m_per_s
-    if speed != 0.0 and not 0.05 <= speed <= 8.0:
-        raise SceneError(f"room: speed_m_per_s must be 0 or within 0.05 to 8, got {speed}")
-    if speed == 0.0:
-        walk = Walk(_LOOP.centre, _LOOP.radii, TICK_S, still=True)
-    else:
-        period, scale = period_for_speed(loop_length_m(_LOOP), speed)
-        walk = Walk(_LOOP.centre, _LOOP.radii, period, scale)
+    """The room as a scene."""
+    walk = walk_at(_LOOP_CENTRE, _LOOP_RADII_M, params.speed_m_per_s)
     grid = np.stack(np.meshgrid([-0.8, 0.2, 1.2], [-1.0, 0.0, 1.0], [2.95]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid, strength=0.80, reach_m=4.0, low=(0.30, 0.29, 0.29), high=(0.50, 0.52, 0.55),
@@ -58,10 +55,11 @@ def build(params: Params) -> Scene:
         name="room",
         params=params,
         cameras=build_rig(_ANGLES_DEG, _TARGET, _RADIUS_M, params.count, pinhole(params)),
+        target=_TARGET,
         world=World((*_shell(), *_furniture()), (walking_person(walk),), light),
         bounds=np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]]),
         period_s=walk.period_s,
-        moving=speed != 0.0,
+        moving=not walk.still,
     )
 
 
@@ -149,6 +147,9 @@ def _furniture() -> list[Part]:
     ball = tx.Stripes((0.96, 0.96, 0.94), (0.90, 0.26, 0.20), 1 / 3, soft=0.03)
     crate = tx.Framed(tx.Stripes((0.80, 0.62, 0.36), (0.70, 0.50, 0.28), 0.12, axis=1),
                       (0.55, 0.37, 0.20), (0.25, 0.25), 0.05)  # fmt: skip
+    dice = tx.Checker((0.96, 0.80, 0.22), (0.30, 0.20, 0.42), 0.11)
+    cushion = tx.Stripes((0.96, 0.84, 0.44), (0.90, 0.60, 0.24), 0.14)
+    shade = tx.Plain((0.98, 0.90, 0.70))
     parts = [
         Part(Box((1.35, 1.05, 0.006)), rug, _at(0, 0.95, 0.006), casts_shadow=False, takes_contact=True),
         Part(Box((0.75, 0.03, 0.60)), window, _at(0.25, 2.97, 1.70)),
@@ -159,16 +160,16 @@ def _furniture() -> list[Part]:
         Part(Box((0.70, 0.42, 0.03)), oak, _at(1.75, 2.25, 0.75, -8)),
         Part(Sphere(0.19), globe, _at(1.45, 2.22, 0.97, 30)),
         Part(RoundCone(0.10, 0.05, 0.24), pot, _at(2.10, 2.34, 0.88)),
-        Part(Box((0.11, 0.11, 0.11)), tx.Checker((0.96, 0.80, 0.22), (0.30, 0.20, 0.42), 0.11), _at(1.78, 2.0, 0.89, 25)),
+        Part(Box((0.11, 0.11, 0.11)), dice, _at(1.78, 2.0, 0.89, 25)),
         # A sofa along the left wall.
         Part(Box((0.38, 0.80, 0.21)), sofa, _at(-2.50, 1.15, 0.21)),
         Part(Box((0.12, 0.80, 0.22)), sofa, _at(-2.84, 1.15, 0.60)),
-        Part(Box((0.14, 0.24, 0.14)), tx.Stripes((0.96, 0.84, 0.44), (0.90, 0.60, 0.24), 0.14), _at(-2.60, 0.70, 0.56, 14)),
+        Part(Box((0.14, 0.24, 0.14)), cushion, _at(-2.60, 0.70, 0.56, 14)),
         # A plant, a lamp, a crate, a ball.
         Part(RoundCone(0.15, 0.20, 0.22), pot, _at(2.55, 1.10, 0.15)),
         Part(Sphere(1.0), leaf, _at(2.55, 1.10, 0.92) @ np.diag([0.34, 0.34, 0.46, 1.0])),
         Part(Cylinder(0.025, 0.75), tx.Plain((0.20, 0.20, 0.22)), _at(-0.95, 2.72, 0.75)),
-        Part(RoundCone(0.22, 0.10, 0.24), tx.Plain((0.98, 0.90, 0.70)), _at(-0.95, 2.72, 1.50), casts_shadow=False, glow=0.35),
+        Part(RoundCone(0.22, 0.10, 0.24), shade, _at(-0.95, 2.72, 1.50), casts_shadow=False, glow=0.35),
         Part(Box((0.25, 0.25, 0.25)), crate, _at(-1.55, 0.05, 0.25, 20)),
         Part(Sphere(0.20), ball, _at(1.45, -0.05, 0.20, 40)),
     ]  # fmt: skip

@@ -12,19 +12,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from camera_node.world.render import CameraRenderer, Image, World
 from camera_node.world.rig import Rig
 from camera_node.world.shapes import Array
 from freshfield.geometry import Pinhole
+from freshfield.payload import MAX_IMAGE_SIDE
+from freshfield.scenario import ScenarioError, read_section
 
 SCENES = ("room", "tile")
 HELD_OUT = "cam00"
 MAX_CAMERAS = 19
+_RANGES = (
+    ("count", 1, MAX_CAMERAS),
+    ("width", 8, MAX_IMAGE_SIDE),
+    ("height", 8, MAX_IMAGE_SIDE),
+    ("horizontal_fov_deg", 5.0, 150.0),
+    ("supersample", 1, 8),
+)
 
 
-class SceneError(ValueError):
+class SceneError(ScenarioError):
     """A scene that cannot be made as asked; the message says what is valid."""
 
 
@@ -43,19 +50,27 @@ class BaseParams:
     supersample: int = 2
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        for key, low, high in _RANGES:
+            value = getattr(self, key)
+            if not low <= value <= high:
+                raise ValueError(f"{key} must be within {low} to {high}, got {value}")
+
 
 @dataclass(frozen=True)
 class Scene:
     """A world seen by posed cameras.
 
-    cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is the held-out one. bounds: (2, 3), lower
-    and upper corner in metres of everything that can be seen. period_s: the frames repeat after this
-    long, a multiple of 0.1 s. moving: False where every instant is the same.
+    cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is the held-out one. target: the point (3,)
+    that they look at. bounds: (2, 3), lower and upper corner in metres of everything that can be seen.
+    period_s: the frames repeat after this long, a multiple of 0.6 s. moving: False where every instant is
+    the same.
     """
 
     name: str
     params: BaseParams
     cameras: Rig
+    target: tuple[float, float, float]
     world: World
     bounds: Array
     period_s: float
@@ -79,7 +94,8 @@ class Scene:
         """The camera's renderer, made on first use (some tenths of a second) and kept."""
         if camera_id not in self._renderers:
             if camera_id not in self.cameras:
-                raise SceneError(f"scene {self.name}: no camera {camera_id!r}; it has {', '.join(self.cameras)}")
+                known = ", ".join(self.cameras)
+                raise SceneError(f"scene {self.name}: no camera {camera_id!r}; it has {known}")
             self._renderers[camera_id] = self.view(*self.cameras[camera_id])
         return self._renderers[camera_id]
 
@@ -100,44 +116,19 @@ def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
     if name not in SCENES:
         raise SceneError(f"unknown scene {name!r}; valid scenes: {', '.join(SCENES)}")
     module = importlib.import_module(f"camera_node.world.{name}")
-    return module.build(_checked(name, module.Params, dict(params or {})))
+    return module.build(_checked(name, module.Params, params or {}))
 
 
-def _checked(name: str, model: type, given: dict[str, Any]) -> Any:
-    defaults = {f.name: f.default for f in dataclasses.fields(model)}
-    for key, value in given.items():
-        if key not in defaults:
-            valid = ", ".join(f"{k} ({v})" for k, v in defaults.items())
+def _checked(name: str, model: type[Any], given: Mapping[str, Any]) -> Any:
+    known = {f.name: f.default for f in dataclasses.fields(model)}
+    for key in given:
+        if key not in known:
+            valid = ", ".join(f"{k} ({v})" for k, v in known.items())
             raise SceneError(f"scene {name}: unknown parameter {key!r}; valid (default): {valid}")
-        given[key] = _as_type(name, key, value, defaults[key])
-    made = model(**given)
-    ranges = {
-        "count": (1, MAX_CAMERAS), "width": (8, 4096), "height": (8, 4096),
-        "horizontal_fov_deg": (5.0, 150.0), "supersample": (1, 8),
-    }  # fmt: skip
-    for key, (low, high) in ranges.items():
-        if not low <= getattr(made, key) <= high:
-            raise SceneError(f"scene {name}: {key} must be within {low} to {high}, got {getattr(made, key)}")
-    return made
-
-
-def _as_type(name: str, key: str, value: Any, default: Any) -> Any:
-    problem = SceneError(f"scene {name}: {key} must be like {default!r}, got {value!r}")
-    if isinstance(default, tuple):
-        try:
-            out = tuple(float(v) for v in value)
-        except (TypeError, ValueError):
-            raise problem from None
-        if len(out) != len(default) or not np.all(np.isfinite(out)):
-            raise problem
-        return out
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise problem
-    if isinstance(default, int):
-        if value != int(value):
-            raise problem
-        return int(value)
-    return float(value)
+    try:
+        return read_section(model, dict(given), f"scene {name}")
+    except ScenarioError as error:
+        raise SceneError(str(error)) from None
 
 
 def pinhole(params: BaseParams) -> Pinhole:

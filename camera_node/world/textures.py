@@ -81,7 +81,8 @@ class Noise:
         rng = np.random.default_rng([self.seed, 7])
         angle = rng.uniform(0, 2 * np.pi, self.waves)
         k = 2 * np.pi / (self.wavelength * rng.uniform(1.0, 3.0, self.waves))
-        object.__setattr__(self, "_k", np.stack([k * np.cos(angle), k * np.sin(angle) / self.stretch], axis=1))
+        vectors = np.stack([k * np.cos(angle), k * np.sin(angle) / self.stretch], axis=1)
+        object.__setattr__(self, "_k", vectors)
         object.__setattr__(self, "_phase", rng.uniform(0, 2 * np.pi, self.waves)[:, None])
 
     def __call__(self, uv: Array) -> Array:

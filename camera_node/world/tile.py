@@ -48,6 +48,7 @@ def build(params: Params) -> Scene:
         name="tile",
         params=params,
         cameras=build_rig(_ANGLES_DEG, _TARGET, _RADIUS_M, params.count, pinhole(params)),
+        target=_TARGET,
         world=World(tuple(_carrier() + _segments() + _bolts()), (), light, _BACKGROUND),
         bounds=np.array([[-0.26, -0.20, -0.07], [0.26, 0.20, 0.13]]),
         period_s=TICK_S,
@@ -95,11 +96,15 @@ def _segments() -> list[Part]:
                 )  # fmt: skip
             if (row, column) == (1, 2):
                 metal = tx.Spots(
-                    metal, [(0.0, 0.0, 0.036, red), (0.0, 0.0, 0.024, paint), (0.0, 0.0, 0.012, red)], soft=0.004
+                    metal,
+                    [(0.0, 0.0, 0.036, red), (0.0, 0.0, 0.024, paint), (0.0, 0.0, 0.012, red)],
+                    soft=0.004,
                 )
             if (row, column) == (1, 0):
                 metal = tx.Bands(
-                    metal, [(-0.03, 0.03, -0.012, 0.012, blue), (-0.012, 0.012, -0.04, 0.04, blue)], soft=0.004
+                    metal,
+                    [(-0.03, 0.03, -0.012, 0.012, blue), (-0.012, 0.012, -0.04, 0.04, blue)],
+                    soft=0.004,
                 )
             if (row, column) == (0, 3):
                 metal = tx.Bands(
@@ -135,8 +140,7 @@ def _bolts() -> list[Part]:
         for y in (-0.155, 0.0, 0.155):
             parts.append(Part(Cylinder(0.014, 0.010), brass, _at(x, y, 0.0)))
     parts.append(Part(Cylinder(0.020, 0.012), brass, _at(0.0, 0.0, 0.046)))
+    spotted = tx.Checker((0.90, 0.42, 0.12), (0.98, 0.90, 0.78), 1 / 8, 0.5, 0.05)
     # A round inspection probe left on the carrier: something that is not flat.
-    parts.append(
-        Part(Sphere(0.030), tx.Checker((0.90, 0.42, 0.12), (0.98, 0.90, 0.78), 1 / 8, 0.5, 0.05), _at(0.19, -0.13, 0.02))
-    )
+    parts.append(Part(Sphere(0.030), spotted, _at(0.19, -0.13, 0.02)))
     return parts

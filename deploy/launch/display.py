@@ -142,14 +142,16 @@ def _camera_cells(camera: Words) -> list[Text]:
 def _channel_line(channel: Words) -> str:
     if not channel:
         return "no channel yet"
+    parts = [str(channel.get("preset") or "custom")]
     state = channel.get("state")
-    p99 = number(channel, "delay_error_ms", "p99")
-    dropped = number(channel, "counts", "dropped_busy")
-    parts = [f"state {state}" if state else "one state"]
-    if p99 is not None:
-        parts.append(f"delay error p99 {p99:.2f} ms")
-    if dropped:
-        parts.append(f"dropped busy {dropped:.0f}")
+    share = number(channel, "state_share", str(state))
+    if state:
+        parts.append(f"state {state}" + (f" ({share:.0%} of the time)" if share is not None else ""))
+    parts.append(f"forwarded {_figure(number(channel, 'counts', 'forwarded'), '.0f')}")
+    for fate in ("dropped_busy", "superseded", "skipped", "lost", "broken"):
+        if count := number(channel, "counts", fate):
+            parts.append(f"{fate.replace('_', ' ')} {count:.0f}")
+    parts.append(f"delay error p99 {_figure(number(channel, 'delay_error_ms', 'p99'), '.2f')} ms")
     return ", ".join(parts)
 
 

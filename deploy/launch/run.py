@@ -16,7 +16,7 @@ from launch.commands import Plan, plan, program
 from launch.display import Display, make_display
 from launch.processes import Child
 from launch.resources import Resources
-from launch.status import read_status
+from launch.status import read_json, read_status
 from launch.summary import summarise
 
 TICK_S = 0.25
@@ -127,11 +127,20 @@ class Run:
             self._display.say(
                 f"      from another machine first: ssh -L {port}:{net.LOOPBACK}:{port} THIS-MACHINE"
             )
-        if self._page_told and emulator.process is not None and net.is_serving(self.plan.emulator_address):
+        waited_for = self._not_ready()
+        if waited_for is None:
             self._ready_s = now_s
         elif now_s - self._began_s > READY_WITHIN_S:
-            waited_for = self.plan.edge if emulator.process is None or not self._page_told else emulator
             self._mourn(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
+
+    def _not_ready(self) -> Child | None:
+        """Whoever is being waited for."""
+        if self.plan.emulator.process is None or not self._page_told:
+            return self.plan.edge
+        if not net.is_serving(self.plan.emulator_address):
+            return self.plan.emulator
+        phases = [read_json(file).get("phase") for file in self.options.out.glob("node-*.json")]
+        return None if phases.count("streaming") == len(self.plan.nodes) else self.plan.nodes[0]
 
     def _all_alive(self, now_s: float) -> bool:
         """Look for the dead; with --restart, start them again after a second. False if the run is over."""
@@ -158,8 +167,8 @@ class Run:
     def _headline(self, now_s: float) -> str:
         if self._ready_s is None:
             if self.plan.emulator.process is None:
-                return "starting: the edge server loads, the cameras prepare"
-            return "starting: the channel emulator"
+                return "starting: the edge server loads, the cameras prepare their frames"
+            return "starting: the channel opens, the cameras prepare their frames"
         elapsed = now_s - self._ready_s
         end = f" of {self.options.duration_s:.0f}" if self.options.duration_s else ""
         return (

@@ -25,14 +25,14 @@ class RunStatus:
 
 def read_status(out: Path, cameras: tuple[str, ...]) -> RunStatus:
     """The newest status of everybody."""
-    edge = _read_json(out / "edge.json")
+    edge = read_json(out / "edge.json")
     merged: dict[str, Words] = {camera: {"camera": camera} for camera in cameras}
     for file in sorted(out.glob("node-*.json")):
-        for camera, words in _by_camera(_read_json(file)).items():
+        for camera, words in _by_camera(read_json(file)).items():
             merged.setdefault(camera, {}).update(words)
     for camera, words in _by_camera(edge).items():
         merged.setdefault(camera, {}).update(words)
-    return RunStatus(tuple(merged.values()), _read_json(out / "channel.json"), edge)
+    return RunStatus(tuple(merged.values()), read_json(out / "channel.json"), edge)
 
 
 def number(words: Words, *path: str) -> float | None:
@@ -51,7 +51,8 @@ def _by_camera(words: Words) -> dict[str, Words]:
     return {w["camera"]: w for w in cameras if isinstance(w, dict) and isinstance(w.get("camera"), str)}
 
 
-def _read_json(path: Path) -> Words:
+def read_json(path: Path) -> Words:
+    """A status file's contents; empty if there is none to be read."""
     try:
         found = json.loads(path.read_bytes())
     except (OSError, ValueError):

@@ -73,12 +73,14 @@ class _Frame:
     generated_ns: int
     load: Load
     viewpoint: Hashable = None
-    image: Image | None = None
+    background: Colour = BLACK
+    # Kept as decoded: 8-bit images take an eighth of the room that metrics need for a moment.
+    image: NDArray | None = None
 
     def pixels(self) -> Image:
         if self.image is None:
-            self.image = to_unit(self.load(), "held-out frame")
-        return self.image
+            self.image = self.load()
+        return to_unit(self.image, "held-out frame", self.background)
 
 
 @dataclass
@@ -130,10 +132,7 @@ class Scorer:
         if state.frames and generated_ns <= state.frames[-1].generated_ns:
             state.frames.clear()
         load: Load = image if callable(image) else (lambda: image)
-        background = self._background
-        state.frames.append(
-            _Frame(generated_ns, lambda: to_unit(load(), "held-out frame", background), viewpoint)
-        )
+        state.frames.append(_Frame(generated_ns, load, viewpoint, self._background))
         oldest = generated_ns - round(HISTORY_MS * 1e6)
         # A rendering may be older than the history is long: what it needs is kept while it waits.
         if state.pending:

@@ -43,13 +43,18 @@ class Budget:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What one fit did: optimiser steps, wall seconds, mean loss of the last steps, rays and samples."""
+    """What one fit did: optimiser steps, wall seconds, mean loss of the last steps, rays and samples.
+
+    dropped: rays and gradients that were not finite and were left out. note: why nothing was done, if so.
+    """
 
     steps: int
     seconds: float
     loss: float
     rays: int
     samples: int
+    dropped: int = 0
+    note: str = ""
 
 
 @dataclass(frozen=True)

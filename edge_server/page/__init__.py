@@ -1,0 +1,191 @@
+"""The live page: the scene as the field renders it for each visitor, the cameras, the figures, the controls.
+
+``start_page`` serves it on one port from threads of its own; it only reads what the loop published, and
+renders with immutable snapshots, so the field never waits for a visitor.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import rich
+import viser
+
+from edge_server.page.panel import Panel
+from edge_server.page.rendering import RenderLoop
+from edge_server.page.scene import Scene
+from edge_server.page.timelines import History
+from edge_server.state import EdgeState
+
+__all__ = ["Page", "PageError", "start_page"]
+
+log = logging.getLogger(__name__)
+
+REFRESH_S = 0.5
+# Until then the field's points are shown with its rendering: they say more than a blur.
+YOUNG_UPDATES = 6
+BRAND: tuple[int, int, int] = (0, 150, 115)
+
+
+class PageError(RuntimeError):
+    """The page cannot be served; the message says why and what to do."""
+
+
+@dataclass
+class Page:
+    """A page being served. url: an address that can be opened on this machine (or through an SSH forward
+    of the port)."""
+
+    url: str
+    port: int
+    _server: viser.ViserServer
+    _keeper: _Keeper
+    _renders: RenderLoop
+
+    def stop(self) -> None:
+        """Close the port and end the page's threads. May be called twice."""
+        self._keeper.stop()
+        self._renders.stop()
+        _quietly(self._server.stop)
+
+
+def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080) -> Page:
+    """Serve the page of ``state``. port 0 takes a free one. Raises PageError if the port cannot be had."""
+    _check_port(host, port)
+    server: viser.ViserServer = _quietly(lambda: viser.ViserServer(host, port, verbose=False))
+    if port and server.get_port() != port:  # taken between the check and now; viser moves on silently
+        _quietly(server.stop)
+        raise PageError(_taken(host, port))
+    # A visitor's browser must not be able to make this machine open a tunnel to the outside.
+    server.request_share_url = _no_sharing  # type: ignore[method-assign]
+    server.gui.configure_theme(
+        dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND, control_width="medium"
+    )
+    scene = Scene(server, state)
+    renders = RenderLoop(state, scene.show_points)
+    panel = Panel(server, state)
+    keeper = _Keeper(server, state, scene, renders, panel)
+
+    async def joined(client: viser.ClientHandle) -> None:
+        renders.join(client)
+
+        async def moved(camera: Any) -> None:
+            renders.moved(client)
+
+        client.camera.on_update(moved)
+
+    async def left(client: viser.ClientHandle) -> None:
+        renders.leave(client)
+        scene.forget(client)
+
+    server.on_client_connect(joined)
+    server.on_client_disconnect(left)
+    renders.start()
+    keeper.start()
+    return Page(page_url(host, server.get_port()), server.get_port(), server, keeper, renders)
+
+
+class _Keeper:
+    """The thread that keeps scene, panel and history up to date, at a fixed and low rate."""
+
+    def __init__(
+        self, server: viser.ViserServer, state: EdgeState, scene: Scene, renders: RenderLoop, panel: Panel
+    ) -> None:
+        self._server, self._state = server, state
+        self._scene, self._renders, self._panel = scene, renders, panel
+        self._history = History()
+        self._stopped = threading.Event()
+        self._complained = ""
+        self._wanted: tuple[Any, ...] = ()
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+    def _run(self) -> None:
+        while not self._stopped.is_set():
+            began = perf_counter()
+            try:
+                self._once()
+            except Exception as error:  # a page must never take the server with it
+                text = f"{type(error).__name__}: {error}"
+                if text != self._complained:
+                    self._complained = text
+                    log.warning("page: refresh failed: %s", text, exc_info=error)
+            # A slow refresh (a starved machine) is followed by as long a rest.
+            spent = perf_counter() - began
+            self._stopped.wait(max(REFRESH_S - spent, spent))
+
+    def _once(self) -> None:
+        state = self._state
+        cameras = state.cameras()
+        self._history.sample(state.now_s(), cameras, state.channel())
+        watched = bool(self._server.get_clients())
+        self._scene.refresh(cameras, watched)
+        if not watched and self._wanted:
+            return
+        publications = state.publications()
+        self._panel.refresh(cameras, self._history, publications)
+        self._choose_view(len(publications))
+
+    def _choose_view(self, updates: int) -> None:
+        """Tell the renderer what visitors want to see: points while the field is young, then images."""
+        controls = self._panel.controls
+        view = controls.view.value
+        points = view == "points" or (view == "automatic" and updates < YOUNG_UPDATES)
+        wanted = (points, view != "points", controls.occlude.value)
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._renders.want_points, self._renders.want_rendering, self._renders.occlude = wanted
+            self._renders.refresh()
+
+
+def page_url(host: str, port: int) -> str:
+    """An address that can be opened: listening everywhere is reached as localhost."""
+    if host in ("", "0.0.0.0", "::", "*"):
+        host = "localhost"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _check_port(host: str, port: int) -> None:
+    """Refuse a taken port or a foreign address now: viser would silently take the next port, or hang."""
+    if not 0 <= port <= 65535:
+        raise PageError(f"page: {port} is not a port; give one from 1 to 65535, or 0 for a free one")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as error:
+        raise PageError(f"{_taken(host, port)} ({error.strerror or error})") from None
+
+
+def _taken(host: str, port: int) -> str:
+    return f"page: cannot listen on {host}:{port}; choose another port with --page-port"
+
+
+def _no_sharing(verbose: bool = True) -> None:
+    del verbose
+    log.warning("page: a visitor asked for a public address; this server does not give one")
+
+
+def _quietly(action: Any) -> Any:
+    """Run what prints through rich's global console without its banners: the terminal is the caller's."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        return action()
+    finally:
+        console.quiet = before

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from edge_server.page.colours import FRESH_MS, HELD_OUT, STALE_MS, age_colour, css, scale_colour
+from edge_server.page.colours import FRESH_MS, HELD_OUT, RGB, STALE_MS, age_colour, css, scale_colour
 from edge_server.state import CameraView
 
 _DIM = "color:var(--mantine-color-dimmed)"
@@ -66,10 +66,11 @@ def status(s: Summary) -> str:
 
 def _tile(name: str, value: str, unit: str, age_ms: float | None = None) -> str:
     edge = f"border-left:3px solid {css(age_colour(age_ms))};" if age_ms is not None else ""
+    big = "font-size:1.15em;font-weight:600;font-variant-numeric:tabular-nums"
     return (
         f'<div style="{_CARD};{edge}padding:.3em .55em;white-space:nowrap;overflow:hidden">'
         f'<div style="{_DIM};font-size:.7em">{name}</div>'
-        f'<div><span style="font-size:1.15em;font-weight:600;font-variant-numeric:tabular-nums">{value}</span>'
+        f'<div><span style="{big}">{value}</span>'
         f'<span style="{_DIM};font-size:.7em"> {unit}</span></div></div>'
     )
 
@@ -128,6 +129,19 @@ def comparison_caption(camera: str, psnr_db: float | None, number_: int) -> str:
         f'<span style="{_DIM}">{score}update {number_}</span>'
         f'<div style="display:grid;grid-template-columns:1fr 1fr;{_DIM};font-size:.95em">'
         "<span>truth at the present</span><span>what the field renders</span></div></div>"
+    )
+
+
+def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], note_: str = "") -> str:
+    """A chart's title at the left, its lines' names in their colours at the right."""
+    names = " ".join(
+        f'<span style="color:{css(colour)};margin-left:.6em">&#9473; {escape(name)}</span>'
+        for name, colour in lines
+    )
+    right = f'<span style="{_DIM}">{escape(note_)}</span>' if note_ else names
+    return (
+        '<div style="padding:.35em .9em .1em;font-size:.78em;display:flex;justify-content:space-between">'
+        f"<span>{escape(title)}</span><span>{right}</span></div>"
     )
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import dataclass
+from itertools import pairwise
 from time import perf_counter
 from typing import Any
 
@@ -24,18 +25,26 @@ from freshfield.geometry import Pinhole
 
 log = logging.getLogger(__name__)
 
-# What an image may cost, in seconds, and its most rows: moving, resting, and at rest with nothing new.
-STAGES = ((0.08, 240), (0.20, 480), (1.2, 720))
-# Share of the time that may be spent on each stage.
-SHARES = (0.5, 0.2, 0.15)
+
+@dataclass(frozen=True)
+class Stage:
+    """How fine an image is. seconds: what it may take; share: of all time that may go into such images;
+    rows between least and most, adapted to what this machine's renderer turns out to need."""
+
+    seconds: float
+    share: float
+    least: int
+    most: int
+
+
+# While the visitor moves, at rest, and at rest with nothing new to show. Below the least rows an image says
+# too little to be worth its fixed cost, which is waiting for a training step of the field to end.
+STAGES = (Stage(0.08, 0.5, 64, 240), Stage(0.20, 0.2, 120, 480), Stage(1.2, 0.15, 200, 720))
 BAND_S = 0.1
-MIN_ROWS = 36
 SETTLE_S = 0.25
 POINTS = 8000
 POINTS_SHARE = 0.05
 POINTS_EVERY_S = 1.0
-# Before anything was measured: an optimistic CPU renderer.
-FIRST_GUESS_S_PER_PIXEL = 5e-6
 # viser packs depth into 24 bits of 1e-5 m: this is the farthest it can say.
 FAR_M = 167.0
 # Coarser depth has a constant low byte, which PNG packs five times better.
@@ -68,7 +77,7 @@ class RenderLoop:
         self._visitors: dict[int, Visitor] = {}
         self._wake = threading.Condition()
         self._stopped = False
-        self._cost = FIRST_GUESS_S_PER_PIXEL
+        self._rows = [1.5 * stage.least for stage in STAGES]
         self._not_before = [0.0] * len(STAGES)
         self._points_from: Renderer | None = None
         self._points_not_before = 0.0
@@ -187,16 +196,16 @@ class RenderLoop:
         with self._wake:
             viewpoint, serial = visitor.viewpoint, visitor.serial
         assert viewpoint is not None
-        pose, camera = visitor_camera(*viewpoint, rows=self._rows(stage, viewpoint))
+        pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[stage]))
         began = perf_counter()
         try:
             image = self._render(renderer, pose, camera, visitor, serial, stage)
         finally:
             spent = perf_counter() - began
-            self._not_before[stage] = began + spent / SHARES[stage]
-        if image is None:
+            self._not_before[stage] = began + spent / STAGES[stage].share
+        if image is None or visitor.client.client_id not in self._visitors:
             return
-        self._cost = 0.5 * self._cost + 0.5 * spent / (camera.width * camera.height)
+        self._adapt(stage, spent)
         color, depth = presentable(image, camera)
         visitor.client.scene.set_background_image(
             color, format="jpeg", jpeg_quality=75 if stage == 0 else 88,
@@ -207,20 +216,20 @@ class RenderLoop:
             if visitor.serial == serial:
                 visitor.stage, visitor.renderer = stage, renderer
 
-    def _rows(self, stage: int, viewpoint: tuple) -> int:
-        seconds, most = STAGES[stage]
-        aspect = viewpoint[3] / viewpoint[4]
-        rows = np.sqrt(seconds / self._cost / aspect)
-        return int(np.clip(rows, MIN_ROWS, most))
+    def _adapt(self, stage: int, spent: float) -> None:
+        """Take more or fewer rows next time, so that an image takes about what its stage allows."""
+        plan = STAGES[stage]
+        change = np.clip(np.sqrt(plan.seconds / max(spent, 1e-4)), 0.7, 1.3)
+        self._rows[stage] = float(np.clip(self._rows[stage] * change, plan.least, plan.most))
 
     def _render(
         self, renderer: Renderer, pose: NDArray, camera: Pinhole, visitor: Visitor, serial: int, stage: int
     ) -> Rendering | None:
         """The image in bands; None if the visitor has moved on meanwhile."""
-        bands = max(1, round(STAGES[stage][0] / BAND_S)) if stage else 1
+        bands = max(1, round(STAGES[stage].seconds / BAND_S)) if stage else 1
         edges = np.linspace(0, camera.height, min(bands, camera.height) + 1).astype(int)
         parts = []
-        for top, bottom in zip(edges[:-1], edges[1:]):
+        for top, bottom in pairwise(edges):
             if stage and (visitor.serial != serial or self._stopped):
                 return None
             parts.append(renderer.render(pose, band(camera, int(top), int(bottom - top))))

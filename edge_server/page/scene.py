@@ -25,9 +25,11 @@ THUMBNAIL_WIDTH = 112
 THUMBNAIL_EVERY_S = 1.0
 # Decoding for pictures may take this long per refresh; cameras take turns.
 THUMBNAIL_BUDGET_S = 0.03
-FRUSTUM_OF_RADIUS = 0.085
+FRUSTUM_OF_RADIUS = 0.075
 # The starting place follows the cameras that report late, for so long, and only for who has not moved.
 SETTLE_S = 20.0
+# Cameras report one after the other: wait until no new one has for so long before choosing.
+QUIET_S = 0.7
 
 
 @dataclass
@@ -51,21 +53,22 @@ class Scene:
         self._viewpoint: Viewpoint | None = None
         self._placed_for = 0
         self._first_seen: float | None = None
+        self._seen = 0
+        self._seen_at = 0.0
         self._placed: dict[int, NDArray[np.float64]] = {}
         self._turn = 0
         self._points: Any = None
         self._undecodable: set[str] = set()
 
     def refresh(self, cameras: list[CameraView], watched: bool) -> None:
-        """Bring the scene up to date; pictures are only decoded while somebody watches."""
+        """Bring the scene up to date, if somebody watches."""
         self._place_visitors(cameras)
-        if self._viewpoint is None:
+        if self._viewpoint is None or not watched:
             return
         for camera in cameras:
             if camera.newest is not None:
                 self._frustum(camera, camera.newest)
-        if watched:
-            self._thumbnails([c for c in cameras if c.newest is not None])
+        self._thumbnails([c for c in cameras if c.newest is not None])
 
     def show_points(self, points: NDArray | None, colours: NDArray | None) -> None:
         """Points (N, 3) and uint8 colours (N, 3), or None to show no points."""
@@ -98,12 +101,12 @@ class Scene:
 
     def _add(self, camera: CameraView, frame: Frame, colour: RGB) -> _Shown:
         assert self._viewpoint is not None
-        k = frame.intrinsics
+        k, size = frame.intrinsics, self._viewpoint.radius_m * FRUSTUM_OF_RADIUS
         handle = self._server.scene.add_camera_frustum(
             f"/cameras/{camera.camera}",
             fov=float(2 * np.arctan(0.5 * k.height / k.fy)),
             aspect=k.width / k.height,
-            scale=self._viewpoint.radius_m * FRUSTUM_OF_RADIUS,
+            scale=size,
             thickness=3.0 if camera.held_out else 2.0,
             thickness_units="screen",
             color=colour,
@@ -116,10 +119,11 @@ class Scene:
         )
         handle.on_click(lambda event: self._look_through(event.client, camera.camera))
         if camera.held_out:
+            _, height, depth = handle.compute_canonical_frustum_size()
+            above = (0.0, -0.75 * height * size, depth * size)
             self._server.scene.add_label(
-                f"/cameras/{camera.camera}/held-out", f"{camera.camera}: held out, the truth",
-                anchor="bottom-center",
-                position=(0.0, -1.6 * self._viewpoint.radius_m * FRUSTUM_OF_RADIUS, 0.0),
+                f"/cameras/{camera.camera}/label", "held out: the truth", anchor="bottom-center",
+                position=above, font_screen_scale=0.85,
             )  # fmt: skip
         return _Shown(handle, frame.pose, colour)
 
@@ -168,7 +172,10 @@ class Scene:
             return
         if self._first_seen is None:
             self._first_seen = now
-        if len(poses) > self._placed_for and now - self._first_seen < SETTLE_S:
+        if len(poses) > self._seen:
+            self._seen, self._seen_at = len(poses), now
+        complete = len(poses) == len(cameras) or now - self._seen_at > QUIET_S
+        if len(poses) > self._placed_for and complete and now - self._first_seen < SETTLE_S:
             self._placed_for = len(poses)
             self._viewpoint = initial_viewpoint(np.stack(poses), self._state.bounds)
             start, view = self._server.initial_camera, self._viewpoint

@@ -1,23 +1,26 @@
-"""The last minutes as curves: age, fidelity, cost of an update, the channel's state."""
+"""The last minutes as curves: age and omega, fidelity, the channel's state."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from edge_server.page.colours import FRESH, HELD_OUT, MIDDLE, STALE, UNKNOWN, css
+from edge_server.page.colours import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
+from edge_server.page.markup import chart_caption
 from edge_server.state import CameraView, Publication
 
 WINDOW_S = 120.0
+LINE_PX = 1.6
+# A line without a value in so many rows, such as omega of a policy that has none, is left out.
+RECENT = 10
 # More points than the chart has pixels would only be sent, never seen.
 MAX_POINTS = 300
-HEIGHT = 118
-_LINE = 1.6
+HEIGHT = 104
 
 
 class History:
@@ -57,55 +60,82 @@ class History:
 
 
 class Timelines:
-    """Four charts in the present GUI container. ``refresh`` is called about once a second."""
+    """Three charts in the present GUI container. ``refresh`` is called about once a second."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
-        self._age = _chart(gui, "Age of the newest frames, ms", ("mean", FRESH), ("worst", STALE),
-                           ("omega", UNKNOWN))  # fmt: skip
-        self._psnr = _chart(gui, "Fidelity at the present, dB", ("PSNR", HELD_OUT), ("moving pixels", MIDDLE))
-        self._cost = _chart(gui, "Cost of an update, ms", ("update", UNKNOWN))
-        self._channel = _chart(gui, "State of the channel", ("state", MIDDLE), stepped=True)
+        self._age = _Chart(gui, "Age of the newest frames, ms",
+                           (("mean", FRESH), ("worst", STALE), ("omega", UNKNOWN)), zero=True)  # fmt: skip
+        self._psnr = _Chart(gui, "Fidelity at the present, dB", (("PSNR", HELD_OUT), ("moving", MIDDLE)))
+        self._channel = _Chart(gui, "Channel", (("state", MIDDLE),), zero=True, stepped=True)
 
     def refresh(self, history: History, publications: Sequence[Publication]) -> None:
         """Redraw the last WINDOW_S seconds of what there is."""
         t, mean, worst, state = history.columns()
         now = float(t[-1]) if len(t) else 0.0
         recent = [p for p in publications if p.t_s > now - WINDOW_S]
-        omega = _held(t, [(p.t_s, p.omega_ms) for p in recent])
-        _draw(self._age, _thin(t, mean, worst, omega))
-        scored = [p for p in recent if p.psnr_db is not None and np.isfinite(p.psnr_db)]
-        _draw(self._psnr, _thin(_column(p.t_s for p in scored), _column(p.psnr_db for p in scored),
-                                _column(p.psnr_moving_db for p in scored)))  # fmt: skip
-        _draw(self._cost, _thin(_column(p.t_s for p in recent), _column(p.update_ms for p in recent)))
-        known = np.isfinite(state)
-        _draw(self._channel, _thin(*_steps(t[known], state[known])))
-        names = history.state_names
-        title = f"State of the channel: {', '.join(f'{i} {n}' for i, n in enumerate(names))}"
-        if names and self._channel.title != title:
-            self._channel.title = title
+        omega = _in_force(t, [(p.t_s, p.omega_ms) for p in recent])
+        self._age.draw(t, mean, worst, omega)
+        scored = [p for p in recent if p.psnr_db is not None]
+        self._psnr.draw(_column(p.t_s for p in scored), _column(p.psnr_db for p in scored),
+                        _column(p.psnr_moving_db for p in scored))  # fmt: skip
+        names = ", ".join(f"{i} {name}" for i, name in enumerate(history.state_names))
+        self._channel.draw(t, state, note=names)
 
 
-def _chart(gui: viser.GuiApi, title: str, *lines: tuple[str, tuple], stepped: bool = False) -> Any:
-    series: list[Any] = [{"label": "s"}]
-    for label, colour in lines:
-        one: dict[str, Any] = {"label": label, "stroke": css(colour), "width": _LINE, "points": {"show": False}}
-        if stepped:
-            one["fill"] = css(colour) + "30"
-        series.append(one)
-    axes: tuple[Any, ...] = ({"size": 22, "font": "10px sans-serif"}, {"size": 40, "font": "10px sans-serif"})
-    return gui.add_uplot(
-        data=tuple(np.array([0.0, 1.0]) for _ in series), series=tuple(series), title=title, height=HEIGHT,
-        scales={"x": {"time": False}}, axes=axes, legend={"show": len(lines) > 1, "live": False},
-        cursor={"y": False}, padding=(0, 10, 0, 0), visible=False,
-    )  # fmt: skip
+class _Chart:
+    """A caption with the lines' colours, and the curves once there is something to connect.
 
+    uPlot takes a NaN for a number and then finds no ends for its axis, so gaps are filled with what was
+    known before them, and a line that has no values is left out: the chart is made anew without it.
+    """
 
-def _draw(chart: Any, data: tuple[NDArray, ...]) -> None:
-    """Show the curves once there are two points to connect."""
-    if len(data[0]) < 2:
-        return
-    chart.data = data
-    chart.visible = True
+    def __init__(
+        self, gui: viser.GuiApi, title: str, lines: Sequence[tuple[str, RGB]],
+        zero: bool = False, stepped: bool = False,
+    ) -> None:  # fmt: skip
+        self._gui, self._title, self._lines = gui, title, lines
+        self._zero, self._stepped = zero, stepped
+        self._caption = gui.add_html("", visible=False)
+        self._place = gui.add_folder(None)
+        self._shown: tuple[int, ...] = ()
+        self._chart: Any = None
+
+    def draw(self, t: NDArray, *curves: NDArray, note: str = "") -> None:
+        """Show curves (N,) over t (N,) seconds, which increase; data are where the first curve has them."""
+        known = np.isfinite(curves[0])
+        if known.sum() < 2:
+            return
+        kept = _thin(t[known], *(c[known] for c in curves))
+        shown = tuple(i for i, c in enumerate(kept[1:]) if np.isfinite(c[-RECENT:]).any())
+        data = (kept[0], *(_filled(kept[1 + i]) for i in shown))
+        if self._stepped:
+            data = _steps(*data)
+        if shown != self._shown:
+            self._shown = shown
+            if self._chart is not None:
+                self._chart.remove()
+            with self._place:
+                self._chart = self._make([self._lines[i] for i in shown], data)
+        else:
+            self._chart.data = data
+        self._caption.content = chart_caption(self._title, [self._lines[i] for i in shown], note)
+        self._caption.visible = True
+
+    def _make(self, lines: Sequence[tuple[str, RGB]], data: tuple[NDArray, ...]) -> Any:
+        series: list[Any] = [{"label": "s"}]
+        for label, colour in lines:
+            line: dict[str, Any] = {"label": label, "stroke": css(colour), "width": LINE_PX}
+            line |= {"points": {"show": False}}
+            series.append(line | ({"fill": css(colour) + "30"} if self._stepped else {}))
+        axis: dict[str, Any] = {"font": "10px sans-serif", "gap": 3, "ticks": {"size": 3}}
+        scales: dict[str, Any] = {"x": {"time": False}}
+        if self._zero:
+            scales["y"] = {"range": (0.0, None)}
+        return self._gui.add_uplot(
+            data=data, series=tuple(series), height=HEIGHT, scales=scales,
+            axes=cast(Any, ({"size": 22} | axis, {"size": 38} | axis)),
+            legend={"show": False}, padding=(6, 10, 0, 0),
+        )  # fmt: skip
 
 
 def _column(values: Any) -> NDArray:
@@ -113,13 +143,19 @@ def _column(values: Any) -> NDArray:
 
 
 def _thin(*columns: NDArray) -> tuple[NDArray, ...]:
-    """At most MAX_POINTS rows, the last one kept; an infinity becomes a gap."""
+    """At most MAX_POINTS rows, the last one kept."""
     step = max(1, -(-len(columns[0]) // MAX_POINTS))
-    picked = tuple(np.ascontiguousarray(c[::-1][::step][::-1], dtype=np.float64) for c in columns)
-    return tuple(np.where(np.isfinite(c), c, np.nan) for c in picked)
+    return tuple(np.ascontiguousarray(c[::-1][::step][::-1], dtype=np.float64) for c in columns)
 
 
-def _held(t: NDArray, events: Sequence[tuple[float, float | None]]) -> NDArray:
+def _filled(values: NDArray) -> NDArray:
+    """Gaps take the value before them, a leading gap the first value. At least one must be finite."""
+    known = np.flatnonzero(np.isfinite(values))
+    place = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+    return values[known[np.maximum(place, 0)]]
+
+
+def _in_force(t: NDArray, events: Sequence[tuple[float, float | None]]) -> NDArray:
     """Value in force at each t: that of the latest event before it, NaN before the first."""
     if not events:
         return np.full(len(t), np.nan)
@@ -129,6 +165,4 @@ def _held(t: NDArray, events: Sequence[tuple[float, float | None]]) -> NDArray:
 
 def _steps(t: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
     """Corners of a staircase: each value holds until the next sample."""
-    if len(t) < 2:
-        return t, y
     return np.repeat(t, 2)[1:], np.repeat(y, 2)[:-1]

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from freshfield.geometry import Pinhole, quaternion_to_matrix
+from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 
 Array = NDArray[np.float64]
 
 VERTICAL_FOV_RAD = float(np.deg2rad(50.0))
-# Seen from this multiple of the rig's own distance the nearest cameras are in front of the visitor.
-PULL_BACK = 1.35
-RAISE = 0.22
+# The visitor stands this much higher above the horizon than the rig, within bounds.
+ABOVE_RIG_DEG = 14.0
+ELEVATION_DEG = (18.0, 55.0)
+# As far away as it takes to see every camera within this part of a square window, in radii of the rig.
+MARGIN = 0.86
+DISTANCES = np.linspace(1.25, 4.0, 56)
 # Below this the mean of unit vectors says nothing: the rig surrounds the scene, or its cameras roll freely.
 _SCATTERED = 0.25
 # Smallest eigenvalue of the mean of I - d d^T at which axes are called parallel (about 3 degrees apart).
@@ -73,14 +76,36 @@ def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> View
         centre = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(3.0 * spread, 1.0)
     radius = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
     radius = max(radius, 1e-2)
-    outward = (eyes - centre).mean(axis=0)
-    if np.linalg.norm(outward) < _SCATTERED * radius:  # a ring of cameras: stand behind the first
-        outward = eyes[0] - centre
-    if np.linalg.norm(outward) < 1e-6 * radius:
-        outward = -axes[0]
-    outward = outward / np.linalg.norm(outward)
-    position = centre + outward * radius * PULL_BACK + up * radius * RAISE
+    direction = _outward(eyes - centre, up, radius)
+    tangent = MARGIN * np.tan(0.5 * VERTICAL_FOV_RAD)
+    for distance in DISTANCES * radius:
+        position = centre + direction * distance
+        if _all_seen(eyes, position, centre, up, tangent):
+            break
     return Viewpoint(position, centre, up, radius)
+
+
+def _outward(offsets: Array, up: Array, radius: float) -> Array:
+    """Unit vector from the centre to the visitor: above the middle of the rig. offsets: (N, 3) metres."""
+    flat = offsets - (offsets @ up)[:, None] * up
+    behind = flat.mean(axis=0)
+    if np.linalg.norm(behind) < _SCATTERED * radius:  # a ring of cameras: stand behind the first
+        behind = flat[0]
+    if np.linalg.norm(behind) < 1e-6 * radius:  # it looks straight down: any side will do
+        least = np.zeros(3)
+        least[np.argmin(np.abs(up))] = 1.0
+        behind = np.cross(up, least)
+    behind = behind / np.linalg.norm(behind)
+    heights = offsets @ up / np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
+    elevation = np.rad2deg(np.arcsin(np.clip(np.mean(heights), -1, 1))) + ABOVE_RIG_DEG
+    elevation = np.deg2rad(np.clip(elevation, *ELEVATION_DEG))
+    return behind * np.cos(elevation) + up * np.sin(elevation)
+
+
+def _all_seen(eyes: Array, position: Array, centre: Array, up: Array, tangent: float) -> bool:
+    """Whether all ``eyes`` lie within a square view whose half angle has this tangent."""
+    local = (eyes - position) @ look_at(position, centre, up)[:3, :3]
+    return bool(np.all((local[:, 2] > 0) & (np.abs(local[:, :2]) < tangent * local[:, 2:]).all(axis=1)))
 
 
 def visitor_camera(

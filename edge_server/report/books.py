@@ -250,7 +250,7 @@ def _settle(history: _History, account: Account) -> list[str]:
             counted = min(count, left)
             account.end(answer, counted)
             left -= counted
-    broken = min(left, emulator["broken"] + node["broken"])
+    broken = min(left, emulator["broken"] or node["broken"])
     account.end("broken", broken)
     account.end("in_flight", left - broken)
     return complaints

@@ -102,7 +102,7 @@ def exp32(x):
 
     The Cephes polynomial, because a call into libm would keep LLVM from vectorising the loop around it.
     """
-    clamped = min(max(x, _LOWEST), _HIGHEST)
+    clamped = min(max(x if x == x else _ONE, _LOWEST), _HIGHEST)  # a NaN has no integer part
     n = np.floor(clamped * _LOG2_E + _HALF)
     r = clamped - n * _LN2_HIGH - n * _LN2_LOW
     p = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5

@@ -169,3 +169,29 @@ def test_the_mean_over_cameras_skips_what_a_camera_lacks():
     mean = mean_score([a, b])
     assert mean.ssim == a.ssim and b.ssim is None and mean.psnr_moving_db == pytest.approx(20.0)
     assert mean.camera == "a,b"
+
+
+def test_a_held_out_camera_that_moves_is_rendered_where_it_was_when_the_truth_was_taken():
+    asked = []
+
+    def render(generated_ns):
+        asked.append(generated_ns)
+        return (truth_at(440) / 255).astype(np.float32)
+
+    scorer = Scorer()
+    feed(scorer, 400)
+    scorer.publish("h", render, 430 * MS)
+    assert asked == []  # nothing is rendered before its truth has come
+    (score,) = scorer.held_out("h", truth_at(440), 440 * MS)
+    assert asked == [440 * MS] and score.psnr_db == PSNR_CEILING_DB
+
+
+def test_frames_from_another_viewpoint_tell_nothing_about_motion_or_noise():
+    for viewpoints, moves in (("same", True), ("new", False)):
+        scorer = Scorer(noisy_truth=True)
+        for ms in range(0, 801, 40):
+            pose = 0 if viewpoints == "same" else ms
+            scorer.held_out("h", truth_at(ms), ms * MS, pose)
+        (score,) = scorer.publish("h", np.zeros((48, 48, 3), np.float32), 790 * MS)
+        assert (score.psnr_moving_db is not None) == moves
+        assert bool(scorer._cameras["h"].noise.pairs) == moves

@@ -155,7 +155,9 @@ class Browser:
     def _note(self, event: dict[str, Any]) -> None:
         params = event.get("params", {})
         if event.get("method") == "Network.requestWillBeSent":
-            self.requests.append(params["request"]["url"])
+            url = params["request"]["url"]
+            if not url.startswith(("data:", "blob:")):  # those stay within the page
+                self.requests.append(url)
         elif event.get("method") == "Network.webSocketCreated":
             self.requests.append(params["url"])
         elif event.get("method") == "Runtime.exceptionThrown":
@@ -229,7 +231,7 @@ class Browser:
     def choose(self, label: str, option: str) -> None:
         """Open the dropdown with this label and click an option."""
         self.click(*self._input(label)[:2])
-        query = f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() === {option!r})"
+        query = f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() == {option!r})"
         self.wait_for(lambda: self.evaluate(f"!!{query}"), f"the option {option!r}")
         time.sleep(0.3)  # the list slides in: a click on its way would miss
         box = self.evaluate(f"(() => {{const r = {query}.getBoundingClientRect();"
@@ -246,6 +248,14 @@ class Browser:
         self.call("Input.insertText", text=text)
         self._key("Enter", 13)
         self._key("Tab", 9)
+
+    def close_notices(self) -> None:
+        """Click away every notification, such as the one that WebGL runs in software."""
+        self.evaluate(
+            "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+        )
+        gone = "!document.querySelector('.mantine-Notification-root')"
+        self.wait_for(lambda: self.evaluate(gone), "the end of the notifications")
 
     def screenshot(self, path: str | Path | None = None) -> NDArray[np.uint8]:
         """The window as RGB (H, W, 3), also written as PNG to ``path``."""

@@ -1,0 +1,140 @@
+"""The command ``camera-node``: run cameras of a scenario, list what they can look at."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import signal
+import sys
+from pathlib import Path
+
+from freshfield import scenario, transport
+
+EXAMPLES = """examples:
+  camera-node run room --all --to 127.0.0.1:7001             every camera of the shipped scenario "room"
+  camera-node run room.yaml --camera cam03 --to emu:7001     one camera, as on a machine of its own
+  camera-node run fox --all --to :7001 --data ~/data         recorded data: where the data sets lie
+  camera-node sources                                        what a scenario's source section can say
+  camera-node effects                                        what it can list under effects
+
+exit codes: 0 stopped as asked, 1 failed while running, 2 wrong scenario, option or data
+"""
+
+
+class UsageError(Exception):
+    """Something the person at the keyboard can put right; shown as one line."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="camera-node", formatter_class=argparse.RawDescriptionHelpFormatter, epilog=EXAMPLES,
+        description="Streams timestamped, posed frames of one or several cameras to the next hop.",
+    )  # fmt: skip
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(commands.add_parser("run", help="stream cameras of a scenario", epilog=EXAMPLES,
+                                 formatter_class=argparse.RawDescriptionHelpFormatter))  # fmt: skip
+    commands.add_parser("sources", help="list kinds of sources and the keys they take")
+    commands.add_parser("effects", help="list effects and their parameters")
+    args = parser.parse_args(arguments)
+    try:
+        if args.command == "run":
+            return _run(args)
+        from camera_node import listing
+
+        print(listing.sources() if args.command == "sources" else listing.effects())
+        return 0
+    except (UsageError, scenario.ScenarioError, transport.TransportError) as error:
+        print(f"camera-node: {error}", file=sys.stderr)
+        return 2
+
+
+def _add_run(run: argparse.ArgumentParser) -> None:
+    run.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    who = run.add_mutually_exclusive_group(required=True)
+    who.add_argument("--camera", metavar="ID[,ID]", help="the scenario's cameras this process hosts")
+    who.add_argument("--all", action="store_true", help="host all of them")
+    run.add_argument("--to", required=True, metavar="HOST:PORT", help="channel emulator or edge server")
+    run.add_argument("--out", type=Path, metavar="DIR", help="folder for the ledger and the status file")
+    run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (else $FRESHFIELD_DATA)")
+    run.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's")
+    run.add_argument("--seconds", type=float, metavar="S", help="stop after S seconds of capture")
+    run.add_argument(
+        "--cache-mb", type=float, default=64.0, metavar="MB",
+        help="bound on compressed frames kept for the next round (default %(default)s, 0 keeps none)",
+    )  # fmt: skip
+    run.add_argument(
+        "--response-timeout", type=float, default=5.0, metavar="S",
+        help="reconnect when a frame is not answered for so long (default %(default)s)",
+    )  # fmt: skip
+    run.add_argument("-q", "--quiet", action="store_true", help="only warnings")
+    transport.add_arguments(run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    logging.basicConfig(
+        level=logging.WARNING if args.quiet else logging.INFO, stream=sys.stderr,
+        format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S",
+    )  # fmt: skip
+    from camera_node.build import build_cameras
+    from camera_node.config import source_config
+    from camera_node.node import Node, NodeOptions
+
+    plan = scenario.load(args.scenario, args.seed)
+    cameras = _chosen(plan, args)
+    if args.seconds is not None and args.seconds <= 0:
+        raise UsageError("--seconds: expected a positive number")
+    if args.cache_mb < 0 or args.response_timeout <= 0:
+        raise UsageError("--cache-mb cannot be negative, --response-timeout must be positive")
+    config = source_config(plan)
+    options = NodeOptions(
+        to=_target(args.to),
+        transport=transport.from_arguments(args),
+        out=args.out,
+        seconds=args.seconds,
+        response_timeout_s=args.response_timeout,
+    )
+    try:
+        built = build_cameras(plan, config, cameras, args.data, int(args.cache_mb * 2**20))
+        if args.out is not None:
+            args.out.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from None
+
+    async def live() -> None:
+        node = Node(plan, built, options)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, node.stop)
+        await node.run()
+
+    try:
+        asyncio.run(live())
+    except (OSError, RuntimeError) as error:
+        print(f"camera-node: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _chosen(plan: scenario.Scenario, args: argparse.Namespace) -> tuple[str, ...]:
+    if args.all:
+        return plan.cameras
+    chosen = tuple(dict.fromkeys(c.strip() for c in args.camera.split(",") if c.strip()))
+    unknown = [c for c in chosen if c not in plan.cameras]
+    if unknown or not chosen:
+        raise UsageError(
+            f"--camera: {plan.path} has no camera {', '.join(unknown) or 'of no name'}; "
+            f"it has {', '.join(plan.cameras)}"
+        )
+    return chosen
+
+
+def _target(text: str) -> str:
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isdigit() or not 0 < int(port) < 65536:
+        raise UsageError(f"--to: expected HOST:PORT, got {text!r}")
+    return f"{host or '127.0.0.1'}:{port}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

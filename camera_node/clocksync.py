@@ -1,0 +1,59 @@
+"""Keeps the estimate of the peer's clock: one small exchange a second on the frames' own channel."""
+
+from __future__ import annotations
+
+import asyncio
+
+import grpc
+import grpc.aio
+
+from freshfield.clock import Clock, Offset, OffsetEstimator
+from freshfield.v1 import clock_pb2 as pb
+from freshfield.v1 import clock_pb2_grpc as rpc
+
+PERIOD_S = 1.0
+# The first exchanges follow one another closely, so that early frames are well dated too.
+_FIRST = 4
+_FIRST_PERIOD_S = 0.05
+
+
+class ClockSync:
+    """``offset()`` is the peer's clock minus ``clock``, or None before the first answer."""
+
+    def __init__(
+        self, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...], clock: Clock
+    ) -> None:
+        self._stub = rpc.ClockServiceStub(channel)
+        self._metadata = metadata
+        self._clock = clock
+        self._estimator = OffsetEstimator()
+
+    def offset(self) -> Offset | None:
+        return self._estimator.estimate(self._clock.now_ns())
+
+    async def run(self) -> None:
+        """Until cancelled."""
+        exchanges = 0
+        while True:
+            # After a silence the peer may be another process with another clock: start afresh, but keep
+            # the old estimate until there is a new one.
+            estimator = self._estimator if exchanges else OffsetEstimator()
+            if await self._exchange(estimator):
+                self._estimator = estimator
+                exchanges += 1
+            else:
+                exchanges = 0
+            await asyncio.sleep(_FIRST_PERIOD_S if 0 < exchanges < _FIRST else PERIOD_S)
+
+    async def _exchange(self, estimator: OffsetEstimator) -> bool:
+        sent = self._clock.now_ns()
+        try:
+            answer = await self._stub.Exchange(
+                pb.ExchangeRequest(client_sent_ns=sent), timeout=PERIOD_S, metadata=self._metadata
+            )
+        except (grpc.RpcError, grpc.aio.BaseError):
+            return False  # the senders say what is wrong with the peer
+        if answer is None or answer.client_sent_ns != sent:
+            return False
+        estimator.add(sent, answer.server_received_ns, answer.server_sent_ns, self._clock.now_ns())
+        return True

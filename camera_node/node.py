@@ -1,0 +1,244 @@
+"""A camera node: its cameras capture on one schedule, each sends on a stream of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import secrets
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import grpc.aio
+
+from camera_node.capture import Camera, Encoded
+from camera_node.clocks import NodeClock
+from camera_node.clocksync import ClockSync
+from camera_node.outbox import Outbox
+from camera_node.prepare import prepare
+from camera_node.sender import Sender
+from camera_node.status import write_status
+from freshfield.clock import Clock, WallClock
+from freshfield.frame import Frame
+from freshfield.ledger import Ledger
+from freshfield.scenario import Scenario
+from freshfield.transport import Transport
+
+log = logging.getLogger("camera-node")
+
+STATUS_PERIOD_S = 1.0
+# How long a clean exit waits for the answers to frames already sent.
+_LAST_ANSWERS_S = 1.0
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """to: HOST:PORT of the next hop. out: folder for ledger and status, or None for neither. seconds: how
+    long to capture, or None until stopped. clock: true time, which decides when frames are taken; a camera
+    with a wrong clock sees it through that. response_timeout_s: an answer later than this means a dead
+    stream."""
+
+    to: str
+    transport: Transport
+    clock: Clock = field(default_factory=WallClock)
+    out: Path | None = None
+    seconds: float | None = None
+    response_timeout_s: float = 5.0
+
+
+class Node:
+    """One process's cameras, from capture to the stream. ``await run()`` returns when ``stop`` was called
+    or the time is over."""
+
+    def __init__(self, scenario: Scenario, cameras: Sequence[Camera], options: NodeOptions) -> None:
+        self.name = node_name([c.name for c in cameras])
+        self.session = f"{os.getpid()}-{secrets.token_hex(6)}"
+        self.phase = "starting"
+        self.outboxes: dict[str, Outbox] = {}
+        self.senders: dict[str, Sender] = {}
+        self._scenario = scenario
+        self._cameras = cameras
+        self._options = options
+        self._clock = options.clock
+        self._clocks: dict[str, NodeClock] = {c.name: c.clock(options.clock) for c in cameras}
+        self._trouble: dict[str, Counter[str]] = {c.name: Counter() for c in cameras}
+        self._syncs: dict[str, ClockSync] = {}
+        self._stopping = asyncio.Event()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="capture")
+
+    def stop(self) -> None:
+        """Ask ``run`` to end; safe to call from a signal handler of the loop, and twice."""
+        self._stopping.set()
+
+    async def run(self) -> None:
+        """Connect, prepare, capture and send until stopped. Raises what a camera's task raised."""
+        ledger = None
+        if self._options.out is not None:
+            ledger = Ledger(self._options.out, "node", self.name, self._clock.now_ns())
+        channel = self._options.transport.aio_channel(self._options.to)
+        metadata = self._options.transport.metadata()
+        for camera in self._cameras:
+            outbox = Outbox(camera.name, self.session, ledger, self._clock)
+            self.outboxes[camera.name] = outbox
+            self._syncs[camera.name] = self._sync_of(camera.name, channel, metadata)
+            self.senders[camera.name] = Sender(
+                outbox, channel, metadata, self._syncs[camera.name].offset,
+                self._scenario.rng("backoff", camera.name), self._options.response_timeout_s,
+            )  # fmt: skip
+        try:
+            await self._work()
+        finally:
+            self.phase = "stopped"
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            await channel.close()
+            self._write_status()
+            if ledger is not None:
+                ledger.close(self._clock.now_ns())
+
+    def _sync_of(
+        self, camera: str, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...]
+    ) -> ClockSync:
+        """Cameras on the machine's clock share one estimate; one with a wrong clock needs its own."""
+        clock = self._clocks[camera]
+        if not clock.true_to_machine:
+            return ClockSync(channel, metadata, clock)
+        shared = [self._syncs[c] for c in self._syncs if self._clocks[c].true_to_machine]
+        return shared[0] if shared else ClockSync(channel, metadata, clock)
+
+    async def _work(self) -> None:
+        background = [asyncio.ensure_future(sync.run()) for sync in set(self._syncs.values())]
+        background += [asyncio.ensure_future(s.run()) for s in self.senders.values()]
+        background += [asyncio.ensure_future(self._report())]
+        stop = asyncio.ensure_future(self._stopping.wait())
+        capture = asyncio.ensure_future(self._capture_all())
+        try:
+            await asyncio.wait({stop, capture, *background}, return_when=asyncio.FIRST_COMPLETED)
+            capture.cancel()
+            await self._last_answers()
+        finally:
+            tasks = [stop, capture, *background]
+            for task in tasks:
+                task.cancel()
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
+
+    async def _capture_all(self) -> None:
+        self.phase = "preparing"
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
+        self.phase = "streaming"
+        tasks = [asyncio.ensure_future(self._capture(c)) for c in self._cameras]
+        try:
+            await asyncio.wait(
+                tasks, timeout=self._options.seconds or None, return_when=asyncio.FIRST_EXCEPTION
+            )
+        finally:
+            for task in tasks:
+                task.cancel()
+        for result in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(result, Exception):
+                raise result
+
+    async def _capture(self, camera: Camera) -> None:
+        """One camera's captures, at the ticks of true time."""
+        loop = asyncio.get_running_loop()
+        outbox, trouble = self.outboxes[camera.name], self._trouble[camera.name]
+        fps = camera.fps
+        per_tick = fps.denominator * 1_000_000_000  # tick k is due at k * per_tick / fps.numerator ns
+        tick = self._clock.now_ns() * fps.numerator // per_tick + 1
+        sequence = 0
+        while True:
+            due_ns = tick * per_tick // fps.numerator
+            await asyncio.sleep((due_ns - self._clock.now_ns()) * 1e-9)
+            try:
+                shot = camera.cached(tick) or await loop.run_in_executor(self._pool, camera.capture, tick)
+            except ValueError as error:
+                self._failed(camera.name, error)
+            else:
+                # The shot shows the instant the tick was due, however late the loop woke for it.
+                generated_ns = self._clocks[camera.name].stamp_ns(due_ns)
+                outbox.put(self._frame(camera, shot, sequence, generated_ns))
+                sequence += 1
+            latest = self._clock.now_ns() * fps.numerator // per_tick
+            trouble["missed"] += max(0, latest - tick - 1)
+            tick = max(tick + 1, latest)
+
+    def _frame(self, camera: Camera, shot: Encoded, sequence: int, generated_ns: int) -> Frame:
+        return Frame(
+            camera=camera.name,
+            session=self.session,
+            sequence=sequence,
+            generated_ns=generated_ns,
+            pose=shot.pose,
+            intrinsics=shot.intrinsics,
+            codec=camera.codec,
+            payload=shot.payload,
+            held_out=camera.name in self._scenario.held_out,
+            pose_gap_ns=shot.pose_gap_ns,
+        )
+
+    def _failed(self, camera: str, error: ValueError) -> None:
+        """A capture that could not be had: counted always, said once."""
+        if not self._trouble[camera]["failed"]:
+            log.warning("%s: no frame: %s (further ones are only counted)", camera, error)
+        self._trouble[camera]["failed"] += 1
+
+    async def _last_answers(self) -> None:
+        try:
+            async with asyncio.timeout(_LAST_ANSWERS_S):
+                while any(sender.busy for sender in self.senders.values()):
+                    await asyncio.sleep(0.01)
+        except TimeoutError:
+            pass  # those frames are written down as broken
+
+    async def _report(self) -> None:
+        while True:
+            self._write_status()
+            await asyncio.sleep(STATUS_PERIOD_S)
+
+    def _write_status(self) -> None:
+        if self._options.out is not None:
+            write_status(self._options.out / f"node-{self.name}.json", self.status())
+
+    def status(self) -> dict[str, Any]:
+        """What the terminal table shows; see ``camera_node.status``."""
+        return {
+            "name": self.name,
+            "pid": os.getpid(),
+            "session": self.session,
+            "phase": self.phase,
+            "to": self._options.to,
+            "t_ns": self._clock.now_ns(),
+            "cameras": {c.name: self._camera_status(c) for c in self._cameras},
+        }
+
+    def _camera_status(self, camera: Camera) -> dict[str, Any]:
+        outbox, sender = self.outboxes[camera.name], self.senders[camera.name]
+        counts = dict(outbox.counts)
+        offset = self._syncs[camera.name].offset()
+        frames = {k: counts.pop(k, 0) for k in ("captured", "replaced", "sent", "broken")}
+        return {
+            "fps": float(camera.fps),
+            "held_out": camera.name in self._scenario.held_out,
+            "connected": sender.connected,
+            "connections": sender.connections,
+            "trouble": sender.trouble or None,
+            "clock_offset_ms": None if offset is None else offset.offset_ns / 1e6,
+            "clock_uncertainty_ms": None if offset is None else offset.uncertainty_ns / 1e6,
+            "waiting": outbox.waiting,
+            **frames,
+            "outcomes": counts,
+            "missed": self._trouble[camera.name]["missed"],
+            "failed": self._trouble[camera.name]["failed"],
+        }
+
+
+def node_name(cameras: Sequence[str]) -> str:
+    """Name of a node in file names: its camera, or the first and how many more."""
+    return cameras[0] if len(cameras) == 1 else f"{cameras[0]}+{len(cameras) - 1}"

@@ -1,0 +1,127 @@
+"""Poses of cameras on a rig: fixed ones, and ones that follow a recorded trajectory.
+
+A trajectory is a TUM file, ``t tx ty tz qx qy qz qw`` a line: seconds, metres, camera-to-world, camera axes
+as in OpenCV, the quaternion's w last (it is first everywhere else in this project).
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from freshfield.geometry import GeometryError, Pose, quaternion_normalise
+
+
+class TrajectoryError(ValueError):
+    """A trajectory file that cannot be used; the message names file and line."""
+
+
+class PoseGapError(ValueError):
+    """No pose sample is near enough to the asked instant."""
+
+
+@dataclass(frozen=True)
+class Paired:
+    """A pose for an instant, and how far (ns) the nearest sample it rests on is from that instant."""
+
+    pose: Pose
+    gap_ns: int
+
+
+class PoseProvider(Protocol):
+    def at(self, t_ns: int) -> Paired:
+        """Raises PoseGapError where no sample is near enough."""
+        ...
+
+
+@dataclass(frozen=True)
+class FixedPose:
+    """A camera that does not move: always the same pose, no gap."""
+
+    pose: Pose
+
+    def at(self, t_ns: int) -> Paired:
+        return Paired(self.pose, 0)
+
+
+class Trajectory:
+    """Pose samples in the order of time (ns), paired with instants.
+
+    interpolate: rotation by slerp and translation by a straight line between the two samples around the
+    instant; otherwise the nearest sample (thesis 4.3.3). Either way an instant further than ``max_gap_ns``
+    from every sample has no pose: before the first, after the last, or within a long hole.
+    """
+
+    def __init__(
+        self, times_ns: list[int], poses: list[Pose], interpolate: bool = True, max_gap_ns: int = 50_000_000
+    ) -> None:
+        if not times_ns or len(times_ns) != len(poses):
+            raise TrajectoryError("a trajectory needs at least one sample, and one pose for each time")
+        if any(b <= a for a, b in itertools.pairwise(times_ns)):
+            raise TrajectoryError("the times of a trajectory must increase")
+        self._times = times_ns
+        self._poses = poses
+        self._interpolate = interpolate
+        self._max_gap_ns = max_gap_ns
+
+    def at(self, t_ns: int) -> Paired:
+        after = bisect.bisect_left(self._times, t_ns)
+        before = after - 1
+        if after == len(self._times) or (
+            before >= 0 and t_ns - self._times[before] <= self._times[after] - t_ns
+        ):
+            nearest = before
+        else:
+            nearest = after
+        gap = abs(self._times[nearest] - t_ns)
+        if gap > self._max_gap_ns:
+            raise PoseGapError(
+                f"the nearest pose is {gap / 1e6:.1f} ms away, more than {self._max_gap_ns / 1e6:g} ms"
+            )
+        if not self._interpolate or gap == 0 or before < 0 or after == len(self._times):
+            return Paired(self._poses[nearest], gap)
+        fraction = (t_ns - self._times[before]) / (self._times[after] - self._times[before])
+        return Paired(self._poses[before].interpolate(self._poses[after], fraction), gap)
+
+
+def read_tum(path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000) -> Trajectory:
+    """Read a trajectory file; lines that are empty or start with # are skipped. Raises TrajectoryError."""
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrajectoryError(f"{path}: cannot be read: {error}") from None
+    times: list[int] = []
+    poses: list[Pose] = []
+    for number, line in enumerate(lines, 1):
+        fields = line.replace(",", " ").split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            t, x, y, z, qx, qy, qz, qw = map(float, fields)
+            if not np.all(np.isfinite([t, x, y, z])):
+                raise ValueError
+            q = quaternion_normalise((qw, qx, qy, qz))
+        except GeometryError as error:
+            raise TrajectoryError(f"{path}:{number}: {error}") from None
+        except ValueError:
+            raise TrajectoryError(f"{path}:{number}: expected t tx ty tz qx qy qz qw") from None
+        times.append(_nanoseconds(fields[0]))
+        poses.append(Pose(tuple(map(float, q)), (x, y, z)))  # type: ignore[arg-type]
+    try:
+        return Trajectory(times, poses, interpolate, max_gap_ns)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+
+
+def _nanoseconds(seconds: str) -> int:
+    # Stamps in UTC seconds have more digits than a float keeps: 1305031102.175304 is off by 100 ns.
+    whole, _, part = seconds.partition(".")
+    if part.isdigit() and whole.lstrip("-").isdigit():
+        value = int(whole.lstrip("-")) * 10**9 + int(part[:9].ljust(9, "0"))
+        return -value if whole.startswith("-") else value
+    return round(float(seconds) * 1e9)

@@ -1,0 +1,40 @@
+"""Makes the shots that will come round again before the first is due, so that streaming is cheap."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+from collections.abc import Callable, Sequence
+
+from camera_node.capture import Camera
+
+log = logging.getLogger("camera-node")
+
+
+def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:
+    """Fill the cache with every shot of each camera whose whole round fits, and let go of what made them.
+
+    A round that does not fit is left to be made as it is captured: making a part of it ahead would delay
+    the first frame and save little.
+    """
+    for camera in cameras:
+        camera.source.prepare(stopped)
+        contents = camera.source.contents
+        if contents is None or not camera.fits():
+            continue
+        for content in range(contents):
+            if stopped():
+                return
+            try:
+                camera.fill(content)
+            except ValueError:
+                continue  # counted when the capture is due
+        camera.source.release()
+    return_memory()
+
+
+def return_memory() -> None:
+    """Hand freed memory back to the system where the C library can (glibc keeps it otherwise)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)

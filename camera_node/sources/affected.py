@@ -1,0 +1,42 @@
+"""A recorded camera with effects on each of its frames, such as sensor noise."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from camera_node.sources import Shot, Source
+from freshfield import payload
+
+if TYPE_CHECKING:
+    from camera_node.world.effects import Effects
+
+
+class AffectedSource:
+    """Another source's shots, each changed by the effects of its own tick, so that none repeats."""
+
+    def __init__(self, source: Source, effects: Effects, codec: str) -> None:
+        self.camera = source.camera
+        self.fps = source.fps
+        self.intrinsics = source.intrinsics
+        self.contents: int | None = None
+        self._source = source
+        self._effects = effects
+        self._codec = codec
+
+    def content(self, tick: int) -> int:
+        return tick
+
+    def read(self, content: int) -> Shot:
+        shot = self._source.read(self._source.content(content))
+        image = shot.image
+        if isinstance(image, bytes):
+            image = payload.decode(image, self._codec, shot.intrinsics.width, shot.intrinsics.height)
+        return dataclasses.replace(shot, image=self._effects.apply(image, content))
+
+    def prepare(self, stopped: Callable[[], bool]) -> None:
+        self._source.prepare(stopped)
+
+    def release(self) -> None:
+        self._source.release()

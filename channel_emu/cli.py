@@ -1,0 +1,231 @@
+"""The ``channel-emu`` command."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import dataclasses
+import json
+import logging
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from channel_emu import spell
+from channel_emu.config import ChannelConfig, channel_from_mapping
+from channel_emu.link import DISCIPLINES
+from channel_emu.presets import PRESETS
+from freshfield import scenario, transport
+
+DESCRIPTION = """\
+Emulates a bad network between cameras and the edge, seeded and per frame.
+
+  channel-emu run room --listen 127.0.0.1:7001 --to 127.0.0.1:7000 --out runs/room
+  channel-emu simulate --preset ch6 --cameras 18 --seconds 600
+  channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
+  channel-emu replay runs/room/trace.jsonl
+  channel-emu bench --seconds 20 --load 2
+"""
+_HARD_LIMIT_STATUS = 3
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line. Exit status 0; 1: a replay or a bench that did not agree; 2: bad input; 3: the
+    hard limit was exceeded."""
+    parser = argparse.ArgumentParser(
+        prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_run(commands)
+    _add_simulate(commands)
+    _add_replay(commands)
+    _add_bench(commands)
+    args = parser.parse_args(argv)
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    try:
+        return args.go(args)
+    except ValueError as error:  # a scenario, a spelling, a transport option, a trace: all say what to change
+        print(f"channel-emu: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _add_run(commands: Any) -> None:
+    sub = commands.add_parser(
+        "run", help="the live emulator: cameras connect to it, it connects to the edge",
+        description="Delays, drops and damages each camera's frames as the scenario's channel section says. "
+        "Writes OUT/channel.json twice a second and a ledger of every frame; ends cleanly on Ctrl-C.",
+    )  # fmt: skip
+    sub.add_argument("scenario", help="a scenario file, or the name of a shipped one")
+    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
+    sub.add_argument("--to", default="127.0.0.1:7000", metavar="HOST:PORT", help="the edge (%(default)s)")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="for channel.json and the ledger")
+    sub.add_argument("--seed", type=int, help="instead of the scenario's")
+    sub.add_argument("--trace", type=Path, metavar="FILE", help="record what happens to every frame")
+    sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
+    sub.add_argument("--hard-limit-ms", type=float, metavar="MS", help="stop if a frame leaves this late")
+    sub.add_argument("--no-priority", action="store_true", help="do not ask to run before other processes")
+    transport.add_arguments(sub)
+    sub.set_defaults(go=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from channel_emu import trace
+    from channel_emu.lane import HardLimit
+    from channel_emu.priority import raise_priority
+    from channel_emu.proxy import Proxy, ProxyOptions
+
+    plan = scenario.load(args.scenario, args.seed)
+    config = channel_from_mapping(plan.channel, f"{plan.path}: channel")
+    if args.hard_limit_ms is not None:
+        config = dataclasses.replace(config, hard_limit_ms=args.hard_limit_ms)
+    options = ProxyOptions(
+        listen=args.listen, to=args.to, out=args.out, transport=transport.from_arguments(args),
+        trace=args.trace, replay=trace.read(args.replay) if args.replay else None,
+        priority="normal" if args.no_priority else raise_priority(),
+    )  # fmt: skip
+
+    async def live() -> None:
+        stop = asyncio.Event()
+        for name in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(name, stop.set)
+        await Proxy(config, plan.cameras, plan.seed, options).run(stop)
+
+    try:
+        asyncio.run(live())
+    except HardLimit as error:
+        print(f"channel-emu: {error}", file=sys.stderr)
+        return _HARD_LIMIT_STATUS
+    return 0
+
+
+def _add_simulate(commands: Any) -> None:
+    sub = commands.add_parser(
+        "simulate", help="the same links in virtual time: ages and losses of a channel before building on it",
+        description="Simulates every camera's link and prints mean age (continuous time average), mean age "
+        "at slot boundaries, peak age, what was delivered and dropped, the chain's shares and the drawn delays.",
+    )  # fmt: skip
+    source = sub.add_mutually_exclusive_group()
+    source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
+    source.add_argument("--scenario", help="take the channel section of a scenario")
+    sub.add_argument("--arrivals", metavar="SPEC", help="as-offered, periodic:30ms, poisson:1/30ms, or a "
+                     "rate for each state: mmpp:1/120ms,1/30ms")  # fmt: skip
+    sub.add_argument("--service", metavar="SPEC", help="none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
+                     "lognormal:60ms:SIGMA, trace:FILE")  # fmt: skip
+    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="exp:30ms,exp:60ms")
+    sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, "
+                     "and scope=per-camera, initial=s1")  # fmt: skip
+    sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
+    sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
+    sub.add_argument("--cameras", type=int, default=1, metavar="N", help="default: %(default)s")
+    sub.add_argument("--seconds", type=float, default=600.0, metavar="S", help="default: %(default)s")
+    sub.add_argument("--seed", type=int, default=0, metavar="K", help="default: %(default)s")
+    sub.add_argument("--frame-period-ms", type=float, metavar="MS", help="the cameras' own period; Poisson "
+                     "arrivals then sample the newest frame, as the live emulator does")  # fmt: skip
+    sub.add_argument("--frame-bytes", type=int, default=20_000, metavar="N", help="for the bandwidth fault")
+    sub.add_argument("--slot-ms", type=float, default=1.0, metavar="MS", help="default: %(default)s")
+    sub.add_argument("--engine", choices=["auto", "python", "kernel"], default="auto")
+    sub.add_argument("--json", action="store_true", help="everything, as one JSON object")
+    sub.set_defaults(go=_simulate)
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from channel_emu.simulate import OUTCOMES, simulate
+
+    result = simulate(
+        _config_of(args), args.cameras, args.seconds, args.seed, engine=args.engine,
+        frame_period_ms=args.frame_period_ms, frame_bytes=args.frame_bytes, slot_ms=args.slot_ms,
+    ).summary()  # fmt: skip
+    if args.json:
+        print(json.dumps(result))
+        return 0
+    for key, label in (("mean_age_ms", "mean age"), ("mean_age_slotted_ms", "mean age at slot boundaries"),
+                       ("peak_age_ms", "peak age")):  # fmt: skip
+        value = result[key]
+        print(f"{label:28} {'-' if value is None else f'{value:.3f} ms'}")
+    delay = result["delay_ms"]
+    if delay["mean"] is not None:
+        figures = ", ".join(f"{k} {v:.2f}" for k, v in delay.items())
+        print(f"{'drawn delay (ms)':28} {figures}")
+    for key in ("offered", "delivered", *OUTCOMES[2:], "in_flight"):
+        if result[key] or key in ("offered", "delivered"):
+            print(f"{key:28} {result[key]:,}")
+    if len(result["state_share"]) > 1:
+        shares = ", ".join(f"{k} {v:.4f}" for k, v in result["state_share"].items())
+        print(f"{'share of states':28} {shares}")
+    print(f"{'cameras x seconds':28} {result['cameras']} x {result['seconds']:g}, seed {result['seed']}, "
+          f"{result['engine']} engine")  # fmt: skip
+    return 0
+
+
+def _config_of(args: argparse.Namespace) -> ChannelConfig:
+    if args.service and args.service_by_state:
+        raise spell.SpellingError("--service and --service-by-state exclude each other")
+    section: dict[str, Any] = {"preset": args.preset}
+    if args.scenario:
+        section = dict(scenario.load(args.scenario).channel)
+    given = {
+        "arrivals": spell.arrivals(args.arrivals) if args.arrivals else None,
+        "service": spell.service(args.service) if args.service else None,
+        "chain": spell.chain(args.chain) if args.chain else None,
+        "service_state": args.service_state,
+        "discipline": args.discipline,
+    }
+    if args.service_by_state:
+        given["service"] = spell.service_by_state(args.service_by_state)
+    return channel_from_mapping({**section, **{k: v for k, v in given.items() if v is not None}}, "simulate")
+
+
+def _add_replay(commands: Any) -> None:
+    sub = commands.add_parser(
+        "replay", help="decide a recorded trace again in virtual time and compare every decision",
+        description="Offers the recorded frames to fresh links of the recorded channel and seed, at the "
+        "recorded instants. Every decision must come out as recorded. To repeat a trace live: run --replay.",
+    )  # fmt: skip
+    sub.add_argument("trace", type=Path)
+    sub.add_argument("--json", action="store_true")
+    sub.set_defaults(go=_replay)
+
+
+def _replay(args: argparse.Namespace) -> int:
+    from channel_emu.trace import compare, read
+
+    result = compare(read(args.trace))
+    if args.json:
+        print(json.dumps(result))
+    else:
+        print(f"{result['frames']:,} frames, {result['equal']:,} decided as recorded")
+        for line in result["different"]:
+            print(f"  {line}")
+    return 0 if result["equal"] == result["frames"] else 1
+
+
+def _add_bench(commands: Any) -> None:
+    sub = commands.add_parser(
+        "bench", help="measure the live emulator on this machine: throughput and its own delay error",
+        description="Cameras, emulator and a sink as separate processes on loopback; exponential delays, "
+        "every frame delivered. Prints messages a second, frames lost, and the histogram of delay error.",
+    )  # fmt: skip
+    sub.add_argument("--cameras", type=int, default=18, metavar="N", help="default: %(default)s")
+    sub.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="of each camera (%(default)s)")
+    sub.add_argument("--bytes", type=int, default=20_000, metavar="N", help="of each frame (%(default)s)")
+    sub.add_argument("--seconds", type=float, default=15.0, metavar="S", help="default: %(default)s")
+    sub.add_argument("--load", type=int, default=0, metavar="N", help="processes that compute beside it")
+    sub.add_argument("--no-priority", action="store_true")
+    sub.add_argument("--json", action="store_true")
+    sub.set_defaults(go=_bench)
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from channel_emu.bench import bench, show
+
+    result = bench(args.cameras, args.rate, args.bytes, args.seconds, args.load, not args.no_priority)
+    print(json.dumps(result) if args.json else show(result))
+    return 0 if result["lost"] == 0 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

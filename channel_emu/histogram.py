@@ -1,0 +1,62 @@
+"""A histogram of durations in fixed memory, for percentiles of a run of any length."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+_PER_DECADE = 100  # bins of 2.3 %
+_DECADES = 9  # 100 ns to 100 s
+_FLOOR_MS = 1e-4
+
+
+class Histogram:
+    """Durations in ms: logarithmic bins, exact count, mean, minimum and maximum."""
+
+    def __init__(self) -> None:
+        self._bins = [0] * (_PER_DECADE * _DECADES + 2)
+        self.count = 0
+        self.sum_ms = 0.0
+        self.max_ms = 0.0
+
+    def add(self, value_ms: float) -> None:
+        """Count one duration; negative ones count as zero."""
+        value = max(value_ms, 0.0)
+        self.count += 1
+        self.sum_ms += value
+        if value > self.max_ms:
+            self.max_ms = value
+        if value < _FLOOR_MS:
+            self._bins[0] += 1
+        else:
+            place = int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
+            self._bins[min(place, len(self._bins) - 1)] += 1
+
+    @property
+    def mean_ms(self) -> float | None:
+        return self.sum_ms / self.count if self.count else None
+
+    def percentile_ms(self, percent: float) -> float | None:
+        """Upper edge of the bin that holds the percentile, at most the maximum; None if empty."""
+        if not self.count:
+            return None
+        rank = max(1, math.ceil(percent / 100 * self.count))
+        place = int(np.searchsorted(np.cumsum(self._bins), rank))
+        return min(_FLOOR_MS * 10 ** (place / _PER_DECADE), self.max_ms)
+
+    def linear(self, count: int = 50) -> tuple[list[float], list[float]]:
+        """Edges (count + 1,) in ms from 0 to the 99.5th percentile, and counts (count,): the logarithmic bins
+        spread over equal ones, for drawing."""
+        top = self.percentile_ms(99.5)
+        if not top:
+            return [], []
+        edges = np.linspace(0.0, top, count + 1)
+        upper = _FLOOR_MS * 10.0 ** (np.arange(len(self._bins)) / _PER_DECADE)
+        # The cumulative count is known at the logarithmic edges; between them frames are spread evenly.
+        below = np.interp(edges, np.append(0.0, upper), np.append(0.0, np.cumsum(self._bins)))
+        return edges.round(4).tolist(), np.diff(below).round(2).tolist()
+
+    def bins(self) -> list[tuple[float, int]]:
+        """(upper edge in ms, count) of the bins that are not empty."""
+        return [(_FLOOR_MS * 10 ** (i / _PER_DECADE), n) for i, n in enumerate(self._bins) if n]

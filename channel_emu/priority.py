@@ -1,0 +1,56 @@
+"""Asks the system to run the emulator when it is due: a network does not wait for a neighbour's training.
+
+Measured on two cores with two processes computing on each, lateness of a timer at 50 / 90 / 99 %: untouched
+0.19 / 2.8 / 9.9 ms; niceness -15 no better (schedulers that group by session or container compare niceness
+within a group only); a short slice 0.21 / 0.5 / 4.4 ms; real-time round robin 0.20 / 0.25 / 0.6 ms.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import platform
+
+_SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+# A thread that asks for short slices is let in sooner when it wakes (Linux 6.12 and later).
+_SLICE_NS = 100_000
+
+
+class _Attributes(ctypes.Structure):
+    _fields_ = (
+        ("size", ctypes.c_uint32),
+        ("policy", ctypes.c_uint32),
+        ("flags", ctypes.c_uint64),
+        ("nice", ctypes.c_int32),
+        ("priority", ctypes.c_uint32),
+        ("runtime_ns", ctypes.c_uint64),
+        ("deadline_ns", ctypes.c_uint64),
+        ("period_ns", ctypes.c_uint64),
+    )
+
+
+def raise_priority() -> str:
+    """Best of what the system permits: ``realtime``, ``short-slice``, ``nice`` or ``normal``.
+
+    Threads started later inherit it, child processes do not: call it before gRPC starts its own. Real time
+    needs CAP_SYS_NICE; the kernel still keeps 5 % of each core from it.
+    """
+    if hasattr(os, "sched_setscheduler"):
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+            return "realtime"
+    reached = "normal"
+    with contextlib.suppress(OSError):
+        os.nice(-5)
+        reached = "nice"
+    return "short-slice" if _shorten_slice() else reached
+
+
+def _shorten_slice() -> bool:
+    number = _SYS_SCHED_SETATTR.get(platform.machine())
+    if number is None or platform.system() != "Linux":
+        return False
+    attributes = _Attributes(size=ctypes.sizeof(_Attributes), runtime_ns=_SLICE_NS)
+    attributes.nice = os.getpriority(os.PRIO_PROCESS, 0)
+    return ctypes.CDLL(None).syscall(number, 0, ctypes.byref(attributes), 0) == 0

@@ -1,0 +1,172 @@
+"""The stream from the emulator to the edge for one camera: several credits, no queue, reconnects for ever."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import random
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+import grpc.aio
+
+from freshfield.v1 import frames_pb2 as pb
+
+log = logging.getLogger("channel-emu")
+
+PUSH = "/freshfield.v1.FrameStreamService/Push"
+# Frames at the edge without an answer yet, at most. More than one, so that the time an answer takes is not
+# added to the next frame's delay; few, so that a stalled edge shows at once.
+CREDITS = 4
+FIRST_BACKOFF_S = 0.1
+MAX_BACKOFF_S = 2.0
+
+
+@dataclass(slots=True)
+class Outgoing:
+    """A frame that the link has let out. ``tag`` is the sender's own."""
+
+    raw: bytes
+    sequence: int
+    tag: Any
+
+
+class Upstream:
+    """Sends frames as they are given. One that cannot go, because the edge is away or has answered none of
+    the last CREDITS and a newer one came, is ``broken``.
+
+    forwarded, broken: called once for each frame, on the event loop; a forwarded frame whose stream ends
+    before its answer is broken after all (what the edge wrote decides whether it arrived).
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        channel: grpc.aio.Channel,
+        metadata: tuple[tuple[str, str], ...],
+        forwarded: Callable[[Outgoing], None],
+        broken: Callable[[Outgoing], None],
+    ) -> None:
+        self.camera = camera
+        self.connected = False
+        self.connections = 0
+        self.rejected: Counter[str] = Counter()
+        """The edge's refusals, by reason."""
+        self._channel = channel
+        self._metadata = metadata
+        self._forwarded = forwarded
+        self._broken = broken
+        self._outbox: deque[Outgoing] = deque()
+        self._unanswered: deque[Outgoing] = deque()
+        self._held: Outgoing | None = None
+        self._wake = asyncio.Event()
+        self._trouble = ""
+
+    def send(self, frame: Outgoing) -> None:
+        """Hand over a frame that is due now. Never blocks, never raises."""
+        if not self.connected:
+            self._broken(frame)
+        elif len(self._outbox) + len(self._unanswered) >= CREDITS:
+            if self._held is not None:
+                self._broken(self._held)
+            self._held = frame
+        else:
+            self._outbox.append(frame)
+            self._wake.set()
+
+    @property
+    def pending(self) -> int:
+        """Frames handed over and not answered yet."""
+        return len(self._outbox) + len(self._unanswered) + (self._held is not None)
+
+    async def run(self) -> None:
+        """Keep a stream open until cancelled."""
+        backoff = FIRST_BACKOFF_S
+        while True:
+            answered = False
+            try:
+                await self._channel.channel_ready()
+                answered = await self._session()
+            except (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError) as error:
+                self._say(error)
+            finally:
+                self._end()
+            backoff = FIRST_BACKOFF_S if answered else min(backoff * 2, MAX_BACKOFF_S)
+            # Jitter, so that the cameras do not come back all at once.
+            await asyncio.sleep(backoff * random.uniform(0.5, 1.0))
+
+    async def _session(self) -> bool:
+        """One stream, until it fails; True if the edge answered anything on it."""
+        call = self._channel.stream_stream(PUSH)(metadata=self._metadata)
+        reader = asyncio.create_task(self._read(call))
+        writer = asyncio.create_task(self._write(call))
+        self.connected = True
+        self.connections += 1
+        try:
+            await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_COMPLETED)
+            code, details = await call.code(), await call.details()
+            self._say(f"{code.name}: {details}" if details else code.name)
+            return reader.done() and not reader.cancelled() and reader.result()
+        finally:
+            self.connected = False
+            call.cancel()
+            for task in (reader, writer):
+                task.cancel()
+                with contextlib.suppress(asyncio.CancelledError, grpc.RpcError, grpc.aio.BaseError,
+                                         asyncio.InvalidStateError):  # fmt: skip
+                    await task
+
+    async def _write(self, call: grpc.aio.StreamStreamCall) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            while self._outbox:
+                frame = self._outbox.popleft()
+                self._unanswered.append(frame)
+                self._forwarded(frame)
+                await call.write(frame.raw)
+
+    async def _read(self, call: grpc.aio.StreamStreamCall) -> bool:
+        answered = False
+        try:
+            while True:
+                data = await call.read()
+                if data is grpc.aio.EOF:
+                    return answered
+                response = pb.PushResponse.FromString(data)
+                if not any(frame.sequence == response.sequence for frame in self._unanswered):
+                    continue  # an answer to nothing that was asked
+                while self._unanswered.popleft().sequence != response.sequence:
+                    pass  # answers come in order: what lies before was answered too
+                if not answered:
+                    answered, self._trouble = True, ""
+                if response.outcome == pb.OUTCOME_REJECTED:
+                    self.rejected[response.reason[:48] or "unspecified"] += 1
+                if self._held is not None:
+                    self._outbox.append(self._held)
+                    self._held = None
+                    self._wake.set()
+        except (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError):
+            return answered
+
+    def _end(self) -> None:
+        self.connected = False
+        ended = [*self._unanswered, *self._outbox, *([self._held] if self._held is not None else [])]
+        self._unanswered.clear()
+        self._outbox.clear()
+        self._held = None
+        self._wake.clear()
+        for frame in ended:
+            self._broken(frame)
+
+    def _say(self, trouble: Any) -> None:
+        """Say what broke, once per kind of trouble and not once per attempt."""
+        if isinstance(trouble, grpc.aio.AioRpcError):
+            trouble = f"{trouble.code().name}: {trouble.details()}"
+        if str(trouble) != self._trouble:
+            self._trouble = str(trouble)
+            log.warning("%s: stream to the edge ended (%s); trying again", self.camera, self._trouble)

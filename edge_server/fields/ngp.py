@@ -1,0 +1,427 @@
+"""Instant-NGP style radiance field on CPUs: hash grid, small network, numba kernels (thesis 3.1, 4.4.4).
+
+One step: chunks of rays are drawn, sampled, rendered and differentiated side by side
+(``kernels.train``); the hash tables' gradients are added up level by level (``kernels.grid``); Adam touches
+what received a gradient (``kernels.adam``). Every 16 steps the occupancy grid is refreshed.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from typing import Any, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Budget, FitReport, Rendering, View
+from edge_server.fields.kernels.adam import PART, Rule, adam
+from edge_server.fields.kernels.composite import Weights
+from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid, scatter
+from edge_server.fields.kernels.mlp import Net
+from edge_server.fields.kernels.pool import shared_pool
+from edge_server.fields.kernels.rays import Space, Views
+from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
+from edge_server.fields.ngp_layout import make_grid, make_net
+from edge_server.fields.ngp_occupancy import EVERY, Occupancy
+from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.ngp_snapshot import NgpSnapshot
+from edge_server.fields.scene_box import SceneBox, scene_box
+from edge_server.fields.supervision import CameraMemory, check_view, pack_views, remember
+from freshfield.geometry import Pinhole
+
+Arrays = dict[str, NDArray[Any]]
+
+BETA1, BETA2 = 0.9, 0.99
+NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
+RIG = 4  # cameras from which on a scene's box is final
+
+
+class NgpField:
+    """A radiance field that learns while it is used. See ``fields.Field`` for the protocol.
+
+    ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
+    meanwhile: they wait for the end of the present step, some milliseconds.
+    """
+
+    def __init__(self, settings: NgpSettings | None = None) -> None:
+        self.settings = settings or NgpSettings()
+        self.pool = shared_pool(self.settings.threads, self.settings.nice)
+        self._turn = _Turn()
+        self.reset()
+
+    # --- the protocol -------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
+        with self._turn.mine():
+            self.step = 0
+            self.dropped = 0
+            self.box: SceneBox | None = None
+            self._box_cameras = 0
+            self._memory: dict[str, CameraMemory] = {}
+            self._mean_color = np.full(3, 0.5, np.float32)
+            self._packed: tuple[tuple[View, ...], Views] | None = None
+            self._snapshot: NgpSnapshot | None = None
+            self._forget_parameters()
+
+    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
+        """Train on ``views`` from the present parameters. Raises ValueError for a view that cannot be one.
+
+        A budget in seconds (0.1 at least makes sense) is kept within 10 per cent, whatever the load; the
+        learning rate falls over the budget, so every fit ends with a settled field.
+        """
+        start = time.perf_counter()
+        if not views:
+            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
+        for view in views:
+            check_view(view)
+        with self._turn.mine():
+            data = self._take_in(views)
+        steps = rays = samples = dropped = 0
+        losses: deque[float] = deque(maxlen=32)
+        slowest = 0.0
+        while True:
+            began = time.perf_counter()
+            if budget.steps is not None:
+                progress, over = steps / max(budget.steps, 1), steps >= budget.steps
+            else:
+                assert budget.seconds is not None
+                progress = (began - start) / budget.seconds
+                over = began - start + slowest > budget.seconds
+            if over:
+                break
+            with self._turn.mine():
+                self._one_step(data, min(progress, 1.0))
+            steps += 1
+            rays += int(self._batch.rays.sum())
+            samples += int(self._batch.samples.sum())
+            dropped += self._dropped_now
+            losses.append(self._loss_now)
+            # The mean of late steps, since one delayed step must not end a fit early.
+            took = time.perf_counter() - began
+            slowest = took if slowest == 0.0 else 0.8 * slowest + 0.2 * took
+        self.dropped += dropped
+        loss = float(np.mean(losses)) if losses else 0.0
+        return FitReport(steps, time.perf_counter() - start, loss, rays, samples, dropped=dropped)
+
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """The picture of a camera, from the present parameters."""
+        return self.snapshot().render(camera_to_world, intrinsics)
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Surface points in world metres and their colours; none before the first fit."""
+        return self.snapshot().points(count)
+
+    def snapshot(self) -> NgpSnapshot:
+        """A copy that renders from any thread and never changes."""
+        with self._turn.mine():
+            if self._snapshot is None or self._snapshot.step != self.step:
+                box = self.box or SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0)
+                space = self._occupancy.space()
+                self._snapshot = NgpSnapshot(
+                    box=box,
+                    grid=self._grid._replace(table=self._grid.table.copy()),
+                    levels=self._levels(),
+                    net=Net(self._net.widths, self._net.params.copy()),
+                    harmonics=self.settings.harmonics,
+                    space=space._replace(occupied=space.occupied.copy(), coarse=space.coarse.copy()),
+                    background=self._background(),
+                    cameras=tuple(m.view for m in self._memory.values()),
+                    pool=self.pool,
+                    step=self.step,
+                )
+            return self._snapshot
+
+    def warm_up(self) -> float:
+        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
+
+        Works on a small field of its own: this field's state is not touched.
+        """
+        start = time.perf_counter()
+        tiny = replace(self.settings, batch_samples=CHUNK, cells=16, samples=16, log2_table=10)
+        camera = Pinhole.from_fov(8, 8, 60.0)
+        pose = np.eye(4)
+        pose[2, 3] = -3.0
+        for channels in (3, 4):
+            field = NgpField(replace(tiny, min_views=1, contracted=channels == 3))
+            image = np.full((8, 8, channels), 128, np.uint8)
+            field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
+            field.render(pose, camera)
+        return time.perf_counter() - start
+
+    # --- state --------------------------------------------------------------------------------
+
+    def state(self) -> Arrays:
+        """Everything needed to go on bit for bit: parameters, moments, occupancy, cameras, counters."""
+        with self._turn.mine():
+            meta = {
+                "version": 1,
+                "settings": asdict(self.settings),
+                "step": self.step,
+                "updates": self._updates,
+                "dropped": self.dropped,
+                "box": asdict(self.box) if self.box else None,
+                "box_cameras": self._box_cameras,
+                "needed": self._occupancy.needed,
+                "cameras": [
+                    {"camera": m.view.camera, "generated_ns": m.view.generated_ns, **asdict(m.view.intrinsics)}
+                    for m in self._memory.values()
+                ],
+            }
+            arrays: Arrays = {
+                "meta": np.array(json.dumps(meta)),
+                "table": self._grid.table,
+                "table_m": self._table_m,
+                "table_v": self._table_v,
+                "net": self._net.params,
+                "net_m": self._net_m,
+                "net_v": self._net_v,
+                "density": self._occupancy.density,
+                "seen": self._occupancy.seen,
+                "mean_color": self._mean_color,
+            }
+            for k, m in enumerate(self._memory.values()):
+                arrays[f"image_{k}"], arrays[f"pose_{k}"] = m.view.image, np.asarray(m.view.camera_to_world)
+                if m.moved is not None:
+                    arrays[f"moved_{k}"] = m.moved
+            return {name: array.copy() for name, array in arrays.items()}
+
+    def load_state(self, state: Arrays) -> None:
+        """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
+        try:
+            meta = json.loads(str(state["meta"]))
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"not a state of an ngp field: {error}") from None
+        for name in _SHAPE:
+            mine, theirs = getattr(self.settings, name), meta["settings"][name]
+            if mine != theirs:
+                raise ValueError(f"state was made with {name} = {theirs}, this field has {mine}")
+        self.reset()
+        with self._turn.mine():
+            self.step, self._updates = int(meta["step"]), int(meta["updates"])
+            self.dropped, self._box_cameras = int(meta["dropped"]), int(meta["box_cameras"])
+            if meta["box"]:
+                meta["box"]["centre_m"] = tuple(meta["box"]["centre_m"])
+                self.box = SceneBox(**meta["box"])
+                self._occupancy = self._make_occupancy()
+            for target, name in (
+                (self._grid.table, "table"),
+                (self._table_m, "table_m"),
+                (self._table_v, "table_v"),
+                (self._net.params, "net"),
+                (self._net_m, "net_m"),
+                (self._net_v, "net_v"),
+                (self._occupancy.density, "density"),
+                (self._occupancy.seen, "seen"),
+                (self._mean_color, "mean_color"),
+            ):
+                if name not in state or state[name].shape != target.shape:
+                    raise ValueError(f"state lacks {name!r} of shape {target.shape}")
+                target[...] = state[name]
+            for k, c in enumerate(meta["cameras"]):
+                c["distortion"] = tuple(c["distortion"])
+                camera, generated_ns = c.pop("camera"), c.pop("generated_ns")
+                view = View(camera, state[f"image_{k}"], state[f"pose_{k}"], Pinhole(**c), generated_ns)
+                self._memory[camera] = CameraMemory(view, state.get(f"moved_{k}"))
+            self._occupancy.needed = int(meta["needed"])
+            self._occupancy.mark()
+
+    # --- inside -------------------------------------------------------------------------------
+
+    def _forget_parameters(self) -> None:
+        s = self.settings
+        rng = np.random.default_rng(np.random.SeedSequence(s.seed))
+        self.step = 0
+        self._updates = 0  # optimiser steps that Adam's bias correction counts
+        self._grid: Grid = make_grid(s, rng)
+        self._net: Net = make_net(s, rng)
+        self._table_m, self._table_v, self._table_g = (np.zeros_like(self._grid.table) for _ in range(3))
+        self._dirty = np.zeros(len(self._grid.table) // SEGMENT, np.bool_)
+        self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
+        self._occupancy = self._make_occupancy()
+        chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
+        inputs, units = int(self._net.widths[0]), int(self._net.widths.sum())
+        self._batch = Batch(
+            x=np.zeros((chunks, 3, CHUNK), np.float32),
+            d_features=np.zeros((chunks, inputs, CHUNK), np.float32),
+            d_params=np.zeros((chunks, self._net.params.size), np.float32),
+            samples=np.zeros(chunks, np.int64),
+            rays=np.zeros(chunks, np.int64),
+            dropped=np.zeros(chunks, np.int64),
+            loss=np.zeros(chunks),
+        )
+        self._scratch = Scratch(
+            acts=np.zeros((workers, units, CHUNK), np.float32),
+            d_acts=np.zeros((workers, units, CHUNK), np.float32),
+            line=np.zeros((workers, 3, CHUNK), np.float32),
+            ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
+            ray=np.zeros((workers, CHUNK_RAYS, 9), np.float32),
+        )
+        self._scratch_x = np.zeros((workers, 3, CHUNK), np.float32)
+        self._dropped_by_task = np.zeros(1 + -(-self._dirty.size // PART), np.int64)
+        self._dropped_now, self._loss_now = 0, 0.0
+
+    def _make_occupancy(self) -> Occupancy:
+        s, box = self.settings, self.box
+        step = 2.0 * np.sqrt(3.0) / s.samples
+        contracted = box.contracted if box else False
+        near = box.near_m / box.radius_m if box else 0.1
+        return Occupancy(s.cells, contracted, step, near, s.min_views)
+
+    def _take_in(self, views: Sequence[View]) -> Views:
+        """Learn about the cameras and pack the pictures; nothing is done again for the same views."""
+        s = self.settings
+        if self._packed is not None and len(views) == len(self._packed[0]) and all(
+            a is b for a, b in zip(views, self._packed[0])
+        ):  # fmt: skip
+            return self._packed[1]
+        news = remember(self._memory, views)
+        grown = self._box_cameras < min(len(self._memory), RIG)
+        if self.box is None or grown:
+            # Two or three cameras say little about where the scene is: begin again when there are more.
+            box = scene_box(
+                [m.view for m in self._memory.values()], s.centre_m, s.radius_m, s.near_m, s.contracted
+            )
+            if self.box is None or not _alike(box, self.box):
+                self.box = box
+                self._forget_parameters()
+            self._box_cameras = len(self._memory)
+            self._mean_color = _mean_color(views)
+        moving = any(m.moved is not None for m in self._memory.values())
+        if news or moving:
+            self._occupancy.look(self.pool, self._memory, self.box)
+        data = pack_views(views, self.box, self._memory)
+        self._packed = (tuple(views), data)
+        return data
+
+    def _levels(self) -> int:
+        s = self.settings
+        if s.levels_every == 0:
+            return s.levels
+        return min(s.levels, s.levels_start + self.step // s.levels_every)
+
+    def _background(self) -> NDArray[np.float32]:
+        name = self.settings.background
+        if name.startswith("#") and len(name) == 7:
+            return np.array([int(name[k : k + 2], 16) / 255 for k in (1, 3, 5)], np.float32)
+        if name == "white" or (name == "auto" and self.box is not None and not self.box.contracted):
+            return np.ones(3, np.float32)
+        if name == "black":
+            return np.zeros(3, np.float32)
+        return self._mean_color.copy()
+
+    def _one_step(self, data: Views, progress: float) -> None:
+        s, levels = self.settings, self._levels()
+        assert self.box is not None
+        key = _key(s.seed, self.step)
+        if self.step % EVERY == 0:
+            self._occupancy.refresh(
+                self.pool, key, self.step // EVERY, self._grid, levels, self._net,
+                self._scratch.acts, self._scratch_x,
+            )  # fmt: skip
+        space: Space = self._occupancy.space()
+        batch = self._batch
+        recipe = Recipe(
+            key=np.uint64(key + np.uint64(1)),
+            chunk_rays=max(s.rays // batch.samples.size, 1),
+            levels=levels,
+            harmonics=s.harmonics,
+            changed_share=np.float32(s.changed_share),
+            background=self._background(),
+            random_background=s.background == "random",
+        )
+        weights = Weights(
+            distortion=np.float32(s.distortion),
+            sparsity=np.float32(s.sparsity),
+            near=np.float32(s.near_fade * self.box.distance_m / self.box.radius_m),
+        )
+        self.pool.run(
+            train_chunks, data, recipe, space, self._grid, self._net, weights, batch, self._scratch
+        )
+        self.pool.run(
+            scatter, self._grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
+        )
+        rays = max(int(batch.rays.sum()), 1)
+        self._updates += 1
+        fall = s.rate_end**progress
+        rule = Rule(
+            rate=np.float32(s.rate * fall),
+            beta1=np.float32(BETA1),
+            beta2=np.float32(BETA2),
+            epsilon=np.float32(s.epsilon),
+            scale=np.float32(NOMINAL_RAYS / rays),
+            decay=np.float32(s.decay),
+            correct1=np.float32(1.0 / (1.0 - BETA1**self._updates)),
+            correct2=np.float32(1.0 / (1.0 - BETA2**self._updates)),
+        )
+        rule_net = rule._replace(rate=np.float32(s.rate_net * fall), decay=np.float32(0.0))
+        self.pool.run(
+            adam,
+            (self._net.params, self._net_m, self._net_v, self._net_g),
+            (self._grid.table, self._table_m, self._table_v, self._table_g, self._dirty),
+            batch.d_params,
+            rule_net,
+            rule,
+            self._dropped_by_task,
+        )
+        self.step += 1
+        self._dropped_now = int(batch.dropped.sum() + self._dropped_by_task.sum())
+        self._loss_now = float(batch.loss.sum()) / (3 * rays)
+
+
+_SHAPE = (
+    "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers", "harmonics",
+    "cells", "samples", "seed",
+)  # fmt: skip
+
+
+def _key(seed: int, step: int) -> np.uint64:
+    """The random stream of one step."""
+    return np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0]
+
+
+def _mean_color(views: Sequence[View]) -> NDArray[np.float32]:
+    return np.mean([v.image[..., :3].mean(axis=(0, 1)) / 255.0 for v in views], axis=0).astype(np.float32)
+
+
+def _alike(a: SceneBox, b: SceneBox) -> bool:
+    apart = float(np.linalg.norm(np.subtract(a.centre_m, b.centre_m)))
+    return apart < 0.1 * b.radius_m and abs(a.radius_m - b.radius_m) < 0.1 * b.radius_m
+
+
+class _Turn:
+    """A lock that is handed over in the order of asking: a training loop must not starve a page."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: deque[threading.Lock] = deque()
+        self._taken = False
+
+    @contextmanager
+    def mine(self) -> Iterator[None]:
+        gate = None
+        with self._lock:
+            if self._taken:
+                gate = threading.Lock()
+                gate.acquire()
+                self._waiting.append(gate)
+            self._taken = True
+        if gate is not None:
+            gate.acquire()  # released by whoever had the turn, which passes to us
+        try:
+            yield
+        finally:
+            with self._lock:
+                if self._waiting:
+                    self._waiting.popleft().release()
+                else:
+                    self._taken = False
+
+
+assert FEATURES == 2

@@ -1,0 +1,52 @@
+"""Sizes and first values of an Instant-NGP style model: which level is how large, and where it starts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid
+from edge_server.fields.kernels.mlp import Net, param_count
+from edge_server.fields.ngp_settings import NgpSettings
+
+FIRST_DENSITY = 0.3  # a scene unit of fog dims by a quarter: every sample gets a gradient at first
+
+
+def _multiple_of_4(n: int) -> int:
+    return (n + 3) // 4 * 4
+
+
+def make_grid(settings: NgpSettings, rng: np.random.Generator) -> Grid:
+    """Levels growing geometrically from base to finest resolution, tables near zero."""
+    share = np.arange(settings.levels) / max(settings.levels - 1, 1)
+    ratio = settings.finest_resolution / settings.base_resolution
+    resolution = np.round(settings.base_resolution * ratio**share).astype(np.int32)
+    most = 1 << settings.log2_table
+    vertices = (resolution.astype(np.int64) + 1) ** 3
+    dense = vertices <= most
+    sizes = np.where(dense, (vertices + SEGMENT - 1) // SEGMENT * SEGMENT, most)
+    first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    table = rng.uniform(-1e-4, 1e-4, size=(int(first[-1]), FEATURES)).astype(np.float32)
+    return Grid(resolution, first, dense, table)
+
+
+def net_widths(settings: NgpSettings) -> NDArray[np.int64]:
+    """Widths of the layers: features in; density, colour and the colour's harmonics out; padded to 4."""
+    inputs = _multiple_of_4(FEATURES * settings.levels)
+    outputs = _multiple_of_4(1 + 3 * settings.harmonics)
+    return np.array([inputs, *[settings.hidden] * settings.hidden_layers, outputs], dtype=np.int64)
+
+
+def make_net(settings: NgpSettings, rng: np.random.Generator) -> Net:
+    """He initialisation, small output; a thin grey fog everywhere."""
+    widths = net_widths(settings)
+    params = np.zeros(param_count(widths), np.float32)
+    first = 0
+    for layer, (n_in, n_out) in enumerate(zip(widths[:-1], widths[1:])):
+        last = layer == len(widths) - 2
+        spread = np.sqrt(2.0 / n_in) * (0.1 if last else 1.0)
+        params[first : first + n_in * n_out] = rng.normal(0.0, spread, int(n_in * n_out))
+        if last:
+            params[first + n_in * n_out] = np.log(FIRST_DENSITY)
+        first += int(n_in * n_out + n_out)
+    return Net(widths, params)

@@ -1,0 +1,86 @@
+"""The field's knowledge of where something is: an occupancy grid fed by the field and by the cameras."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.grid import Grid
+from edge_server.fields.kernels.mlp import Net
+from edge_server.fields.kernels.occupancy import CELLS_A_TASK, count_views, sample_density, threshold
+from edge_server.fields.kernels.pool import Pool
+from edge_server.fields.kernels.rays import COARSE, Space
+from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.supervision import CameraMemory, pack_cameras
+
+EVERY = 16  # steps between refreshes
+PHASES = 4  # refreshes until every cell has been looked at
+FADE = 0.9  # of a cell's density per look
+OPTICAL_DEPTH = 5e-3  # of one step: less cannot be seen
+
+
+class Occupancy:
+    """density: float32 (cells^3,), x fastest; seen: uint16, cameras that look at each cell."""
+
+    def __init__(self, cells: int, contracted: bool, step: float, near: float, min_views: int) -> None:
+        self.cells, self.contracted, self.near, self.min_views = cells, contracted, near, min_views
+        self.step = np.float32(step)
+        self.density = np.ones(cells**3, np.float32) * np.float32(1e3)  # unknown: to be looked at
+        self.seen = np.zeros(cells**3, np.uint16)
+        self.occupied = np.zeros(cells**3, np.uint8)
+        self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
+        self.needed = 1
+
+    @property
+    def bound(self) -> float:
+        return OPTICAL_DEPTH / float(self.step)
+
+    def space(self) -> Space:
+        """The grid as the kernels read it: a view on the living arrays."""
+        return Space(
+            self.occupied, self.coarse, self.cells, self.contracted, self.step, np.float32(self.near)
+        )
+
+    def look(self, pool: Pool, memory: dict[str, CameraMemory], box: SceneBox) -> None:
+        """Count anew which cells the known cameras see, and open those where something moved.
+
+        A cell where something moved is seen to change by most cameras that see it at all: the hull of the
+        changed pixels. Without it a moving body could not grow where space was known to be empty.
+        """
+        views = pack_cameras([m.view for m in memory.values()], box)
+        masks = [m.moved for m in memory.values()]
+        mask_first = np.full(len(masks), -1, np.int64)
+        parts, length = [np.zeros(0, np.uint8)], 0
+        for k, mask in enumerate(masks):
+            if mask is not None:
+                mask_first[k] = length
+                parts.append(mask.reshape(-1).astype(np.uint8))
+                length += mask.size
+        marked = np.zeros_like(self.seen)
+        pool.run(
+            count_views, self.cells, self.contracted, self.near, views, mask_first, np.concatenate(parts),
+            self.seen, marked,
+        )  # fmt: skip
+        self.needed = min(self.min_views, len(memory))
+        if length:
+            moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
+            np.maximum(self.density, np.float32(1.5 * self.bound), out=self.density, where=moving)
+        self.mark()
+
+    def refresh(self, pool: Pool, key: np.uint64, turn: int, grid: Grid, levels: int, net: Net,
+                acts: NDArray[np.float32], x: NDArray[np.float32]) -> None:  # fmt: skip
+        """Look at a part of the cells again."""
+        pool.run(
+            sample_density, key, turn % PHASES, PHASES, np.float32(FADE), grid, levels, net, self.cells,
+            self.contracted, self.seen, self.needed, self.density, acts, x,
+        )  # fmt: skip
+        self.mark()
+
+    def mark(self) -> None:
+        """Decide anew which cells get samples."""
+        threshold(
+            self.density, self.seen, self.needed, self.bound, self.cells, self.occupied, self.coarse
+        )
+
+
+assert CELLS_A_TASK <= 4096, "a task's samples must fit the scratch of a training chunk"

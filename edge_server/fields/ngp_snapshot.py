@@ -1,0 +1,104 @@
+"""An immutable copy of a trained field: renders from any thread while the field itself trains on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Rendering, View
+from edge_server.fields.kernels.grid import Grid
+from edge_server.fields.kernels.mlp import Net
+from edge_server.fields.kernels.pool import Pool
+from edge_server.fields.kernels.rays import Space
+from edge_server.fields.kernels.render import ROUND, TILE, render_tiles
+from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.supervision import lens_row
+from freshfield.geometry import Pinhole
+
+SOLID = 0.5  # opacity from which on a ray has met a surface
+
+
+@dataclass(frozen=True)
+class NgpSnapshot:
+    """Parameters, occupancy and cameras of one instant. Nothing in it is written after it is made."""
+
+    box: SceneBox
+    grid: Grid
+    levels: int
+    net: Net
+    harmonics: int
+    space: Space
+    background: NDArray[np.float32]
+    cameras: tuple[View, ...]
+    pool: Pool
+    step: int
+
+    def render(
+        self,
+        camera_to_world: NDArray[np.float64],
+        intrinsics: Pinhole,
+        max_samples: int | None = None,
+    ) -> Rendering:
+        """The picture a camera at this pose would take; max_samples: a ray's samples at most (faster)."""
+        w, h = intrinsics.width, intrinsics.height
+        v, u = np.mgrid[0:h, 0:w]
+        pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
+        color, depth, opacity = self.render_pixels(camera_to_world, intrinsics, pixels, max_samples)
+        return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
+
+    def render_pixels(
+        self,
+        camera_to_world: NDArray[np.float64],
+        intrinsics: Pinhole,
+        pixels: NDArray[np.float64],
+        max_samples: int | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Colour (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
+        pose = np.asarray(camera_to_world, dtype=np.float64)
+        n, room, workers = len(pixels), TILE * ROUND, self.pool.threads
+        color, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+        opacity = np.empty(n, np.float32)
+        self.pool.run(
+            render_tiles,
+            np.array(lens_row(intrinsics), dtype=np.float64),
+            np.ascontiguousarray(pose[:3, :3]),
+            self.box.normalise(pose[:3, 3]),
+            np.ascontiguousarray(pixels, dtype=np.float64),
+            self.space,
+            self.grid,
+            self.levels,
+            self.net,
+            self.harmonics,
+            max_samples or 1 << 30,
+            self.background,
+            np.empty((workers, int(self.net.widths.sum()), room), np.float32),
+            np.empty((workers, 3, room), np.float32),
+            np.empty((workers, 2, room), np.float32),
+            color,
+            depth,
+            opacity,
+        )
+        depth *= np.float32(self.box.radius_m)
+        return color, depth, opacity
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras' rays
+        meet a surface: their pixels are sampled evenly."""
+        positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+        share = -(-count // max(len(self.cameras), 1))
+        for view in self.cameras:
+            camera = view.intrinsics
+            stride = np.sqrt(camera.width * camera.height / share)
+            v, u = np.meshgrid(
+                np.arange(0.5 * stride, camera.height, stride), np.arange(0.5 * stride, camera.width, stride)
+            )
+            pixels = np.floor(np.stack([v.ravel(), u.ravel()], axis=-1)[:, ::-1]) + 0.5
+            color, depth, opacity = self.render_pixels(view.camera_to_world, camera, pixels)
+            solid = (opacity > SOLID) & (depth > 0)
+            rays = camera.rays(pixels[solid]) @ view.camera_to_world[:3, :3].T
+            points = view.camera_to_world[:3, 3] + rays * depth[solid, None]
+            positions.append(points.astype(np.float32))
+            colors.append(color[solid])
+        return np.concatenate(positions)[:count], np.concatenate(colors)[:count]

@@ -1,0 +1,97 @@
+"""Where the scene is, found from the rig: the normalisation of poses before a field is trained (4.4.4).
+
+The thesis re-centres the world on the geometric centre of the cameras. Inward-looking rigs are better
+served by the point their optical axes approach most closely, so that is taken where there is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SceneBox:
+    """Scene coordinates are (world - centre_m) / radius_m; contracted: the scene goes on beyond the box.
+
+    near_m: how near to a camera density may be. distance_m: median distance of the cameras to the centre.
+    """
+
+    centre_m: tuple[float, float, float]
+    radius_m: float
+    near_m: float
+    contracted: bool
+    distance_m: float
+
+    def normalise(self, points_m: Array) -> Array:
+        """World metres (..., 3) -> scene units."""
+        return (points_m - np.asarray(self.centre_m)) / self.radius_m
+
+
+def converging_point(origins: Array, directions: Array) -> Array | None:
+    """The point (3,) nearest to all rays (N, 3) in least squares; None where they run parallel or apart."""
+    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    total = projectors.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] < 1e-3 * len(origins):
+        return None
+    point = np.linalg.solve(total, (projectors @ origins[:, :, None]).sum(axis=0)[:, 0])
+    along = ((point - origins) * directions).sum(axis=1)
+    return point if np.median(along) > 0 else None
+
+
+def scene_box(
+    views: Sequence[View],
+    centre_m: tuple[float, float, float] | None = None,
+    radius_m: float | None = None,
+    near_m: float | None = None,
+    contracted: bool | None = None,
+) -> SceneBox:
+    """The box for these views; what is given is kept, the rest is found from the cameras.
+
+    Pictures with transparency show an object: the box is what nearly all cameras see around the point
+    they look at. Without it the surroundings belong to the scene: the box reaches from there to the
+    cameras, and space beyond it is contracted.
+    """
+    poses = np.stack([v.camera_to_world for v in views])
+    origins, axes = poses[:, :3, 3], poses[:, :3, 2]
+    point = converging_point(origins, axes)
+    if centre_m is not None:
+        centre = np.asarray(centre_m, dtype=np.float64)
+    elif point is not None:
+        centre = point
+    elif len(views) > 1 and np.linalg.norm(axes.mean(axis=0)) < 0.5:
+        centre = origins.mean(axis=0)  # looking outwards
+    else:
+        # Nothing tells how far the scene is: a few times the rig's own extent, or a room's width.
+        spread = float(np.linalg.norm(origins - origins.mean(axis=0), axis=1).max())
+        centre = origins.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
+    distance = float(np.median(np.linalg.norm(origins - centre, axis=1)))
+    distance = distance if distance > 1e-6 else 1.0
+    if contracted is None:
+        contracted = not any(v.image.shape[2] == 4 for v in views)
+    if radius_m is None:
+        radius_m = distance if contracted else _seen_radius(views, centre)
+    if near_m is None:
+        near_m = NEAR_SHARE * distance if contracted else max(0.05 * distance, distance - 1.8 * radius_m)
+    return SceneBox(tuple(map(float, centre)), float(radius_m), float(near_m), contracted, distance)
+
+
+NEAR_SHARE = 0.4
+
+
+def _seen_radius(views: Sequence[View], centre: Array) -> float:
+    """Radius in metres of the ball around ``centre`` that nine in ten cameras see whole."""
+    radii = []
+    for view in views:
+        camera = view.intrinsics
+        half = min(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
+        distance = np.linalg.norm(view.camera_to_world[:3, 3] - centre)
+        radii.append(distance * half / np.hypot(1.0, half))
+    return max(float(np.percentile(radii, 10)), 1e-6)

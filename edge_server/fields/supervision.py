@@ -1,0 +1,112 @@
+"""From views to what the kernels read: packed pixels, cameras in scene units, and what has moved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.kernels.rays import Views
+from edge_server.fields.scene_box import SceneBox
+from freshfield.geometry import Pinhole
+
+CHANGE = 16  # of 255, after blurring: above the noise of sensors and of video compression
+MARGIN_PX = 2
+
+
+@dataclass
+class CameraMemory:
+    """The newest view of one camera, and the pixels that moved in it: bool (H, W), or None."""
+
+    view: View
+    moved: NDArray[np.bool_] | None = None
+
+
+def lens_row(camera: Pinhole) -> list[float]:
+    return [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+
+
+def check_view(view: View) -> None:
+    """Refuse what would poison a field; ValueError says which camera and why."""
+    image, camera = view.image, view.intrinsics
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise ValueError(f"camera {view.camera}: image must be uint8 (H, W, 3 or 4), not {image.shape}")
+    if image.shape[:2] != (camera.height, camera.width):
+        raise ValueError(
+            f"camera {view.camera}: image is {image.shape[1]} x {image.shape[0]}, "
+            f"its intrinsics say {camera.width} x {camera.height}"
+        )
+    if np.shape(view.camera_to_world) != (4, 4) or not np.all(np.isfinite(view.camera_to_world)):
+        raise ValueError(f"camera {view.camera}: camera_to_world must be a finite (4, 4) matrix")
+    if not np.all(np.isfinite(lens_row(camera))) or camera.fx <= 0 or camera.fy <= 0:
+        raise ValueError(f"camera {view.camera}: intrinsics must be finite, focal lengths positive")
+
+
+def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
+    """Where a camera that stood still sees something else than before; None where that cannot be said."""
+    if before.image.shape != now.image.shape or before.intrinsics != now.intrinsics:
+        return None
+    if not np.allclose(before.camera_to_world, now.camera_to_world, atol=1e-6):
+        return None
+    difference = cv2.absdiff(cv2.blur(before.image, (3, 3)), cv2.blur(now.image, (3, 3))).max(axis=2)
+    moved = (difference > CHANGE).astype(np.uint8)
+    if not moved.any():
+        return None
+    size = 2 * MARGIN_PX + 1
+    return cv2.dilate(moved, np.ones((size, size), np.uint8)).astype(bool)
+
+
+def remember(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
+    """Take in the newest view of each camera; whether a camera is new, has moved or sees with another lens."""
+    news = False
+    for view in views:
+        known = memory.get(view.camera)
+        if known is not None and known.view is view:
+            continue
+        if known is None or (
+            known.view.intrinsics != view.intrinsics
+            or not np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3)
+        ):
+            news = True
+        moved = None
+        if known is not None:
+            same = known.view.image is view.image or np.array_equal(known.view.image, view.image)
+            moved = known.moved if same else moved_pixels(known.view, view)
+        memory[view.camera] = CameraMemory(view, moved)
+    return news
+
+
+def pack_cameras(views: Sequence[View], box: SceneBox) -> Views:
+    """The cameras of ``views`` in scene units, without pixels."""
+    size = np.array([[v.intrinsics.width, v.intrinsics.height] for v in views], dtype=np.int64)
+    pose = np.stack([np.asarray(v.camera_to_world, dtype=np.float64) for v in views])
+    return Views(
+        first=np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])]).astype(np.int64),
+        size=size,
+        lens=np.array([lens_row(v.intrinsics) for v in views], dtype=np.float64),
+        rotation=np.ascontiguousarray(pose[:, :3, :3]),
+        origin=np.ascontiguousarray(box.normalise(pose[:, :3, 3])),
+        pixels=np.zeros((0, 3), np.uint8),
+        changed=np.zeros(0, np.int64),
+    )
+
+
+def pack_views(views: Sequence[View], box: SceneBox, memory: dict[str, CameraMemory]) -> Views:
+    """Everything one fit reads. Opaque and transparent pictures may be mixed."""
+    packed = pack_cameras(views, box)
+    channels = max(v.image.shape[2] for v in views)
+    pixels = np.full((int(packed.first[-1]), channels), 255, np.uint8)
+    changed = []
+    for k, view in enumerate(views):
+        a, b = packed.first[k], packed.first[k + 1]
+        pixels[a:b, : view.image.shape[2]] = view.image.reshape(int(b - a), -1)
+        known = memory.get(view.camera)
+        if known is not None and known.view is view and known.moved is not None:
+            changed.append(a + np.flatnonzero(known.moved))
+    return packed._replace(
+        pixels=pixels, changed=np.concatenate(changed) if changed else np.zeros(0, np.int64)
+    )

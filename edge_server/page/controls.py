@@ -1,0 +1,143 @@
+"""What an operator may change: policy and its value, pause, reset, snapshot.
+
+Whatever is refused becomes a notification for who asked; what is in force is shown to everybody.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import threading
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+
+from edge_server.page.markup import note
+from edge_server.scheduler import POLICIES, make_policy
+from edge_server.state import EdgeState
+
+log = logging.getLogger(__name__)
+
+NOTICE_S = 8.0
+VIEWS = ("automatic", "rendering", "points")
+
+
+class ControlPanel:
+    """Inputs in the present GUI container, kept equal to ``state.controls`` whoever changes it."""
+
+    def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
+        gui = server.gui
+        self._state = state
+        self._lock = threading.Lock()
+        self._parameter: dict[str, str | None] = {}
+        names = state.policies or (state.controls.policy,)
+        current = state.controls.policy if state.controls.policy in names else names[0]
+        self.policy = gui.add_dropdown(
+            "policy", names, initial_value=current, hint="Which of the newest views an update uses."
+        )
+        self.value = gui.add_number("value", _shown(state.controls.value), min=0.0, step=1.0)
+        self.help = gui.add_html("")
+        self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
+        self.view = gui.add_dropdown(
+            "view", VIEWS, hint="Automatic shows the field's points while it is young, then its rendering."
+        )
+        self.occlude = gui.add_checkbox(
+            "occlusion", True, hint="Draw cameras behind the surfaces that the field has learned."
+        )
+        self._paused: bool | None = None
+        self.policy.on_update(lambda event: self._policy_chosen(event))
+        self.value.on_update(lambda event: self._value_entered(event))
+        self.buttons.on_click(self._pressed)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Show what is in force."""
+        controls = self._state.controls
+        with self._lock:
+            if controls.policy in self.policy.options and self.policy.value != controls.policy:
+                self.policy.value = controls.policy
+            parameter = self._parameter_of(controls.policy)
+            self.value.visible = parameter is not None
+            self.value.label = _label(parameter)
+            if self.value.value != _shown(controls.value):
+                self.value.value = _shown(controls.value)
+            self.help.content = _help(controls.policy)
+            if self._paused != controls.paused:
+                self._paused = controls.paused
+                self.buttons.options = ("resume" if controls.paused else "pause", "reset", "snapshot")
+
+    # --- what people do -------------------------------------------------------------------------
+
+    def _policy_chosen(self, event: Any) -> None:
+        if event.client is None:  # the page itself, following a change made elsewhere
+            return
+        name = event.target.value
+        self._attempt(event.client, f"policy {name}", lambda: self._state.set_policy(name, None))
+
+    def _value_entered(self, event: Any) -> None:
+        if event.client is None or event.target.value == _shown(self._state.controls.value):
+            return
+        value = float(event.target.value)
+        name = self._state.controls.policy
+        self._attempt(event.client, f"value {value:g}", lambda: self._state.set_policy(name, value))
+
+    async def _pressed(self, event: Any) -> None:
+        # A coroutine runs before the next click is taken, so the group's value is still this click's.
+        pressed, client, controls = event.target.value, event.client, self._state.controls
+        if pressed == "reset":
+            controls.reset_requested = True
+            _notify(client, "Reset", "The field forgets the scene and starts anew.")
+        elif pressed == "snapshot":
+            save = partial(self._attempt, client, "snapshot", lambda: self._snapshot(client))
+            threading.Thread(target=save, name="page-snapshot", daemon=True).start()
+        else:
+            controls.paused = pressed == "pause"
+            self.refresh()
+
+    def _snapshot(self, client: Any) -> None:
+        path = self._state.save_snapshot()
+        _notify(client, "Snapshot saved", str(path), seconds=30.0)
+
+    def _attempt(self, client: Any, what: str, action: Any) -> None:
+        """Do it; if it cannot be done say why, and show what is still in force."""
+        try:
+            action()
+        except Exception as error:  # whatever goes wrong is the operator's to know, never the page's end
+            log.info("page: %s refused: %s", what, error)
+            _notify(client, f"Not done: {what}", str(error) or type(error).__name__, bad=True)
+        self.refresh()
+
+    def _parameter_of(self, policy: str) -> str | None:
+        """Name of the policy's one value, None if it has none; policies unknown here may have one."""
+        if policy not in self._parameter:
+            try:
+                self._parameter[policy] = make_policy(policy, None, np.random.default_rng(0)).parameter
+            except ValueError:
+                self._parameter[policy] = "value"
+        return self._parameter[policy]
+
+
+def _shown(value: float | None) -> float:
+    return float(value) if value is not None and math.isfinite(value) else 0.0
+
+
+def _label(parameter: str | None) -> str:
+    """``omega_ms`` as people write it: omega, ms."""
+    if parameter is None:
+        return "value"
+    name, _, unit = parameter.partition("_")
+    return f"{name}, {unit}" if unit else name
+
+
+def _help(policy: str) -> str:
+    """The scheduler's line on the policy, without what only readers of its source need."""
+    line = POLICIES[policy][2] if policy in POLICIES else ""
+    return note(re.sub(r" \([\d.-]+\)", "", line.split("; value:")[0]))
+
+
+def _notify(client: Any, title: str, body: str, bad: bool = False, seconds: float = NOTICE_S) -> None:
+    if client is not None:
+        client.add_notification(title, body, auto_close_seconds=seconds, color="red" if bad else None)

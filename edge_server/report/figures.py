@@ -1,0 +1,242 @@
+"""The figures of a report, one function each; a figure whose data are missing is not drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edge_server.report.records import Records, Row
+from edge_server.report.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    figure,
+    label_lines,
+)
+
+Report = dict[str, Any]
+# Errors are shown this many times as bright, or nobody would see them.
+_ERROR_GAIN = 4.0
+_MOST_LABELS = 24
+_BARS = 40
+
+
+def draw_all(report: Report, records: Records) -> dict[str, Path]:
+    """Write every figure there are data for into the run's folder; returns their paths by name, in the
+    order of reading. Figures of an earlier report that are not drawn this time are removed."""
+    drawn = {}
+    for name, draw in FIGURES.items():
+        path = records.out / f"figure-{name}.png"
+        path.unlink(missing_ok=True)
+        if draw(report, records, path):
+            drawn[name] = path
+    return drawn
+
+
+def draw_fidelity(report: Report, records: Records, path: Path) -> bool:
+    """PSNR (whole image, moving pixels, both baselines), SSIM and LPIPS at every publication."""
+    series, found = report["fidelity"]["series"], report["fidelity"]
+    psnr, moving = _points(series, "psnr_db"), _points(series, "psnr_moving_db")
+    ssim, lpips = _points(series, "ssim"), _points(series, "lpips")
+    if not len(psnr[0]):
+        return False
+    with figure(path, 2, height_inch=2.5, sharex=True) as (_, axes):
+        top, bottom = axes[:, 0]
+        top.plot(*psnr, color=BLUE, label="whole image")
+        if len(moving[0]):
+            top.plot(*moving, color=VERMILION, label="moving pixels")
+        flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean colour"}
+        for (key, label), dash in zip(flat.items(), ("--", ":")):
+            if found["baseline"].get(key) is not None:
+                top.axhline(found["baseline"][key], color=GREY, linestyle=dash, linewidth=1.2, label=label)
+        label_lines(top, "PSNR (dB)", title="Fidelity against the truth at the present")
+        bottom.plot(*ssim, color=GREEN, label="SSIM (higher is better)")
+        if len(lpips[0]):
+            network = found.get("lpips_network") or "network unknown"
+            bottom.plot(*lpips, color=ORANGE, label=f"LPIPS-{network} (lower is better)")
+        bottom.set_ylim(0.0, 1.02)
+        label_lines(bottom, "score", "seconds since the edge started")
+    return True
+
+
+def draw_ages(report: Report, records: Records, path: Path) -> bool:
+    """Age over time (median and range over cameras, mean age of what was selected), and by camera."""
+    rows = [r for r in records.ages if any(a is not None for a in (r.get("age_ms") or {}).values())]
+    spreads = {c: s for c, s in report["age_ms"]["by_camera"].items() if s is not None}
+    if not rows or not spreads:
+        return False
+    t = [r["t_s"] for r in rows]
+    known = [[a for a in r["age_ms"].values() if a is not None] for r in rows]
+    low, mid, high = (np.array([np.percentile(k, p) for k in known]) for p in (0, 50, 100))
+    aaoi = _points(report["fidelity"]["series"], "aaoi_ms")
+    with figure(path, 2, height_inch=2.6) as (_, axes):
+        over_time, by_camera = axes[:, 0]
+        over_time.fill_between(t, low, high, color=SKY, alpha=0.35, linewidth=0, label="all cameras")
+        over_time.plot(t, mid, color=BLUE, label="median camera")
+        if len(aaoi[0]):
+            over_time.plot(*aaoi, color=VERMILION, linewidth=1.2, label="selected views,\nat publication")
+        over_time.set_ylim(0, _robust_top([*high, *aaoi[1]]))
+        label_lines(over_time, "age (ms)", "seconds since the edge started", "Age of information")
+        x = np.arange(len(spreads))
+        mean, p50, p95 = (np.array([s[k] for s in spreads.values()]) for k in ("mean", "p50", "p95"))
+        by_camera.vlines(x, p50, p95, color=SKY, linewidth=5, label="median to 95 %")
+        by_camera.plot(x, mean, "o", color=BLUE, markersize=4.5, label="mean")
+        step = max(1, -(-len(x) // _MOST_LABELS))
+        by_camera.set_xticks(x[::step], list(spreads)[::step], rotation=60, ha="right", fontsize=8)
+        by_camera.set_ylim(bottom=0)
+        by_camera.grid(axis="x", visible=False)
+        label_lines(by_camera, "age (ms)", title="Age by camera")
+    return True
+
+
+def draw_updates(report: Report, records: Records, path: Path) -> bool:
+    """Time of every update, and how many views it used."""
+    series = report["fidelity"]["series"]
+    spent = _points(series, "update_ms")
+    if not len(spent[0]):
+        return False
+    counts = [(r["t_s"], _how_many(r.get("selected"))) for r in series]
+    with figure(path, 2, height_inch=1.9, sharex=True) as (_, axes):
+        top, bottom = axes[:, 0]
+        top.plot(*spent, ".", color=BLUE, markersize=4, label="each update")
+        top.axhline(report["updates"]["ms_p50"], color=INK, linewidth=1.0, label="median")
+        top.set_ylim(0, _robust_top(spent[1]))
+        label_lines(top, "ms", title="From decision to publication")
+        bottom.step(*zip(*counts), where="post", color=GREEN)
+        bottom.set_ylim(bottom=0)
+        label_lines(bottom, "views used", "seconds since the edge started")
+    return True
+
+
+def draw_channel(report: Report, records: Records, path: Path) -> bool:
+    """Share of time in each state of the chain, and the histogram of drawn delays."""
+    shares = _shares(report["channel"].get("state_share"))
+    drawn = report["channel"].get("drawn_delay_ms")
+    edges, counts = _histogram(drawn.get("bins") if isinstance(drawn, dict) else None)
+    if not shares and not len(counts):
+        return False
+    with figure(path, 1, 2, height_inch=2.7, width_ratios=[1, 2]) as (_, axes):
+        left, right = axes[0]
+        left.bar(range(len(shares)), [100 * s for s in shares.values()], color=SKY, width=0.6)
+        left.set_xticks(range(len(shares)), list(shares))
+        left.set_ylim(0, 100)
+        left.grid(axis="x", visible=False)
+        label_lines(left, "% of the time", "state of the channel", "Where the chain was")
+        if len(counts):
+            width = np.diff(edges)
+            right.bar(edges[:-1], counts / counts.sum() / width, width, align="edge", color=BLUE, alpha=0.85)
+            mean = drawn.get("mean") if isinstance(drawn, dict) else None
+            if mean is not None:
+                right.axvline(mean, color=VERMILION, linewidth=1.4, label=f"mean {mean:.1f} ms")
+                right.legend()
+            right.set_xlim(0, edges[-1])
+            right.set_yticks([])
+            label_lines(right, "density", "drawn delay (ms)", "Delays the channel drew")
+        else:
+            right.set_axis_off()
+            right.text(0.5, 0.5, "no delays were drawn", ha="center", color=GREY)
+    return True
+
+
+def draw_comparison(report: Report, records: Records, path: Path) -> bool:
+    """The last scored truth beside the field's rendering of it, and the absolute error."""
+    truth, rendered = _picture(records, "truth"), _picture(records, "rendered")
+    if truth is None or rendered is None or truth.shape != rendered.shape:
+        return False
+    error = np.clip(np.abs(truth - rendered) * _ERROR_GAIN, 0.0, 1.0)
+    height = 2.75 * truth.shape[0] / truth.shape[1] + 0.35
+    with figure(path, 1, 3, height_inch=height) as (_, axes):
+        titles = ("truth at the present", "the field's rendering", f"error, {_ERROR_GAIN:g} times")
+        for ax, image, title in zip(axes[0], (truth, rendered, error), titles):
+            ax.imshow(image, interpolation="nearest")
+            ax.set_title(title)
+            ax.set_axis_off()
+    return True
+
+
+def draw_processes(report: Report, records: Records, path: Path) -> bool:
+    """Memory and processor time of every process."""
+    names = sorted({n for row in records.processes for n, v in row.items() if _is_use(v)} - {"machine"})
+    if not names:
+        return False
+    # Many camera processes: their sum says what matters, and the legend stays readable.
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(name if name in ("edge", "emulator") else "camera nodes", []).append(name)
+    with figure(path, 2, height_inch=1.9, sharex=True) as (_, axes):
+        top, bottom = axes[:, 0]
+        for (group, members), colour in zip(groups.items(), (BLUE, VERMILION, GREEN, PURPLE)):
+            rows = [r for r in records.processes if any(_is_use(r.get(m)) for m in members)]
+            t = [r["t_s"] for r in rows]
+            for ax, key, label in ((top, "rss_mb", group), (bottom, "cpu", None)):
+                total = [sum(r[m][key] for m in members if _is_use(r.get(m))) for r in rows]
+                ax.plot(t, total, color=colour, label=label)
+        top.set_ylim(bottom=0)
+        bottom.set_ylim(bottom=0)
+        label_lines(top, "resident (MB)", title="What the processes cost")
+        label_lines(bottom, "cores", "seconds since the start")
+    return True
+
+
+FIGURES: dict[str, Callable[[Report, Records, Path], bool]] = {
+    "comparison": draw_comparison,
+    "fidelity": draw_fidelity,
+    "ages": draw_ages,
+    "updates": draw_updates,
+    "channel": draw_channel,
+    "processes": draw_processes,
+}
+
+
+def _picture(records: Records, name: str) -> np.ndarray | None:
+    """A picture of the run as RGB (H, W, 3) in [0, 1], or None."""
+    image = cv2.imread(str(records.pictures[name])) if name in records.pictures else None
+    return None if image is None else np.asarray(image)[..., ::-1] / 255.0
+
+
+def _points(series: list[Row], name: str) -> tuple[list[float], list[float]]:
+    """Times and values of the rows that have a value."""
+    rows = [r for r in series if r.get(name) is not None]
+    return [r["t_s"] for r in rows], [r[name] for r in rows]
+
+
+def _robust_top(values: list[float]) -> float:
+    """An axis limit that one outlier (a start, a kill) does not own."""
+    return 1.25 * float(np.percentile(values, 99)) + 1e-9 if len(values) else 1.0
+
+
+def _how_many(selected: Any) -> int:
+    return len(selected) if isinstance(selected, list) else int(selected or 0)
+
+
+def _shares(found: Any) -> dict[str, float]:
+    if isinstance(found, dict):
+        return {str(k): float(v) for k, v in found.items()}
+    return {str(i): float(v) for i, v in enumerate(found)} if isinstance(found, list) else {}
+
+
+def _histogram(found: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Bin edges (n + 1,) in ms and counts (n,) of ``bins``, a list of (upper edge in ms, count) in bins of
+    any width: redrawn in equal ones, without the last half per cent that would squeeze the rest."""
+    try:
+        upper, counts = np.array(found, dtype=np.float64).reshape(-1, 2).T
+    except (TypeError, ValueError):
+        return np.zeros(0), np.zeros(0)
+    if not counts.sum() > 0:
+        return np.zeros(0), np.zeros(0)
+    last = int(np.searchsorted(np.cumsum(counts), 0.995 * counts.sum()))
+    redrawn, edges = np.histogram(upper, _BARS, (0.0, float(upper[last]) + 1e-9), weights=counts)
+    return edges, redrawn
+
+
+def _is_use(value: Any) -> bool:
+    return isinstance(value, dict) and "rss_mb" in value and "cpu" in value

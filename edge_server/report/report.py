@@ -1,0 +1,156 @@
+"""Builds report.json, report.html and the figures of a run from the files in its folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_server.report.books import close_books
+from edge_server.report.machine import machine, outside_load, versions
+from edge_server.report.records import Records, Row, read_records
+
+METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
+SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")
+# ``final`` is the mean of this last share of the run.
+FINAL_SHARE = 0.2
+
+
+def build_report(out_dir: str | Path) -> dict[str, Any]:
+    """Write report.json, report.html and PNGs into the run's folder; returns what report.json holds.
+
+    Works on whatever is there: killed runs, other machines' files missing, no channel. What was missing is
+    said in ``notes``. Raises FileNotFoundError if the folder does not exist.
+    """
+    # Drawing loads matplotlib, which the figures alone need.
+    from edge_server.report.figures import draw_all
+    from edge_server.report.html import render_html
+
+    out = Path(out_dir)
+    records = read_records(out)
+    report = assemble(records)
+    _write(out / "report.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
+    figures = draw_all(report, records)
+    _write(out / "report.html", render_html(report, figures))
+    return report
+
+
+def assemble(records: Records) -> dict[str, Any]:
+    """The contents of report.json, without writing anything but what the ledgers' reading needs."""
+    edge, series = records.edge, records.series
+    books = close_books(records.out)
+    last_s = series[-1]["t_s"] if series else 0.0
+    seconds = max(_number(edge.get("seconds", edge.get("uptime_s"))) or 0.0, last_s)
+    report = {
+        "scenario": edge.get("scenario"),
+        "seed": edge.get("seed"),
+        "seconds": seconds,
+        "field": edge.get("field"),
+        "policy": {"name": edge.get("policy"), "value": edge.get("value")},
+        "versions": versions(),
+        "machine": machine(),
+        "outside_load": outside_load(records.processes),
+        "frames": {**books.as_dict(), "ledgers": books.ledgers},
+        "age_ms": ages(records.ages),
+        "updates": updates(series, edge.get("updates") or {}),
+        "fidelity": fidelity(series, seconds, edge),
+        "channel": {
+            name: records.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")
+        },
+        "notes": records.notes + books.notes,
+    }
+    cleaned: dict[str, Any] = _finite(report)
+    return cleaned
+
+
+def ages(rows: Sequence[Row]) -> dict[str, Any]:
+    """Time averages of the newest buffered frame's age: {mean, p50, p95, by_camera: {camera: the same, or
+    None if it never reported}}. Samples are evenly spaced, so their mean is the age's time average."""
+    samples: dict[str, list[float]] = {}
+    for row in rows:
+        for camera, age in (row.get("age_ms") or {}).items():
+            values = samples.setdefault(camera, [])
+            if (known := _number(age)) is not None:
+                values.append(known)
+    everything = [age for values in samples.values() for age in values]
+    total = _spread(everything) or {"mean": None, "p50": None, "p95": None}
+    return {**total, "by_camera": {camera: _spread(values) for camera, values in sorted(samples.items())}}
+
+
+def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
+    """{count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication,
+    undecodable}. ``edge``: the same as the edge knew it, for lines that were not written any more."""
+    spent = _known(row.get("update_ms") for row in series)
+    first = series[0]["t_s"] * 1e3 if series else None
+    return {
+        "count": max(len(series), int(_number(edge.get("count")) or 0)),
+        "ms_p50": float(np.percentile(spent, 50)) if spent else edge.get("ms_p50"),
+        "ms_p95": float(np.percentile(spent, 95)) if spent else edge.get("ms_p95"),
+        "first_ms": edge.get("first_ms", first),
+        "undecodable": edge.get("undecodable"),
+    }
+
+
+def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]:
+    """Scores against the truth at the present: {final, mean, baseline, lpips_missing, lpips_network,
+    scored_on, series}. ``final``: publications in the last fifth of the run's ``seconds``."""
+    late = [row for row in series if row["t_s"] >= (1.0 - FINAL_SHARE) * seconds]
+    baseline = edge.get("baseline") or {}
+    return {
+        "final": _mean_scores(late),
+        "mean": _mean_scores(series),
+        "baseline": {name: baseline.get(name) for name in ("mean_colour_db", "nearest_view_db")},
+        "lpips_missing": edge.get("lpips_missing"),
+        "lpips_network": edge.get("lpips_network"),
+        "scored_on": sorted({str(row["scored_on"]) for row in series if row.get("scored_on")}),
+        "scored": sum(row.get("psnr_db") is not None for row in series),
+        "series": [{name: row.get(name) for name in SERIES} for row in series],
+    }
+
+
+def _mean_scores(rows: Sequence[Row]) -> dict[str, float | None]:
+    scores: dict[str, float | None] = {}
+    for name in METRICS:
+        values = _known(row.get(name) for row in rows)
+        scores[name] = float(np.mean(values)) if values else None
+    return scores
+
+
+def _spread(values: Sequence[float]) -> dict[str, float | None] | None:
+    if not values:
+        return None
+    p50, p95 = np.percentile(values, [50, 95])
+    return {"mean": float(np.mean(values)), "p50": float(p50), "p95": float(p95)}
+
+
+def _known(values: Iterable[Any]) -> list[float]:
+    return [v for value in values if (v := _number(value)) is not None]
+
+
+def _number(value: Any) -> float | None:
+    """A finite number, or None for anything else a damaged file may hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def _finite(value: Any) -> Any:
+    """The same structure with None in place of NaN and infinity, which JSON does not know."""
+    if isinstance(value, dict):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _write(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(text)
+    os.replace(temporary, path)

@@ -1,0 +1,90 @@
+"""One look for all figures: quiet axes, readable sizes, colours that colour-blind readers can tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")  # figures are files; no display is ever needed
+
+import matplotlib.pyplot as plt
+from cycler import cycler
+from matplotlib.axes import Axes
+
+# Okabe and Ito's palette, ordered so that neighbours differ in lightness too.
+BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, YELLOW = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#E69F00",
+    "#56B4E9",
+    "#CC79A7",
+    "#F0E442",
+)
+INK, GREY, PALE = "#222222", "#777777", "#E4E4E4"
+CYCLE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE)
+WIDTH_INCH = 8.4
+
+_RC: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.prop_cycle": cycler(color=CYCLE),
+    "grid.color": PALE,
+    "grid.linewidth": 0.8,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.dpi": 110,
+    "savefig.dpi": 110,
+    "figure.constrained_layout.use": True,
+}
+
+
+@contextmanager
+def figure(
+    path: Path, rows: int = 1, columns: int = 1, height_inch: float = 2.6, **kwargs
+) -> Iterator[tuple]:
+    """``with figure(path, rows) as (fig, axes):`` draws in the common style and writes ``path`` (PNG).
+
+    axes: array (rows, columns). kwargs go to ``plt.subplots``.
+    """
+    with plt.rc_context(_RC):
+        fig, axes = plt.subplots(
+            rows, columns, figsize=(WIDTH_INCH, height_inch * rows), squeeze=False, **kwargs
+        )
+        try:
+            yield fig, axes
+            # No creation date inside: the same run draws the same bytes.
+            fig.savefig(path, metadata={"Software": "freshfield"})
+        finally:
+            plt.close(fig)
+
+
+def label_lines(axes: Axes, y: str, x: str | None = None, title: str | None = None) -> None:
+    """Axis labels, title and, where there is something to tell apart, a legend beside the plot."""
+    axes.set_ylabel(y)
+    if x:
+        axes.set_xlabel(x)
+    if title:
+        axes.set_title(title)
+    if len(axes.get_legend_handles_labels()[0]) > 1:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)

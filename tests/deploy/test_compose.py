@@ -1,0 +1,129 @@
+"""The compose file: what it promises about networks, checked as data and, where an engine runs, for real."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+import yaml
+
+from freshfield.scenario import load
+from launch.summary import books_close
+from tests.conftest import ROOT
+
+FILE = ROOT / "deploy" / "compose.yaml"
+COMPOSE = yaml.safe_load(FILE.read_text())
+SERVICES = COMPOSE["services"]
+CAMERAS = {name: s for name, s in SERVICES.items() if "camera-node" in s["command"]}
+STREAM_S = 30.0
+
+
+def test_every_camera_of_the_scenario_has_its_container() -> None:
+    scenario = load(ROOT / "deploy" / "scenarios" / "compose.yaml")
+    assert set(CAMERAS) == set(scenario.cameras)
+    for name, service in CAMERAS.items():
+        assert re.search(rf"--camera {name}$", service["command"])
+        assert service["environment"]["CAMERA"] == name
+
+
+def test_the_only_way_from_a_camera_to_the_edge_is_the_emulator() -> None:
+    edge, emulator = set(SERVICES["edge"]["networks"]), set(SERVICES["emulator"]["networks"])
+    assert edge and edge <= set(COMPOSE["networks"])
+    for name, service in CAMERAS.items():
+        networks = set(service["networks"])
+        assert networks and not networks & edge, f"{name} shares a network with the edge"
+        assert networks <= emulator
+        assert "--to emulator:" in service["command"]
+    assert edge <= emulator
+    assert not any("network_mode" in s or "links" in s for s in SERVICES.values())
+
+
+def test_only_the_page_is_published_and_only_on_this_machine() -> None:
+    published = {name: s["ports"] for name, s in SERVICES.items() if s.get("ports")}
+    assert published == {"edge": ["127.0.0.1:8080:8080"]}
+
+
+def test_every_service_has_a_health_check_and_no_privileges() -> None:
+    for name, service in SERVICES.items():
+        dockerfile = ROOT / "deploy" / ("edge" if name == "edge" else "camera")
+        assert "HEALTHCHECK" in dockerfile.with_suffix(".Dockerfile").read_text() or "healthcheck" in service
+        assert not {"privileged", "cap_add", "user", "pid"} & set(service)
+
+
+@pytest.mark.parametrize("name", ["camera", "edge"])
+def test_an_image_runs_as_nobody_in_particular(name: str) -> None:
+    text = (ROOT / "deploy" / f"{name}.Dockerfile").read_text()
+    stages = text.split("\nFROM ")
+    assert stages[-1].startswith("docker.io/library/python:3.11-slim-bookworm")
+    assert re.search(r"^USER freshfield$", stages[-1], re.M)
+    assert "apt-get" not in text, "wheels bring what they need"
+    sources = re.findall(r"^COPY (?!--from)(.+) \S+$", text, re.M)
+    for path in " ".join(sources).split():
+        assert (ROOT / path).exists(), f"{name}.Dockerfile copies {path}, which is gone"
+
+
+def test_the_camera_image_has_no_torch() -> None:
+    text = (ROOT / "deploy" / "camera.Dockerfile").read_text()
+    assert "install" in text and "edge]" not in text and "torch==" not in text
+
+
+def engine() -> list[str]:
+    """A compose command that works here, or skip with the reason."""
+    tried = []
+    for command, check in (
+        (["docker", "compose"], ["docker", "info"]),
+        (["podman-compose"], ["podman", "info"]),
+    ):
+        if shutil.which(command[0]) is None or shutil.which(check[0]) is None:
+            tried.append(f"{command[0]} is not installed")
+            continue
+        for probe in ([*command, "version"], check):
+            done = subprocess.run(probe, capture_output=True, text=True, timeout=60)
+            if done.returncode != 0:
+                tried.append(f"{' '.join(probe)}: {(done.stderr or done.stdout).strip()[:100]}")
+                break
+        else:
+            return command
+    pytest.skip(f"no working compose: {'; '.join(tried)}")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_the_deployment_streams_and_its_books_close(tmp_path: Path) -> None:
+    compose = [*engine(), "-f", str(FILE)]
+
+    def run(*words: str, timeout_s: float = 1200.0) -> str:
+        done = subprocess.run([*compose, *words], cwd=ROOT, capture_output=True, text=True, timeout=timeout_s)
+        assert done.returncode == 0, f"{' '.join(words)}: {done.stderr[-2000:]}"
+        return done.stdout
+
+    run("build")
+    try:
+        run("up", "-d")
+        deadline = time.monotonic() + 180.0
+        while True:
+            try:
+                with urllib.request.urlopen("http://127.0.0.1:8080", timeout=2.0) as page:
+                    assert page.status == 200
+                    break
+            except OSError:
+                assert time.monotonic() < deadline, "the page did not answer"
+                time.sleep(1.0)
+        time.sleep(STREAM_S)
+        run("stop", *CAMERAS)
+        run("stop", "emulator")
+        run("stop", "edge")
+        run("run", "--rm", "edge", "edge-server", "report", "/runs")
+        report = json.loads(run("run", "--rm", "edge", "cat", "/runs/report.json"))
+    finally:
+        subprocess.run([*compose, "down", "-v"], cwd=ROOT, capture_output=True, timeout=120.0)
+    assert books_close(report["frames"])
+    assert report["frames"]["delivered"] > 100
+    assert set(report["age_ms"]["by_camera"]) >= set(CAMERAS) - {"cam00"}
+    assert report["updates"]["count"] >= 3

@@ -1,0 +1,59 @@
+"""Which folders a run may use: a mistyped --out must never cost anybody a file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from launch.folder import MARKER, FolderError, prepare
+
+
+def test_a_new_folder_gets_a_marker(tmp_path: Path) -> None:
+    with prepare(tmp_path / "a" / "b", {"scenario": "room"}):
+        assert json.loads((tmp_path / "a" / "b" / MARKER).read_text()) == {"scenario": "room"}
+
+
+def test_an_earlier_run_is_replaced(tmp_path: Path) -> None:
+    prepare(tmp_path, {"run": 1}).close()
+    (tmp_path / "ledger-edge-edge-1.tsv").write_text("old")
+    (tmp_path / "field").mkdir()
+    (tmp_path / "field" / "weights").write_text("old")
+    prepare(tmp_path, {"run": 2}).close()
+    assert [p.name for p in tmp_path.iterdir()] == [MARKER]
+    assert json.loads((tmp_path / MARKER).read_text()) == {"run": 2}
+
+
+def test_a_link_in_an_earlier_run_is_removed_and_not_followed(tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "photo").write_text("keep")
+    out = tmp_path / "out"
+    prepare(out, {}).close()
+    (out / "link").symlink_to(precious)
+    prepare(out, {}).close()
+    assert not (out / "link").exists() and (precious / "photo").read_text() == "keep"
+
+
+def test_anything_else_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(FolderError, match="not an earlier run's"):
+        prepare(tmp_path, {})
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_run_that_is_still_going_on_is_refused(tmp_path: Path) -> None:
+    with (
+        prepare(tmp_path, {"run": 1}),
+        pytest.raises(FolderError, match="another run is writing"),
+    ):
+        prepare(tmp_path, {"run": 2})
+    assert json.loads((tmp_path / MARKER).read_text()) == {"run": 1}
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "out"
+    file.write_text("")
+    with pytest.raises(FolderError, match="cannot use"):
+        prepare(file, {})

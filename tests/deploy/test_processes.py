@@ -1,0 +1,99 @@
+"""Starting, stopping and mourning processes, with real ones."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from launch import processes
+from launch.processes import Child
+
+
+def python(tmp_path: Path, code: str, name: str = "one") -> Child:
+    return Child(name, f"process {name}", [sys.executable, "-c", code], tmp_path / f"log-{name}.txt")
+
+
+def wait_for(what, seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def test_an_obituary_names_the_exit_code_and_the_last_words(tmp_path: Path) -> None:
+    child = python(tmp_path, "print('reading'); raise SystemExit('the lens cap is on')")
+    child.start()
+    wait_for(lambda: not child.running)
+    text = child.obituary()
+    assert "process one ended by itself with exit code 1" in text
+    assert "| the lens cap is on" in text and "| reading" in text
+    assert str(child.log) in text
+
+
+def test_an_obituary_names_the_signal(tmp_path: Path) -> None:
+    child = python(tmp_path, "import time; time.sleep(60)")
+    child.start()
+    os.kill(child.pid, signal.SIGKILL)
+    wait_for(lambda: not child.running)
+    assert "killed by SIGKILL" in child.obituary()
+    assert "wrote nothing" in child.obituary()
+
+
+def test_stop_is_gentle_first_and_firm_afterwards(tmp_path: Path) -> None:
+    polite = python(tmp_path, "import signal, sys, time\n"
+                    "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('goodbye')))\n"
+                    "print('up')\ntime.sleep(60)", "polite")  # fmt: skip
+    deaf = python(tmp_path, "import signal, time\n"
+                  "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+                  "print('up')\ntime.sleep(60)", "deaf")  # fmt: skip
+    for child in (polite, deaf):
+        child.start()
+        wait_for(lambda child=child: "\nup\n" in child.log.read_text())
+    began = time.monotonic()
+    processes.stop([polite, deaf], grace_s=1.0)
+    assert time.monotonic() - began < 5.0
+    assert not polite.running and not deaf.running
+    assert not polite.killed and polite.process.returncode == 0 and "goodbye" in polite.log.read_text()
+    assert deaf.killed and deaf.process.returncode == -signal.SIGKILL
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells children that their parent is gone")
+def test_no_child_outlives_a_launcher_that_was_killed_outright(tmp_path: Path) -> None:
+    launcher = """
+import sys, time
+from pathlib import Path
+from launch.processes import Child
+child = Child("c", "c", [sys.executable, "-c", "import time; time.sleep(60)"], Path(sys.argv[1]))
+child.start()
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+    deploy = Path(processes.__file__).parents[1]
+    command = [sys.executable, "-c", launcher, str(tmp_path / "log.txt")]
+    with subprocess.Popen(command, cwd=deploy, stdout=subprocess.PIPE) as parent:
+        pid = int(parent.stdout.readline())
+        assert Path(f"/proc/{pid}").exists()
+        parent.kill()
+    wait_for(lambda: not _lives(pid))
+
+
+def _lives(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"  # an orphan that nobody has collected yet is dead enough
+
+
+def test_the_tail_of_a_large_log_has_whole_lines_only(tmp_path: Path) -> None:
+    log = tmp_path / "log.txt"
+    log.write_text("$ the command\n" + "".join(f"line {i} äöü\n" for i in range(20_000)))
+    lines = processes.tail(log, 5)
+    assert lines == [f"line {i} äöü" for i in range(19_995, 20_000)]
+    assert processes.tail(tmp_path / "missing", 5) == []

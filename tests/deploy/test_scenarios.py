@@ -1,0 +1,62 @@
+"""Every shipped scenario is what its packages accept, and says what it is."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from edge_server.fields.registry import make_field
+
+from camera_node.config import source_config
+from camera_node.sources import open_sources
+from channel_emu.config import channel_from_mapping
+from edge_server.config import read_config
+from edge_server.scheduler import make_policy
+from freshfield.scenario import SCENARIO_FOLDER, load
+from tests.conftest import data_dir
+
+FILES = sorted(SCENARIO_FOLDER.glob("*.yaml"))
+NAMES = {"room", "room19", "tile", "ideal", "fox", "lego", "people", "kitchen"}
+
+
+def test_the_promised_scenarios_are_there() -> None:
+    assert {file.stem for file in FILES} >= NAMES
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_every_package_accepts_its_section(file: Path) -> None:
+    scenario = load(file)
+    assert scenario.name == file.stem, "a report names the scenario: it must lead back to the file"
+    assert scenario.description
+    assert len(scenario.training) >= 3
+    source_config(scenario)
+    channel_from_mapping(scenario.channel, f"{file}: channel")
+    edge = read_config(scenario)
+    make_policy(edge.policy.name, edge.policy.value, scenario.rng("policy"))
+    make_field(edge.field, edge.field_options, seed=scenario.seed)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_every_camera_has_a_first_image(file: Path) -> None:
+    scenario = load(file)
+    config = source_config(scenario)
+    folder = getattr(config, "data", "")
+    data = data_dir(folder.split("/")[0]).parent if folder else None
+    # One trained and one held-out camera: a world takes a while to prepare each.
+    cameras = [scenario.training[0], *scenario.held_out[:1]]
+    sources = open_sources(scenario, config, cameras, data)
+    assert set(sources) == set(cameras)
+    for source in sources.values():
+        shot = source.read(source.content(0))
+        assert (shot.intrinsics.width, shot.intrinsics.height) == (
+            source.intrinsics.width,
+            source.intrinsics.height,
+        )
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_person_can_read_it(file: Path) -> None:
+    text = file.read_text()
+    assert text.startswith("# "), "the first lines say what this is and why one would run it"
+    assert not re.search(r"/(home|root|work|tmp)/", text)

@@ -1,0 +1,102 @@
+"""A run's folder, written by the parts that write it in a real run: journal and ledgers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge_server.journal import Journal
+from edge_server.state import Publication
+from tests.edge_server.report.ledgers import write
+
+CAMERAS = ("cam00", "cam01", "cam02", "cam03")
+SECONDS = 40.0
+EDGE = {
+    "scenario": "sample",
+    "seed": 7,
+    "field": "ngp",
+    "policy": "threshold",
+    "value": 120.0,
+    "uptime_s": SECONDS,
+    "updates": {"count": 50, "ms_p50": 800.0, "ms_p95": 900.0, "first_ms": 3100.0, "undecodable": 1},
+    "baseline": {"mean_colour_db": 14.5, "nearest_view_db": 13.8},
+    "lpips_missing": None,
+    "lpips_network": "alex",
+}
+CHANNEL = {
+    "state_share": {"high": 0.4, "low": 0.6},
+    "drawn_delay_ms": {
+        "mean": 60.2,
+        "p50": 41.0,
+        "p95": 180.0,
+        "bins": [[1.023**i, int(40 * 1.023**i * 2.718 ** (-(1.023**i) / 60))] for i in range(280)],
+    },
+    "delay_error_ms": {"p50": 0.1, "p99": 1.2, "max": 4.0},
+}
+
+
+def publication(number: int) -> Publication:
+    """Fidelity rises to 26 dB; every tenth publication found no truth; cam03 moves nothing."""
+    t_s = 3.1 + 0.75 * number
+    scored = number % 10 != 9
+    psnr = 26.0 - 10.0 * 0.9**number
+    return Publication(
+        number=number,
+        t_s=t_s,
+        published_ns=round(t_s * 1e9),
+        omega_ms=120.0,
+        selected=CAMERAS[: 2 + number % 3],
+        ages_ms=(80.0,) * (2 + number % 3),
+        aaoi_ms=80.0 + number % 7,
+        update_ms=740.0 + 3 * (number % 11),
+        psnr_db=psnr if scored else None,
+        psnr_moving_db=psnr - 4 if scored else None,
+        ssim=psnr / 30 if scored else None,
+        lpips=0.6 - psnr / 60 if scored else None,
+        truth_gap_ms=3.0 if scored else None,
+        scored_on="cam00" if scored else None,
+    )
+
+
+def write_run(out: Path, publications: int = 49, ages: int = 200) -> None:
+    """The folder after a clean end."""
+    journal = Journal(out, lambda: EDGE)
+    rng = np.random.default_rng(0)
+    for i in range(ages):
+        found: dict[str, float | None] = {c: 60.0 + 40.0 * float(rng.exponential()) for c in CAMERAS[1:]}
+        journal.ages(0.2 * i, {**found, "never": None})
+    for number in range(publications):
+        journal.published(publication(number))
+        journal.scored(publication(number), final=True)
+    journal.close()
+    (out / "channel.json").write_text(json.dumps(CHANNEL))
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[10:30, 20:40] = (40, 160, 220)
+    cv2.imwrite(str(out / "truth.png"), image)
+    cv2.imwrite(str(out / "rendered.png"), cv2.GaussianBlur(image, (0, 0), 2.0))
+    node, emulator, edge = [], [], []
+    for camera in CAMERAS:
+        for i in range(50):
+            at = (camera, "s1", i)
+            node += [(*at, "captured"), (*at, "replaced" if i % 5 == 4 else "sent")]
+            if i % 5 == 4:
+                continue
+            emulator += [(*at, "received"), (*at, "dropped_busy" if i % 2 else "forwarded")]
+            if i % 2 == 0:
+                edge.append((*at, "rejected", "crc") if i == 30 else (*at, "delivered"))
+    write(out, "node", node)
+    write(out, "emulator", emulator)
+    write(out, "edge", edge)
+    rows = [
+        {"t_s": 2.0 * i}
+        | {
+            "edge": {"rss_mb": 600.0 + i, "cpu": 1.4, "pid": 2},
+            "emulator": {"rss_mb": 60.0, "cpu": 0.1, "pid": 3},
+        }
+        | {f"node-{c}": {"rss_mb": 90.0, "cpu": 0.02, "pid": 4} for c in CAMERAS}
+        for i in range(20)
+    ]
+    (out / "processes.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))

@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from edge_server.report import build_report
+from edge_server.report.records import read_records
+from edge_server.report.report import METRICS, SERIES, assemble, fidelity
+from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    write_run(out)
+    return out, build_report(out)
+
+
+def test_report_json_holds_what_is_returned_and_every_key_that_was_promised(run):
+    out, report = run
+    assert json.loads((out / "report.json").read_text()) == report
+    promised = {
+        "scenario": "sample",
+        "seed": 7,
+        "seconds": SECONDS,
+    }
+    assert {k: report[k] for k in promised} == promised
+    assert set(report["frames"]) >= {
+        "captured", "replaced", "waiting", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
+        "duplicated", "delivered", "rejected", "in_flight",
+    }  # fmt: skip
+    assert set(report["age_ms"]) == {"mean", "p50", "p95", "by_camera"}
+    assert set(report["updates"]) == {"count", "ms_p50", "ms_p95", "first_ms", "undecodable"}
+    assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
+    assert set(report["fidelity"]["baseline"]) == {"mean_colour_db", "nearest_view_db"}
+    assert report["fidelity"]["lpips_missing"] is None
+    assert all(tuple(row) == SERIES for row in report["fidelity"]["series"])
+    assert report["channel"] == CHANNEL
+    assert report["versions"]["python"] and report["machine"]["cores"] >= 1
+    assert set(report["outside_load"]) == {"cores", "ours", "method"}
+
+
+def test_frames_close(run):
+    frames = run[1]["frames"]
+    assert frames["captured"] == 200 == frames["replaced"] + frames["waiting"] + frames["sent"]
+    assert (frames["dropped_busy"], frames["delivered"], frames["rejected"]) == (80, 76, {"crc": 4})
+    assert frames["closes"] and frames["contradiction_count"] == 0 and frames["ledgers"] == 3
+
+
+def test_final_is_the_mean_of_the_last_fifth_of_the_run(run):
+    late = [publication(i) for i in range(49)]
+    late = [p.psnr_db for p in late if p.t_s >= 0.8 * SECONDS and p.psnr_db is not None]
+    assert run[1]["fidelity"]["final"]["psnr_db"] == pytest.approx(np.mean(late))
+    whole = [p.psnr_db for i in range(49) if (p := publication(i)).psnr_db is not None]
+    assert run[1]["fidelity"]["mean"]["psnr_db"] == pytest.approx(np.mean(whole))
+    assert run[1]["fidelity"]["scored"] == len(whole)
+
+
+def test_a_field_that_stopped_early_has_no_final_score():
+    series = [{"t_s": t, "psnr_db": 20.0} for t in (1.0, 2.0)]
+    found = fidelity(series, 60.0, {})
+    assert found["final"]["psnr_db"] is None and found["mean"]["psnr_db"] == 20.0
+
+
+def test_ages_are_time_averages_and_silence_is_none(run):
+    ages = run[1]["age_ms"]
+    assert ages["by_camera"]["never"] is None
+    means = [ages["by_camera"][c]["mean"] for c in CAMERAS[1:]]
+    assert ages["mean"] == pytest.approx(np.mean(means)) and 60.0 < ages["p50"] < ages["p95"]
+
+
+def test_updates_are_counted_as_the_edge_counted_them(run):
+    updates = run[1]["updates"]
+    assert updates["count"] == 50  # the last one's line was not written any more
+    assert updates["first_ms"] == 3100.0 and updates["undecodable"] == 1
+    assert updates["ms_p50"] == np.percentile([publication(i).update_ms for i in range(49)], 50)
+
+
+def test_every_figure_is_drawn_and_inside_the_page(run):
+    out, _ = run
+    names = ["comparison", "fidelity", "ages", "updates", "channel", "processes"]
+    assert sorted(p.name for p in out.glob("figure-*.png")) == sorted(f"figure-{n}.png" for n in names)
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == len(names)
+    assert "The books close." in page and "LPIPS-alex" in page
+
+
+def test_the_page_needs_nothing_from_anywhere(run):
+    page = (run[0] / "report.html").read_text()
+    for foreign in ("http://", "https://", "<script", "<link", "@import", 'src="/'):
+        assert foreign not in page
+
+
+def test_a_report_of_the_same_files_is_the_same(run):
+    out, report = run
+    before = {p.name: p.read_bytes() for p in out.glob("figure-*.png")}
+    again = build_report(out)
+    again["outside_load"] = report["outside_load"]
+    assert again == report
+    assert {p.name: p.read_bytes() for p in out.glob("figure-*.png")} == before
+
+
+def test_a_killed_run_reports_what_it_left_and_says_what_is_torn(tmp_path):
+    write_run(tmp_path)
+    for name in ("series.jsonl", "ages.jsonl"):
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(data[: len(data) // 2])
+    (tmp_path / "channel.json").write_text('{"state_sh')
+    (tmp_path / "edge.json").unlink()
+    (tmp_path / "rendered.png").write_bytes(b"\x89PNG torn")
+    report = build_report(tmp_path)
+    said = " | ".join(report["notes"])
+    for part in ("edge.json is missing", "channel.json left out", "series.jsonl: 1 of", "ages.jsonl: 1 of"):
+        assert part in said
+    assert report["scenario"] is None and report["updates"]["count"] > 10
+    assert report["fidelity"]["final"]["psnr_db"] is not None
+    assert not (tmp_path / "figure-comparison.png").exists()
+    assert "What was missing or torn" in (tmp_path / "report.html").read_text()
+
+
+def test_an_empty_folder_gives_a_report_that_says_so(tmp_path):
+    report = build_report(tmp_path)
+    assert report["updates"]["count"] == 0 and report["frames"]["captured"] == 0
+    assert report["age_ms"] == {"mean": None, "p50": None, "p95": None, "by_camera": {}}
+    page = (tmp_path / "report.html").read_text()
+    assert "The field was never updated" in page and "No ledgers" in page
+
+
+def test_no_such_folder_is_an_error_that_names_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere is not a folder"):
+        build_report(tmp_path / "nowhere")
+
+
+def test_a_process_that_started_again_goes_on_in_time(tmp_path):
+    write_run(tmp_path, publications=5, ages=10)
+    line = (tmp_path / "series.jsonl").read_text().splitlines()[0]
+    with (tmp_path / "series.jsonl").open("a") as file:
+        file.write(line + "\n")
+    times = [row["t_s"] for row in read_records(tmp_path).series]
+    assert times == sorted(times) and len(times) == 6 and times[5] > times[4]
+
+
+def test_nan_in_a_file_does_not_become_nan_in_the_report(tmp_path):
+    write_run(tmp_path, publications=3, ages=3)
+    with (tmp_path / "series.jsonl").open("a") as file:
+        file.write('{"t_s": 9.0, "psnr_db": NaN, "update_ms": Infinity}\n')
+        file.write('{"t_s": NaN}\n{"t_s": "8"}\n[1]\n{}\nnull\n')
+    report = assemble(read_records(tmp_path))
+    json.dumps(report, allow_nan=False)
+    assert report["fidelity"]["series"][-1]["psnr_db"] is None
+    assert "series.jsonl: 5 of 9 lines unreadable (killed while writing?)" in report["notes"]
+    build_report(tmp_path)
+
+
+def test_hostile_names_do_not_reach_the_page_as_markup(tmp_path):
+    write_run(tmp_path, publications=2, ages=2)
+    edge = json.loads((tmp_path / "edge.json").read_text())
+    edge["scenario"] = "<script>alert(1)</script>"
+    (tmp_path / "edge.json").write_text(json.dumps(edge))
+    build_report(tmp_path)
+    assert "<script" not in (tmp_path / "report.html").read_text()
+
+
+def test_scores_on_selected_views_are_called_that(tmp_path):
+    write_run(tmp_path, publications=3, ages=3)
+    text = (tmp_path / "series.jsonl").read_text().replace('"scored_on": "cam00"', '"scored_on": "selected"')
+    (tmp_path / "series.jsonl").write_text(text)
+    assert build_report(tmp_path)["fidelity"]["scored_on"] == ["selected"]
+    assert "No camera is held out" in (tmp_path / "report.html").read_text()
+
+
+def test_importing_the_books_loads_neither_matplotlib_nor_torch():
+    code = "import sys, edge_server.report.report; print({'matplotlib', 'torch'} & set(sys.modules))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "set()"
