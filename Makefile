@@ -24,7 +24,8 @@ SELECT ?= not slow
 PYTEST ?=
 
 PY := .venv/bin/python
-PIP := $(PY) -m pip --disable-pip-version-check -q
+# Byte code is made by the first import of what is used: compiling all of it ahead doubles the set-up's time.
+INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
 TORCH := $(shell sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml)
 PROTOC = -m grpc_tools.protoc -I . --pyi_out=$(1) --python_out=$(1) --grpc_python_out=$(1)
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
@@ -82,18 +83,28 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "cannot make a virtual environment (Debian: apt-get install python3-venv)"; exit 1; }
 	@touch $@
 
-# torch first and alone, so that TORCH_INDEX decides where it comes from and nothing else does.
+# torch apart from the rest: TORCH_INDEX decides where it comes from and nothing else does.
 .venv/.ok-torch: .venv/.ok-venv pyproject.toml
-	@echo "set-up 2/3: $(TORCH) (the large one)"
-	@$(PIP) install $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) $(TORCH)
+	@$(INSTALL) --no-deps $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) $(TORCH)
 	@touch $@
 
-.venv/.ok-run: .venv/.ok-torch pyproject.toml
-	@echo "set-up 3/3: freshfield and what it runs on"
-	@$(PIP) install -e '.[edge,up]'
+.venv/.ok-base: .venv/.ok-venv pyproject.toml
+	@$(INSTALL) --no-warn-conflicts -e '.[edge-base,up]'
 	@touch $@
 
-.venv/.ok-test: .venv/.ok-torch pyproject.toml
-	@echo "set-up 3/3: freshfield, what it runs on, and the test tools"
-	@$(PIP) install -e '.[edge,up,test,dev]'
+# Side by side: torch is one large archive to unpack, the others are many small ones to look up. What torch
+# itself needs comes last, when pip can see that torch is there.
+.venv/.ok-parts: .venv/.ok-venv pyproject.toml
+	@echo "set-up 2/3: $(TORCH), and beside it what freshfield runs on"
+	@$(MAKE) --no-print-directory -j2 .venv/.ok-torch .venv/.ok-base
+	@touch $@
+
+.venv/.ok-run: .venv/.ok-parts pyproject.toml
+	@echo "set-up 3/3: freshfield"
+	@$(INSTALL) -e '.[edge,up]'
+	@touch $@
+
+.venv/.ok-test: .venv/.ok-parts pyproject.toml
+	@echo "set-up 3/3: freshfield and its test tools"
+	@$(INSTALL) -e '.[edge,up,test,dev]'
 	@touch .venv/.ok-run $@

@@ -14,15 +14,13 @@ from freshfield.scenario import Scenario, ScenarioError
 if TYPE_CHECKING:
     from camera_node.world.effects import Effects
 
-DEFAULT_CACHE_BYTES = 64 * 2**20
-
 
 def build_cameras(
     scenario: Scenario,
     config: SourceConfig,
     cameras: Sequence[str],
     data: Path | None = None,
-    cache_bytes: int = DEFAULT_CACHE_BYTES,
+    cache_bytes: int = 64 * 2**20,
 ) -> list[Camera]:
     """Open the sources of ``cameras``, in the scenario's order, with one cache for all.
 
@@ -31,7 +29,8 @@ def build_cameras(
     effects = {camera: load(scenario, config, camera) for camera in cameras}
     sources = open_sources(scenario, config, cameras, data, effects)
     cache = EncodedCache(cache_bytes)
-    return [Camera(sources[c], config, cache, effects[c]) for c in scenario.cameras if c in sources]
+    drifts = {c: made for c, made in effects.items() if made is not None and made.clock}
+    return [Camera(sources[c], config, cache, drifts.get(c)) for c in scenario.cameras if c in sources]
 
 
 def load(scenario: Scenario, config: SourceConfig, camera: str) -> Effects | None:

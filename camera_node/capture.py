@@ -59,18 +59,18 @@ class Camera:
         source: Source,
         config: SourceConfig,
         cache: EncodedCache,
-        effects: Drifting | None = None,
+        drift: Drifting | None = None,
     ) -> None:
         self.name = source.camera
         self.fps = source.fps
         self.source = source
         self._codec, self._quality = config.codec, config.quality
         self._cache = cache
-        self._effects = effects
+        self._drift = drift
 
     def clock(self, true: Clock) -> NodeClock:
         """The clock this camera stamps with, given the true time."""
-        return NodeClock(true, self._effects)
+        return NodeClock(true, self._drift)
 
     @property
     def codec(self) -> str:

@@ -8,18 +8,26 @@ import logging
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from freshfield import scenario, transport
+
+if TYPE_CHECKING:
+    from camera_node.capture import Camera
 
 EXAMPLES = """examples:
   camera-node run room --all --to 127.0.0.1:7001             every camera of the shipped scenario "room"
   camera-node run room.yaml --camera cam03 --to emu:7001     one camera, as on a machine of its own
   camera-node run fox --all --to :7001 --data ~/data         recorded data: where the data sets lie
+  camera-node prepare room --all                             render ahead, for a quick start later
   camera-node sources                                        what a scenario's source section can say
   camera-node effects                                        what it can list under effects
 
 exit codes: 0 stopped as asked, 1 failed while running, 2 wrong scenario, option or data
 """
+
+
+DEFAULT_CACHE_MB = 64.0
 
 
 class UsageError(Exception):
@@ -34,12 +42,19 @@ def main(arguments: list[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands.add_parser("run", help="stream cameras of a scenario", epilog=EXAMPLES,
                                  formatter_class=argparse.RawDescriptionHelpFormatter))  # fmt: skip
+    prepare = commands.add_parser(
+        "prepare", help="render a scenario's frames ahead and keep them, as run does when it starts"
+    )
+    _add_cameras(prepare)
+    prepare.add_argument("-q", "--quiet", action="store_true", help="only warnings")
     commands.add_parser("sources", help="list kinds of sources and the keys they take")
     commands.add_parser("effects", help="list effects and their parameters")
     args = parser.parse_args(arguments)
     try:
         if args.command == "run":
             return _run(args)
+        if args.command == "prepare":
+            return _prepare(args)
         from camera_node import listing
 
         print(listing.sources() if args.command == "sources" else listing.effects())
@@ -49,18 +64,22 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
 
 
-def _add_run(run: argparse.ArgumentParser) -> None:
-    run.add_argument("scenario", help="scenario file, or the name of a shipped one")
-    who = run.add_mutually_exclusive_group(required=True)
+def _add_cameras(command: argparse.ArgumentParser) -> None:
+    command.add_argument("scenario", help="scenario file, or the name of a shipped one")
+    who = command.add_mutually_exclusive_group(required=True)
     who.add_argument("--camera", metavar="ID[,ID]", help="the scenario's cameras this process hosts")
     who.add_argument("--all", action="store_true", help="host all of them")
+    command.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    command.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's")
+
+
+def _add_run(run: argparse.ArgumentParser) -> None:
+    _add_cameras(run)
     run.add_argument("--to", required=True, metavar="HOST:PORT", help="channel emulator or edge server")
     run.add_argument("--out", type=Path, metavar="DIR", help="folder for the ledger and the status file")
-    run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (else $FRESHFIELD_DATA)")
-    run.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's")
     run.add_argument("--seconds", type=float, metavar="S", help="stop after S seconds of capture")
     run.add_argument(
-        "--cache-mb", type=float, default=64.0, metavar="MB",
+        "--cache-mb", type=float, default=DEFAULT_CACHE_MB, metavar="MB",
         help="bound on compressed frames kept for the next round (default %(default)s, 0 keeps none)",
     )  # fmt: skip
     run.add_argument(
@@ -71,22 +90,40 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     transport.add_arguments(run)
 
 
-def _run(args: argparse.Namespace) -> int:
-    logging.basicConfig(
-        level=logging.WARNING if args.quiet else logging.INFO, stream=sys.stderr,
-        format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S",
-    )  # fmt: skip
+def _open(args: argparse.Namespace, cache_mb: float) -> tuple[scenario.Scenario, list[Camera]]:
+    """The scenario and the chosen cameras, opened. Raises UsageError or ScenarioError."""
     from camera_node.build import build_cameras
     from camera_node.config import source_config
+
+    level = logging.WARNING if args.quiet else logging.INFO
+    logging.basicConfig(
+        level=level, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
+    )
+    plan = scenario.load(args.scenario, args.seed)
+    try:
+        cameras = build_cameras(
+            plan, source_config(plan), _chosen(plan, args), args.data, int(cache_mb * 2**20)
+        )
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from None
+    return plan, cameras
+
+
+def _prepare(args: argparse.Namespace) -> int:
+    from camera_node.prepare import prepare
+
+    _, cameras = _open(args, DEFAULT_CACHE_MB)
+    prepare(cameras, lambda: False)
+    return 0
+
+
+def _run(args: argparse.Namespace) -> int:
     from camera_node.node import Node, NodeOptions
 
-    plan = scenario.load(args.scenario, args.seed)
-    cameras = _chosen(plan, args)
     if args.seconds is not None and args.seconds <= 0:
         raise UsageError("--seconds: expected a positive number")
     if args.cache_mb < 0 or args.response_timeout <= 0:
         raise UsageError("--cache-mb cannot be negative, --response-timeout must be positive")
-    config = source_config(plan)
     options = NodeOptions(
         to=_target(args.to),
         transport=transport.from_arguments(args),
@@ -94,15 +131,15 @@ def _run(args: argparse.Namespace) -> int:
         seconds=args.seconds,
         response_timeout_s=args.response_timeout,
     )
-    try:
-        built = build_cameras(plan, config, cameras, args.data, int(args.cache_mb * 2**20))
-        if args.out is not None:
+    plan, cameras = _open(args, args.cache_mb)
+    if args.out is not None:
+        try:
             args.out.mkdir(parents=True, exist_ok=True)
-    except (ValueError, OSError) as error:
-        raise UsageError(str(error)) from None
+        except OSError as error:
+            raise UsageError(f"--out: {args.out}: {error.strerror}") from None
 
     async def live() -> None:
-        node = Node(plan, built, options)
+        node = Node(plan, cameras, options)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, node.stop)

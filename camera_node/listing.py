@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import inspect
 from typing import Any
 
@@ -10,23 +11,46 @@ from camera_node.config import MODELS, SourceConfig
 
 
 def sources() -> str:
-    """Every kind with its keys, defaults and the keys common to all."""
-    common = {f.name for f in dataclasses.fields(SourceConfig)}
-    lines = ["source: keys of every kind", "", _indented(SourceConfig), ""]
+    """Every kind of source with its keys and their defaults."""
+    lines = ["keys of every kind", "", _doc(SourceConfig), "", *_keys(SourceConfig)]
+    common = [f.name for f in dataclasses.fields(SourceConfig)]
     for kind, model in MODELS.items():
-        lines += [f"source: {{kind: {kind}, ...}}", "", _indented(model), ""]
-        for item in dataclasses.fields(model):
-            if item.name not in common:
-                lines.append(f"  {item.name:20} {_default(item)}")
-        lines.append("")
-    return "\n".join(lines).rstrip()
+        lines += ["", f"source: {{kind: {kind}, ...}}", ""]
+        for part in reversed(model.__mro__):
+            if issubclass(part, SourceConfig) and part is not SourceConfig:
+                lines += [_doc(part), ""]
+        lines += _keys(model, leave_out=common)
+    return "\n".join(lines)
 
 
-def _indented(model: type) -> str:
-    return "\n".join(f"  {line}".rstrip() for line in inspect.getdoc(model).splitlines())  # type: ignore[union-attr]
+def effects() -> str:
+    """Every effect with its parameters and their defaults."""
+    from camera_node.world.effects import NAMES
+
+    lines = ["source: {effects: {NAME: {parameters}}}; held-out cameras are spared unless in_truth: true"]
+    for name in NAMES:
+        effect = _effect_class(name)
+        lines += ["", f"{name} (acts on: {effect.kind})", "", _doc(effect), "", _doc(effect.Parameters), ""]
+        lines += _keys(effect.Parameters)
+    return "\n".join(lines)
+
+
+def _effect_class(name: str) -> Any:
+    module = importlib.import_module(f"camera_node.world.effects.{name}")
+    own = [c for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module.__name__]
+    return next(c for c in own if hasattr(c, "kind"))
+
+
+def _doc(model: type) -> str:
+    return "\n".join(f"  {line}".rstrip() for line in (inspect.getdoc(model) or "").splitlines())
+
+
+def _keys(model: Any, leave_out: list[str] | None = None) -> list[str]:
+    fields = [f for f in dataclasses.fields(model) if f.name not in (leave_out or [])]
+    return [f"    {f.name:22} {_default(f)}" for f in fields]
 
 
 def _default(item: dataclasses.Field[Any]) -> str:
     if item.default is not dataclasses.MISSING:
-        return "not given" if item.default is None else f"default {item.default!r}"
+        return "not given" if item.default in (None, "") else f"default {item.default!r}"
     return "empty" if item.default_factory is not dataclasses.MISSING else "required"

@@ -92,10 +92,10 @@ class Node:
         try:
             await self._work()
         finally:
-            self.phase = "stopped"
+            self._stopping.set()  # what the pool is at looks at this
             self._pool.shutdown(wait=False, cancel_futures=True)
             await channel.close()
-            self._write_status()
+            self._enter("stopped")
             if ledger is not None:
                 ledger.close(self._clock.now_ns())
 
@@ -129,10 +129,10 @@ class Node:
                 raise result
 
     async def _capture_all(self) -> None:
-        self.phase = "preparing"
+        self._enter("preparing")
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
-        self.phase = "streaming"
+        self._enter("streaming")
         tasks = [asyncio.ensure_future(self._capture(c)) for c in self._cameras]
         try:
             await asyncio.wait(
@@ -196,6 +196,10 @@ class Node:
                     await asyncio.sleep(0.01)
         except TimeoutError:
             pass  # those frames are written down as broken
+
+    def _enter(self, phase: str) -> None:
+        self.phase = phase
+        self._write_status()
 
     async def _report(self) -> None:
         while True:

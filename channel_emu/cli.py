@@ -106,7 +106,7 @@ def _add_simulate(commands: Any) -> None:
     sub = commands.add_parser(
         "simulate", help="the same links in virtual time: ages and losses of a channel before building on it",
         description="Simulates every camera's link and prints mean age (continuous time average), mean age "
-        "at slot boundaries, peak age, what was delivered and dropped, the chain's shares and the drawn delays.",
+        "at slot boundaries, peak age, what was delivered and dropped, the chain's shares and the delays.",
     )  # fmt: skip
     source = sub.add_mutually_exclusive_group()
     source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")

@@ -33,12 +33,13 @@ class _Attributes(ctypes.Structure):
 def raise_priority() -> str:
     """Best of what the system permits: ``realtime``, ``short-slice``, ``nice`` or ``normal``.
 
-    Threads started later inherit it, child processes do not: call it before gRPC starts its own. Real time
-    needs CAP_SYS_NICE; the kernel still keeps 5 % of each core from it.
+    Threads started later inherit it: call it before gRPC starts its own, for a thread that was put aside
+    while it held the interpreter's lock would hold up the others. Real time needs CAP_SYS_NICE; the kernel
+    still keeps 5 % of each core from it.
     """
     if hasattr(os, "sched_setscheduler"):
         with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
             return "realtime"
     reached = "normal"
     with contextlib.suppress(OSError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from camera_node.sources.imaging import resize
+from camera_node.sources.imaging import as_image, resize
 from camera_node.sources.records import DatasetError, Image
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 
@@ -45,7 +45,7 @@ class Clip:
         if not ok:
             raise self._damaged(index)
         self._next += 1
-        return resize(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), width, height)
+        return resize(as_image(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)), width, height)
 
     def close(self) -> None:
         self._capture.release()

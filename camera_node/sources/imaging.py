@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +24,17 @@ def read_image(path: Path) -> Image:
     if image is None:
         raise DatasetError(f"{path}: not an image that OpenCV can read, or larger than its limit")
     if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
+        image = (image // 256).astype(np.uint8)
     if image.dtype != np.uint8:
         raise DatasetError(f"{path}: expected 8 or 16 bits a channel, got {image.dtype}")
     if image.ndim == 2:
-        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
-    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+        return as_image(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
+    return as_image(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB))
+
+
+def as_image(array: np.ndarray) -> Image:
+    """The same array, for type checkers: OpenCV's stubs do not say that uint8 in is uint8 out."""
+    return cast(Image, array)
 
 
 def resize(image: Image, width: int, height: int) -> Image:
@@ -37,7 +43,7 @@ def resize(image: Image, width: int, height: int) -> Image:
     if image.shape[:2] == (height, width):
         return image
     if image.shape[2] == 3:
-        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return as_image(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
     alpha = image[..., 3:].astype(np.float32)
     premultiplied = np.concatenate([image[..., :3] * (alpha / 255.0), alpha], axis=-1)
     small = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)

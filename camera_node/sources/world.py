@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 Stopped = Callable[[], bool]
 
 WORLD_FPS = 15.0
-# Casting takes some 350 bytes a ray at its peak. Beyond this many rays another process renders ahead, so that this
-# one stays small.
+# Casting takes some 350 bytes a ray at its peak. Beyond this many rays another process renders ahead, so
+# that this one stays small.
 _MAX_RAYS = 200_000
 
 

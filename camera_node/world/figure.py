@@ -129,7 +129,7 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
     gait = 2 * math.pi * _CYCLES * phase
     swing, bob = math.sin(gait), -0.025 * math.cos(2 * gait)  # lowest when the legs are apart
 
-    pelvis = (x, y, 0.86 + bob)
+    pelvis = (x, y, 0.845 + bob)
     waist = _go(pelvis, (0.10, up), (0.01, forward))
     chest = _go(waist, (0.33, up), (0.035, forward))
     # Shoulders turn against the hips.

@@ -5,8 +5,9 @@ Adding a representation is one file here (and its kernels in ``kernels/``) plus 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray

@@ -11,35 +11,34 @@ import json
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from typing import Any, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Budget, FitReport, Rendering, View
+from edge_server.fields import Budget, Field, FitReport, Rendering, View
 from edge_server.fields.kernels.adam import PART, Rule, adam
 from edge_server.fields.kernels.composite import Weights
-from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid, scatter
+from edge_server.fields.kernels.grid import SEGMENT, Grid, scatter
 from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.pool import shared_pool
 from edge_server.fields.kernels.rays import Space, Views
 from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
 from edge_server.fields.ngp_layout import make_grid, make_net
 from edge_server.fields.ngp_occupancy import EVERY, Occupancy
-from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.ngp_rig import Rig
+from edge_server.fields.ngp_settings import NgpSettings, make_settings
 from edge_server.fields.ngp_snapshot import NgpSnapshot
-from edge_server.fields.scene_box import SceneBox, scene_box
-from edge_server.fields.supervision import CameraMemory, check_view, pack_views, remember
+from edge_server.fields.scene_box import SceneBox
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
 
 BETA1, BETA2 = 0.9, 0.99
 NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
-RIG = 4  # cameras from which on a scene's box is final
 
 
 class NgpField:
@@ -60,13 +59,8 @@ class NgpField:
     def reset(self) -> None:
         """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
         with self._turn.mine():
-            self.step = 0
             self.dropped = 0
-            self.box: SceneBox | None = None
-            self._box_cameras = 0
-            self._memory: dict[str, CameraMemory] = {}
-            self._mean_color = np.full(3, 0.5, np.float32)
-            self._packed: tuple[tuple[View, ...], Views] | None = None
+            self.rig = Rig(self.settings)
             self._snapshot: NgpSnapshot | None = None
             self._forget_parameters()
 
@@ -79,10 +73,12 @@ class NgpField:
         start = time.perf_counter()
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        for view in views:
-            check_view(view)
         with self._turn.mine():
-            data = self._take_in(views)
+            intake = self.rig.take_in(views)
+            if intake.new_box:
+                self._forget_parameters()
+            if intake.look:
+                self._occupancy.look(self.pool, self.rig)
         steps = rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
         slowest = 0.0
@@ -97,7 +93,7 @@ class NgpField:
             if over:
                 break
             with self._turn.mine():
-                self._one_step(data, min(progress, 1.0))
+                self._one_step(intake.data, min(progress, 1.0))
             steps += 1
             rays += int(self._batch.rays.sum())
             samples += int(self._batch.samples.sum())
@@ -122,7 +118,7 @@ class NgpField:
         """A copy that renders from any thread and never changes."""
         with self._turn.mine():
             if self._snapshot is None or self._snapshot.step != self.step:
-                box = self.box or SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0)
+                box = self.rig.box or SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0)
                 space = self._occupancy.space()
                 self._snapshot = NgpSnapshot(
                     box=box,
@@ -131,8 +127,8 @@ class NgpField:
                     net=Net(self._net.widths, self._net.params.copy()),
                     harmonics=self.settings.harmonics,
                     space=space._replace(occupied=space.occupied.copy(), coarse=space.coarse.copy()),
-                    background=self._background(),
-                    cameras=tuple(m.view for m in self._memory.values()),
+                    background=self.rig.background(),
+                    cameras=self.rig.views,
                     pool=self.pool,
                     step=self.step,
                 )
@@ -166,13 +162,8 @@ class NgpField:
                 "step": self.step,
                 "updates": self._updates,
                 "dropped": self.dropped,
-                "box": asdict(self.box) if self.box else None,
-                "box_cameras": self._box_cameras,
                 "needed": self._occupancy.needed,
-                "cameras": [
-                    {"camera": m.view.camera, "generated_ns": m.view.generated_ns, **asdict(m.view.intrinsics)}
-                    for m in self._memory.values()
-                ],
+                **self.rig.meta(),
             }
             arrays: Arrays = {
                 "meta": np.array(json.dumps(meta)),
@@ -184,12 +175,8 @@ class NgpField:
                 "net_v": self._net_v,
                 "density": self._occupancy.density,
                 "seen": self._occupancy.seen,
-                "mean_color": self._mean_color,
+                **self.rig.arrays(),
             }
-            for k, m in enumerate(self._memory.values()):
-                arrays[f"image_{k}"], arrays[f"pose_{k}"] = m.view.image, np.asarray(m.view.camera_to_world)
-                if m.moved is not None:
-                    arrays[f"moved_{k}"] = m.moved
             return {name: array.copy() for name, array in arrays.items()}
 
     def load_state(self, state: Arrays) -> None:
@@ -205,11 +192,9 @@ class NgpField:
         self.reset()
         with self._turn.mine():
             self.step, self._updates = int(meta["step"]), int(meta["updates"])
-            self.dropped, self._box_cameras = int(meta["dropped"]), int(meta["box_cameras"])
-            if meta["box"]:
-                meta["box"]["centre_m"] = tuple(meta["box"]["centre_m"])
-                self.box = SceneBox(**meta["box"])
-                self._occupancy = self._make_occupancy()
+            self.dropped = int(meta["dropped"])
+            self.rig.load(meta, state)
+            self._occupancy = self._make_occupancy()
             for target, name in (
                 (self._grid.table, "table"),
                 (self._table_m, "table_m"),
@@ -219,16 +204,10 @@ class NgpField:
                 (self._net_v, "net_v"),
                 (self._occupancy.density, "density"),
                 (self._occupancy.seen, "seen"),
-                (self._mean_color, "mean_color"),
             ):
                 if name not in state or state[name].shape != target.shape:
                     raise ValueError(f"state lacks {name!r} of shape {target.shape}")
                 target[...] = state[name]
-            for k, c in enumerate(meta["cameras"]):
-                c["distortion"] = tuple(c["distortion"])
-                camera, generated_ns = c.pop("camera"), c.pop("generated_ns")
-                view = View(camera, state[f"image_{k}"], state[f"pose_{k}"], Pinhole(**c), generated_ns)
-                self._memory[camera] = CameraMemory(view, state.get(f"moved_{k}"))
             self._occupancy.needed = int(meta["needed"])
             self._occupancy.mark()
 
@@ -268,37 +247,11 @@ class NgpField:
         self._dropped_now, self._loss_now = 0, 0.0
 
     def _make_occupancy(self) -> Occupancy:
-        s, box = self.settings, self.box
+        s, box = self.settings, self.rig.box
         step = 2.0 * np.sqrt(3.0) / s.samples
         contracted = box.contracted if box else False
         near = box.near_m / box.radius_m if box else 0.1
         return Occupancy(s.cells, contracted, step, near, s.min_views)
-
-    def _take_in(self, views: Sequence[View]) -> Views:
-        """Learn about the cameras and pack the pictures; nothing is done again for the same views."""
-        s = self.settings
-        if self._packed is not None and len(views) == len(self._packed[0]) and all(
-            a is b for a, b in zip(views, self._packed[0])
-        ):  # fmt: skip
-            return self._packed[1]
-        news = remember(self._memory, views)
-        grown = self._box_cameras < min(len(self._memory), RIG)
-        if self.box is None or grown:
-            # Two or three cameras say little about where the scene is: begin again when there are more.
-            box = scene_box(
-                [m.view for m in self._memory.values()], s.centre_m, s.radius_m, s.near_m, s.contracted
-            )
-            if self.box is None or not _alike(box, self.box):
-                self.box = box
-                self._forget_parameters()
-            self._box_cameras = len(self._memory)
-            self._mean_color = _mean_color(views)
-        moving = any(m.moved is not None for m in self._memory.values())
-        if news or moving:
-            self._occupancy.look(self.pool, self._memory, self.box)
-        data = pack_views(views, self.box, self._memory)
-        self._packed = (tuple(views), data)
-        return data
 
     def _levels(self) -> int:
         s = self.settings
@@ -306,19 +259,9 @@ class NgpField:
             return s.levels
         return min(s.levels, s.levels_start + self.step // s.levels_every)
 
-    def _background(self) -> NDArray[np.float32]:
-        name = self.settings.background
-        if name.startswith("#") and len(name) == 7:
-            return np.array([int(name[k : k + 2], 16) / 255 for k in (1, 3, 5)], np.float32)
-        if name == "white" or (name == "auto" and self.box is not None and not self.box.contracted):
-            return np.ones(3, np.float32)
-        if name == "black":
-            return np.zeros(3, np.float32)
-        return self._mean_color.copy()
-
     def _one_step(self, data: Views, progress: float) -> None:
-        s, levels = self.settings, self._levels()
-        assert self.box is not None
+        s, levels, box = self.settings, self._levels(), self.rig.box
+        assert box is not None
         key = _key(s.seed, self.step)
         if self.step % EVERY == 0:
             self._occupancy.refresh(
@@ -333,17 +276,15 @@ class NgpField:
             levels=levels,
             harmonics=s.harmonics,
             changed_share=np.float32(s.changed_share),
-            background=self._background(),
+            background=self.rig.background(),
             random_background=s.background == "random",
         )
         weights = Weights(
             distortion=np.float32(s.distortion),
             sparsity=np.float32(s.sparsity),
-            near=np.float32(s.near_fade * self.box.distance_m / self.box.radius_m),
+            near=np.float32(s.near_fade * box.distance_m / box.radius_m),
         )
-        self.pool.run(
-            train_chunks, data, recipe, space, self._grid, self._net, weights, batch, self._scratch
-        )
+        self.pool.run(train_chunks, data, recipe, space, self._grid, self._net, weights, batch, self._scratch)
         self.pool.run(
             scatter, self._grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
         )
@@ -386,15 +327,6 @@ def _key(seed: int, step: int) -> np.uint64:
     return np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0]
 
 
-def _mean_color(views: Sequence[View]) -> NDArray[np.float32]:
-    return np.mean([v.image[..., :3].mean(axis=(0, 1)) / 255.0 for v in views], axis=0).astype(np.float32)
-
-
-def _alike(a: SceneBox, b: SceneBox) -> bool:
-    apart = float(np.linalg.norm(np.subtract(a.centre_m, b.centre_m)))
-    return apart < 0.1 * b.radius_m and abs(a.radius_m - b.radius_m) < 0.1 * b.radius_m
-
-
 class _Turn:
     """A lock that is handed over in the order of asking: a training loop must not starve a page."""
 
@@ -424,4 +356,13 @@ class _Turn:
                     self._taken = False
 
 
-assert FEATURES == 2
+def make(options: dict[str, Any], seed: int = 0) -> Field:
+    """A field from plain options (``ngp_settings``), for the device they ask for."""
+    settings = make_settings(options, seed)
+    if settings.device == "cpu":
+        return NgpField(settings)
+    from edge_server.fields.ngp_torch import NgpTorchField, cuda_present  # torch, only where it may be used
+
+    if settings.device == "cuda" or cuda_present():
+        return NgpTorchField(settings)
+    return NgpField(settings)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,7 +44,7 @@ def make_net(settings: NgpSettings, rng: np.random.Generator) -> Net:
     widths = net_widths(settings)
     params = np.zeros(param_count(widths), np.float32)
     first = 0
-    for layer, (n_in, n_out) in enumerate(zip(widths[:-1], widths[1:])):
+    for layer, (n_in, n_out) in enumerate(pairwise(widths)):
         last = layer == len(widths) - 2
         spread = np.sqrt(2.0 / n_in) * (0.1 if last else 1.0)
         params[first : first + n_in * n_out] = rng.normal(0.0, spread, int(n_in * n_out))

@@ -10,12 +10,12 @@ from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.occupancy import CELLS_A_TASK, count_views, sample_density, threshold
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import COARSE, Space
-from edge_server.fields.scene_box import SceneBox
-from edge_server.fields.supervision import CameraMemory, pack_cameras
+from edge_server.fields.ngp_rig import Rig
+from edge_server.fields.supervision import pack_cameras
 
-EVERY = 16  # steps between refreshes
+EVERY = 8  # steps between refreshes
 PHASES = 4  # refreshes until every cell has been looked at
-FADE = 0.9  # of a cell's density per look
+FADE = 0.75  # of a cell's density per look
 OPTICAL_DEPTH = 5e-3  # of one step: less cannot be seen
 
 
@@ -25,7 +25,7 @@ class Occupancy:
     def __init__(self, cells: int, contracted: bool, step: float, near: float, min_views: int) -> None:
         self.cells, self.contracted, self.near, self.min_views = cells, contracted, near, min_views
         self.step = np.float32(step)
-        self.density = np.ones(cells**3, np.float32) * np.float32(1e3)  # unknown: to be looked at
+        self.density = np.full(cells**3, 2.0 * self.bound, np.float32)  # unknown: to be looked at
         self.seen = np.zeros(cells**3, np.uint16)
         self.occupied = np.zeros(cells**3, np.uint8)
         self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
@@ -41,14 +41,15 @@ class Occupancy:
             self.occupied, self.coarse, self.cells, self.contracted, self.step, np.float32(self.near)
         )
 
-    def look(self, pool: Pool, memory: dict[str, CameraMemory], box: SceneBox) -> None:
+    def look(self, pool: Pool, rig: Rig) -> None:
         """Count anew which cells the known cameras see, and open those where something moved.
 
         A cell where something moved is seen to change by most cameras that see it at all: the hull of the
         changed pixels. Without it a moving body could not grow where space was known to be empty.
         """
-        views = pack_cameras([m.view for m in memory.values()], box)
-        masks = [m.moved for m in memory.values()]
+        assert rig.box is not None
+        views = pack_cameras(rig.views, rig.box)
+        masks = [m.moved for m in rig.memory.values()]
         mask_first = np.full(len(masks), -1, np.int64)
         parts, length = [np.zeros(0, np.uint8)], 0
         for k, mask in enumerate(masks):
@@ -61,7 +62,7 @@ class Occupancy:
             count_views, self.cells, self.contracted, self.near, views, mask_first, np.concatenate(parts),
             self.seen, marked,
         )  # fmt: skip
-        self.needed = min(self.min_views, len(memory))
+        self.needed = min(self.min_views, len(rig.memory))
         if length:
             moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
             np.maximum(self.density, np.float32(1.5 * self.bound), out=self.density, where=moving)
@@ -78,9 +79,7 @@ class Occupancy:
 
     def mark(self) -> None:
         """Decide anew which cells get samples."""
-        threshold(
-            self.density, self.seen, self.needed, self.bound, self.cells, self.occupied, self.coarse
-        )
+        threshold(self.density, self.seen, self.needed, self.bound, self.cells, self.occupied, self.coarse)
 
 
 assert CELLS_A_TASK <= 4096, "a task's samples must fit the scratch of a training chunk"

@@ -1,6 +1,6 @@
 """Ages as colours: one scale for frustums, tables and the legend, readable by colour-blind people.
 
-Bluish green, yellow, vermillion of Okabe and Ito's palette, on a logarithmic axis: a network's delays
+Bluish green, yellow, vermillion after Okabe and Ito's palette, on a logarithmic axis: a network's delays
 spread over decades, and what matters is whether an age is tens, hundreds or thousands of milliseconds.
 """
 
@@ -16,11 +16,12 @@ FRESH_MS = 50.0
 STALE_MS = 2000.0
 FRESH: RGB = (0, 190, 140)
 MIDDLE: RGB = (240, 228, 66)
-STALE: RGB = (226, 88, 10)
+STALE: RGB = (210, 50, 10)
 UNKNOWN: RGB = (125, 131, 143)
 """A camera without an age: it never reported."""
-HELD_OUT: RGB = (96, 186, 240)
-"""The truth is not part of the age scale: it is never trained on."""
+HELD_OUT: RGB = (158, 128, 255)
+"""The truth is not part of the age scale: it is never trained on. Violet, because sky blue is the same as the
+fresh green to a tritanope."""
 # Frustums change colour in steps, so that a page at rest sends next to nothing.
 STEPS = 24
 

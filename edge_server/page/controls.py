@@ -35,10 +35,10 @@ class ControlPanel:
         self._parameter: dict[str, str | None] = {}
         names = state.policies or (state.controls.policy,)
         current = state.controls.policy if state.controls.policy in names else names[0]
-        self.policy = gui.add_dropdown(
+        self.policy: Any = gui.add_dropdown(
             "policy", names, initial_value=current, hint="Which of the newest views an update uses."
         )
-        self.value = gui.add_number("value", _shown(state.controls.value), min=0.0, step=1.0)
+        self.value: Any = gui.add_number("value", _shown(state.controls.value), min=0.0, step=1.0)
         self.help = gui.add_html("")
         self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
         self.view = gui.add_dropdown(
@@ -78,11 +78,13 @@ class ControlPanel:
         self._attempt(event.client, f"policy {name}", lambda: self._state.set_policy(name, None))
 
     def _value_entered(self, event: Any) -> None:
-        if event.client is None or event.target.value == _shown(self._state.controls.value):
+        entered, name = event.target.value, self._state.controls.policy
+        if event.client is None or entered == _shown(self._state.controls.value):
             return
-        value = float(event.target.value)
-        name = self._state.controls.policy
-        self._attempt(event.client, f"value {value:g}", lambda: self._state.set_policy(name, value))
+        # The browser decides what is sent: an emptied field must end as a notification too.
+        self._attempt(
+            event.client, f"{name} with {entered}", lambda: self._state.set_policy(name, float(entered))
+        )
 
     async def _pressed(self, event: Any) -> None:
         # A coroutine runs before the next click is taken, so the group's value is still this click's.

@@ -22,12 +22,12 @@ INTRO = (
 
 @dataclass(frozen=True)
 class Summary:
-    """What the tiles show. None is drawn as a dash."""
+    """What the tiles show. None is drawn as a dash. condition: live, waiting or paused."""
 
     scenario: str
     field: str
     doing: str
-    running: bool
+    condition: str
     updates: int
     update_ms: float | None
     psnr_db: float | None
@@ -41,12 +41,11 @@ class Summary:
 
 def status(s: Summary) -> str:
     """Status line and six tiles."""
-    dot = css(scale_colour(0.0)) if s.running else css(scale_colour(0.5))
-    word = "live" if s.running else "waiting"
+    dot = css(scale_colour(0.0 if s.condition == "live" else 0.5))
     head = (
         f'<div style="padding:.45em .9em;font-size:.85em"><span style="color:{dot}">&#9679;</span> '
         f"<b>{escape(s.scenario)}</b> &middot; {escape(s.field or 'no field')} &middot; "
-        f"{word} &middot; {_clock(s.t_s)}"
+        f"{s.condition} &middot; {_clock(s.t_s)}"
         f'<div style="{_DIM};font-size:.92em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis;'
         f'min-height:1.4em">{escape(s.doing)}</div></div>'
     )

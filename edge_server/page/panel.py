@@ -87,7 +87,7 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
         scenario=state.scenario,
         field=state.field_name,
         doing="paused by the operator" if state.controls.paused else state.last_decision,
-        running=state.started and not state.controls.paused,
+        condition="paused" if state.controls.paused else "live" if state.started else "waiting",
         updates=last.number + 1 if last else 0,
         update_ms=last.update_ms if last else None,
         psnr_db=scored.psnr_db if scored else None,

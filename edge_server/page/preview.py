@@ -99,7 +99,9 @@ class Preview:
     """Cameras, network and updates of the toy deployment, as an EdgeState."""
 
     def __init__(self, folder: Path, cameras: int = CAMERAS, silent: int = 0, seed: int = 0) -> None:
-        """``silent`` of the cameras never report. Snapshots go to ``folder``."""
+        """``silent`` of the cameras never report. Snapshots go to ``folder``. cameras: 3 or more."""
+        if cameras < 3:
+            raise ValueError(f"3 cameras or more are needed, not {cameras}: the middle one is held out")
         self._folder = folder
         self._clock = WallClock()
         self._start_ns = self._clock.now_ns()
@@ -255,7 +257,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--cameras", type=int, default=CAMERAS)
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for snapshots")
     args = parser.parse_args(arguments)
-    preview = Preview(args.out, args.cameras)
+    try:
+        preview = Preview(args.out, args.cameras)
+    except ValueError as error:
+        parser.error(str(error))
     page = start_page(preview.state, args.host, args.port)
     preview.start()
     print(f"page: {page.url}  (Ctrl-C ends it)", flush=True)

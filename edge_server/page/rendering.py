@@ -203,12 +203,14 @@ class RenderLoop:
         finally:
             spent = perf_counter() - began
             self._not_before[stage] = began + spent / STAGES[stage].share
-        if image is None or visitor.client.client_id not in self._visitors:
+        if image is None:
             return
         self._adapt(stage, spent)
         color, depth = presentable(image, camera)
+        if visitor.client.client_id not in self._visitors:  # gone meanwhile
+            return
         visitor.client.scene.set_background_image(
-            color, format="jpeg", jpeg_quality=75 if stage == 0 else 88,
+            color, format="jpeg", jpeg_quality=85,
             depth=depth if self.occlude else None,
         )  # fmt: skip
         visitor.sent += 1
@@ -273,16 +275,12 @@ class RenderLoop:
 def presentable(image: Rendering, camera: Pinhole) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """What a browser is sent: colour uint8 (H, W, 3) and depth float32 (h, w) along the view axis, metres.
 
-    Whatever the field rendered is safe to show: NaN and infinities become empty space. Where a field with a
-    constant background shows nothing, the page's own backdrop is seen instead.
+    Whatever the field rendered is safe to show: what is not a number becomes empty space.
     """
     color = np.nan_to_num(image.color, nan=0.0, posinf=1.0, neginf=0.0).astype(np.float32)
     opacity = np.clip(np.nan_to_num(image.opacity, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
-    bad = ~np.isfinite(image.color).all(axis=-1)
+    bad: NDArray[np.bool_] = ~np.all(np.isfinite(image.color), axis=-1)
     opacity = np.where(bad, 0.0, opacity).astype(np.float32)
-    background = _background(color, opacity, bad)
-    if background is not None:
-        color = color + (1.0 - opacity[..., None]) * (BACKDROP - background)
     color = np.where(bad[..., None], BACKDROP, color)
     step = max(1, -(-camera.height // DEPTH_ROWS))
     distance = image.depth[::step, ::step]
@@ -293,14 +291,6 @@ def presentable(image: Rendering, camera: Pinhole) -> tuple[NDArray[np.uint8], N
     return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8), depth.astype(np.float32)
 
 
-def _background(color: NDArray, opacity: NDArray, bad: NDArray) -> NDArray[np.float32] | None:
-    """The one colour that a field puts behind empty space, None if it is not one colour."""
-    empty = color[(opacity < 0.02) & ~bad]
-    if len(empty) < 16 or float(empty.std(axis=0).max()) > 0.02:
-        return None
-    return np.median(empty, axis=0).astype(np.float32)
-
-
 def _same(a: tuple | None, b: tuple) -> bool:
     """Whether two viewpoints would give the same image."""
-    return a is not None and all(np.allclose(x, y, rtol=0, atol=1e-6) for x, y in zip(a, b))
+    return a is not None and all(bool(np.allclose(x, y, rtol=0, atol=1e-6)) for x, y in zip(a, b))

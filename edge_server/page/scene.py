@@ -72,7 +72,7 @@ class Scene:
 
     def show_points(self, points: NDArray | None, colours: NDArray | None) -> None:
         """Points (N, 3) and uint8 colours (N, 3), or None to show no points."""
-        if points is None:
+        if points is None or colours is None:
             if self._points is not None:
                 self._points.remove()
                 self._points = None

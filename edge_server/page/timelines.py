@@ -133,7 +133,7 @@ class _Chart:
             scales["y"] = {"range": (0.0, None)}
         return self._gui.add_uplot(
             data=data, series=tuple(series), height=HEIGHT, scales=scales,
-            axes=cast(Any, ({"size": 22} | axis, {"size": 38} | axis)),
+            axes=cast(Any, ({"size": 22} | axis, {"size": 38, "space": 22} | axis)),
             legend={"show": False}, padding=(6, 10, 0, 0),
         )  # fmt: skip
 

@@ -69,10 +69,12 @@ def dry_run(*arguments: str, **variables: str) -> str:
 
 def test_a_fresh_clone_installs_torch_first_and_the_demo_without_test_tools() -> None:
     plan = dry_run("demo")
-    torch = plan.index("install  torch==")
-    rest = plan.index("install -e '.[edge,up]'")
-    assert plan.index("-m venv .venv") < torch < rest < plan.index("deploy/up.py deploy/scenarios/room.yaml")
-    assert requirement("torch").specifier == Requirement(plan[torch + 9 :].split()[0]).specifier
+    (torch,) = re.finditer(r"install .*--no-deps +(torch==\S+)", plan)
+    rest = plan.index("-e '.[edge,up]'")
+    assert plan.index("-m venv .venv") < torch.start() < rest < plan.index("deploy/up.py")
+    assert "deploy/up.py deploy/scenarios/room.yaml --for 60s" in plan
+    assert requirement("torch").specifier == Requirement(torch[1]).specifier
+    assert "torch" not in plan[plan.index("edge-base") :].split("\n")[0]
     assert "test,dev" not in plan
 
 
@@ -94,7 +96,7 @@ def test_no_package_index_is_written_down() -> None:
 
 
 def test_a_second_set_up_has_nothing_to_do() -> None:
-    stamps = [ROOT / ".venv" / name for name in (".ok-venv", ".ok-torch", ".ok-test", ".ok-run")]
+    stamps = [ROOT / ".venv" / name for name in (".ok-venv", ".ok-parts", ".ok-test", ".ok-run")]
     newest = (ROOT / "pyproject.toml").stat().st_mtime
     if not all(s.exists() and s.stat().st_mtime >= newest for s in stamps):
         pytest.skip("this environment was not made by `make test`")

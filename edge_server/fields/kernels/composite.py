@@ -16,7 +16,7 @@ from edge_server.fields.kernels.intrinsics import FAST, exp32
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
 # step opaque many times over, the smallest makes a whole ray transparent.
 RAW_LOW, RAW_HIGH = -12.0, 9.0
-OPAQUE = 1e-4  # transmittance at which a ray ends
+OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance of 1e-4
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
@@ -52,15 +52,38 @@ def harmonic(k, x, y, z):
 
 
 @njit(nogil=True, fastmath=FAST, cache=True)
-def activate(out, n):
-    """Raw density and colours -> density and colours in [0, 1], in place: rows 0 and 1 to 3 of out."""
-    sigma = out[0, :n]
-    for s in range(n):
+def activate(out, a, b):
+    """Both of the following."""
+    activate_density(out, a, b)
+    activate_color(out, a, b)
+
+
+@njit(nogil=True, fastmath=FAST, cache=True)
+def activate_density(out, a, b):
+    """Raw density -> density, in place, samples a to b of row 0."""
+    sigma = out[0, a:b]
+    for s in range(sigma.size):
         sigma[s] = exp32(min(max(sigma[s], np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
+
+
+@njit(nogil=True, fastmath=FAST, cache=True)
+def activate_color(out, a, b):
+    """Raw colours -> colours in [0, 1], in place, samples a to b of rows 1 to 3."""
     for c in range(1, 4):
-        row = out[c, :n]
-        for s in range(n):
+        row = out[c, a:b]
+        for s in range(row.size):
             row[s] = _F1 / (_F1 + exp32(-row[s]))
+
+
+@njit(nogil=True, fastmath=FAST, cache=True)
+def seen_samples(out, dts, first, end):
+    """How many samples of a ray there are until it is opaque: density in row 0 of out."""
+    depth = _F0
+    for s in range(first, end):
+        depth += out[0, s] * dts[s]
+        if depth > np.float32(OPAQUE_DEPTH):
+            return s + 1 - first
+    return end - first
 
 
 @njit(nogil=True, fastmath=FAST, cache=True)
@@ -106,7 +129,7 @@ def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
         weight += w[s]
         moment += w[s] * ts[s]
         transmitted = after
-        if after < np.float32(OPAQUE):
+        if depth > np.float32(OPAQUE_DEPTH):
             last = s + 1
             break
     e_r = shade_r + transmitted * background[0] - target[0]

@@ -78,23 +78,23 @@ def _weights(fx, fy, fz):
 
 
 @njit(inline="always")
-def _encode_level(dense, res, mask, x, table, out0, out1):
+def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
     for s in range(out0.size):
-        ix, fx = _corner(x[0, s], res)
-        iy, fy = _corner(x[1, s], res)
-        iz, fz = _corner(x[2, s], res)
+        ix, fx = _corner(x[s], res)
+        iy, fy = _corner(y[s], res)
+        iz, fz = _corner(z[s], res)
         rows = _corners(dense, res, mask, ix, iy, iz)
         out0[s], out1[s] = weighted_pairs(table, rows, _weights(fx, fy, fz))
 
 
 @njit(nogil=True, fastmath=FAST, cache=True)
-def encode(grid, levels, x, n, features):
-    """Features of n points: x float32 (3, >= n) in the unit cube -> features float32 (>= 2 L, >= n).
+def encode(grid, levels, x, a, b, features):
+    """Features of points a to b: x float32 (3, N) in the unit cube -> features float32 (>= 2 L, N).
 
     Levels from ``levels`` on are switched off (coarse to fine): their features are 0.
     """
     for l in range(grid.resolution.size):
-        out0, out1 = features[2 * l, :n], features[2 * l + 1, :n]
+        out0, out1 = features[2 * l, a:b], features[2 * l + 1, a:b]
         if l >= levels:
             out0[:] = np.float32(0.0)
             out1[:] = np.float32(0.0)
@@ -103,9 +103,9 @@ def encode(grid, levels, x, n, features):
         table = grid.table[grid.first[l] : grid.first[l + 1]]
         mask = np.uint32(table.shape[0] - 1)
         if grid.dense[l]:
-            _encode_level(True, res, mask, x, table, out0, out1)
+            _encode_level(True, res, mask, x[0, a:b], x[1, a:b], x[2, a:b], table, out0, out1)
         else:
-            _encode_level(False, res, mask, x, table, out0, out1)
+            _encode_level(False, res, mask, x[0, a:b], x[1, a:b], x[2, a:b], table, out0, out1)
 
 
 @njit(inline="always")

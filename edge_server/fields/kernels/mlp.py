@@ -6,6 +6,7 @@ loop. Blocks of BLOCK samples pass through all layers while their activations st
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ class Net(NamedTuple):
 
 def param_count(widths: NDArray[np.int64]) -> int:
     """Length of ``Net.params`` for these widths."""
-    return int(sum(o * i + o for i, o in zip(widths[:-1], widths[1:])))
+    return int(sum(o * i + o for i, o in pairwise(widths)))
 
 
 @njit(inline="always")
@@ -77,16 +78,16 @@ def _weight_gradient(d_w, first, n_out, n_in, d_y, y_row, x, x_row, a, b):
 
 
 @njit(nogil=True, fastmath=FAST, cache=True)
-def forward(net, acts, n):
-    """Run n samples through the net.
+def forward(net, acts, start, end):
+    """Run samples start to end through the net.
 
-    acts: float32 (sum of widths, >= n). Rows 0 .. widths[0] hold the input; each layer's output follows
+    acts: float32 (sum of widths, N). Rows 0 .. widths[0] hold the input; each layer's output follows
     its input's rows, so the result stands in the last widths[-1] rows.
     """
     widths, params = net.widths, net.params
     zero = np.float32(0.0)
-    for a in range(0, n, BLOCK):
-        b = min(a + BLOCK, n)
+    for a in range(start, end, BLOCK):
+        b = min(a + BLOCK, end)
         first, row = 0, 0
         for layer in range(widths.size - 1):
             n_in, n_out = widths[layer], widths[layer + 1]

@@ -92,9 +92,9 @@ def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net,
             x[worker, 1, n] = (np.float32(j) + uniform(key, k + np.uint64(1))) * size
             x[worker, 2, n] = (np.float32(l) + uniform(key, k + np.uint64(2))) * size
             n += 1
-        encode(grid, levels, x[worker], n, acts[worker])
+        encode(grid, levels, x[worker], 0, n, acts[worker])
         acts[worker, 2 * grid.resolution.size : net.widths[0], :n] = np.float32(0.0)
-        forward(net, acts[worker], n)
+        forward(net, acts[worker], 0, n)
         raw = acts[worker, out_row]
         n = 0
         for turn in range(first, end):
@@ -106,7 +106,7 @@ def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net,
             _, _, _, stretch = cell_centre(cell, cells, contracted)
             fresh = sigma * np.float32(stretch)
             # A density that is not finite says nothing: look again, and let training repair it.
-            density[cell] = max(density[cell] * fade, fresh) if np.isfinite(fresh) else np.float32(1e6)
+            density[cell] = max(density[cell] * fade, fresh) if np.isfinite(fresh) else np.float32(1e3)
             n += 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from edge_server.fields.kernels.composite import OPAQUE, activate, add_harmonics
+from edge_server.fields.kernels.composite import OPAQUE_DEPTH, activate, add_harmonics
 from edge_server.fields.kernels.grid import encode
 from edge_server.fields.kernels.intrinsics import FAST, exp32, fetch_add
 from edge_server.fields.kernels.mlp import forward
@@ -61,14 +61,14 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, l
                 way[r, 3] = t
                 taken[r] += n - before
                 first[k + 1] = n
-            encode(grid, levels, x[worker], n, acts[worker])
+            encode(grid, levels, x[worker], 0, n, acts[worker])
             acts[worker, 2 * grid.resolution.size : inputs, :n] = _F0
-            forward(net, acts[worker], n)
+            forward(net, acts[worker], 0, n)
             if harmonics > 1:
                 for k in range(count):
                     r = active[k]
                     add_harmonics(out, harmonics, first[k], first[k + 1], way[r, 0], way[r, 1], way[r, 2])
-            activate(out, n)
+            activate(out, 0, n)
             left = 0
             for k in range(count):
                 r = active[k]
@@ -84,7 +84,7 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, l
                     depth[pixel] += w * ts[s]
                     opacity[pixel] += w
                     through = after
-                if through >= np.float32(OPAQUE) and way[r, 3] < way[r, 4] and taken[r] < max_samples:
+                if way[r, 5] <= np.float32(OPAQUE_DEPTH) and way[r, 3] < way[r, 4] and taken[r] < max_samples:
                     active[left] = r
                     left += 1
             count = left

@@ -9,10 +9,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.composite import (
-    Weights,
-    activate,
+    activate_color,
+    activate_density,
     add_harmonics,
     ray_loss,
+    seen_samples,
     spread_harmonics,
 )
 from edge_server.fields.kernels.grid import encode
@@ -23,7 +24,7 @@ from edge_server.fields.kernels.rays import interval, march, pixel_direction
 CHUNK = 4096  # samples a chunk has room for; its activations stay in the second-level cache
 CHUNK_RAYS = 1024
 
-_F0, _F1 = np.float32(0.0), np.float32(1.0)
+_F0, _F1, _BYTE = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 255.0)
 
 
 class Batch(NamedTuple):
@@ -88,47 +89,82 @@ def _draw(views, recipe, n, ray):
     ray[0], ray[1], ray[2] = pixel_direction(views.lens[view], views.rotation[view], u, v)
     alpha = np.float32(1.0)
     if views.pixels.shape[1] == 4:
-        alpha = np.float32(views.pixels[pixel, 3]) * np.float32(1.0 / 255.0)
+        alpha = np.float32(views.pixels[pixel, 3]) * _BYTE
     for c in range(3):
         back = recipe.background[c]
         if recipe.random_background:
             back = uniform(key, k + np.uint64(3 + c))
         ray[6 + c] = back
-        ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (_F1 - alpha)
+        ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (
+            _F1 - alpha
+        )
     return view
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
-def draw_chunk(views, recipe, space, chunk, x, ts, dts, ray_first, ray):
-    """Fill a chunk with rays and their samples. Returns (rays, samples).
+@njit(inline="always")
+def _keep(rows, a, b, to):
+    """Move columns a to b of every row to ``to`` <= a."""
+    for k in range(rows.shape[0]):
+        row = rows[k]
+        for s in range(b - a):
+            row[to + s] = row[a + s]
 
-    The chunk ends with the first ray for which there is no room: the number of rays follows the number of
-    samples they need, so that every step costs about the same.
+
+@njit(nogil=True, fastmath=FAST, cache=True)
+def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first, ray):
+    """Fill a chunk with rays, their samples and the net's output at them. Returns (rays, samples).
+
+    Only samples that can be seen are kept: what lies behind an opaque one would cost a backward pass for
+    a gradient of nothing. The room they leave is filled with further rays, so that the number of rays
+    follows the number of samples they need and every step costs about the same.
     """
-    n, rays = 0, 0
+    ts, dts = line[0], line[1]
+    inputs, out = net.widths[0], acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
+    n, rays = 0, 0
     ray_first[0] = 0
-    for r in range(limit):
-        index = chunk * CHUNK_RAYS + r
-        view = _draw(views, recipe, index, ray[r])
-        o = views.origin[view]
-        ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
-        dx, dy, dz = ray[r, 0], ray[r, 1], ray[r, 2]
-        enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
-        enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
-        end, t = march(space, ox, oy, oz, dx, dy, dz, enter, leave, x, ts, dts, n, CHUNK)
-        if t < leave:
+    while rays < limit and CHUNK - n > CHUNK // 8:
+        end, drawn = n, rays
+        while drawn < limit:
+            index = chunk * CHUNK_RAYS + drawn
+            view = _draw(views, recipe, index, ray[drawn])
+            o = views.origin[view]
+            ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
+            dx, dy, dz = ray[drawn, 0], ray[drawn, 1], ray[drawn, 2]
+            enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
+            enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
+            more, t = march(space, ox, oy, oz, dx, dy, dz, enter, leave, x, ts, dts, end, CHUNK)
+            if t < leave:
+                break
+            end = more
+            drawn += 1
+            ray_first[drawn] = end
+        if drawn == rays:
             break
-        n, rays = end, r + 1
-        ray_first[rays] = n
+        encode(grid, recipe.levels, x, n, end, acts)
+        acts[2 * grid.resolution.size : inputs, n:end] = _F0
+        forward(net, acts, n, end)
+        activate_density(out, n, end)
+        begin = n
+        for r in range(rays, drawn):
+            stop = ray_first[r + 1]
+            kept = seen_samples(out, dts, begin, stop)
+            if n < begin:
+                _keep(acts, begin, begin + kept, n)
+                _keep(x, begin, begin + kept, n)
+                _keep(line[:2], begin, begin + kept, n)
+            n += kept
+            begin = stop
+            ray_first[r + 1] = n
+        rays = drawn
     return rays, n
 
 
 @njit(nogil=True, fastmath=FAST, cache=True)
 def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batch, scratch):
     """Tasks are chunks: everything but the table's own gradient, which ``grid.scatter`` adds up."""
-    acts, d_acts = scratch.acts[worker], scratch.d_acts[worker]
-    ts, dts, w = scratch.line[worker, 0], scratch.line[worker, 1], scratch.line[worker, 2]
+    acts, d_acts, line = scratch.acts[worker], scratch.d_acts[worker], scratch.line[worker]
+    ts, dts, w = line[0], line[1], line[2]
     ray_first, ray = scratch.ray_first[worker], scratch.ray[worker]
     inputs, outputs = net.widths[0], net.widths[-1]
     out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
@@ -137,15 +173,12 @@ def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batc
         if chunk >= batch.samples.size:
             return
         x = batch.x[chunk]
-        rays, n = draw_chunk(views, recipe, space, chunk, x, ts, dts, ray_first, ray)
-        encode(grid, recipe.levels, x, n, acts)
-        acts[2 * grid.resolution.size : inputs, :n] = _F0
-        forward(net, acts, n)
+        rays, n = fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first, ray)
         if recipe.harmonics > 1:
             for r in range(rays):
                 a, b = ray_first[r], ray_first[r + 1]
                 add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
-        activate(out, n)
+        activate_color(out, 0, n)
         d_out[4:, :n] = _F0
         loss, dropped = 0.0, 0
         for r in range(rays):

@@ -42,8 +42,8 @@ def test_limbs_keep_their_lengths():
         for name, expected in (("upper_arm_l", 0.29), ("forearm_r", 0.25)):
             assert length[names.index(name)] == pytest.approx(expected)
         # A leg may be stretched a little at the end of a long step, never folded wrongly.
-        assert length[names.index("thigh_l")] == pytest.approx(0.42, rel=0.06)
-        assert length[names.index("shin_r")] == pytest.approx(0.41, rel=0.06)
+        assert length[names.index("thigh_l")] == pytest.approx(0.42, rel=0.07)
+        assert length[names.index("shin_r")] == pytest.approx(0.41, rel=0.07)
 
 
 def test_a_foot_rests_during_its_stance_and_moves_during_its_swing():

@@ -1,0 +1,122 @@
+"""What a field remembers of the cameras that feed it: newest views, the scene's box, the mean colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.kernels.rays import Views
+from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.scene_box import SceneBox, scene_box
+from edge_server.fields.supervision import CameraMemory, check_view, pack_views, remember
+from freshfield.geometry import Pinhole
+
+Arrays = dict[str, NDArray[Any]]
+
+FINAL = 4  # cameras from which on a scene's box is kept
+
+
+@dataclass(frozen=True)
+class Intake:
+    """data: what the kernels read. new_box: the scene was found anew, so what was learnt is void.
+    look: cameras or moving pixels changed, so visibility must be counted again."""
+
+    data: Views
+    new_box: bool
+    look: bool
+
+
+class Rig:
+    """The cameras of one field."""
+
+    def __init__(self, settings: NgpSettings) -> None:
+        self.settings = settings
+        self.box: SceneBox | None = None
+        self.memory: dict[str, CameraMemory] = {}
+        self.mean_color = np.full(3, 0.5, np.float32)
+        self._box_cameras = 0
+        self._packed: tuple[tuple[View, ...], Views] | None = None
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The newest view of every camera."""
+        return tuple(m.view for m in self.memory.values())
+
+    def take_in(self, views: Sequence[View]) -> Intake:
+        """Learn from ``views`` and pack them. Raises ValueError for one that cannot be a view."""
+        if self._packed is not None and _same(views, self._packed[0]):
+            return Intake(self._packed[1], new_box=False, look=False)
+        for view in views:
+            check_view(view)
+        look, new_box = remember(self.memory, views), False
+        if self.box is None or self._box_cameras < min(len(self.memory), FINAL):
+            # Two or three cameras say little about where the scene is: look again when there are more.
+            s = self.settings
+            box = scene_box(self.views, s.centre_m, s.radius_m, s.near_m, s.contracted)
+            if self.box is None or not _alike(box, self.box):
+                self.box, new_box = box, True
+            self._box_cameras = len(self.memory)
+            means = [v.image[..., :3].mean(axis=(0, 1)) / 255.0 for v in views]
+            self.mean_color = np.mean(means, axis=0).astype(np.float32)
+        look = look or any(m.moved is not None for m in self.memory.values())
+        data = pack_views(views, self.box, self.memory)
+        self._packed = (tuple(views), data)
+        return Intake(data, new_box, look or new_box)
+
+    def background(self) -> NDArray[np.float32]:
+        """The colour (3,) behind everything that is rendered."""
+        name = self.settings.background
+        if name.startswith("#"):
+            return np.array([int(name[k : k + 2], 16) / 255 for k in (1, 3, 5)], np.float32)
+        object_alone = self.box is not None and not self.box.contracted
+        if name == "white" or (name in ("auto", "random") and object_alone):
+            return np.ones(3, np.float32)
+        return np.zeros(3, np.float32) if name == "black" else self.mean_color.copy()
+
+    def meta(self) -> dict[str, Any]:
+        """The part of the state that is not arrays, ready for JSON."""
+        return {
+            "box": asdict(self.box) if self.box else None,
+            "box_cameras": self._box_cameras,
+            "cameras": [
+                {"camera": v.camera, "generated_ns": v.generated_ns, **asdict(v.intrinsics)}
+                for v in self.views
+            ],
+        }
+
+    def arrays(self) -> Arrays:
+        """The arrays of the state."""
+        arrays: Arrays = {"mean_color": self.mean_color}
+        for k, m in enumerate(self.memory.values()):
+            arrays[f"image_{k}"], arrays[f"pose_{k}"] = m.view.image, np.asarray(m.view.camera_to_world)
+            if m.moved is not None:
+                arrays[f"moved_{k}"] = m.moved
+        return arrays
+
+    def load(self, meta: dict[str, Any], arrays: Arrays) -> None:
+        """Undo ``meta`` and ``arrays``."""
+        self._packed, self.memory = None, {}
+        self._box_cameras = int(meta["box_cameras"])
+        box = meta["box"]
+        self.box = SceneBox(**{**box, "centre_m": tuple(box["centre_m"])}) if box else None
+        self.mean_color = np.array(arrays["mean_color"], dtype=np.float32)
+        for k, entry in enumerate(meta["cameras"]):
+            known = dict(entry)
+            camera, generated_ns = known.pop("camera"), known.pop("generated_ns")
+            known["distortion"] = tuple(known["distortion"])
+            view = View(camera, arrays[f"image_{k}"], arrays[f"pose_{k}"], Pinhole(**known), generated_ns)
+            self.memory[camera] = CameraMemory(view, arrays.get(f"moved_{k}"))
+
+
+def _same(a: Sequence[View], b: Sequence[View]) -> bool:
+    return len(a) == len(b) and all(x is y for x, y in zip(a, b))
+
+
+def _alike(a: SceneBox, b: SceneBox) -> bool:
+    apart = float(np.linalg.norm(np.subtract(a.centre_m, b.centre_m)))
+    return apart < 0.1 * b.radius_m and abs(a.radius_m - b.radius_m) < 0.1 * b.radius_m

@@ -1,0 +1,28 @@
+"""Representations by name. A module is imported only when its representation is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+from edge_server.fields import Field
+
+# name -> "module:function"; the function takes (options, seed) and raises ValueError for a wrong option
+_FIELDS: dict[str, str] = {
+    "ngp": "edge_server.fields.ngp:make",
+}
+
+
+def field_names() -> tuple[str, ...]:
+    """The representations there are."""
+    return tuple(_FIELDS)
+
+
+def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
+    """A fresh field. ValueError: no such representation, or an option it does not have (both are listed)."""
+    if name not in _FIELDS:
+        raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
+    module, _, function = _FIELDS[name].partition(":")
+    make: Callable[[dict[str, Any], int], Field] = getattr(import_module(module), function)
+    return make(dict(options or {}), seed)

@@ -1,0 +1,319 @@
+"""``edge-server fit``: a recorded data set without a network, fidelity over seconds of fitting."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from camera_node.sources.records import DatasetError
+from edge_server.fidelity.baselines import Baseline, baseline
+from edge_server.fidelity.images import Colour, to_unit
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fields import Field, View, checkpoint
+from edge_server.journal import write_json
+from edge_server.offline.fitting import Scored, evaluate, fit_in_slices, marks_s
+from edge_server.offline.recorded import Recorded, load_recorded
+from edge_server.offline.usage import Usage
+from edge_server.scoring import to_bytes
+
+DESCRIPTION = """\
+Fit a recorded data set as fast as this machine can, and measure fidelity on views it never saw.
+
+  edge-server fit ~/data/lego --seconds 60 --holdout 8 --scale 2 --out runs/lego
+  edge-server fit ~/data/kitchen --holdout cam00 --frame 12
+  edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --option samples=256
+
+DATA is a transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), the calibration JSON of a rig's videos,
+or a folder with either. A set that moves is fitted at one instant (--frame). Time spent on evaluation is not
+counted as fitting. Ctrl-C ends it early; report, pictures and checkpoint are written all the same, and
+--resume goes on from there.
+"""
+
+BACKGROUNDS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+# Enough to tell how far a field is from the views it was trained on, where nothing is held out.
+_SCORED_OF_TRAINING = 8
+
+
+class FitError(ValueError):
+    """An option that cannot work; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One fit as asked for. options: of the field, as in a scenario."""
+
+    data: Path
+    field: str = "ngp"
+    seconds: float = 60.0
+    holdout: str = "8"
+    scale: float = 1.0
+    frame: int = 0
+    background: str = "white"
+    seed: int = 0
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    parser = argparse.ArgumentParser(
+        prog="edge-server fit", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path, metavar="DATA", help="data set: folder or JSON file")
+    parser.add_argument("--field", default="ngp", help="representation [%(default)s]")
+    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
+    parser.add_argument(
+        "--holdout", default="8", metavar="K|NAME,...",
+        help="every K-th view, or these images or cameras; 0: none [%(default)s]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]"
+    )
+    parser.add_argument(
+        "--frame", type=int, default=0, metavar="N", help="instant of a moving set [%(default)s]"
+    )
+    parser.add_argument(
+        "--background", choices=sorted(BACKGROUNDS), default="white",
+        help="what transparent images are laid on [%(default)s]",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="KEY=VALUE",
+        help="setting of the field, e.g. levels=12; again for more (a wrong one lists them all)",
+    )  # fmt: skip
+    parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
+    parser.add_argument("--resume", action="store_true", help="go on from OUT until --seconds in all")
+    args = parser.parse_args(argv)
+    job = Job(args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background,
+              args.seed)  # fmt: skip
+    name = (args.data if args.data.is_dir() else args.data.parent).resolve().name
+    out = args.out or Path("runs") / f"fit-{name}"
+    try:
+        job.options.update(parse_options(args.option))
+        run(job, out, args.lpips, args.resume)
+    except (DatasetError, FitError) as error:
+        print(f"edge-server fit: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parse_options(words: Sequence[str]) -> dict[str, Any]:
+    """``key=value`` words as settings; values are YAML (8, 0.5, true, [0, 0, 1], white)."""
+    options: dict[str, Any] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not key or not equals:
+            raise FitError(f"--option {word}: expected KEY=VALUE")
+        try:
+            options[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise FitError(f"--option {word}: {value!r} is not a value") from None
+    return options
+
+
+def run(job: Job, out: Path, lpips_folder: Path | None = None, resume: bool = False) -> dict[str, Any]:
+    """Fit, measure and leave everything in ``out``; returns the contents of report.json.
+
+    Raises DatasetError or FitError for input that cannot be used.
+    """
+    from edge_server.fields.registry import make_field  # numba loads only once the options are read
+
+    if not 0.0 < job.seconds <= 1e6:
+        raise FitError(f"--seconds {job.seconds:g}: expected more than 0")
+    data = load_recorded(job.data, job.holdout, job.scale, job.frame)
+    transparent = any(v.image.shape[2] == 4 for v in data.training)
+    options = {"background": job.background, **job.options} if transparent else job.options
+    try:
+        model = make_field(job.field, options, seed=job.seed)
+    except (ValueError, TypeError) as error:
+        raise FitError(f"--field {job.field}: {error}") from None
+    out.mkdir(parents=True, exist_ok=True)
+    run_ = _Run(job, options, data, model, out, lpips_folder)
+    if resume:
+        run_.load()
+    print(run_.headline(), flush=True)
+    warm_up = getattr(model, "warm_up", None)
+    if warm_up is not None:
+        print(f"kernels ready after {warm_up():.1f} s", flush=True)
+    return run_.go()
+
+
+class _Run:
+    """One fit in progress: the files of ``out`` and the lines on the terminal."""
+
+    def __init__(
+        self, job: Job, options: dict[str, Any], data: Recorded, model: Field, out: Path, lpips: Path | None
+    ) -> None:
+        self.job, self.options, self.data, self.model, self.out = job, options, data, model, out
+        metric, self.lpips_missing = open_lpips(lpips)
+        self.background = BACKGROUNDS[job.background]
+        self.scorer = Scorer(metric, background=self.background)
+        self.views = data.held_out or data.training[:_SCORED_OF_TRAINING]
+        self.rendered: NDArray[np.float32] | None = None
+        self.rows: list[dict[str, Any]] = []
+        self.processes: list[dict[str, Any]] = []
+        self.spent_s, self.spent_steps = 0.0, 0
+        self.usage = Usage("fit")
+
+    def headline(self) -> str:
+        d, image = self.data, self.data.training[0].image
+        held_out = f"{len(d.held_out)} held out" if d.held_out else "none held out: scored on training views"
+        instant = f", {d.instant}" if d.instant else ""
+        missing = f" ({d.missing} entries have no image)" if d.missing else ""
+        sizes = f"{image.shape[1]} x {image.shape[0]}"
+        return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
+
+    def load(self) -> None:
+        """Take up what ``save`` left. Raises FitError where that is not possible."""
+        try:
+            state, about = checkpoint.load(self.out / "field")
+            self.model.load_state(state)
+            self.spent_s, self.spent_steps = float(about["seconds"]), int(about["steps"])
+            self.rows = [json.loads(line) for line in (self.out / "series.jsonl").read_text().splitlines()]
+            self.processes = [
+                json.loads(line) for line in (self.out / "processes.jsonl").read_text().splitlines()
+            ]
+        except (OSError, ValueError, KeyError) as error:
+            raise FitError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
+        if self.spent_s >= self.job.seconds - 0.05:
+            raise FitError(
+                f"--resume: {self.out} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
+            )
+
+    def go(self) -> dict[str, Any]:
+        marks = marks_s(self.job.seconds)
+        try:
+            done = fit_in_slices(
+                self.model,
+                self.data.training,
+                self._score,
+                marks,
+                self._scored,
+                self.spent_s,
+                self.spent_steps,
+            )
+        except KeyboardInterrupt:  # during an evaluation: the last one scored stands
+            done = False
+        if not done:
+            print("stopped early", flush=True)
+        return self.finish()
+
+    def _score(self) -> Score:
+        self.processes.append(self.usage.row(0.0))
+        score, self.rendered = evaluate(self.model, self.views, self.scorer)
+        return score
+
+    def _scored(self, at: Scored) -> None:
+        score = at.score
+        self.spent_s = at.seconds
+        self.spent_steps = at.steps if at.steps is not None else self.spent_steps
+        self.processes[-1]["t_s"] = round(at.seconds, 3)
+        outside = self.usage.outside(self.processes[-1])
+        self.usage.row(0.0)  # what evaluation used is nobody's load
+        self.rows.append(
+            {
+                "number": len(self.rows),
+                "t_s": at.seconds,
+                "psnr_db": score.psnr_db,
+                "psnr_moving_db": None,
+                "ssim": score.ssim,
+                "lpips": score.lpips,
+                "aaoi_ms": None,
+                "selected": len(self.data.training),
+                "update_ms": at.slice_s * 1e3,
+                "truth_gap_ms": None,
+                "steps": at.steps,
+                "loss": at.loss,
+                "scored_on": "held-out views" if self.data.held_out else "selected",
+            }
+        )
+        print(progress(at, outside), flush=True)
+
+    def finish(self) -> dict[str, Any]:
+        """Write checkpoint, pictures and report."""
+        from edge_server.report import build_report  # draws with matplotlib
+
+        about = {
+            "field": self.job.field,
+            "options": self.options,
+            "scenario": self._name(),
+            "seed": self.job.seed,
+            "seconds": self.spent_s,
+            "steps": self.spent_steps,
+        }
+        checkpoint.save(self.out / "field", self.model.state(), about)
+        _write_lines(self.out / "series.jsonl", self.rows)
+        _write_lines(self.out / "processes.jsonl", self.processes)
+        write_json(self.out / "edge.json", self._status())
+        if self.rendered is not None:
+            truth = to_unit(self.views[0].image, "held-out view", self.background)
+            _write_png(self.out / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
+            _write_png(self.out / "rendered.png", to_bytes(self.rendered))
+        report = build_report(self.out)
+        print(self.out / "report.html", flush=True)
+        return report
+
+    def _status(self) -> dict[str, Any]:
+        found = [self._baseline(view) for view in self.data.held_out]
+        return {
+            "kind": "fit",
+            "scenario": self._name(),
+            "seed": self.job.seed,
+            "field": self.job.field,
+            "options": self.options,
+            "data": {
+                "file": self.data.file.name,
+                "instant": self.data.instant,
+                "training": len(self.data.training),
+                "held_out": [v.camera for v in self.data.held_out],
+                "missing": self.data.missing,
+            },
+            "seconds": self.spent_s,
+            "baseline": {
+                name: float(np.mean([getattr(b, name) for b in found])) if found else None
+                for name in ("mean_colour_db", "nearest_view_db")
+            },
+            "lpips_missing": self.lpips_missing,
+            "lpips_network": None if self.lpips_missing else "alex",
+        }
+
+    def _baseline(self, view: View) -> Baseline:
+        return baseline(self.data.training, view.image, view.camera_to_world, self.background)
+
+    def _name(self) -> str:
+        return f"fit {self.data.file.resolve().parent.name}"
+
+
+def progress(at: Scored, outside: float | None) -> str:
+    """One line for people: time, steps, scores and how many cores others kept busy."""
+    score = at.score
+    words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
+    words.append(f"PSNR {score.psnr_db:5.2f} dB")
+    words += [f"SSIM {score.ssim:.3f}"] if score.ssim is not None else []
+    words += [f"LPIPS {score.lpips:.3f}"] if score.lpips is not None else []
+    words += [f"(others used {outside:.1f} cores)"] if outside is not None else []
+    return "  ".join(words)
+
+
+def _write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+
+
+def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

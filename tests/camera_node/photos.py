@@ -1,0 +1,53 @@
+"""Small data sets written on the spot: real files for real sources, without a download."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from freshfield.geometry import OPENGL_TO_OPENCV, look_at
+from freshfield.scenario import Scenario, parse
+
+
+def picture(seed: int, width: int = 32, height: int = 24, channels: int = 3) -> np.ndarray:
+    """A smooth random image, uint8 (height, width, channels)."""
+    coarse = np.random.default_rng(seed).integers(0, 256, (4, 5, channels), dtype=np.uint8)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def opencv_pose(index: int) -> np.ndarray:
+    """Camera-to-world (4, 4) of image ``index``: on a circle, looking at the middle."""
+    return look_at([3 * np.cos(index / 5), 3 * np.sin(index / 5), 1.0], [0, 0, 0])
+
+
+def write_photos(folder: Path, count: int, cameras: int = 0, **top: Any) -> Path:
+    """``count`` images (of each camera) and a transforms JSON; with ``cameras`` a recording at 10 frames a
+    second. Returns the JSON."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = []
+    for index in range(count * max(1, cameras)):
+        name = f"images/{index:03d}.png"
+        (folder / "images").mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / name), picture(index))
+        frame: dict[str, Any] = {
+            "file_path": name,
+            "transform_matrix": (opencv_pose(index) @ OPENGL_TO_OPENCV).tolist(),
+        }
+        if cameras:
+            frame |= {"camera": f"cam{index // count:02d}", "time": (index % count) / 10}
+        frames.append(frame)
+    data = {"fl_x": 40.0, "fl_y": 41.0, "cx": 16.0, "cy": 12.0, "w": 32, "h": 24, **top, "frames": frames}
+    file = folder / "transforms.json"
+    file.write_text(json.dumps(data))
+    return file
+
+
+def photo_scenario(data: Path, cameras: int = 3, file: Path = Path("test.yaml"), **source: Any) -> Scenario:
+    """cam00 is held out; 20 captures a second unless told otherwise."""
+    section = {"kind": "transforms", "data": str(data), "fps": 20, "codec": "png", **source}
+    top = {"name": "photos", "seed": 3, "cameras": {"count": cameras, "held_out": ["cam00"]}}
+    return parse({**top, "source": section}, file)

@@ -1,0 +1,171 @@
+"""The scenes as their users see them: names, cameras, bounds, motion, and what is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.world import SCENES, SceneError, make_scene, preview, rig
+from freshfield.geometry import Pose, world_rays
+
+SMALL = {"width": 48, "height": 48}
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("count", [1, 2, 13, 19])
+def test_cameras_are_named_posed_and_look_at_the_target(name, count):
+    scene = make_scene(name, {"count": count, **SMALL})
+    assert list(scene.cameras) == [f"cam{k:02d}" for k in range(count)]
+    for camera, pose in scene.cameras.values():
+        Pose.from_matrix(pose)
+        assert (camera.width, camera.height) == (48, 48)
+        to = np.asarray(scene.target) - pose[:3, 3]
+        assert pose[:3, 2] @ to / np.linalg.norm(to) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_held_out_camera_is_15_degrees_from_every_other(name):
+    scene = make_scene(name, {"count": 19, **SMALL})
+    axes = np.stack([pose[:3, 2] for _, pose in scene.cameras.values()])
+    angles = np.degrees(np.arccos(np.clip(axes[1:] @ axes[0], -1, 1)))
+    assert scene.held_out == "cam00" and angles.min() >= 15.0
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_fewer_cameras_keep_their_places_and_stay_spread(name):
+    full = make_scene(name, {"count": 19, **SMALL}).cameras
+    some = make_scene(name, {"count": 13, **SMALL}).cameras
+    assert all(np.array_equal(some[c][1], full[c][1]) for c in some)
+    axes = np.stack([p[:3, 2] for _, p in full.values()])
+    # No camera that was left out is further from a kept one than 35 degrees.
+    nearest = np.degrees(np.arccos(np.clip((axes[13:] @ axes[:13].T).max(axis=1), -1, 1)))
+    assert nearest.max() < 35.0
+
+
+def test_spread_order_is_a_permutation_that_starts_far_apart():
+    d = np.random.default_rng(0).standard_normal((12, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    order = rig.spread_order(d)
+    assert sorted(order) == list(range(12)) and order[0] == 0
+    assert order[1] == int(np.argmin(d @ d[0]))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_everything_seen_lies_within_the_bounds(name):
+    scene = make_scene(name, {"count": 19, **SMALL, "supersample": 1})
+    for camera_id, (camera, pose) in scene.cameras.items():
+        origin, d = world_rays(camera, pose)
+        t = scene.renderer(camera_id).distance()
+        points = (origin + np.where(np.isfinite(t), t, 0.0)[..., None] * d)[np.isfinite(t)]
+        assert (points >= scene.bounds[0] - 1e-6).all() and (points <= scene.bounds[1] + 1e-6).all()
+        assert np.isfinite(t).all() or name == "tile"
+
+
+def test_the_moving_person_stays_within_the_bounds():
+    scene = make_scene("room", {"speed_m_per_s": 3.0, **SMALL})
+    mover = scene.world.movers[0]
+    for t in np.linspace(0, scene.period_s, 41):
+        for part, m in zip(mover.parts, mover.matrices(t)):
+            centre, radius = part.shape.bounding_sphere()
+            at = m[:3, :3] @ centre + m[:3, 3]
+            assert (at + radius < scene.bounds[1]).all() and (at[:2] - radius > scene.bounds[0][:2]).all()
+
+
+def moving_share(scene, instants: int = 16) -> float:
+    """Mean share of held-out pixels that differ by more than .03 in some channel from the truth 60, 120,
+    200 or 300 ms earlier (the definition used for moving pixels everywhere)."""
+    shares = []
+    for t in np.arange(instants) / instants * scene.period_s:
+        now = scene.render("cam00", t).astype(float) / 255
+        moved = np.zeros(now.shape[:2], dtype=bool)
+        for lag in (0.06, 0.12, 0.2, 0.3):
+            moved |= np.abs(now - scene.render("cam00", t - lag) / 255.0).max(axis=-1) > 0.03
+        shares.append(moved.mean())
+    return float(np.mean(shares))
+
+
+def test_the_share_of_moving_pixels():
+    shares = {v: moving_share(make_scene("room", {"speed_m_per_s": v})) for v in (0.0, 0.5, 1.0, 4.0)}
+    assert shares[0.0] == 0.0
+    assert 0.04 <= shares[1.0] <= 0.075
+    assert shares[0.5] < shares[1.0] < shares[4.0]
+
+
+@pytest.mark.parametrize("params", [{"speed_m_per_s": 0.0}, None])
+def test_what_does_not_move_is_the_same_at_every_instant(params):
+    scene = make_scene("room" if params else "tile", {**SMALL, **(params or {})})
+    assert not scene.moving
+    first = scene.render("cam00", 0.0)
+    for t in (0.1, 3.21, 1e9, -5.0):
+        assert np.array_equal(scene.render("cam00", t), first)
+
+
+def test_the_same_instant_gives_the_same_bytes_in_another_process():
+    code = (
+        "import zlib; from camera_node.world import make_scene; "
+        "s = make_scene('room', {'width': 48, 'height': 48}); s.render('cam03', 0.7); "
+        "print(zlib.crc32(s.render('cam03', 1.3).tobytes()))"
+    )
+    import zlib
+
+    mine = zlib.crc32(make_scene("room", SMALL).render("cam03", 1.3).tobytes())
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(out.stdout) == mine
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "message"),
+    [
+        ("rooom", {}, "valid scenes: room, tile"),
+        ("room", {"speed": 1.0}, "valid .default.: count .13., width"),
+        ("tile", {"speed_m_per_s": 1.0}, "unknown parameter 'speed_m_per_s'"),
+        ("room", {"count": 20}, "count must be within 1 to 19"),
+        ("room", {"count": 0}, "count must be within 1 to 19"),
+        ("room", {"width": 12.5}, "whole number"),
+        ("room", {"width": 5000}, "width must be within"),
+        ("room", {"speed_m_per_s": -1.0}, "speed_m_per_s must be 0 or within"),
+        ("room", {"speed_m_per_s": float("nan")}, "expected a number"),
+        ("room", {"distortion": [0.0]}, "4 values"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_refused_in_one_line(name, params, message):
+    with pytest.raises(SceneError, match=message) as error:
+        make_scene(name, params)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_camera_is_refused_by_name():
+    with pytest.raises(SceneError, match="no camera 'cam13'; it has cam00, cam01"):
+        make_scene("room", SMALL).render("cam13", 0.0)
+
+
+def test_only_the_scene_in_use_is_imported_and_no_heavy_library():
+    code = (
+        "import sys; import camera_node.world.cache; from camera_node.world import make_scene; "
+        "s = make_scene('tile', {'width': 16, 'height': 16}); s.render('cam00', 0.0); "
+        "bad = [m for m in sys.modules if m.split('.')[0] in "
+        "('torch', 'numba', 'edge_server', 'channel_emu', 'scipy', 'matplotlib') "
+        "or m in ('camera_node.world.room', 'camera_node.world.figure')]; print(bad)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_distortion_reaches_the_cameras():
+    scene = make_scene("tile", {**SMALL, "distortion": [-0.2, 0.05, 0.0, 0.0]})
+    straight = make_scene("tile", SMALL)
+    assert scene.cameras["cam00"][0].distortion == (-0.2, 0.05, 0.0, 0.0)
+    assert not np.array_equal(scene.render("cam00", 0.0), straight.render("cam00", 0.0))
+
+
+def test_preview_writes_every_camera(tmp_path: Path):
+    out = tmp_path / "sheet.png"
+    preview.main(["tile", "--out", str(out), "--size", "32", "--set", "count=5", "--set", "supersample=1"])
+    sheet = cv2.imread(str(out))
+    assert sheet.shape[0] >= 64 and sheet.shape[1] >= 96
+    assert sheet.std() > 10

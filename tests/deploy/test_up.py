@@ -1,0 +1,219 @@
+"""The launcher with the real processes: a run that ends as asked, and runs in which something dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch.summary import books_close
+from tests.conftest import ROOT
+
+SMALL = """
+name: small
+description: the smallest thing that is still a room
+seed: 3
+cameras: {count: 4, held_out: [cam00]}
+source: {kind: world, scene: room, width: 48, height: 48, fps: 10}
+channel: {preset: ch5}
+edge: {field: ngp, update_ms: 300, lpips: none}
+"""
+READY_S = 150.0
+
+
+class Up:
+    """One ``up.py`` at work in a folder; its output goes to a file, as with nohup."""
+
+    def __init__(self, folder: Path, *options: str, scenario: str = SMALL) -> None:
+        self.out = folder / "run"
+        self.port = free_port()
+        file = folder / "small.yaml"
+        file.write_text(scenario)
+        self._log = folder / "output.txt"
+        words = [str(file), "--out", str(self.out), "--port", str(self.port), *options]
+        with self._log.open("wb") as log:
+            command = [sys.executable, str(ROOT / "deploy" / "up.py"), *words]
+            self.process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+
+    @property
+    def output(self) -> str:
+        return self._log.read_text()
+
+    def wait_until(self, what: Callable[[], Any], seconds: float = READY_S) -> Any:
+        deadline = time.monotonic() + seconds
+        while not (found := what()):
+            assert self.process.poll() is None, f"up.py ended too early:\n{self.output}"
+            assert time.monotonic() < deadline, f"it did not happen in {seconds:.0f} s:\n{self.output}"
+            time.sleep(0.1)
+        return found
+
+    def wait_for_updates(self, count: int = 2) -> None:
+        self.wait_until(lambda: (self.status().get("updates") or {}).get("count", 0) >= count)
+
+    def status(self) -> dict[str, Any]:
+        return read_json(self.out / "edge.json")
+
+    def pid(self, name: str) -> int:
+        """Process id as the launcher's own record has it."""
+
+        def find() -> int | None:
+            lines = (self.out / "processes.jsonl").read_text().splitlines()
+            return json.loads(lines[-1]).get(name, {}).get("pid") if lines else None
+
+        return self.wait_until(find)
+
+    def report(self) -> dict[str, Any]:
+        return json.loads((self.out / "report.json").read_text())
+
+    def end(self, seconds: float = 90.0) -> int:
+        return self.process.wait(seconds)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+@pytest.fixture
+def up(tmp_path: Path) -> Iterator[Callable[..., Up]]:
+    started: list[Up] = []
+
+    def start(*options: str, **more: str) -> Up:
+        started.append(Up(tmp_path, *options, **more))
+        return started[-1]
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            one.process.terminate()
+            one.process.wait(60.0)
+
+
+def leftovers(out: Path) -> list[str]:
+    """Command lines of processes that still work on the run."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes().decode(errors="replace").replace("\0", " ")
+        except OSError:
+            continue
+        if str(out) in words:
+            found.append(words)
+    return found
+
+
+def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> None:
+    run = up("--for", "6s")
+    assert run.end(READY_S + 60.0) == 0, run.output
+    assert re.search(rf"page: http://127\.0\.0\.1:{run.port}\b", run.output)
+    assert "0.0.0.0" not in run.output
+    assert f"ssh -L {run.port}:127.0.0.1:{run.port}" in run.output
+    assert re.search(r"\[\d+ of 6 s\] 4/4 cameras, age \d+ ms", run.output)
+    assert "the books close" in run.output and str(run.out / "report.html") in run.output
+    report = run.report()
+    assert books_close(report["frames"]) and report["frames"]["delivered"] > 20
+    assert report["updates"]["count"] >= 3
+    used = [json.loads(line) for line in (run.out / "processes.jsonl").read_text().splitlines()]
+    assert all(used[-1][name]["rss_mb"] > 10 for name in ("node", "emulator", "edge"))
+    assert not leftovers(run.out)
+
+
+@pytest.mark.parametrize("name, role", [("node", "the camera node"), ("edge", "the edge server")])
+def test_a_killed_process_is_named_and_the_report_still_closes(
+    up: Callable[..., Up], name: str, role: str
+) -> None:
+    run = up("--for", "0")
+    run.wait_for_updates()
+    os.kill(run.pid(name), signal.SIGKILL)
+    assert run.end() == 1
+    assert f"{role} was killed by SIGKILL" in run.output
+    assert "The last lines of" in run.output or "It wrote nothing" in run.output
+    assert books_close(run.report()["frames"])
+    assert not leftovers(run.out)
+
+
+def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
+    run = up("--for", "0", "--process-per-camera")
+    run.wait_for_updates()
+    assert {run.pid(f"node-cam0{i}") for i in range(4)} >= {run.pid("node-cam03")}
+    run.process.send_signal(signal.SIGINT)
+    assert run.end() == 0, run.output
+    assert "stopping (Ctrl-C)" in run.output and "Traceback" not in run.output
+    assert books_close(run.report()["frames"])
+    assert not leftovers(run.out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["node", "emulator", "edge"])
+def test_with_restart_a_run_survives_the_death_of_any_process(up: Callable[..., Up], name: str) -> None:
+    run = up("--for", "0", "--restart")
+    run.wait_for_updates()
+    first = run.pid(name)
+    os.kill(first, signal.SIGKILL)
+    run.wait_until(lambda: "It is started again" in run.output, 10.0)
+    run.wait_until(lambda: run.pid(name) != first)
+    before = sum(c["delivered"] for c in run.status()["cameras"])
+    # An edge that is new counts from zero.
+    run.wait_until(
+        lambda: sum(c["delivered"] for c in run.status()["cameras"]) > (0 if name == "edge" else before) + 10
+    )
+    run.process.send_signal(signal.SIGTERM)
+    assert run.end() == 0, run.output
+    assert books_close(run.report()["frames"])
+
+
+def refusal(*words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "deploy" / "up.py"), *words], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert done.stderr.count("\n") == 1, "one line says it"
+    return done.stderr
+
+
+def test_a_mistyped_scenario_is_refused_in_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "typo.yaml"
+    file.write_text(SMALL.replace("cameras:", "camera:"))
+    assert "did you mean 'cameras'?" in refusal(str(file), "--out", str(tmp_path / "run"))
+    assert "shipped scenarios: " in refusal("no-such-scenario")
+
+
+def test_a_taken_port_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        s.listen()
+        text = refusal("room", "--out", str(tmp_path / "run"), "--port", str(s.getsockname()[1]))
+    assert "is taken by another program" in text
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear")
+    assert "not an earlier run's" in refusal("room", "--out", str(tmp_path), "--port", str(free_port()))
+
+
+@pytest.mark.parametrize(
+    "text, seconds", [("60", 60.0), ("60s", 60.0), ("1.5m", 90.0), ("2h", 7200.0), ("0", 0.0)]
+)
+def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
+    import up as script
+
+    assert script.seconds(text) == seconds

@@ -1,0 +1,127 @@
+"""The page in a real browser: live values, a picture, and controls that reach the server."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from edge_server.page import start_page
+from edge_server.page.preview import Preview
+from tests.edge_server.page.browser import Browser
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """A preview with its page open in Chromium."""
+    preview = Preview(tmp_path_factory.mktemp("page"), silent=1)
+    page = start_page(preview.state, "127.0.0.1", 0)
+    preview.start()
+    try:
+        with Browser(page.url, timeout_s=90.0) as browser:
+            browser.wait_for_text("PSNR")
+            browser.wait_for_text(" dB on cam04")
+            browser.close_notices()
+            yield preview, page, browser
+    finally:
+        page.stop()
+        preview.stop()
+
+
+def test_the_page_says_what_is_going_on_and_stays_live(shown):
+    preview, _, browser = shown
+    text = browser.wait_for_text("live")
+    for part in ("preview", "analytic", "mean age", "worst age", "8/9", "Age of the newest frames",
+                 "Fidelity at the present", "truth at the present", "no frame yet", "held out",
+                 "Cameras send frames over a bad network"):  # fmt: skip
+        assert part in text, part
+    _until_updates(browser, after=len(preview.state.publications()))
+
+
+def test_the_picture_shows_scene_cameras_and_panels(shown, tmp_path):
+    _, _, browser = shown
+    browser.wait_for(lambda: _centre(browser.screenshot()).std() > 15, "a picture of the scene")
+    image = browser.screenshot(tmp_path / "page.png")
+    assert image.shape == (900, 1600, 3) and (tmp_path / "page.png").stat().st_size > 50_000
+    orange = (image[..., 0] > 150) & (image[..., 0] > 1.4 * image[..., 2]) & (image[..., 1] < 190)
+    assert orange[:, 360:1220].sum() > 1500  # the ball, in the scene
+    violet = (image[..., 2] > 190) & (image[..., 0] > 100) & (image[..., 1] < 160)
+    assert violet[:, 360:1220].sum() > 100  # the held-out camera's frustum
+    assert image[:, :350].std() > 10 and image[:, 1240:].std() > 10  # both panels
+
+
+def test_nothing_fails_and_nothing_outside_is_asked_for(shown):
+    _, page, browser = shown
+    browser.evaluate("1")  # lets events that are under way arrive
+    assert browser.errors == []
+    assert browser.requests
+    assert all(f":{page.port}" in address for address in browser.requests), browser.requests
+
+
+def test_pause_and_resume(shown):
+    preview, _, browser = shown
+    browser.click_text("pause")
+    browser.wait_for(lambda: preview.state.controls.paused, "the pause")
+    browser.wait_for_text("paused by the operator")
+    browser.click_text("resume")
+    browser.wait_for(lambda: not preview.state.controls.paused, "the resumption")
+    _until_updates(browser, after=len(preview.state.publications()))
+
+
+def test_policy_and_value_reach_the_server_and_mistakes_are_explained(shown):
+    preview, _, browser = shown
+    controls = preview.state.controls
+    browser.choose("policy", "freshest-k")
+    browser.wait_for(lambda: controls.policy == "freshest-k", "the policy")
+    browser.wait_for(lambda: browser.input_value("k") == "6", "the policy's own default")
+    browser.type_number("k", "3")
+    browser.wait_for(lambda: controls.value == 3, "the value")
+    browser.type_number("k", "0")
+    browser.wait_for_text("expected a whole number from 1")
+    browser.wait_for(lambda: browser.input_value("k") == "3", "what is still in force")
+    assert (controls.policy, controls.value) == ("freshest-k", 3)
+    browser.close_notices()
+    preview.state.set_policy("threshold", 400.0)  # by someone else
+    browser.wait_for(lambda: browser.input_value("policy") == "threshold", "the other's policy")
+    browser.wait_for(lambda: browser.input_value("omega, ms") == "400", "the other's value")
+
+
+def test_reset_and_snapshot(shown):
+    preview, _, browser = shown
+    browser.click_text("reset")
+    browser.wait_for_text("starts anew")
+    browser.wait_for(lambda: not preview.state.controls.reset_requested, "the reset's execution")
+    browser.close_notices()
+    browser.click_text("snapshot")
+    browser.wait_for_text("preview-snapshot.json")
+    assert (preview._folder / "preview-snapshot.json").exists()
+    browser.close_notices()
+
+
+def test_turning_the_view_renders_from_the_new_place(shown):
+    _, page, browser = shown
+    (client,) = page._server.get_clients().values()
+    before, at = browser.screenshot(), np.array(client.camera.position)
+    browser.drag((790, 300), (640, 260))
+    browser.wait_for(lambda: np.linalg.norm(client.camera.position - at) > 0.5, "the movement")
+    time.sleep(2.0)  # the finer image
+    after = browser.screenshot()
+    assert np.abs(_centre(before).astype(float) - _centre(after)).mean() > 3
+
+
+def _centre(image: np.ndarray) -> np.ndarray:
+    return image[250:650, 450:1150]
+
+
+def _until_updates(browser: Browser, after: int) -> None:
+    """The page counts more than ``after`` updates: its figures move."""
+
+    def counted() -> bool:
+        lines = browser.text().splitlines()
+        at = lines.index("updates") if "updates" in lines else -1
+        return at >= 0 and int(lines[at + 1].split()[0]) > after
+
+    browser.wait_for(counted, f"update {after + 1}")

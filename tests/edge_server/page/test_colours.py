@@ -1,0 +1,78 @@
+"""The age scale: right at its ends, monotone, and told apart by colour-blind people."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from edge_server.page.colours import (
+    FRESH,
+    FRESH_MS,
+    HELD_OUT,
+    MIDDLE,
+    STALE,
+    STALE_MS,
+    UNKNOWN,
+    age_colour,
+    age_fraction,
+    css,
+    scale_colour,
+)
+
+# Machado, Oliveira and Fernandes (2009), severity 1, acting on linear RGB.
+DEFICIENCIES = {
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+                   [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+                     [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
+                   [0.004733, 0.691367, 0.303900]],
+}  # fmt: skip
+
+
+def test_ends_and_middle_of_the_scale():
+    assert age_colour(0.0) == age_colour(FRESH_MS) == FRESH
+    assert age_colour(STALE_MS) == age_colour(1e9) == STALE
+    assert age_colour(math.sqrt(FRESH_MS * STALE_MS)) == MIDDLE
+
+
+def test_what_is_no_age_has_a_colour_too():
+    assert age_colour(None) == UNKNOWN
+    assert age_colour(float("nan")) == STALE
+    assert age_colour(float("inf")) == STALE
+    assert age_colour(-30.0) == FRESH  # a clock a little ahead
+
+
+def test_older_is_never_drawn_as_fresher():
+    fractions = [age_fraction(a) for a in np.geomspace(1, 1e5, 200)]
+    assert fractions == sorted(fractions)
+    assert fractions[0] == 0.0 and fractions[-1] == 1.0
+
+
+def test_few_distinct_colours_so_that_a_resting_page_is_quiet():
+    assert len({age_colour(float(a)) for a in np.linspace(0, 5000, 5001)}) <= 25
+
+
+def test_css():
+    assert css((0, 190, 140)) == "#00be8c"
+
+
+@pytest.mark.parametrize("deficiency", DEFICIENCIES)
+def test_the_scale_survives_colour_blindness(deficiency):
+    matrix = DEFICIENCIES[deficiency]
+    scale = [_lab(scale_colour(f), matrix) for f in np.linspace(0, 1, 25)]
+    fresh, middle, stale = scale[0], scale[12], scale[24]
+    # CIE76, in which 2.3 is just noticeable: the scale's ends and middle must be unmistakable.
+    assert min(np.linalg.norm(a - b) for a, b in ((fresh, middle), (middle, stale), (fresh, stale))) > 40
+    assert min(np.linalg.norm(_lab(HELD_OUT, matrix) - colour) for colour in scale) > 25
+
+
+def _lab(colour: tuple[int, int, int], matrix: list[list[float]]) -> np.ndarray:
+    rgb = np.array(colour) / 255
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(np.array(matrix) @ linear, 0, 1)
+    back = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
+    return cv2.cvtColor(back.astype(np.float32).reshape(1, 1, 3), cv2.COLOR_RGB2Lab).reshape(3)

@@ -1,0 +1,65 @@
+"""The panel's text: nothing from outside becomes HTML, nothing unknown becomes a number."""
+
+from __future__ import annotations
+
+from edge_server.page import markup
+from edge_server.page.colours import HELD_OUT, STALE, css
+from edge_server.state import CameraView
+
+
+def summary(**changes) -> markup.Summary:
+    values = dict(scenario="room", field="ngp", doing="fitting", condition="live", updates=41,
+                  update_ms=812.4, psnr_db=25.31, scored_on="cam00", mean_age_ms=130.2, worst_age_ms=411.0,
+                  reporting=12, cameras=13, t_s=75.0)  # fmt: skip
+    return markup.Summary(**(values | changes))
+
+
+def test_the_status_says_what_is_going_on():
+    html = markup.status(summary())
+    for part in (
+        "room",
+        "ngp",
+        "live",
+        "1:15",
+        "fitting",
+        "25.3",
+        "cam00",
+        ">41<",
+        ">812<",
+        ">130<",
+        "12/13",
+    ):
+        assert part in html
+
+
+def test_unknown_values_are_dashes():
+    html = markup.status(summary(psnr_db=None, update_ms=None, mean_age_ms=None, worst_age_ms=float("nan")))
+    assert html.count("&ndash;") == 4
+    assert "nan" not in html and "None" not in html
+    assert markup.number(float("inf")) == "&infin;"  # PSNR of equal images
+
+
+def test_what_comes_from_outside_is_escaped():
+    evil = "<img src=x onerror=alert(1)>"
+    camera = CameraView(evil, False, None, None, 0, 0)
+    pages = [
+        markup.status(summary(scenario=evil, field=evil, doing=evil, scored_on=evil, condition="live")),
+        markup.table([camera]),
+        markup.comparison_caption(evil, None, 0),
+        markup.chart_caption(evil, [(evil, (0, 0, 0))]),
+        markup.chart_caption("", [], evil),
+        markup.note(evil),
+    ]
+    assert not any("<img" in page for page in pages)
+
+
+def test_the_table_marks_age_truth_use_and_refusals():
+    cameras = [
+        CameraView("cam00", True, None, 40.0, 5, 0),
+        CameraView("cam01", False, None, 9000.0, 7, 3),
+        CameraView("cam02", False, None, None, 0, 0),
+    ]
+    rows = markup.table(cameras, selected=("cam01",)).split("<tr>")[2:]
+    assert "truth" in rows[0] and css(HELD_OUT) in rows[0]
+    assert "9000 ms" in rows[1] and "&#10003;" in rows[1] and css(STALE) in rows[1] and ">3<" in rows[1]
+    assert "no frame yet" in rows[2] and "&#10003;" not in rows[2]

@@ -1,0 +1,323 @@
+"""The page as its visitors' machines see it: alive through anything, bounded in what it sends and costs."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from edge_server.fields import Rendering
+from edge_server.page import Page, PageError, page_url, start_page
+from edge_server.page.panel import PAIR_WIDTH, side_by_side
+from edge_server.page.preview import BallScene, Preview
+from edge_server.page.rendering import DEPTH_ROWS, FAR_M, presentable
+from edge_server.page.scene import thumbnail
+from edge_server.state import CameraView, Comparison, Controls, EdgeState, Publication
+from freshfield.geometry import Pinhole, look_at
+from tests.edge_server.page.visitor import Visitor
+
+
+@contextlib.contextmanager
+def preview_page(tmp_path, **options) -> Iterator[tuple[Preview, Page]]:
+    preview = Preview(tmp_path, **options)
+    page = start_page(preview.state, "127.0.0.1", 0)
+    preview.start()
+    try:
+        yield preview, page
+    finally:
+        page.stop()
+        preview.stop()
+
+
+class Broken:
+    """A field that has diverged: everything it renders is not a number."""
+
+    renders = 0
+
+    def render(self, camera_to_world, intrinsics: Pinhole) -> Rendering:
+        self.renders += 1
+        shape = (intrinsics.height, intrinsics.width)
+        return Rendering(
+            np.full((*shape, 3), np.nan, np.float32),
+            np.full(shape, np.inf, np.float32),
+            np.full(shape, np.nan, np.float32),
+        )
+
+    def points(self, count: int):
+        return np.full((count, 3), np.nan, np.float32), np.full((count, 3), np.inf, np.float32)
+
+
+class Raising(Broken):
+    """A renderer that fails outright."""
+
+    def render(self, camera_to_world, intrinsics: Pinhole) -> Rendering:
+        self.renders += 1
+        raise FloatingPointError("no such density")
+
+
+def bare_state(cameras: list[CameraView] | None = None) -> EdgeState:
+    def refuse(name: str, value: float | None) -> None:
+        raise ValueError("no policies here")
+
+    return EdgeState(
+        scenario="bare", policies=(), controls=Controls("all", None), cameras=lambda: cameras or [],
+        now_s=time.monotonic, set_policy=refuse, save_snapshot=lambda: (_ for _ in ()).throw(OSError("full")),
+    )  # fmt: skip
+
+
+def publication(number: int) -> Publication:
+    return Publication(number, float(number), 0, None, (), (), float("nan"), 1.0)
+
+
+# --- what is sent ------------------------------------------------------------------------------
+
+
+def test_an_image_is_safe_to_show_whatever_was_rendered():
+    camera = Pinhole.from_fov(40, 400, 60)
+    color, depth = presentable(Broken().render(np.eye(4), camera), camera)
+    assert color.dtype == np.uint8 and color.shape == (400, 40, 3)
+    assert np.ptp(color.reshape(-1, 3), axis=0).max() == 0  # the backdrop, everywhere
+    assert (depth >= FAR_M - 0.01).all() and depth.shape[0] <= DEPTH_ROWS
+
+
+def test_depth_is_along_the_view_axis_not_along_the_ray():
+    """A floor seen from straight above has one depth; rays to its corners are longer."""
+    camera = Pinhole.from_fov(64, 64, 50)
+    floor = BallScene(0.0).render(look_at((-1.2, 0, 1.0), (-1.2, 0, 0)), camera)
+    assert floor.depth[0, 0] > 1.1
+    _, depth = presentable(floor, camera)
+    assert np.allclose(depth, 1.0, atol=0.003)
+
+
+def test_thumbnails_are_small_and_damaged_frames_have_none(tmp_path):
+    preview = Preview(tmp_path)
+    with contextlib.closing(_Running(preview)):
+        _until(lambda: any(c.newest for c in preview.cameras()))
+    frame = next(c.newest for c in preview.cameras() if c.newest)
+    assert thumbnail(frame).shape == (84, 112, 3)
+    assert thumbnail(replace(frame, payload=b"\xff\xd8 nothing")) is None
+
+
+def test_truth_and_rendering_of_any_size_fit_side_by_side():
+    for shape in ((128, 128, 3), (1080, 1920, 3), (7, 500, 3), (500, 7, 3)):
+        image = np.full(shape, 200, np.uint8)
+        pair = side_by_side(image, image[: shape[0] // 2 + 1])
+        assert pair.shape[1] == PAIR_WIDTH and pair.dtype == np.uint8
+        assert (pair[:, :100] == 200).all() and (pair[:, -100:] == 200).all()
+
+
+# --- the port ----------------------------------------------------------------------------------
+
+
+def test_the_address_can_be_opened():
+    assert page_url("0.0.0.0", 8080) == page_url("::", 8080) == page_url("", 8080) == "http://localhost:8080"
+    assert page_url("127.0.0.1", 1) == "http://127.0.0.1:1"
+    assert page_url("::1", 8080) == "http://[::1]:8080"
+
+
+def test_a_taken_port_is_said_not_silently_exchanged():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        with pytest.raises(PageError, match="--page-port"):
+            start_page(bare_state(), "127.0.0.1", other.getsockname()[1])
+
+
+@pytest.mark.parametrize(("host", "port"), [("203.0.113.7", 8080), ("127.0.0.1", 70000)])
+def test_an_impossible_address_is_refused(host, port):
+    with pytest.raises(PageError):
+        start_page(bare_state(), host, port)
+
+
+def test_stop_frees_the_port_and_ends_the_threads(tmp_path, capfd):
+    before = set(threading.enumerate())
+    with preview_page(tmp_path) as (_, page):
+        port = page.port
+        with Visitor(port) as visitor:
+            visitor.wait_for(lambda: visitor.images > 0, "an image")
+    page.stop()  # twice is once
+    start_page(bare_state(), "127.0.0.1", port).stop()
+    left = [t for t in set(threading.enumerate()) - before if t.name.startswith(("page", "preview"))]
+    assert not left
+    assert "viser" not in capfd.readouterr().out  # no banner of a library on the operator's terminal
+
+
+# --- visitors ----------------------------------------------------------------------------------
+
+
+def test_a_visitor_is_sent_the_scene_from_where_they_stand(tmp_path):
+    with preview_page(tmp_path) as (preview, page):
+        _until(lambda: preview.state.started)
+        preview.state.controls.paused = True
+        with Visitor(page.port, (4.0, 0.0, 3.0)) as visitor:
+            visitor.wait_for(lambda: visitor.images >= 2, "a coarse and a finer image")
+            here = _decode(visitor)
+            visitor.stand_at((0.2, 0.1, 6.0))
+            at = visitor.images
+            visitor.wait_for(lambda: visitor.images > at + 1, "an image from the new place")
+            above = _decode(visitor)
+    assert here.shape[1] / here.shape[0] == pytest.approx(800 / 600, rel=0.02)
+    assert here.std() > 20 and above.std() > 20
+    size = (64, 48)
+    assert np.abs(cv2.resize(here, size).astype(float) - cv2.resize(above, size)).mean() > 10
+
+
+def test_images_come_coarse_first_then_fine(tmp_path):
+    with preview_page(tmp_path) as (preview, page):
+        _until(lambda: preview.state.started)
+        preview.state.controls.paused = True
+        with Visitor(page.port) as visitor:
+            visitor.wait_for(lambda: visitor.images >= 1, "an image")
+            first = _decode(visitor).shape[0]
+            visitor.wait_for(lambda: visitor.images >= 3, "two refinements")
+            assert _decode(visitor).shape[0] > first
+            settled = visitor.images
+            time.sleep(1.5)
+            assert visitor.images == settled  # nothing new: nothing sent
+
+
+def test_rates_are_bounded_however_fast_the_field_publishes(tmp_path):
+    """200 publications a second and a restless visitor: images, text and pictures keep their rates."""
+    with preview_page(tmp_path, cameras=9) as (preview, page), Visitor(page.port) as visitor:
+        visitor.wait_for(lambda: visitor.images > 0, "an image")
+        before, images, began = visitor.counts.copy(), visitor.images, time.monotonic()
+        number = 1000
+        while (seconds := time.monotonic() - began) < 5.0:
+            preview.state.publish(publication(number), BallScene(seconds))
+            visitor.stand_at((4.0, np.sin(seconds), 3.0))
+            number += 1
+            time.sleep(0.005)
+        sent = visitor.counts - before
+        assert 2 <= visitor.images - images <= 25 * seconds
+        # Two refreshes a second of some ten elements, nine frustums' colours and pictures.
+        assert sent["GuiUpdateMessage"] <= 2 * 12 * (seconds + 1)
+        assert sent["SceneNodeUpdateMessage"] <= 9 * 5 * (seconds + 1)
+        assert visitor.bytes / seconds < 3e6
+
+
+def test_a_visitor_who_does_not_read_costs_no_memory_and_holds_up_nobody(tmp_path):
+    with (
+        preview_page(tmp_path) as (_, page),
+        Visitor(page.port, reads=False) as deaf,
+        Visitor(page.port, (0.0, 4.0, 3.0)) as visitor,
+    ):
+        visitor.wait_for(lambda: visitor.images > 2, "images for who does read")
+        handle = page._server.get_clients()[0]
+        waiting = handle._websock_connection._state.message_buffer.message_from_id
+        for i in range(600):  # until the network itself holds nothing more
+            deaf.stand_at((4.0, 0.02 * i, 3.0))
+            time.sleep(0.02)
+            if waiting and i > 100:
+                break
+        time.sleep(1.0)
+        # What is not read is replaced, not queued: at most one image and the starting place.
+        assert 1 <= len(waiting) <= 12
+        at = visitor.images
+        visitor.wait_for(lambda: visitor.images > at, "an image for who does read")
+
+
+def test_nobody_watching_costs_no_rendering(tmp_path):
+    broken = Broken()
+    state = bare_state()
+    page = start_page(state, "127.0.0.1", 0)
+    try:
+        for i in range(20):
+            state.publish(publication(i), broken)
+            time.sleep(0.05)
+        assert broken.renders == 0
+    finally:
+        page.stop()
+
+
+# --- whatever happens --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("field", [Broken(), Raising()])
+def test_the_page_outlives_a_broken_field(tmp_path, field):
+    state = bare_state([CameraView("never", False, None, None, 0, 0)])
+    page = start_page(state, "127.0.0.1", 0)
+    try:
+        with Visitor(page.port) as visitor:
+            for i in range(8):
+                state.publish(publication(i), field)
+            state.scored(
+                Publication(7, 7.0, 0, 5.0, ("never",), (1.0,), 1.0, 1.0, psnr_db=float("inf")),
+                Comparison("never", np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8), 7),
+            )
+            _until(lambda: field.renders > 0)
+            state.publish(publication(8), BallScene(0.0))  # it has recovered
+            visitor.wait_for(lambda: visitor.images and _decode(visitor).std() > 20, "the ball")
+    finally:
+        page.stop()
+
+
+def test_cameras_that_never_report_stand_in_the_table_only(tmp_path):
+    with preview_page(tmp_path, cameras=6, silent=2) as (_, page), Visitor(page.port) as visitor:
+        visitor.wait_for(lambda: visitor.counts["CameraFrustumMessage"] >= 4, "four frustums")
+        time.sleep(1.2)
+        assert visitor.counts["CameraFrustumMessage"] == 4
+
+
+def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):
+    state = bare_state()
+    answers = {"fail": True}
+
+    def cameras() -> list[CameraView]:
+        if answers["fail"]:
+            raise RuntimeError("half started")
+        return [CameraView("late", False, None, None, 0, 0)]
+
+    state.cameras = cameras
+    page = start_page(state, "127.0.0.1", 0)
+    try:
+        with Visitor(page.port) as visitor:
+            _until(lambda: "half started" in caplog.text)
+            time.sleep(1.2)
+            assert caplog.text.count("page: refresh failed") == 1
+            answers["fail"] = False
+            at = visitor.counts["GuiUpdateMessage"]
+            visitor.wait_for(lambda: visitor.counts["GuiUpdateMessage"] > at, "the table")
+    finally:
+        page.stop()
+
+
+def test_no_visitor_can_open_a_public_tunnel(tmp_path, caplog):
+    with preview_page(tmp_path) as (_, page), Visitor(page.port) as visitor:
+        visitor.wait_for(lambda: visitor.counts["GuiHtmlMessage"] > 0, "the panel")
+        visitor.send("ShareUrlRequest")
+        _until(lambda: "does not give one" in caplog.text)
+        assert page._server._share_tunnel is None
+
+
+# --- helpers -----------------------------------------------------------------------------------
+
+
+class _Running:
+    def __init__(self, preview: Preview) -> None:
+        self._preview = preview
+        preview.start()
+
+    def close(self) -> None:
+        self._preview.stop()
+
+
+def _until(wanted, timeout_s: float = 20.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not wanted():
+        assert time.monotonic() < end, "did not happen in time"
+        time.sleep(0.02)
+
+
+def _decode(visitor: Visitor) -> np.ndarray:
+    assert visitor.image is not None
+    data = np.frombuffer(visitor.image, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert image is not None
+    return image

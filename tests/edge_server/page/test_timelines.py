@@ -1,0 +1,65 @@
+"""What the curves are drawn from: bounded, without gaps that a chart cannot draw."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_server.page.timelines import MAX_POINTS, History, _filled, _in_force, _steps, _thin
+from edge_server.state import CameraView
+
+
+def views(*ages: float | None) -> list[CameraView]:
+    held_out = CameraView("truth", True, None, 1.0, 0, 0)
+    return [held_out, *(CameraView(f"c{i}", False, None, a, 0, 0) for i, a in enumerate(ages))]
+
+
+def test_history_keeps_the_window_and_leaves_the_held_out_camera_aside():
+    history = History(window_s=10.0)
+    for i in range(1000):
+        history.sample(0.1 * i, views(100.0, 300.0, None), {"state": "high"})
+    t, mean, worst, state = history.columns()
+    assert t[0] >= t[-1] - 10.0 and len(t) <= 102
+    assert np.allclose(mean, 200.0) and np.allclose(worst, 300.0) and np.allclose(state, 0.0)
+
+
+def test_history_is_bounded_even_if_time_stands_still_or_goes_back():
+    history = History(window_s=1e9, most=50)
+    for t in [*range(200), 5, 5, 199]:
+        history.sample(float(t), views(1.0), None)
+    t = history.columns()[0]
+    assert len(t) == 50 and (np.diff(t) > 0).all()
+
+
+def test_states_are_numbered_by_the_emulators_list_or_as_they_come():
+    history = History()
+    said = [{"state": "high", "states": ["low", "high"]}, {"state": "low"}, {}, None, {"state": 2}]
+    for i, status in enumerate([*said, {"state": [1]}]):
+        history.sample(float(i), views(), status)
+    assert history.state_names == ["low", "high", "2"]
+    state = history.columns()[3]
+    assert state[:2].tolist() == [1, 0] and np.isnan(state[[2, 3, 5]]).all() and state[4] == 2
+    assert np.isnan(history.columns()[1]).all()  # no camera has reported
+
+
+def test_value_in_force():
+    t = np.array([0.0, 1.0, 2.0, 3.0])
+    held = _in_force(t, [(0.5, 100.0), (2.0, None), (2.5, 50.0)])
+    assert np.isnan(held[[0, 2]]).all() and held[1] == 100.0 and held[3] == 50.0
+    assert np.isnan(_in_force(t, [])).all()
+
+
+def test_thinning_keeps_the_newest_and_its_place():
+    t = np.arange(1000.0)
+    thin_t, thin_y = _thin(t, 2 * t)
+    assert len(thin_t) <= MAX_POINTS and thin_t[-1] == 999 and np.array_equal(thin_y, 2 * thin_t)
+    assert np.array_equal(_thin(t[:5])[0], t[:5])
+
+
+def test_gaps_are_filled_with_what_was_known():
+    nan = np.nan
+    assert _filled(np.array([nan, 2.0, nan, nan, 5.0, nan])).tolist() == [2, 2, 2, 2, 5, 5]
+
+
+def test_a_staircase_holds_each_value():
+    t, y = _steps(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
+    assert t.tolist() == [0, 1, 1, 2, 2] and y.tolist() == [0, 0, 1, 1, 0]

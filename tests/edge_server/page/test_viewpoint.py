@@ -1,0 +1,145 @@
+"""Where visitors start, and whether their window's camera is the right one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge_server.page.preview import BallScene
+from edge_server.page.viewpoint import (
+    VERTICAL_FOV_RAD,
+    band,
+    convergence,
+    initial_viewpoint,
+    visitor_camera,
+    world_up,
+)
+from freshfield.geometry import look_at, matrix_to_quaternion, quaternion_to_matrix, se3_inverse
+
+TARGET = np.array([1.0, -2.0, 0.5])
+
+
+def rig(count: int, spread_deg: float, elevation_deg: float = 20.0, radius_m: float = 3.0) -> np.ndarray:
+    """Cameras on an arc that look at TARGET, world z up."""
+    poses = []
+    for azimuth in np.deg2rad(np.linspace(-spread_deg / 2, spread_deg / 2, count)):
+        e = np.deg2rad(elevation_deg)
+        out = np.array([np.cos(azimuth) * np.cos(e), np.sin(azimuth) * np.cos(e), np.sin(e)])
+        poses.append(look_at(TARGET + radius_m * out, TARGET))
+    return np.stack(poses)
+
+
+def test_axes_meet_where_the_cameras_look():
+    assert np.allclose(convergence(rig(7, 120)), TARGET, atol=1e-9)
+
+
+def test_parallel_diverging_and_single_cameras_meet_nowhere():
+    parallel = np.stack([np.eye(4)] * 5)
+    parallel[:, 0, 3] = np.arange(5)
+    assert convergence(parallel) is None
+    assert convergence(rig(1, 0)) is None
+    outward = rig(6, 90)
+    outward[:, :3, 0] *= -1  # turned half about their y axis: they look away from the centre
+    outward[:, :3, 2] *= -1
+    assert convergence(outward) is None
+
+
+def test_up_is_the_cameras_up():
+    assert np.allclose(world_up(rig(9, 100, elevation_deg=0)), (0, 0, 1), atol=1e-9)
+    upside_down = rig(3, 60, elevation_deg=0)
+    upside_down[:, :3, :2] *= -1
+    assert np.allclose(world_up(upside_down), (0, 0, -1), atol=1e-9)
+    # Cameras that roll evenly have no common up: the first one's is taken, and it is finite.
+    rolling = np.stack([np.eye(4)] * 4)
+    for i, pose in enumerate(rolling):
+        a = i * np.pi / 2
+        pose[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    assert np.allclose(world_up(rolling), (0, -1, 0))
+
+
+@pytest.mark.parametrize("spread_deg", [40, 120, 200])
+def test_the_visitor_sees_the_whole_rig_from_behind_and_above(spread_deg):
+    poses = rig(9, spread_deg)
+    view = initial_viewpoint(poses)
+    assert np.allclose(view.look_at, TARGET, atol=1e-6)
+    assert view.radius_m == pytest.approx(3.0)
+    eyes = poses[:, :3, 3]
+    assert (view.position - TARGET) @ view.up > eyes.mean(axis=0)[2] - TARGET[2]
+    camera = look_at(view.position, view.look_at, view.up)
+    local = (eyes - camera[:3, 3]) @ camera[:3, :3]
+    assert (local[:, 2] > 0).all()
+    assert (np.abs(local[:, :2] / local[:, 2:]) < np.tan(VERTICAL_FOV_RAD / 2)).all()
+
+
+def test_a_ring_has_no_behind_so_the_visitor_stands_behind_its_first_camera():
+    poses = rig(12, 330)
+    view = initial_viewpoint(poses)
+    out, first = view.position - TARGET, poses[0, :3, 3] - TARGET
+    assert out[:2] @ first[:2] > 0.98 * np.linalg.norm(out[:2]) * np.linalg.norm(first[:2])
+
+
+def test_one_camera_uses_the_fields_box_or_else_what_is_before_it():
+    pose = rig(1, 0)
+    boxed = initial_viewpoint(pose, bounds=[TARGET - 1, TARGET + 1])
+    assert np.allclose(boxed.look_at, TARGET)
+    alone = initial_viewpoint(pose)
+    ahead = alone.look_at - pose[0, :3, 3]
+    assert np.allclose(ahead / np.linalg.norm(ahead), pose[0, :3, 2], atol=1e-6)
+
+
+def test_cameras_that_look_straight_down_and_cameras_in_one_place():
+    for poses in (np.stack([look_at((0, 0, 5), (0, 0, 0))] * 3), np.stack([np.eye(4)] * 4)):
+        view = initial_viewpoint(poses)
+        assert all(np.isfinite(v).all() for v in (view.position, view.look_at, view.up))
+        assert np.linalg.norm(view.position - view.look_at) > 0.5 * view.radius_m
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.floats(-1, 1)] * 4, *[st.floats(-1e3, 1e3)] * 3), min_size=1, max_size=8).filter(
+        lambda rows: all(np.linalg.norm(r[:4]) > 1e-3 for r in rows)
+    )
+)
+def test_any_poses_give_a_place_from_which_one_can_look(rows):
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    for pose, row in zip(poses, rows):
+        pose[:3, :3], pose[:3, 3] = quaternion_to_matrix(row[:4]), row[4:]
+    view = initial_viewpoint(poses)
+    assert all(np.isfinite(v).all() for v in (view.position, view.look_at, view.up, [view.radius_m]))
+    assert np.linalg.norm(view.up) == pytest.approx(1.0)
+    gap = view.position - view.look_at
+    assert np.linalg.norm(np.cross(gap, view.up)) > 1e-6 * np.linalg.norm(gap)  # never along up
+
+
+@pytest.mark.parametrize("rows", [60, 151, 600])
+def test_a_windows_camera_sees_what_the_window_sees(rows):
+    pose = look_at((3, 1, 2), (0, 0, 0))
+    wxyz = matrix_to_quaternion(pose[:3, :3])
+    found, camera = visitor_camera(pose[:3, 3], wxyz, np.deg2rad(50), 811, 600, rows)
+    assert np.allclose(found, pose)
+    assert camera.height == rows
+    # Corners of the window, whatever the number of rows: half a field of view up, aspect times that aside.
+    top = np.tan(np.deg2rad(25))
+    corner = camera.project(np.array([top * 811 / 600, top, 1.0]))
+    assert np.allclose(corner, (camera.width, camera.height), atol=1e-6)
+    local = se3_inverse(pose) @ np.array([0, 0, 0, 1.0])
+    assert np.allclose(camera.project(local[:3]), (camera.width / 2, camera.height / 2), atol=1e-6)
+
+
+def test_never_more_rows_than_the_window_has():
+    _, camera = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 300, 200, 720)
+    assert (camera.width, camera.height) == (300, 200)
+    _, tiny = visitor_camera((0, 0, 0), (1, 0, 0, 0), 0.9, 1, 1, 100)
+    assert (tiny.width, tiny.height) == (1, 1)
+
+
+def test_bands_are_the_image():
+    pose = look_at((3, 1, 2), (0, 0, 0.3))
+    _, camera = visitor_camera(pose[:3, 3], matrix_to_quaternion(pose[:3, :3]), 0.8, 160, 120, 61)
+    scene = BallScene(0.7)
+    whole = scene.render(pose, camera)
+    parts = [scene.render(pose, band(camera, a, b - a)) for a, b in ((0, 20), (20, 47), (47, 61))]
+    assert np.allclose(np.concatenate([p.color for p in parts]), whole.color, atol=1e-6)
+    assert np.allclose(np.concatenate([p.depth for p in parts]), whole.depth, atol=1e-4)

@@ -1,0 +1,96 @@
+"""A visitor without a browser: speaks the viewer's wire protocol, counts what the page sends.
+
+For what a browser is too slow and too large to test: message rates, many visitors, one who does not read.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import viser
+import websocket
+import zstandard
+
+
+class Visitor:
+    """Connects and stands at ``position`` looking at the origin; reads in a thread unless ``reads`` is
+    False. ``counts``: messages by type; ``bytes``: all that came; ``images``: number of renderings;
+    ``image``: the last one, encoded."""
+
+    def __init__(
+        self, port: int, position: tuple[float, float, float] = (4.0, 0.0, 3.0), reads: bool = True,
+        size: tuple[int, int] = (800, 600),
+    ) -> None:  # fmt: skip
+        self.counts: Counter[str] = Counter()
+        self.bytes = 0
+        self.images = 0
+        self.image: bytes | None = None
+        self._size = size
+        self._closing = False
+        self._socket = websocket.create_connection(
+            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], timeout=20,
+            sockopt=() if reads else ((socket.SOL_SOCKET, socket.SO_RCVBUF, 4096),),
+        )  # fmt: skip
+        self.stand_at(position)
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        if reads:
+            self._thread.start()
+
+    def __enter__(self) -> Visitor:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._closing = True
+        self._socket.close()
+        if self._thread.ident is not None:
+            self._thread.join(timeout=5)
+
+    def stand_at(self, position: tuple[float, float, float]) -> None:
+        """Tell the page where this visitor is now."""
+        p = np.asarray(position, float)
+        forward = -p / np.linalg.norm(p)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(forward, right), forward], axis=1)
+        self.send(
+            "ViewerCameraMessage", wxyz=list(viser.transforms.SO3.from_matrix(axes).wxyz), position=list(p),
+            fov=0.9, near=0.01, far=1000.0, image_width=self._size[0], image_height=self._size[1],
+            look_at=[0.0, 0.0, 0.0], up_direction=[0.0, 0.0, 1.0],
+        )  # fmt: skip
+
+    def send(self, kind: str, **fields: Any) -> None:
+        data = msgspec.msgpack.encode(fields | {"type": kind}, enc_hook=float)
+        self._socket.send_binary(data)
+
+    def wait_for(self, wanted: Callable[[], bool], what: str, timeout_s: float = 30.0) -> None:
+        end = time.monotonic() + timeout_s
+        while not wanted():
+            assert time.monotonic() < end, f"{what} did not happen; received {dict(self.counts)}"
+            time.sleep(0.02)
+
+    def _read(self) -> None:
+        while not self._closing:
+            try:
+                data = self._socket.recv()
+            except (OSError, websocket.WebSocketException):
+                return
+            if not isinstance(data, bytes) or len(data) < 16:
+                return
+            packed = int.from_bytes(data[8:16], "little")
+            inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed])
+            self.bytes += len(data)
+            for message in msgspec.msgpack.decode(inner)["messages"]:
+                if message["type"] == "BackgroundImageMessage":
+                    self.image = message["rgb_data"]
+                    self.images += self.image is not None
+                self.counts[message["type"]] += 1

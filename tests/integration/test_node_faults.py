@@ -1,0 +1,184 @@
+"""A node and its books when processes die: its peer again and again, or the node itself."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import yaml
+
+from freshfield import ledger
+from tests.camera_node.photos import write_photos
+from tests.integration.peer import Peer, answer
+from tests.integration.test_node_stream import books, check_books, make_node, run_while
+
+CAMERAS = ["cam00", "cam01", "cam02"]
+
+
+def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
+    async def scene():
+        peer = await Peer().start()
+        await peer.stop()  # the port is known now, and nobody listens
+        node = make_node(tmp_path, peer.address)
+        gaps_s = []
+
+        async def work():
+            await asyncio.sleep(0.7)
+            for _ in range(4):
+                begin = time.perf_counter()
+                await peer.start()
+                await peer.until_each(CAMERAS, 5)
+                gaps_s.append(time.perf_counter() - begin)
+                await peer.stop()
+                await asyncio.sleep(0.3)
+            await peer.start()
+            await peer.until_each(CAMERAS, 5)
+
+        await run_while(node, work())
+        await peer.stop()
+        return peer, node, gaps_s
+
+    peer, node, gaps_s = asyncio.run(scene())
+    counts = check_books(tmp_path / "out")
+    for camera in CAMERAS:
+        sequences = [f.sequence for f in peer.frames if f.camera == camera]
+        assert sequences == sorted(set(sequences))
+        assert len(sequences) <= counts[camera]["sent"] <= len(sequences) + counts[camera]["broken"]
+        assert node.senders[camera].connections >= 5
+    # Back-off is capped: five frames at 20 a second arrive within seconds of every restart.
+    assert max(gaps_s) < 10
+    # What waited through an outage was replaced by newer captures, not kept.
+    late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
+    assert sorted(late_ms)[len(late_ms) // 2] < 100 and max(late_ms) < 1000
+
+
+def test_endless_reconnecting_does_not_grow(tmp_path):
+    async def scene():
+        peer = await Peer().start()
+        node = make_node(tmp_path, peer.address, cameras=2, source={"fps": 100})
+        seen: set[str] = set()
+        accept = answer()
+
+        async def one_answer_a_stream(request):
+            camera = request.header.camera_id
+            if camera in seen:
+                seen.remove(camera)
+                raise RuntimeError("this stream has had its answer")
+            seen.add(camera)
+            return await accept(request)
+
+        peer.respond = one_answer_a_stream
+        sizes = []
+
+        async def work():
+            for streams in (30, 90):
+                while peer.streams < streams:
+                    await asyncio.sleep(0.05)
+                peer.frames.clear()
+                peer.arrived_ns.clear()
+                sizes.append(psutil.Process().memory_info().rss)
+
+        await run_while(node, work())
+        await peer.stop()
+        return sizes
+
+    sizes = asyncio.run(scene())
+    counts = check_books(tmp_path / "out")
+    assert all(c["broken"] >= 40 and c["answered"] >= 40 for c in counts.values())
+    assert sizes[1] - sizes[0] < 6e6
+
+
+def start_node(tmp_path: Path, to: str, *options: str, cameras: str = "--all") -> subprocess.Popen:
+    data = write_photos(tmp_path / "data", 24)
+    file = tmp_path / "photos.yaml"
+    file.write_text(
+        yaml.safe_dump(
+            {
+                "name": "photos",
+                "cameras": {"count": 3, "held_out": ["cam00"]},
+                "source": {"kind": "transforms", "data": str(data), "fps": 50, "codec": "png"},
+            }
+        )
+    )
+    command = [sys.executable, "-m", "camera_node.cli", "run", str(file), cameras, "--to", to]
+    return subprocess.Popen([*command, "--out", str(tmp_path / "out"), *options], stderr=subprocess.PIPE)
+
+
+def test_books_close_after_sigkill_of_the_node(tmp_path):
+    async def scene():
+        peer = await Peer().start()
+        node = start_node(tmp_path, peer.address)
+        await peer.until_each(CAMERAS, 30)
+        node.send_signal(signal.SIGKILL)
+        node.wait()
+        await asyncio.sleep(0.3)
+        await peer.stop()
+        return peer
+
+    peer = asyncio.run(scene())
+    (file,) = ledger.read_all(tmp_path / "out")
+    assert not file.closed
+    counts = check_books(tmp_path / "out")
+    for camera in CAMERAS:
+        arrived = {f.sequence for f in peer.frames if f.camera == camera}
+        sent = {e.sequence for e in file.events if e.camera == camera and e.event == "sent"}
+        assert arrived <= sent and len(sent - arrived) <= 1
+        assert counts[camera]["captured"] >= 30
+
+
+def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):
+    async def scene():
+        peer = await Peer().start()
+        node = start_node(tmp_path, peer.address, "--quiet")
+        await peer.until_each(CAMERAS, 10)
+        status = json.loads((tmp_path / "out" / "node-cam00+2.json").read_text())
+        begin = time.perf_counter()
+        node.send_signal(signal.SIGTERM)
+        _, said = await asyncio.to_thread(node.communicate, timeout=10)
+        await peer.stop()
+        return node.returncode, time.perf_counter() - begin, said.decode(), status
+
+    code, seconds, said, status = asyncio.run(scene())
+    assert code == 0 and seconds < 5 and said == ""
+    assert status["phase"] in ("preparing", "streaming") and status["cameras"]["cam02"]["fps"] == 50
+    (file,) = ledger.read_all(tmp_path / "out")
+    assert file.closed and not file.torn
+    assert all(c["sent"] == c["answered"] for c in books(tmp_path / "out").values())
+
+
+def test_a_node_needs_no_torch_and_imports_no_effect_that_is_not_listed(tmp_path):
+    program = """
+import sys
+from camera_node.cli import main
+code = main(["run", sys.argv[1], "--all", "--to", sys.argv[2], "--seconds", "0.5", "-q"])
+heavy = {"torch", "numba", "scipy", "edge_server", "channel_emu", "matplotlib"} & set(sys.modules)
+world = [m for m in sys.modules if m.startswith("camera_node.world")]
+print(code, sorted(heavy), sorted(world))
+"""
+
+    async def scene():
+        peer = await Peer().start()
+        start_node(tmp_path, peer.address).kill()  # for its files
+        for effects in ({}, {"sensor_noise": None}):
+            file = tmp_path / "photos.yaml"
+            scenario = yaml.safe_load(file.read_text())
+            scenario["source"]["effects"] = effects
+            file.write_text(yaml.safe_dump(scenario))
+            run = [sys.executable, "-c", program, str(file), peer.address]
+            out = await asyncio.to_thread(subprocess.check_output, run, env={**os.environ}, timeout=60)
+            yield_lines.append(out.decode().strip())
+        await peer.stop()
+        return len(peer.frames)
+
+    yield_lines: list[str] = []
+    assert asyncio.run(scene()) > 10
+    assert yield_lines[0] == "0 [] []"  # recorded data, no effects: not even the world is imported
+    assert yield_lines[1].startswith("0 []") and "camera_node.world.effects.sensor_noise" in yield_lines[1]
+    assert "clock_drift" not in yield_lines[1] and "motion_blur" not in yield_lines[1]

@@ -1,0 +1,225 @@
+"""A node against a real peer: what arrives, what it is told, and one frame at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.config import source_config
+from camera_node.node import Node, NodeOptions
+from freshfield import ledger, payload
+from freshfield.clock import WallClock
+from freshfield.transport import Transport
+from freshfield.v1 import frames_pb2 as pb
+from tests.camera_node.photos import photo_scenario, picture, write_photos
+from tests.integration.peer import Peer, answer, silence, wrong_number
+
+
+def make_node(tmp_path: Path, to: str, seconds: float | None = None, cameras: int = 3, **options) -> Node:
+    source = options.pop("source", {})
+    scenario = photo_scenario(write_photos(tmp_path / "data", 24), cameras, **source)
+    built = build_cameras(scenario, source_config(scenario), scenario.cameras)
+    options = {"transport": Transport(), "response_timeout_s": 1.0, **options}
+    return Node(scenario, built, NodeOptions(to=to, out=tmp_path / "out", seconds=seconds, **options))
+
+
+def books(out: Path) -> dict[str, Counter[str]]:
+    """Events by camera, of the only ledger in ``out``."""
+    (file,) = ledger.read_all(out)
+    counts: dict[str, Counter[str]] = {}
+    for event in file.events:
+        if event.camera:
+            counts.setdefault(event.camera, Counter())[event.event] += 1
+    return counts
+
+
+def check_books(out: Path, waiting_at_most: int = 1) -> dict[str, Counter[str]]:
+    counts = books(out)
+    for camera, c in counts.items():
+        waiting = c["captured"] - c["replaced"] - c["sent"]
+        assert 0 <= waiting <= waiting_at_most, (camera, c)
+        assert c["sent"] - c["answered"] - c["broken"] in (0, 1), (camera, c)
+    return counts
+
+
+async def run_while(node: Node, work) -> None:
+    """Run a node while ``work`` is done, then stop it."""
+    running = asyncio.ensure_future(node.run())
+    try:
+        await work
+    finally:
+        node.stop()
+        await asyncio.wait_for(running, 10)
+
+
+def test_frames_arrive_as_captured(tmp_path):
+    async def scene():
+        peer = await Peer().start()
+        node = make_node(tmp_path, peer.address, seconds=2.0)
+        await node.run()
+        await peer.stop()
+        return peer, node
+
+    peer, node = asyncio.run(scene())
+    by_camera = {c: [f for f in peer.frames if f.camera == c] for c in ("cam00", "cam01", "cam02")}
+    counts = check_books(tmp_path / "out", waiting_at_most=0)
+    images = {picture(i).tobytes() for i in range(24)}
+    for camera, frames in by_camera.items():
+        assert len(frames) == counts[camera]["sent"] >= 20
+        assert counts[camera]["answered"] == counts[camera]["sent"]
+        assert all(b.sequence > a.sequence for a, b in pairwise(frames))
+        # Captures lie on one grid of true time: cameras in different processes agree on it.
+        assert {f.generated_ns % 50_000_000 for f in frames} == {0}
+        assert {f.held_out for f in frames} == {camera == "cam00"}
+        assert {f.session for f in frames} == {node.session}
+        for f in frames:
+            image = payload.decode(f.payload, f.codec, f.intrinsics.width, f.intrinsics.height)
+            assert image[..., ::-1].tobytes() in images
+    late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
+    assert min(late_ms) > -5 and np.median(late_ms) < 50
+    assert peer.frames[-1].clock_uncertainty_ns < 100_000_000
+    assert peer.most_unanswered == 1
+
+    status = json.loads((tmp_path / "out" / f"node-{node.name}.json").read_text())
+    assert status["phase"] == "stopped"
+    assert status["cameras"]["cam01"]["outcomes"] == {"accepted": counts["cam01"]["answered"]}
+
+
+def test_a_slow_peer_gets_the_newest_frame_and_never_two(tmp_path):
+    async def scene():
+        peer = await Peer(respond=answer(after_s=0.4)).start()
+        await make_node(tmp_path, peer.address, seconds=4.0).run()
+        await peer.stop()
+        return peer
+
+    peer = asyncio.run(scene())
+    counts = check_books(tmp_path / "out")
+    assert peer.most_unanswered == 1
+    for camera, c in counts.items():
+        frames = [f for f in peer.frames if f.camera == camera]
+        assert c["replaced"] > c["sent"]
+        # 20 captures a second, an answer every 0.4 s: about eight captures lie between two sent ones.
+        steps = [b.sequence - a.sequence for a, b in pairwise(frames)]
+        assert 6 <= np.median(steps) <= 12
+    # What was sent had been captured just then, not when the last answer was awaited.
+    late_ms = [(a - f.generated_edge_ns) / 1e6 for a, f in zip(peer.arrived_ns, peer.frames)]
+    assert np.median(late_ms) < 120
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reason", "expected"),
+    [
+        (pb.OUTCOME_DROPPED_BUSY, "", "dropped_busy"),
+        (pb.OUTCOME_SUPERSEDED, "", "superseded"),
+        (pb.OUTCOME_REJECTED, "stale_sequence", "rejected:stale_sequence"),
+        (pb.OUTCOME_REJECTED, "tab\tand\nnewline", "rejected:unspecified"),
+    ],
+)
+def test_refusals_are_counted_and_said_once(tmp_path, caplog, outcome, reason, expected):
+    async def scene():
+        peer = await Peer(respond=answer(outcome, reason)).start()
+        node = make_node(tmp_path, peer.address, cameras=2)
+        await run_while(node, peer.until(20))
+        await peer.stop()
+        return node
+
+    with caplog.at_level(logging.INFO, "camera-node"):
+        node = asyncio.run(scene())
+    check_books(tmp_path / "out")
+    (file,) = ledger.read_all(tmp_path / "out")
+    details = {e.detail for e in file.events if e.event == "answered"}
+    assert details == {expected} and not file.torn
+    for name, outbox in node.outboxes.items():
+        assert outbox.counts[expected] >= 8
+        said = [r for r in caplog.records if r.getMessage().startswith(f"{name}: frame refused")]
+        assert len(said) == (1 if expected.startswith("rejected") else 0)
+
+
+@pytest.mark.parametrize("respond", [silence, wrong_number])
+def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
+    async def scene():
+        peer = await Peer(respond=respond).start()
+        node = make_node(tmp_path, peer.address, cameras=2, response_timeout_s=0.3)
+
+        async def work():
+            await peer.until(4)
+            peer.respond = answer()
+            await peer.until(24)
+
+        await run_while(node, work())
+        await peer.stop()
+        return peer
+
+    peer = asyncio.run(scene())
+    counts = check_books(tmp_path / "out")
+    assert peer.streams >= 4  # each camera left its first stream and came back
+    assert all(c["broken"] >= 1 and c["answered"] >= 8 for c in counts.values())
+    for camera in counts:
+        sequences = [f.sequence for f in peer.frames if f.camera == camera]
+        assert sequences == sorted(set(sequences))  # nothing is ever sent twice
+
+
+def test_offset_of_a_wrong_clock_is_estimated(tmp_path):
+    ahead_ns = 7_000_000_000
+
+    async def scene():
+        peer = await Peer(clock=WallClock(offset_ns=ahead_ns)).start()
+        drift = {"effects": {"clock_drift": {"offset_ms": -1500.0, "offset_spread_ms": 100.0}}}
+        node = make_node(tmp_path, peer.address, source=drift)
+        await run_while(node, peer.until(60))
+        await peer.stop()
+        return peer
+
+    peer = asyncio.run(scene())
+    newest = {f.camera: f for f in peer.frames}
+    offsets_ms = {c: f.clock_offset_ns / 1e6 for c, f in newest.items()}
+    assert offsets_ms["cam00"] == pytest.approx(7000, abs=50)  # the held-out camera's clock is right
+    assert offsets_ms["cam01"] == pytest.approx(8500, abs=450)
+    assert abs(offsets_ms["cam01"] - offsets_ms["cam02"]) > 1  # each camera has its own
+    for frame in newest.values():
+        # On the peer's clock all cameras' ticks fall together again, within what was promised.
+        off_grid = (frame.generated_edge_ns - ahead_ns + 25_000_000) % 50_000_000 - 25_000_000
+        assert abs(off_grid) <= frame.clock_uncertainty_ns + 2_000_000
+        assert frame.clock_uncertainty_ns < 20_000_000
+
+
+def test_without_a_clock_service_the_offset_is_said_to_be_unknown(tmp_path):
+    async def scene():
+        peer = await Peer(with_clock_service=False).start()
+        await run_while(make_node(tmp_path, peer.address), peer.until(10))
+        await peer.stop()
+        return peer
+
+    peer = asyncio.run(scene())
+    assert {f.clock_uncertainty_ns for f in peer.frames} == {payload.MAX_PAST_NS}
+
+
+def test_the_token_is_needed_and_sent(tmp_path):
+    async def scene(token):
+        peer = await Peer(transport=Transport(token="right")).start()
+        node = make_node(tmp_path / str(token), peer.address, transport=Transport(token=token))
+        running = asyncio.ensure_future(node.run())
+        try:
+            await peer.until(5, timeout_s=3)
+        except TimeoutError:
+            pass
+        trouble = node.senders["cam01"].trouble
+        node.stop()
+        await running
+        await peer.stop()
+        return len(peer.frames), trouble
+
+    frames, trouble = asyncio.run(scene("right"))
+    assert frames >= 5 and not trouble
+    frames, trouble = asyncio.run(scene("wrong"))
+    assert frames == 0 and "UNAUTHENTICATED" in trouble
+    counts = books(tmp_path / "wrong" / "out")
+    assert all(c["captured"] - c["replaced"] - c["sent"] in (0, 1) for c in counts.values())
