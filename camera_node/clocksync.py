@@ -23,26 +23,29 @@ class ClockSync:
     def __init__(
         self, channel: grpc.aio.Channel, metadata: tuple[tuple[str, str], ...], clock: Clock
     ) -> None:
+        self._channel = channel
         self._stub = rpc.ClockServiceStub(channel)
         self._metadata = metadata
         self._clock = clock
-        self._estimator = OffsetEstimator()
+        self._estimator = OffsetEstimator()  # the first one is believed from its first exchange on
 
     def offset(self) -> Offset | None:
         return self._estimator.estimate(self._clock.now_ns())
 
     async def run(self) -> None:
         """Until cancelled."""
-        exchanges = 0
+        fresh, exchanges = self._estimator, 0
         while True:
-            # After a silence the peer may be another process with another clock: start afresh, but keep
-            # the old estimate until there is a new one.
-            estimator = self._estimator if exchanges else OffsetEstimator()
-            if await self._exchange(estimator):
-                self._estimator = estimator
+            # A call made while the connection is being set up would count that as a round trip.
+            await self._channel.channel_ready()
+            if await self._exchange(fresh):
                 exchanges += 1
             else:
-                exchanges = 0
+                # After a silence the peer may be another process with another clock: start afresh, but
+                # keep to the old estimate until the new one rests on a few exchanges.
+                fresh, exchanges = OffsetEstimator(), 0
+            if exchanges == _FIRST:
+                self._estimator = fresh
             await asyncio.sleep(_FIRST_PERIOD_S if 0 < exchanges < _FIRST else PERIOD_S)
 
     async def _exchange(self, estimator: OffsetEstimator) -> bool:

@@ -21,7 +21,7 @@ log = logging.getLogger("channel-emu")
 PUSH = "/freshfield.v1.FrameStreamService/Push"
 # Frames at the edge without an answer yet, at most. More than one, so that the time an answer takes is not
 # added to the next frame's delay; few, so that a stalled edge shows at once.
-CREDITS = 4
+CREDITS = 8
 FIRST_BACKOFF_S = 0.1
 MAX_BACKOFF_S = 2.0
 

@@ -9,23 +9,23 @@ COPY proto proto
 COPY camera_node camera_node
 COPY channel_emu channel_emu
 COPY edge_server edge_server
-RUN python -m venv /opt/freshfield \
- && /opt/freshfield/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[emu]' \
- && /opt/freshfield/bin/python -m pip uninstall --disable-pip-version-check -y -q pip setuptools
+RUN python -m venv /venv \
+ && /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q . \
+ && /venv/bin/python -m pip uninstall --disable-pip-version-check -y -q pip setuptools
 
 FROM docker.io/library/python:3.11-slim-bookworm
 RUN useradd --system --create-home --uid 10001 freshfield \
  && install -d -o freshfield -g freshfield /runs
-COPY --from=build /opt/freshfield /opt/freshfield
+COPY --from=build /venv /venv
 COPY deploy/scenarios /app/deploy/scenarios
 COPY deploy/healthy.py /app/deploy/healthy.py
-ENV PATH=/opt/freshfield/bin:$PATH PYTHONUNBUFFERED=1 \
+ENV PATH=/venv/bin:$PATH PYTHONUNBUFFERED=1 \
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
 WORKDIR /app
 USER freshfield
 VOLUME /runs
-# A camera is healthy while it keeps its status file fresh; the emulator's own check is in compose.yaml. In a
-# folder that several nodes share, CAMERA says which one is this container's.
+# A node is healthy while it keeps its status file fresh (in a folder that several share, CAMERA names it);
+# the emulator's own check is in compose.yaml.
 HEALTHCHECK --interval=5s --timeout=3s --start-period=60s --retries=3 \
-  CMD python deploy/healthy.py --fresh "/runs/node-${CAMERA:-*}.json"
+  CMD ["python", "deploy/healthy.py", "--node", "/runs"]
 CMD ["camera-node", "--help"]

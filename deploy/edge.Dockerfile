@@ -8,24 +8,24 @@ ARG TORCH_INDEX
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
 # torch first: its layer is large and changes only with its version.
-RUN python -m venv /opt/freshfield \
+RUN python -m venv /venv \
  && torch=$(sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml) \
- && /opt/freshfield/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q \
+ && /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q \
       ${TORCH_INDEX:+--index-url $TORCH_INDEX} "$torch"
 COPY proto proto
 COPY camera_node camera_node
 COPY channel_emu channel_emu
 COPY edge_server edge_server
-RUN /opt/freshfield/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[edge]'
+RUN /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[edge]'
 
 FROM docker.io/library/python:3.11-slim-bookworm
 RUN useradd --system --create-home --uid 10001 freshfield \
  && install -d -o freshfield -g freshfield /runs
-COPY --from=build /opt/freshfield /opt/freshfield
+COPY --from=build /venv /venv
 COPY deploy/scenarios /app/deploy/scenarios
 COPY deploy/healthy.py /app/deploy/healthy.py
 # Compiled kernels are kept in the user's home: the installed packages are not theirs to write to.
-ENV PATH=/opt/freshfield/bin:$PATH PYTHONUNBUFFERED=1 \
+ENV PATH=/venv/bin:$PATH PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/home/freshfield/.cache/numba MPLCONFIGDIR=/home/freshfield/.cache/matplotlib
 WORKDIR /app
 USER freshfield

@@ -1,21 +1,23 @@
 """Health check of the containers: exit code 0 if the process beside it does its work.
 
 python healthy.py --serving HOST:PORT     the gRPC health service there says SERVING
-python healthy.py --fresh 'GLOB'          a matching status file was written in the last ten seconds
+python healthy.py --node DIR              a node's status file there is younger than ten seconds: the
+                                          file of the camera named by $CAMERA, or of any node
 """
 
 from __future__ import annotations
 
 import argparse
-import glob
 import os
 import sys
 import time
+from pathlib import Path
 
 FRESH_S = 10.0
 
 
 def is_serving(address: str) -> bool:
+    """Whether the gRPC server at ``host:port`` says that it serves."""
     import grpc
     from grpc_health.v1 import health_pb2, health_pb2_grpc
 
@@ -27,18 +29,19 @@ def is_serving(address: str) -> bool:
         return bool(reply.status == health_pb2.HealthCheckResponse.SERVING)
 
 
-def is_fresh(pattern: str) -> bool:
-    files = glob.glob(pattern)
-    return bool(files) and time.time() - max(os.path.getmtime(file) for file in files) < FRESH_S
+def is_fresh(folder: Path, camera: str | None) -> bool:
+    """Whether the node that hosts ``camera`` alone (None: any node) wrote its status lately."""
+    files = list(folder.glob(f"node-{camera or '*'}.json"))
+    return bool(files) and time.time() - max(file.stat().st_mtime for file in files) < FRESH_S
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--serving", metavar="HOST:PORT")
-    which.add_argument("--fresh", metavar="GLOB")
+    which.add_argument("--node", type=Path, metavar="DIR")
     args = parser.parse_args()
-    healthy = is_serving(args.serving) if args.serving else is_fresh(args.fresh)
+    healthy = is_serving(args.serving) if args.serving else is_fresh(args.node, os.environ.get("CAMERA"))
     return 0 if healthy else 1
 
 

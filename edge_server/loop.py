@@ -18,9 +18,9 @@ from queue import Empty, Queue
 import numpy as np
 
 from edge_server.buffer import Buffered, FrameBuffer
-from edge_server.fields import Budget, Field, FitReport, View
+from edge_server.fields import Budget, Field, FitReport, Renderer, View
 from edge_server.scheduler import Epoch, Plan, Policy
-from edge_server.state import Publication, Renderer
+from edge_server.state import Publication
 from edge_server.views import Decoder
 from freshfield.clock import Clock
 
@@ -155,9 +155,7 @@ class Loop:
     def _main(self) -> None:
         try:
             self._on_status("compiling the field's kernels")
-            warm_up = getattr(self._updates.field, "warm_up", None)
-            if warm_up is not None:
-                warm_up()
+            self._updates.field.warm_up()
             self._await_cameras()
             while not self._stop.is_set():
                 self._once()

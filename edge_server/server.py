@@ -23,8 +23,7 @@ from edge_server.buffer import FrameBuffer
 from edge_server.config import EdgeConfig
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
-from edge_server.fields import Budget, View
-from edge_server.fields.checkpoint import load_checkpoint, save_checkpoint
+from edge_server.fields import Budget, View, checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.ingest import Ingest, Recent
 from edge_server.journal import Journal, write_json
@@ -79,7 +78,7 @@ class EdgeServer:
 
         self.field = make_field(config.field, config.field_options, seed=scenario.seed)
         if options.resume is not None:
-            self.field.load_state(load_checkpoint(options.resume)[0])
+            self.field.load_state(checkpoint.load(options.resume)[0])
         self.buffer = FrameBuffer(scenario.training)
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)
         lpips, self.lpips_missing = (
@@ -178,7 +177,7 @@ class EdgeServer:
             every_s = self.options.checkpoint_s
             if every_s is not None and now_ns - saved_ns > every_s * 1e9:
                 saved_ns = now_ns
-                self.loop.request_checkpoint(self.options.out / "field")
+                self.loop.request_checkpoint(self.options.out / "field.npz")
 
     def _serve(self, ready: threading.Event, problem: list[BaseException]) -> None:
         try:
@@ -244,14 +243,14 @@ class EdgeServer:
     def _save_snapshot(self) -> Path:
         if not self.state.started:
             raise RuntimeError("the field has not been trained yet")
-        path = self.options.out / f"snapshot-{self.updates.number:06d}"
+        path = self.options.out / f"snapshot-{self.updates.number:06d}.npz"
         try:
             return self.loop.request_checkpoint(path).result(_SNAPSHOT_S)
         except TimeoutError:
             raise RuntimeError(f"the update in progress took over {_SNAPSHOT_S:g} s") from None
 
     def _checkpoint(self, path: Path) -> None:
-        save_checkpoint(path, self.field.state(), self._about())
+        checkpoint.save(path, self.field.state(), self._about())
 
     def _cameras(self) -> list[CameraView]:
         now_ns = self.clock.now_ns()
@@ -335,7 +334,7 @@ class EdgeServer:
             for name, image in pair.items():
                 cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if self.state.started and not self.loop.alive:
-            self._checkpoint(self.options.out / "field")
+            self._checkpoint(self.options.out / "field.npz")
         self.ledger.close(self.clock.now_ns())
 
     def _about(self) -> dict[str, Any]:

@@ -11,22 +11,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Rendering
+from edge_server.fields import Renderer
 from freshfield.frame import Frame
-from freshfield.geometry import Pinhole
-
-
-class Renderer(Protocol):
-    """An immutable snapshot of a field; safe to use from any thread while the field trains on."""
-
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,10 @@ def segment(starts, at_ns, hint):
 @njit(cache=True)
 def spend(work, rates_per_ns, starts, states, start_ns, hint):
     """Instant at which ``work`` is used up; NEVER_NS if not before the path's end."""
-    if (rates_per_ns == rates_per_ns[0]).all():
+    alike = True
+    for k in range(1, len(rates_per_ns)):
+        alike &= rates_per_ns[k] == rates_per_ns[0]
+    if alike:
         rate = rates_per_ns[0]
         return later(start_ns, saturate(work / rate)) if rate > 0.0 else NEVER_NS
     at_ns = start_ns

@@ -68,14 +68,30 @@ class Rendering:
     opacity: NDArray[np.float32]
 
 
-class Field(Protocol):
+class Renderer(Protocol):
+    """An immutable snapshot of a field; safe to use from any thread while the field trains on."""
+
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Up to ``count`` surface points (N, 3) in world metres and colours (N, 3) in [0, 1]."""
+        ...
+
+
+class Field(Renderer, Protocol):
     """A radiance field. Every implementation is deterministic for one seed and one sequence of calls."""
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""
         ...
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
+    def snapshot(self) -> Renderer:
+        """The field as it is now, for others to render from while it trains on."""
+        ...
+
+    def warm_up(self) -> float:
+        """Compile or load every kernel, so that the first fit is not the slow one; seconds it took."""
+        ...
 
     def state(self) -> dict[str, NDArray]:
         """Everything needed to go on as if nothing had happened: plain arrays, no pickle."""
@@ -85,8 +101,4 @@ class Field(Protocol):
 
     def reset(self) -> None:
         """Forget the scene (4.4.4's manual reset); keep the settings and the compiled kernels."""
-        ...
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` surface points (N, 3) in world metres and colours (N, 3) in [0, 1]."""
         ...

@@ -32,7 +32,7 @@ def save(path: Path | str, state: Mapping[str, NDArray[Any]], about: Mapping[str
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, __facts__=np.array(facts), **state)
+            np.savez(file, allow_pickle=False, __facts__=np.array(facts), **state)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

@@ -7,13 +7,12 @@ what received a gradient (``kernels.adam``). Every 16 steps the occupancy grid i
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,16 +28,13 @@ from edge_server.fields.kernels.rays import Space, Views
 from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
 from edge_server.fields.ngp_layout import make_grid, make_net
 from edge_server.fields.ngp_occupancy import EVERY, Occupancy
-from edge_server.fields.ngp_rig import Rig
+from edge_server.fields.ngp_rig import Arrays, Rig
+from edge_server.fields.ngp_schedule import BETA1, BETA2, NOMINAL_RAYS, Pace, active_levels, step_key
 from edge_server.fields.ngp_settings import NgpSettings, make_settings
 from edge_server.fields.ngp_snapshot import NgpSnapshot
+from edge_server.fields.ngp_state import pack, unpack
 from edge_server.fields.scene_box import SceneBox
 from freshfield.geometry import Pinhole
-
-Arrays = dict[str, NDArray[Any]]
-
-BETA1, BETA2 = 0.9, 0.99
-NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
 
 
 class NgpField:
@@ -70,41 +66,27 @@ class NgpField:
         A budget in seconds (0.1 at least makes sense) is kept within 10 per cent, whatever the load; the
         learning rate falls over the budget, so every fit ends with a settled field.
         """
-        start = time.perf_counter()
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
+        pace = Pace(budget)
         with self._turn.mine():
             intake = self.rig.take_in(views)
             if intake.new_box:
                 self._forget_parameters()
             if intake.look:
                 self._occupancy.look(self.pool, self.rig)
-        steps = rays = samples = dropped = 0
+        rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
-        slowest = 0.0
-        while True:
-            began = time.perf_counter()
-            if budget.steps is not None:
-                progress, over = steps / max(budget.steps, 1), steps >= budget.steps
-            else:
-                assert budget.seconds is not None
-                progress = (began - start) / budget.seconds
-                over = began - start + slowest > budget.seconds
-            if over:
-                break
+        while (progress := pace.begin()) is not None:
             with self._turn.mine():
-                self._one_step(intake.data, min(progress, 1.0))
-            steps += 1
-            rays += int(self._batch.rays.sum())
-            samples += int(self._batch.samples.sum())
-            dropped += self._dropped_now
-            losses.append(self._loss_now)
-            # The mean of late steps, since one delayed step must not end a fit early.
-            took = time.perf_counter() - began
-            slowest = took if slowest == 0.0 else 0.8 * slowest + 0.2 * took
+                losses.append(self._one_step(intake.data, progress))
+                rays += int(self._batch.rays.sum())
+                samples += int(self._batch.samples.sum())
+                dropped += int(self._batch.dropped.sum() + self._dropped_by_task.sum())
+            pace.end()
         self.dropped += dropped
         loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(steps, time.perf_counter() - start, loss, rays, samples, dropped=dropped)
+        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture of a camera, from the present parameters."""
@@ -123,7 +105,7 @@ class NgpField:
                 self._snapshot = NgpSnapshot(
                     box=box,
                     grid=self._grid._replace(table=self._grid.table.copy()),
-                    levels=self._levels(),
+                    levels=active_levels(self.settings, self.step),
                     net=Net(self._net.widths, self._net.params.copy()),
                     harmonics=self.settings.harmonics,
                     space=space._replace(occupied=space.occupied.copy(), coarse=space.coarse.copy()),
@@ -156,60 +138,40 @@ class NgpField:
     def state(self) -> Arrays:
         """Everything needed to go on bit for bit: parameters, moments, occupancy, cameras, counters."""
         with self._turn.mine():
-            meta = {
-                "version": 1,
-                "settings": asdict(self.settings),
+            counters = {
                 "step": self.step,
                 "updates": self._updates,
                 "dropped": self.dropped,
                 "needed": self._occupancy.needed,
-                **self.rig.meta(),
             }
-            arrays: Arrays = {
-                "meta": np.array(json.dumps(meta)),
-                "table": self._grid.table,
-                "table_m": self._table_m,
-                "table_v": self._table_v,
-                "net": self._net.params,
-                "net_m": self._net_m,
-                "net_v": self._net_v,
-                "density": self._occupancy.density,
-                "seen": self._occupancy.seen,
-                **self.rig.arrays(),
-            }
-            return {name: array.copy() for name, array in arrays.items()}
+            return pack(self.settings, self.rig, counters, self._arrays())
 
     def load_state(self, state: Arrays) -> None:
         """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        try:
-            meta = json.loads(str(state["meta"]))
-        except (KeyError, ValueError) as error:
-            raise ValueError(f"not a state of an ngp field: {error}") from None
-        for name in _SHAPE:
-            mine, theirs = getattr(self.settings, name), meta["settings"][name]
-            if mine != theirs:
-                raise ValueError(f"state was made with {name} = {theirs}, this field has {mine}")
-        self.reset()
         with self._turn.mine():
-            self.step, self._updates = int(meta["step"]), int(meta["updates"])
-            self.dropped = int(meta["dropped"])
+            meta = unpack(self.settings, state, self._arrays())
+            self.rig = Rig(self.settings)
             self.rig.load(meta, state)
-            self._occupancy = self._make_occupancy()
-            for target, name in (
-                (self._grid.table, "table"),
-                (self._table_m, "table_m"),
-                (self._table_v, "table_v"),
-                (self._net.params, "net"),
-                (self._net_m, "net_m"),
-                (self._net_v, "net_v"),
-                (self._occupancy.density, "density"),
-                (self._occupancy.seen, "seen"),
-            ):
-                if name not in state or state[name].shape != target.shape:
-                    raise ValueError(f"state lacks {name!r} of shape {target.shape}")
-                target[...] = state[name]
-            self._occupancy.needed = int(meta["needed"])
+            self._forget_parameters()
+            for name, array in self._arrays().items():
+                array[...] = state[name]
+            self.step, self._updates = int(meta["step"]), int(meta["updates"])
+            self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
             self._occupancy.mark()
+            self._snapshot = None
+
+    def _arrays(self) -> Arrays:
+        return {
+            "table": self._grid.table,
+            "table_m": self._table_m,
+            "table_v": self._table_v,
+            "net": self._net.params,
+            "net_m": self._net_m,
+            "net_v": self._net_v,
+            "density": self._occupancy.density,
+            "seen": self._occupancy.seen,
+            "occupied": self._occupancy.occupied,
+        }
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -223,7 +185,7 @@ class NgpField:
         self._table_m, self._table_v, self._table_g = (np.zeros_like(self._grid.table) for _ in range(3))
         self._dirty = np.zeros(len(self._grid.table) // SEGMENT, np.bool_)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
-        self._occupancy = self._make_occupancy()
+        self._occupancy = Occupancy.for_box(s, self.rig.box)
         chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
         inputs, units = int(self._net.widths[0]), int(self._net.widths.sum())
         self._batch = Batch(
@@ -244,25 +206,12 @@ class NgpField:
         )
         self._scratch_x = np.zeros((workers, 3, CHUNK), np.float32)
         self._dropped_by_task = np.zeros(1 + -(-self._dirty.size // PART), np.int64)
-        self._dropped_now, self._loss_now = 0, 0.0
 
-    def _make_occupancy(self) -> Occupancy:
-        s, box = self.settings, self.rig.box
-        step = 2.0 * np.sqrt(3.0) / s.samples
-        contracted = box.contracted if box else False
-        near = box.near_m / box.radius_m if box else 0.1
-        return Occupancy(s.cells, contracted, step, near, s.min_views)
-
-    def _levels(self) -> int:
-        s = self.settings
-        if s.levels_every == 0:
-            return s.levels
-        return min(s.levels, s.levels_start + self.step // s.levels_every)
-
-    def _one_step(self, data: Views, progress: float) -> None:
-        s, levels, box = self.settings, self._levels(), self.rig.box
+    def _one_step(self, data: Views, progress: float) -> float:
+        """One optimiser step; returns its mean squared error. progress: of the fit, in [0, 1]."""
+        s, levels, box = self.settings, active_levels(self.settings, self.step), self.rig.box
         assert box is not None
-        key = _key(s.seed, self.step)
+        key = step_key(s.seed, self.step)
         if self.step % EVERY == 0:
             self._occupancy.refresh(
                 self.pool, key, self.step // EVERY, self._grid, levels, self._net,
@@ -312,19 +261,7 @@ class NgpField:
             self._dropped_by_task,
         )
         self.step += 1
-        self._dropped_now = int(batch.dropped.sum() + self._dropped_by_task.sum())
-        self._loss_now = float(batch.loss.sum()) / (3 * rays)
-
-
-_SHAPE = (
-    "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers", "harmonics",
-    "cells", "samples", "seed",
-)  # fmt: skip
-
-
-def _key(seed: int, step: int) -> np.uint64:
-    """The random stream of one step."""
-    return np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0]
+        return float(batch.loss.sum()) / (3 * rays)
 
 
 class _Turn:
@@ -361,7 +298,10 @@ def make(options: dict[str, Any], seed: int = 0) -> Field:
     settings = make_settings(options, seed)
     if settings.device == "cpu":
         return NgpField(settings)
-    from edge_server.fields.ngp_torch import NgpTorchField, cuda_present  # torch, only where it may be used
+    from edge_server.fields.ngp_torch_field import (  # torch, only where it may be used
+        NgpTorchField,
+        cuda_present,
+    )
 
     if settings.device == "cuda" or cuda_present():
         return NgpTorchField(settings)

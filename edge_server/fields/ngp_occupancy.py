@@ -11,12 +11,14 @@ from edge_server.fields.kernels.occupancy import CELLS_A_TASK, count_views, samp
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import COARSE, Space
 from edge_server.fields.ngp_rig import Rig
+from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.supervision import pack_cameras
 
 EVERY = 8  # steps between refreshes
 PHASES = 4  # refreshes until every cell has been looked at
 FADE = 0.75  # of a cell's density per look
-OPTICAL_DEPTH = 5e-3  # of one step: less cannot be seen
+OPTICAL_DEPTH = 2e-2  # of one step: less cannot be seen
 
 
 class Occupancy:
@@ -30,6 +32,13 @@ class Occupancy:
         self.occupied = np.zeros(cells**3, np.uint8)
         self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
         self.needed = 1
+
+    @classmethod
+    def for_box(cls, settings: NgpSettings, box: SceneBox | None) -> Occupancy:
+        """An occupancy that knows nothing yet of the scene in ``box``."""
+        near = box.near_m / box.radius_m if box else 0.1
+        step = 2.0 * np.sqrt(3.0) / settings.samples
+        return cls(settings.cells, box.contracted if box else False, step, near, settings.min_views)
 
     @property
     def bound(self) -> float:

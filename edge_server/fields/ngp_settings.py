@@ -21,9 +21,9 @@ class NgpSettings:
     hidden: int = _option(32, "units of each hidden layer, a multiple of 4")
     hidden_layers: int = _option(1, "hidden layers of the network")
     harmonics: int = _option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
-    rays: int = _option(8192, "rays of one step at most")
-    batch_samples: int = _option(65536, "samples of one step at most, in chunks of 4096")
-    samples: int = _option(192, "steps across the scene's box, corner to corner")
+    rays: int = _option(4096, "rays of one step at most")
+    batch_samples: int = _option(16384, "samples of one step at most, in chunks of 4096")
+    samples: int = _option(96, "steps across the scene's box, corner to corner")
     cells: int = _option(64, "cells a side of the occupancy grid, a multiple of 4")
     centre_m: tuple[float, float, float] | None = _option(None, "centre of the scene's box")
     radius_m: float | None = _option(None, "half the side of the scene's box")
@@ -31,16 +31,16 @@ class NgpSettings:
     contracted: bool | None = _option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
     background: str = _option("auto", "auto, white, black, mean, random, or '#rrggbb': behind everything")
     min_views: int = _option(2, "no density where fewer cameras than this look (never more than there are)")
-    rate: float = _option(1e-2, "learning rate of the hash tables at the start of a fit")
+    rate: float = _option(2e-2, "learning rate of the hash tables at the start of a fit")
     rate_net: float = _option(1e-2, "learning rate of the network at the start of a fit")
     rate_end: float = _option(0.1, "share of the learning rate that is left at the end of a fit")
-    epsilon: float = _option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
+    epsilon: float = _option(1e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
     decay: float = _option(0.0, "pull of the tables' entries towards zero, per step and rate")
-    distortion: float = _option(0.0, "weight of the distortion loss: gathers each ray's density")
+    distortion: float = _option(1e-2, "weight of the distortion loss: gathers each ray's density")
     sparsity: float = _option(0.0, "weight of the loss on optical depth: empties what no picture needs")
     near_fade: float = _option(0.0, "share of the cameras' distance over which gradients are held back")
     levels_start: int = _option(4, "levels in use at first; the finer ones follow (coarse to fine)")
-    levels_every: int = _option(40, "steps after which one more level is switched on")
+    levels_every: int = _option(30, "steps after which one more level is switched on")
     changed_share: float = _option(0.5, "rays drawn from pixels that changed since the camera's last view")
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
@@ -76,9 +76,9 @@ class NgpSettings:
 
 
 EFFORTS: dict[str, dict[str, Any]] = {
-    "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 16384, "samples": 96},
+    "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 64},
     "medium": {},
-    "high": {"finest_resolution": 384, "hidden": 64, "batch_samples": 131072, "rays": 16384, "samples": 288},
+    "high": {"finest_resolution": 384, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 160},
 }
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,19 +88,35 @@ class NgpSnapshot:
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras' rays
         meet a surface: their pixels are sampled evenly."""
-        positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
-        share = -(-count // max(len(self.cameras), 1))
-        for view in self.cameras:
-            camera = view.intrinsics
-            stride = np.sqrt(camera.width * camera.height / share)
-            v, u = np.meshgrid(
-                np.arange(0.5 * stride, camera.height, stride), np.arange(0.5 * stride, camera.width, stride)
-            )
-            pixels = np.floor(np.stack([v.ravel(), u.ravel()], axis=-1)[:, ::-1]) + 0.5
-            color, depth, opacity = self.render_pixels(view.camera_to_world, camera, pixels)
-            solid = (opacity > SOLID) & (depth > 0)
-            rays = camera.rays(pixels[solid]) @ view.camera_to_world[:3, :3].T
-            points = view.camera_to_world[:3, 3] + rays * depth[solid, None]
-            positions.append(points.astype(np.float32))
-            colors.append(color[solid])
-        return np.concatenate(positions)[:count], np.concatenate(colors)[:count]
+        return surface_points(self, self.cameras, count)
+
+
+class PixelRenderer(Protocol):
+    """Renders single pixels: what ``surface_points`` needs of a field."""
+
+    def render_pixels(
+        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
+
+
+def surface_points(
+    renderer: PixelRenderer, cameras: Sequence[View], count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points (N, 3) in world metres and colours (N, 3) where evenly spaced pixels of ``cameras`` meet a
+    surface; N <= count."""
+    positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+    share = max(count // max(len(cameras), 1), 1)
+    for view in cameras:
+        camera = view.intrinsics
+        stride = max(np.sqrt(camera.width * camera.height / share), 1.0)
+        u, v = np.meshgrid(
+            np.arange(0.5 * stride, camera.width, stride), np.arange(0.5 * stride, camera.height, stride)
+        )
+        pixels = np.floor(np.stack([u.ravel(), v.ravel()], axis=-1)) + 0.5
+        color, depth, opacity = renderer.render_pixels(view.camera_to_world, camera, pixels)
+        solid = (opacity > SOLID) & (depth > 0)
+        rays = camera.rays(pixels[solid]) @ view.camera_to_world[:3, :3].T
+        points = view.camera_to_world[:3, 3] + rays * depth[solid, None]
+        positions.append(points.astype(np.float32))
+        colors.append(color[solid])
+    return np.concatenate(positions)[:count], np.concatenate(colors)[:count]

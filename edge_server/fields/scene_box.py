@@ -80,7 +80,8 @@ def scene_box(
         radius_m = distance if contracted else _seen_radius(views, centre)
     if near_m is None:
         near_m = NEAR_SHARE * distance if contracted else max(0.05 * distance, distance - 1.8 * radius_m)
-    return SceneBox(tuple(map(float, centre)), float(radius_m), float(near_m), contracted, distance)
+    x, y, z = map(float, centre)
+    return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance)
 
 
 NEAR_SHARE = 0.4

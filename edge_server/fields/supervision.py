@@ -61,7 +61,7 @@ def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
 
 
 def remember(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
-    """Take in the newest view of each camera; whether a camera is new, has moved or sees with another lens."""
+    """Take in the newest view of each camera; whether one is new, has moved or has a new lens."""
     news = False
     for view in views:
         known = memory.get(view.camera)

@@ -129,20 +129,22 @@ class _Keeper:
     def _once(self) -> None:
         state = self._state
         cameras = state.cameras()
-        self._history.sample(state.now_s(), cameras, state.channel())
+        channel = state.channel()
+        channel = channel if isinstance(channel, dict) else None
+        self._history.sample(state.now_s(), cameras, channel)
         watched = bool(self._server.get_clients())
         self._scene.refresh(cameras, watched)
         if not watched and self._wanted:
             return
         publications = state.publications()
-        self._panel.refresh(cameras, self._history, publications)
-        self._choose_view(len(publications))
+        self._panel.refresh(cameras, self._history, publications, channel)
+        self._choose_view(publications[-1].number + 1 if publications else 0)
 
     def _choose_view(self, updates: int) -> None:
         """Tell the renderer what visitors want to see: points while the field is young, then images."""
         controls = self._panel.controls
         view = controls.view.value
-        points = view == "points" or (view == "automatic" and updates < YOUNG_UPDATES)
+        points = view == "points" or (view == "automatic" and updates < controls.young_from + YOUNG_UPDATES)
         wanted = (points, view != "points", controls.occlude.value)
         if wanted != self._wanted:
             self._wanted = wanted

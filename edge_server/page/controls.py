@@ -48,6 +48,8 @@ class ControlPanel:
             "occlusion", True, hint="Draw cameras behind the surfaces that the field has learned."
         )
         self._paused: bool | None = None
+        self.young_from = 0
+        """Number of updates at the last reset from here: from there on the field is young again."""
         self.policy.on_update(lambda event: self._policy_chosen(event))
         self.value.on_update(lambda event: self._value_entered(event))
         self.buttons.on_click(self._pressed)
@@ -91,6 +93,7 @@ class ControlPanel:
         pressed, client, controls = event.target.value, event.client, self._state.controls
         if pressed == "reset":
             controls.reset_requested = True
+            self.young_from = next((p.number + 1 for p in reversed(self._state.publications())), 0)
             _notify(client, "Reset", "The field forgets the scene and starts anew.")
         elif pressed == "snapshot":
             save = partial(self._attempt, client, "snapshot", lambda: self._snapshot(client))

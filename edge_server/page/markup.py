@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 from edge_server.page.colours import FRESH_MS, HELD_OUT, RGB, STALE_MS, age_colour, css, scale_colour
 from edge_server.state import CameraView
@@ -142,6 +143,21 @@ def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], note_: str = "")
         '<div style="padding:.35em .9em .1em;font-size:.78em;display:flex;justify-content:space-between">'
         f"<span>{escape(title)}</span><span>{right}</span></div>"
     )
+
+
+def channel_line(channel: dict[str, Any]) -> str:
+    """What the emulator does, in one line; whatever it does not say is left out."""
+    counts = channel.get("counts")
+    delay = channel.get("drawn_delay_ms")
+    mean_ms = delay.get("mean") if isinstance(delay, dict) else None
+    parts = [str(channel[key]) for key in ("preset", "discipline") if channel.get(key)]
+    if isinstance(mean_ms, int | float):
+        parts.append(f"mean delay {mean_ms:.0f} ms")
+    for key in ("forwarded", "dropped_busy", "superseded", "lost"):
+        count = counts.get(key) if isinstance(counts, dict) else None
+        if count:
+            parts.append(f"{count} {key.replace('_', ' ')}")
+    return note(", ".join(parts))
 
 
 def note(text: str) -> str:

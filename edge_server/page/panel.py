@@ -44,18 +44,28 @@ class Panel:
         with side.add_tab("Time lines"):
             self._timelines = Timelines(gui)
             self._waiting = gui.add_html(markup.note("Curves appear with the first frames and updates."))
+            self._channel = gui.add_html("", visible=False)
             gui.add_html(markup.legend())
             self._table = gui.add_html("")
         side.dock_left()
         side.set_width(SIDE_WIDTH)
         self._gui = gui
 
-    def refresh(self, cameras: list[CameraView], history: History, publications: list[Publication]) -> None:
+    def refresh(
+        self,
+        cameras: list[CameraView],
+        history: History,
+        publications: list[Publication],
+        channel: dict[str, Any] | None,
+    ) -> None:
         """Show the present."""
         last = publications[-1] if publications else None
         self._status.content = markup.status(summary(self._state, cameras, publications))
         self._table.content = markup.table(cameras, last.selected if last else ())
         self._waiting.visible = last is None
+        if channel is not None:
+            self._channel.content = markup.channel_line(channel)
+            self._channel.visible = True
         self._turn += 1
         if self._turn % 2:  # curves need no more than one new point a second
             self._timelines.refresh(history, publications)

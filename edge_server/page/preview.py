@@ -13,6 +13,7 @@ import json
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +126,7 @@ class Preview:
             now_s=lambda: (self._clock.now_ns() - self._start_ns) / 1e9,
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
-            channel=lambda: {"state": "high" if self._congested else "low", "states": ["low", "high"]},
+            channel=self._channel,
             field_name="analytic",
             bounds=np.array([[-2.5, -2.5, -0.1], [2.5, 2.5, 2.0]]),
         )
@@ -153,6 +154,13 @@ class Preview:
             age = (now_ns - frame.generated_ns) / 1e6 if frame else None
             views.append(CameraView(name, name == self._held_out, frame, age, self._delivered[name], 0))
         return views
+
+    def _channel(self) -> dict[str, Any]:
+        """As the emulator's status file says it."""
+        state = "high" if self._congested else "low"
+        forwarded = sum(self._delivered.values())
+        return {"preset": "toy", "discipline": "parallel", "states": ["low", "high"], "state": state,
+                "counts": {"forwarded": forwarded}}  # fmt: skip
 
     # --- cameras and network --------------------------------------------------------------------
 

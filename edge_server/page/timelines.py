@@ -47,16 +47,25 @@ class History:
         return data[:, 0], data[:, 1], data[:, 2], data[:, 3]
 
     def _state_number(self, channel: dict | None) -> float:
-        """The state's index among the names seen; NaN where the emulator does not say."""
-        state = (channel or {}).get("state")
-        if not isinstance(state, str | int):
-            return float("nan")
-        for name in (channel or {}).get("states", ()):
-            if str(name) not in self.state_names:
-                self.state_names.append(str(name))
-        if str(state) not in self.state_names:
-            self.state_names.append(str(state))
-        return float(self.state_names.index(str(state)))
+        """The state's place in the emulator's list, or in the order in which states were seen; the mean
+        place where each camera has a chain of its own; NaN where the emulator does not say."""
+        channel = channel or {}
+        for name in _names(channel.get("states")):
+            self._place(name)
+        of_each = channel.get("by_camera")
+        lanes = of_each.values() if isinstance(of_each, dict) else ()
+        found = [channel.get("state"), *(lane.get("state") for lane in lanes if isinstance(lane, dict))]
+        places = [self._place(str(state)) for state in found if isinstance(state, str | int)]
+        return float(np.mean(places)) if places else float("nan")
+
+    def _place(self, name: str) -> int:
+        if name not in self.state_names:
+            self.state_names.append(name)
+        return self.state_names.index(name)
+
+
+def _names(states: Any) -> list[str]:
+    return [str(name) for name in states] if isinstance(states, list | tuple) else []
 
 
 class Timelines:

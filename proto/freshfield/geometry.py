@@ -36,13 +36,13 @@ class GeometryError(ValueError):
 
 def quaternion_normalise(q: ArrayLike) -> Array:
     """Unit quaternion(s) (..., 4), w >= 0. Raises GeometryError for a zero or non-finite one."""
-    q = np.asarray(q, dtype=np.float64)
-    scale = np.max(np.abs(q), axis=-1, keepdims=True)
-    if not np.all(np.isfinite(q)) or np.any(scale == 0.0):
+    given = np.asarray(q, dtype=np.float64)
+    scale = np.max(np.abs(given), axis=-1, keepdims=True)
+    if not np.all(np.isfinite(given)) or np.any(scale == 0.0):
         raise GeometryError("quaternion has no direction: zero or non-finite")
-    q = q / scale  # first, so that squaring can neither overflow nor underflow
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0.0, -q, q)
+    scaled = given / scale  # first, so that squaring can neither overflow nor underflow
+    unit = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return np.where(unit[..., :1] < 0.0, -unit, unit)
 
 
 def quaternion_multiply(a: ArrayLike, b: ArrayLike) -> Array:

@@ -116,8 +116,10 @@ def decode(payload: bytes, codec: str, width: int, height: int) -> NDArray[np.ui
     if image is None or image.dtype != np.uint8 or image.shape[:2] != (height, width):
         raise PayloadError("undecodable", f"the {codec} data is damaged")
     if image.ndim == 2:
-        return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
-    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
+        order = cv2.COLOR_GRAY2RGB
+    else:
+        order = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
+    return np.asarray(cv2.cvtColor(image, order), dtype=np.uint8)
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:

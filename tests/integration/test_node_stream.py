@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 from collections import Counter
@@ -207,10 +208,8 @@ def test_the_token_is_needed_and_sent(tmp_path):
         peer = await Peer(transport=Transport(token="right")).start()
         node = make_node(tmp_path / str(token), peer.address, transport=Transport(token=token))
         running = asyncio.ensure_future(node.run())
-        try:
+        with contextlib.suppress(TimeoutError):
             await peer.until(5, timeout_s=3)
-        except TimeoutError:
-            pass
         trouble = node.senders["cam01"].trouble
         node.stop()
         await running

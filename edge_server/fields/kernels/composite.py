@@ -20,6 +20,10 @@ OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance o
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
+# A density beyond these was clamped, whatever the exponential's last bit: it has no gradient.
+_CLAMPED_LOW = np.float32(np.exp(RAW_LOW) * 1.00001)
+_CLAMPED_HIGH = np.float32(np.exp(RAW_HIGH) * 0.99999)
+
 
 class Weights(NamedTuple):
     """Strengths of the regularisers, float32. distortion: mip-NeRF 360's, gathers a ray's weight in one
@@ -161,7 +165,7 @@ def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
         if t < weights.near:
             scale = t * t / (weights.near * weights.near)
         sigma = out[0, s]
-        free = sigma > np.float32(np.exp(RAW_LOW)) and sigma < np.float32(np.exp(RAW_HIGH))
+        free = sigma > _CLAMPED_LOW and sigma < _CLAMPED_HIGH
         d_out[0, s] = d_depth * delta * sigma * scale if free else _F0
         d_out[1, s] = w[s] * d_r * r * (_F1 - r) * scale
         d_out[2, s] = w[s] * d_g * g * (_F1 - g) * scale

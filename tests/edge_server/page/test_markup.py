@@ -63,3 +63,14 @@ def test_the_table_marks_age_truth_use_and_refusals():
     assert "truth" in rows[0] and css(HELD_OUT) in rows[0]
     assert "9000 ms" in rows[1] and "&#10003;" in rows[1] and css(STALE) in rows[1] and ">3<" in rows[1]
     assert "no frame yet" in rows[2] and "&#10003;" not in rows[2]
+
+
+def test_the_channels_line_says_what_the_emulator_says_and_no_more():
+    line = markup.channel_line({"preset": "ch5", "discipline": "drop-new", "drawn_delay_ms": {"mean": 60.4},
+                                "counts": {"forwarded": 481, "dropped_busy": 12, "lost": 0}})  # fmt: skip
+    for part in ("ch5", "drop-new", "mean delay 60 ms", "481 forwarded", "12 dropped busy"):
+        assert part in line
+    assert "lost" not in line
+    for odd in ({}, {"counts": 3, "drawn_delay_ms": []}, {"drawn_delay_ms": {"mean": None}}):
+        assert "None" not in markup.channel_line(odd)
+    assert "<b>" not in markup.channel_line({"preset": "<b>"})

@@ -41,6 +41,14 @@ def test_states_are_numbered_by_the_emulators_list_or_as_they_come():
     assert np.isnan(history.columns()[1]).all()  # no camera has reported
 
 
+def test_chains_of_each_camera_are_averaged_and_odd_status_files_survived():
+    history = History()
+    lanes = {"a": {"state": "low"}, "b": {"state": "high"}, "c": {}, "d": 3}
+    history.sample(0.0, views(), {"state": None, "states": ["low", "high"], "by_camera": lanes})
+    history.sample(1.0, views(), {"states": 7, "by_camera": [1], "state": None})
+    assert history.columns()[3][0] == 0.5 and np.isnan(history.columns()[3][1])
+
+
 def test_value_in_force():
     t = np.array([0.0, 1.0, 2.0, 3.0])
     held = _in_force(t, [(0.5, 100.0), (2.0, None), (2.5, 50.0)])

@@ -1,0 +1,102 @@
+"""A scenario file as a deployment in virtual time: the same cameras, channel, policy and field as live."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from camera_node.build import build_cameras, load
+from camera_node.capture import Camera
+from camera_node.config import SourceConfig, WorldConfig, source_config
+from camera_node.world import Scene, make_scene
+from channel_emu.config import channel_from_mapping
+from edge_server.buffer import FrameBuffer
+from edge_server.config import EdgeConfig, read_config
+from edge_server.fidelity.scorer import Scorer
+from edge_server.fields import Field
+from edge_server.loop import Updates
+from edge_server.offline.truth import CapturedTruth, ExactTruth
+from edge_server.offline.virtual import Terms, Truth, VirtualDeployment
+from edge_server.scheduler import make_policy
+from edge_server.state import Publication
+from freshfield.scenario import Scenario, ScenarioError
+
+# Encoded frames kept in memory: in virtual time a minute of nineteen cameras passes in seconds.
+_CACHE_BYTES = 512 * 2**20
+
+
+def deploy(
+    scenario: Scenario,
+    terms: Terms,
+    *,
+    field: Field | None = None,
+    scorer: Scorer | None = None,
+    cameras: list[Camera] | None = None,
+    data: Path | None = None,
+    on_published: Callable[[Publication], None] | None = None,
+) -> VirtualDeployment:
+    """``scenario`` in virtual time, from its seed.
+
+    field: one to go on with; None makes the scenario's. scorer: None scores without LPIPS. cameras: of
+    ``training_cameras``, when several runs share what was rendered. data: folder of recorded data sets.
+    Raises ScenarioError or DatasetError.
+    """
+    edge = read_config(scenario)
+    source = source_config(scenario)
+    channel = channel_from_mapping(scenario.channel, f"{scenario.path}: channel")
+    try:
+        policy = make_policy(edge.policy.name, edge.policy.value, scenario.rng("policy", edge.policy.name))
+        field = field or _field(edge, scenario.seed)
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: edge: {error}") from None
+    updates = Updates(FrameBuffer(scenario.training), policy, field, start_ns=0)
+    return VirtualDeployment(
+        cameras or training_cameras(scenario, data),
+        channel,
+        updates,
+        terms,
+        scenario.seed,
+        truth_of(scenario, source, edge, scorer or Scorer(), data),
+        on_published,
+    )
+
+
+def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camera]:
+    """The training cameras as a node would host them."""
+    return build_cameras(scenario, source_config(scenario), scenario.training, data, _CACHE_BYTES)
+
+
+def truth_of(
+    scenario: Scenario, source: SourceConfig, edge: EdgeConfig, scorer: Scorer, data: Path | None = None
+) -> Truth | None:
+    """The exact scene where the world is synthetic, else the held-out captures; None where nothing is."""
+    if not scenario.held_out:
+        return None
+    if isinstance(source, WorldConfig):
+        scene = exact_scene(scenario, source)
+        names = dict(zip(scenario.cameras, scene.cameras))
+        if all(camera in scene.cameras for camera in scenario.cameras):
+            names = {camera: camera for camera in scenario.cameras}
+        return ExactTruth(
+            scorer,
+            {camera: scene.cameras[names[camera]] for camera in scenario.held_out},
+            lambda camera, t_s: scene.render(names[camera], t_s),
+        )
+    cameras = build_cameras(scenario, source, scenario.held_out, data, _CACHE_BYTES)
+    return CapturedTruth(scorer, cameras, edge.noisy_truth)
+
+
+def exact_scene(scenario: Scenario, source: WorldConfig) -> Scene:
+    """The world as the held-out cameras see it, with the effects that are listed to be in the truth."""
+    try:
+        scene = make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: source: {error}") from None
+    effects = load(scenario, source, scenario.held_out[0])
+    return scene if effects is None else effects.extend(scene)
+
+
+def _field(edge: EdgeConfig, seed: int) -> Field:
+    from edge_server.fields.registry import make_field
+
+    return make_field(edge.field, edge.field_options, seed=seed)

@@ -1,0 +1,90 @@
+"""The cache and the outbox: bounded, and honest about every frame."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.capture import Encoded, EncodedCache
+from camera_node.config import source_config
+from camera_node.outbox import Outbox
+from camera_node.prepare import prepare
+from freshfield import ledger
+from freshfield.clock import VirtualClock
+from freshfield.frame import Frame
+from freshfield.geometry import Pinhole, Pose
+from tests.camera_node.photos import photo_scenario, write_photos
+
+POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8, 60)
+
+
+def test_the_cache_never_exceeds_its_bound_and_keeps_what_it_has():
+    cache = EncodedCache(100)
+    shots = [Encoded(bytes(30), POSE, LENS, 0) for _ in range(5)]
+    assert [cache.put("a", k, shots[k]) for k in range(5)] == [True, True, True, False, False]
+    assert cache.put("a", 0, shots[0]) and cache.bytes == 90
+    assert cache.get("a", 1) is shots[1] and cache.get("a", 4) is None and cache.get("b", 1) is None
+
+
+@pytest.mark.parametrize(("megabytes", "all_cached"), [(1.0, True), (0.004, False), (0.0, False)])
+def test_preparing_fills_what_fits(tmp_path, megabytes, all_cached):
+    scenario = photo_scenario(write_photos(tmp_path, 24), 3)
+    cameras = build_cameras(
+        scenario, source_config(scenario), scenario.cameras, cache_bytes=int(megabytes * 2**20)
+    )
+    prepare(cameras, lambda: False)
+    for camera in cameras[1:]:
+        assert all(camera.cached(k) is not None for k in range(40)) == all_cached
+        assert len(camera.capture(5).payload) > 0  # with or without
+
+
+def test_preparing_stops_when_told(tmp_path):
+    scenario = photo_scenario(write_photos(tmp_path, 24), 3)
+    cameras = build_cameras(scenario, source_config(scenario), scenario.cameras)
+    asked = iter([False, False, True])
+    prepare(cameras, lambda: next(asked))
+    assert sum(cameras[0].cached(k) is not None for k in range(3)) == 2
+
+
+def test_a_frame_too_large_to_send_is_an_error_of_that_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr("freshfield.payload.MAX_MESSAGE_BYTES", 100)
+    scenario = photo_scenario(write_photos(tmp_path, 24), 3)
+    camera = build_cameras(scenario, source_config(scenario), scenario.cameras)[1]
+    with pytest.raises(ValueError, match="exceeds 100"):
+        camera.capture(0)
+
+
+def frame(sequence: int) -> Frame:
+    return Frame("cam", "s", sequence, 0, POSE, LENS, "jpeg", b"")
+
+
+def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):
+    async def scene():
+        book = ledger.Ledger(tmp_path, "node", "cam", 1)
+        box = Outbox("cam", "s", book, VirtualClock(5))
+        for k in range(4):
+            box.put(frame(k))
+        assert box.waiting == 1
+        await box.wait()
+        assert box.take().sequence == 3 and box.waiting == 0
+        with pytest.raises(LookupError):
+            box.take()
+        box.note(3, "answered", "accepted")
+        box.put(frame(4))
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.02):
+                box.take()
+                await box.wait()  # nothing waits any more
+        book.close(9)
+        return box.counts
+
+    counts = asyncio.run(scene())
+    assert counts == {"captured": 5, "replaced": 3, "sent": 2, "accepted": 1}
+    (file,) = ledger.read_all(tmp_path)
+    written = [(e.event, e.sequence) for e in file.events if e.camera]
+    # At every prefix at most one frame waits: a kill between two lines leaves no frame unexplained.
+    for end in range(len(written) + 1):
+        seen = [name for name, _ in written[:end]]
+        assert 0 <= seen.count("captured") - seen.count("replaced") - seen.count("sent") <= 1

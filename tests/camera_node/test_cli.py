@@ -1,0 +1,53 @@
+"""The command as a person meets it."""
+
+from __future__ import annotations
+
+import pytest
+
+from camera_node.cli import main
+
+
+def fails(capsys, *arguments: str) -> str:
+    assert main(list(arguments)) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("camera-node: ") and said.count("\n") == 1
+    return said
+
+
+def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    to = ("--to", "127.0.0.1:1")
+    assert "shipped scenarios: " in fails(capsys, "run", "nope", "--all", *to)
+    assert "has no camera cam77; it has cam00, " in fails(
+        capsys, "run", "room", "--camera", "cam01,cam77", *to
+    )
+    assert "FRESHFIELD_DATA" in fails(capsys, "run", "fox", "--all", *to)
+    assert "does not exist" in fails(capsys, "run", "fox", "--all", "--data", str(tmp_path), *to)
+    assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", "host")
+    assert "--seconds" in fails(capsys, "run", "room", "--all", "--seconds", "-1", *to)
+    assert "cannot read" in fails(capsys, "run", "room", "--all", "--token-file", str(tmp_path / "no"), *to)
+    assert "seed" in fails(capsys, "run", "room", "--all", "--seed", "-4", *to)
+    (tmp_path / "file").write_text("")
+    assert "--out" in fails(capsys, "run", "tile", "--all", "--out", str(tmp_path / "file/x"), *to)
+    (tmp_path / "bad.yaml").write_text("cameras: {count: 20}\nsource: {kind: world, scene: room}\n")
+    assert "bad.yaml: source: " in fails(capsys, "run", str(tmp_path / "bad.yaml"), "--all", *to)
+
+
+def test_lists_say_what_there_is(capsys):
+    assert main(["sources"]) == 0
+    said = capsys.readouterr().out
+    assert all(
+        word in said for word in ("kind: world", "kind: transforms", "kind: video", "background", "fps")
+    )
+    assert main(["effects"]) == 0
+    said = capsys.readouterr().out
+    assert all(
+        word in said for word in ("sensor_noise", "motion_blur", "occluder", "clock_drift", "offset_ms")
+    )
+
+
+def test_help_teaches_with_examples(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["run", "--help"])
+    assert end.value.code == 0
+    assert "camera-node run room --all --to 127.0.0.1:7001" in capsys.readouterr().out

@@ -1,0 +1,70 @@
+"""The source section: what it takes, and one clear line for what it does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from camera_node.config import WorldConfig, find_data, source_config
+from freshfield.scenario import ScenarioError, load, parse
+
+
+def config(**source):
+    return source_config(parse({"cameras": {"count": 2}, "source": source}, Path("s.yaml")))
+
+
+def test_what_is_given_reaches_the_scene():
+    world = config(
+        kind="world", scene="tile", width=64, params={"supersample": 1}, effects={"sensor_noise": None}
+    )
+    assert isinstance(world, WorldConfig) and world.codec == "jpeg" and world.fps is None
+    assert world.scene_parameters() == {"width": 64, "supersample": 1}
+    assert world.effect_parameters == {"sensor_noise": {}}
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ({}, "source.kind: expected one of world, transforms, video"),
+        ({"kind": "wrold"}, "source.kind: .*'wrold'"),
+        ({"kind": "world", "fbs": 3}, "source.fbs: unknown key; did you mean 'fps'"),
+        ({"kind": "world", "fps": 0}, "fps is 0"),
+        ({"kind": "world", "fps": "fast"}, "source.fps: expected a number"),
+        ({"kind": "world", "codec": "webp"}, "codec is 'webp'"),
+        ({"kind": "world", "quality": 101}, "quality is 101"),
+        ({"kind": "world", "data": "x"}, "source.data: unknown key"),
+        ({"kind": "world", "effects": {"sensor_noise": 3}}, "source.effects.sensor_noise"),
+        ({"kind": "transforms"}, "data: missing"),
+        ({"kind": "transforms", "data": "x", "scale": 0.5}, "scale is 0.5"),
+        ({"kind": "transforms", "data": "x", "background": "keep"}, "use png"),
+        ({"kind": "transforms", "data": "x", "loop": "once"}, "loop is 'once'"),
+        ({"kind": "video", "data": "x", "trajectory": {"files": {}, "pairing": "best"}}, "pairing is 'best'"),
+        ({"kind": "video", "data": "x", "background": "white"}, "source.background: unknown key"),
+    ],
+)
+def test_errors_name_file_and_key(source, message):
+    with pytest.raises(ScenarioError, match=message) as error:
+        config(**source)
+    assert str(error.value).startswith("s.yaml: source") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["room", "room19", "tile", "ideal", "fox", "lego", "people", "kitchen", "compose"]
+)
+def test_shipped_scenarios_have_a_valid_source(name):
+    source_config(load(name))
+
+
+def test_data_is_found_below_the_folder_that_was_given(tmp_path, monkeypatch):
+    scenario = parse({"cameras": {"count": 2}}, Path("s.yaml"))
+    (tmp_path / "set").mkdir()
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    with pytest.raises(ScenarioError, match="--data DIR or set FRESHFIELD_DATA"):
+        find_data("set", scenario, None)
+    assert find_data("set", scenario, tmp_path) == tmp_path / "set"
+    assert find_data(str(tmp_path / "set"), scenario, None) == tmp_path / "set"
+    monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
+    assert find_data("set", scenario, None) == tmp_path / "set"
+    with pytest.raises(ScenarioError, match="does not exist"):
+        find_data("other", scenario, None)

@@ -1,0 +1,96 @@
+"""Average age of information in closed form, for the systems the links can be. Rates per ms, ages in ms.
+
+Sources: Kaul, Yates and Gruteser (INFOCOM 2012); Costa, Codreanu and Ephremides (IEEE T-IT 62(4), 2016) for
+one waiting place; the drop-new and modulated forms are renewal arguments.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.special import lambertw
+
+
+def mm1_fcfs(lam: float, mu: float) -> float:
+    rho = lam / mu
+    return (1 + 1 / rho + rho**2 / (1 - rho)) / mu
+
+
+def md1_fcfs(lam: float, mu: float) -> float:
+    rho = lam / mu
+    return (1 / (2 * (1 - rho)) + 0.5 + (1 - rho) * math.exp(rho) / rho) / mu
+
+
+def dm1_fcfs(period: float, mu: float) -> float:
+    rho = 1 / (period * mu)
+    beta = -rho * float(np.real(lambertw(-math.exp(-1 / rho) / rho)))
+    return (1 / (2 * rho) + 1 / (1 - beta)) / mu
+
+
+def mm1_blocking(lam: float, mu: float) -> float:
+    return 1 / lam + 2 / mu - 1 / (lam + mu)
+
+
+def mm1_newest_waits(lam: float, mu: float) -> float:
+    both = lam**2 + lam * mu + mu**2
+    return 1 / lam + 2 / mu + lam / (lam + mu) ** 2 + 1 / (lam + mu) - 2 * (lam + mu) / both
+
+
+def mm1_preemptive(lam: float, mu: float) -> float:
+    return 1 / lam + 1 / mu
+
+
+def mg1_blocking(lam: float, mean: float, second_moment: float) -> float:
+    """E[S] + E[(S + X)²] / (2 (E[S] + 1/lambda)), X exponential of rate lambda."""
+    square = second_moment + 2 * mean / lam + 2 / lam**2
+    return mean + square / (2 * (mean + 1 / lam))
+
+
+def md1_preemptive(lam: float, service: float) -> float:
+    """1 / (lambda E[e^(-lambda S)])."""
+    return math.exp(lam * service) / lam
+
+
+def dm1_drop_new(period: float, mu: float) -> float:
+    return 1 / mu + period / 2 / math.tanh(mu * period / 2)
+
+
+def dm1_drop_new_peak(period: float, mu: float) -> float:
+    return 1 / mu + period / (1 - math.exp(-mu * period))
+
+
+def dd1_drop_new(period: float, service: float) -> float:
+    k = math.ceil(service / period)
+    return service + period * k / 2
+
+
+def dm1_parallel(period: float, mu: float) -> float:
+    """No server limit: the age is that of the youngest frame that has arrived. Summed over the frames, from
+    the youngest on, and averaged over the phase of the period."""
+    phases = (np.arange(2000) + 0.5) / 2000 * period
+    ages = phases[:, None] + period * np.arange(400)  # of the youngest, second youngest, ... frame
+    arrived = -np.expm1(-mu * ages)
+    none_younger = np.cumprod(np.concatenate((np.ones((2000, 1)), 1 - arrived[:, :-1]), 1), 1)
+    return float((none_younger * arrived * ages).sum(1).mean())
+
+
+def modulated_drop_new(a: float, b: float, mu_good: float, mu_bad: float, period: float) -> float:
+    """Gilbert-Elliott-modulated exponential service, periodic arrivals, drop-new. a: rate good to bad, b: back.
+
+    T = Q - diag(mu), A = e^(QC), B = e^(TC), R = (I - B)^-1, m = (-T)^-1 1; alpha = alpha R (A - B) is the state
+    at the start of service; E[K] = alpha R 1, E[K²] = alpha (I + B) R² 1;
+    age = [C² E[K²] / 2 + C alpha R² (A - B) m] / (C E[K]).
+    """
+    q = np.array([[-a, a], [b, -b]])
+    t = q - np.diag([mu_good, mu_bad])
+    big_a, big_b, one, eye = expm(q * period), expm(t * period), np.ones(2), np.eye(2)
+    r = np.linalg.inv(eye - big_b)
+    m = np.linalg.inv(-t) @ one
+    values, vectors = np.linalg.eig((r @ (big_a - big_b)).T)
+    alpha = np.real(vectors[:, np.argmin(abs(values - 1))])
+    alpha /= alpha.sum()
+    mean = alpha @ r @ one
+    square = alpha @ (eye + big_b) @ r @ r @ one
+    return float((period**2 * square / 2 + period * (alpha @ r @ r @ (big_a - big_b) @ m)) / (period * mean))

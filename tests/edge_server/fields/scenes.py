@@ -1,0 +1,52 @@
+"""A small analytic scene for field tests: a textured ball on a plain ground, ray-cast without any field."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from freshfield.geometry import Pinhole, look_at, world_rays
+
+BALL_M, RADIUS_M = np.array([0.0, 0.0, 0.5]), 0.5
+
+
+def picture(camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M) -> NDArray:
+    """uint8 (H, W, 3): striped ball, checkered ground, blue sky."""
+    origin, rays = world_rays(camera, pose)
+    color = np.broadcast_to(np.array([0.5, 0.7, 0.9]), rays.shape).copy()
+    down = rays[..., 2] < -1e-6
+    t_ground = np.where(down, -origin[2] / np.where(down, rays[..., 2], -1.0), np.inf)
+    hit = origin + rays * np.where(down, t_ground, 0.0)[..., None]
+    near = down & (np.abs(hit[..., :2]).max(axis=-1) < 1.5)
+    check = (np.floor(hit[..., 0] * 2) + np.floor(hit[..., 1] * 2)) % 2
+    color[near] = np.where(check[near, None] > 0, [0.8, 0.8, 0.7], [0.3, 0.25, 0.2])
+    offset = origin - ball_m
+    b = rays @ offset
+    root = b * b - (offset @ offset - RADIUS_M**2)
+    t_ball = np.where(root > 0, -b - np.sqrt(np.maximum(root, 0.0)), np.inf)
+    front = (t_ball > 0) & (t_ball < np.where(near, t_ground, np.inf))
+    normal = (origin + rays * np.where(front, t_ball, 0.0)[..., None] - ball_m) / RADIUS_M
+    stripe = 0.5 + 0.5 * np.sign(np.sin(8.0 * normal[..., 2]))
+    paint = np.stack([0.9 - 0.5 * stripe, 0.2 + 0.4 * stripe, 0.2 + 0.2 * normal[..., 0]], axis=-1)
+    color[front] = paint[front]
+    return np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8)
+
+
+def ring(
+    count: int, size: int = 48, ball_m: NDArray[np.float64] = BALL_M, distance_m: float = 2.5
+) -> list[View]:
+    """``count`` cameras around the scene, at two heights, all looking at its middle."""
+    camera = Pinhole.from_fov(size, size, 50.0)
+    views = []
+    for k in range(count):
+        angle = 2.0 * np.pi * k / count
+        eye = distance_m * np.array([np.cos(angle), np.sin(angle), 0.35 + 0.35 * (k % 2)])
+        pose = look_at(eye, (0.0, 0.0, 0.4))
+        views.append(View(f"cam{k:02d}", picture(camera, pose, ball_m), pose, camera, k))
+    return views
+
+
+def psnr(a: NDArray, b: NDArray) -> float:
+    """PSNR in dB of float pictures in [0, 1]."""
+    return float(-10.0 * np.log10(np.mean((np.asarray(a, float) - b) ** 2) + 1e-12))
