@@ -62,7 +62,8 @@ class Scene:
     """A world seen by posed cameras.
 
     cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is the held-out one. target: the point (3,)
-    that they look at. bounds: (2, 3), lower and upper corner in metres of everything that can be seen.
+    that they look at. bounds: (2, 3), lower and upper corner in metres of everything that can be seen (an
+    effect's occluder apart).
     period_s: the frames repeat after this long, a multiple of 0.6 s. moving: False where every instant is
     the same.
     """

@@ -53,7 +53,7 @@ class Compute:
 
 
 class Wake(NamedTuple):
-    """When the edge goes on: at an instant, or at the next arrival if that is earlier and it waits for one."""
+    """When the edge goes on: at an instant, or at the next arrival where it waits for one."""
 
     at_ns: int = NEVER_NS
     on_arrival: bool = False

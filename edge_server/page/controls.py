@@ -45,7 +45,7 @@ class ControlPanel:
             "view", VIEWS, hint="Automatic shows the field's points while it is young, then its rendering."
         )
         self.occlude = gui.add_checkbox(
-            "occlusion", True, hint="Draw cameras behind the surfaces that the field has learned."
+            "occlusion", False, hint="Hide cameras behind what the field takes for surfaces."
         )
         self._paused: bool | None = None
         self.young_from = 0

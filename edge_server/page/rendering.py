@@ -85,7 +85,7 @@ class RenderLoop:
         self._complained = ""
         self.want_points = False
         self.want_rendering = True
-        self.occlude = True
+        self.occlude = False
         self._thread = threading.Thread(target=self._run, name="page-render", daemon=True)
 
     def start(self) -> None:

@@ -25,7 +25,7 @@ THUMBNAIL_WIDTH = 112
 THUMBNAIL_EVERY_S = 1.0
 # Decoding for pictures may take this long per refresh; cameras take turns.
 THUMBNAIL_BUDGET_S = 0.03
-FRUSTUM_OF_RADIUS = 0.075
+FRUSTUM_OF_RADIUS = 0.06
 # The starting place follows the cameras that report late, for so long, and only for who has not moved.
 SETTLE_S = 20.0
 # Cameras report one after the other: wait until no new one has for so long before choosing.

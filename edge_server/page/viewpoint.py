@@ -11,13 +11,15 @@ from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 
 Array = NDArray[np.float64]
 
-VERTICAL_FOV_RAD = float(np.deg2rad(50.0))
+VERTICAL_FOV_RAD = float(np.deg2rad(60.0))
 # The visitor stands this much higher above the horizon than the rig, within bounds.
-ABOVE_RIG_DEG = 14.0
+ABOVE_RIG_DEG = 10.0
 ELEVATION_DEG = (18.0, 55.0)
-# As far away as it takes to see every camera within this part of a square window, in radii of the rig.
-MARGIN = 0.86
-DISTANCES = np.linspace(1.25, 4.0, 56)
+# As far away as it takes to see so many of the cameras in a square window, in radii of the rig; no farther,
+# because a field knows little of the space behind the cameras, and hides the scene behind what it imagines.
+SEEN_SHARE = 0.75
+MARGIN = 0.95
+DISTANCES = np.linspace(1.3, 2.2, 37)
 # Below this the mean of unit vectors says nothing: the rig surrounds the scene, or its cameras roll freely.
 _SCATTERED = 0.25
 # Smallest eigenvalue of the mean of I - d d^T at which axes are called parallel (about 3 degrees apart).
@@ -80,7 +82,7 @@ def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> View
     tangent = MARGIN * np.tan(0.5 * VERTICAL_FOV_RAD)
     for distance in DISTANCES * radius:
         position = centre + direction * distance
-        if _all_seen(eyes, position, centre, up, tangent):
+        if _share_seen(eyes, position, centre, up, tangent) >= SEEN_SHARE:
             break
     return Viewpoint(position, centre, up, radius)
 
@@ -102,10 +104,11 @@ def _outward(offsets: Array, up: Array, radius: float) -> Array:
     return behind * np.cos(elevation) + up * np.sin(elevation)
 
 
-def _all_seen(eyes: Array, position: Array, centre: Array, up: Array, tangent: float) -> bool:
-    """Whether all ``eyes`` lie within a square view whose half angle has this tangent."""
+def _share_seen(eyes: Array, position: Array, centre: Array, up: Array, tangent: float) -> float:
+    """Share of ``eyes`` within a square view whose half angle has this tangent."""
     local = (eyes - position) @ look_at(position, centre, up)[:3, :3]
-    return bool(np.all((local[:, 2] > 0) & (np.abs(local[:, :2]) < tangent * local[:, 2:]).all(axis=1)))
+    inside = (local[:, 2] > 0) & (np.abs(local[:, :2]) < tangent * local[:, 2:]).all(axis=1)
+    return float(inside.mean())
 
 
 def visitor_camera(

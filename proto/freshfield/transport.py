@@ -41,7 +41,7 @@ CLIENT_OPTIONS = [
 ]
 SERVER_OPTIONS = [
     *_COMMON,
-    ("grpc.http2.min_recv_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
+    ("grpc.http2.min_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
     ("grpc.max_concurrent_streams", 1024),
     # Two servers silently sharing one port would split the cameras between them.
     ("grpc.so_reuseport", 0),

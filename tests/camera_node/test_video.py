@@ -55,8 +55,9 @@ def opened(scenario, cameras=None):
     return open_sources(scenario, source_config(scenario), cameras or scenario.cameras)
 
 
-def shade(shot) -> float:
-    return (float(shot.image.mean()) - 16) / 6
+def shade(shot) -> int:
+    """The frame's number, off its brightness (the codec darkens by about three counts)."""
+    return round((float(shot.image.mean()) - 13) / 6)
 
 
 def test_pixel_centres_gain_a_half_and_poses_are_inverted(tmp_path):
@@ -97,10 +98,10 @@ def test_the_source_plays_back_and_forth_at_its_own_pace(tmp_path):
     ticks = list(range(60))
     expected = [min(2 * k % 78, 78 - 2 * k % 78) for k in ticks]
     seen = [shade(source.read(source.content(k))) for k in ticks]
-    np.testing.assert_allclose(seen, expected, atol=0.4)
+    assert seen == expected
     assert source.read(0).image.shape == (24, 32, 3) and source.intrinsics.cx == 16.0
     source.release()
-    assert shade(source.read(31)) == pytest.approx(31, abs=0.4)
+    assert shade(source.read(31)) == 31
 
 
 def test_a_trajectory_gives_the_poses(tmp_path):

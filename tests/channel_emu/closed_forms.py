@@ -77,10 +77,10 @@ def dm1_parallel(period: float, mu: float) -> float:
 
 
 def modulated_drop_new(a: float, b: float, mu_good: float, mu_bad: float, period: float) -> float:
-    """Gilbert-Elliott-modulated exponential service, periodic arrivals, drop-new. a: rate good to bad, b: back.
+    """Gilbert-Elliott-modulated exponential service, periodic arrivals, drop-new. a: good to bad, b: back.
 
-    T = Q - diag(mu), A = e^(QC), B = e^(TC), R = (I - B)^-1, m = (-T)^-1 1; alpha = alpha R (A - B) is the state
-    at the start of service; E[K] = alpha R 1, E[K²] = alpha (I + B) R² 1;
+    T = Q - diag(mu), A = e^(QC), B = e^(TC), R = (I - B)^-1, m = (-T)^-1 1; alpha = alpha R (A - B) is the
+    state at the start of service; E[K] = alpha R 1, E[K²] = alpha (I + B) R² 1;
     age = [C² E[K²] / 2 + C alpha R² (A - B) m] / (C E[K]).
     """
     q = np.array([[-a, a], [b, -b]])

@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 
 from edge_server.fields.kernels.grid import SEGMENT
-from edge_server.fields.kernels.intrinsics import FAST, fetch_add
+from edge_server.fields.kernels.intrinsics import fetch_add, is_finite
+from edge_server.fields.kernels.jit import kernel
 
 PART = 512  # segments a task
 GRADIENT_LIMIT = 1e3  # a hundred times what healthy scenes show; keeps the second moment finite
@@ -42,7 +43,7 @@ def _update(rule, p, g, m, v):
     for k in range(p.size):
         raw = g[k] * rule.scale
         g[k] = _F0
-        finite = abs(raw) <= np.float32(3e38)
+        finite = is_finite(raw)
         dropped += 0 if finite else 1
         use = finite and raw != _F0
         d = min(max(raw, -limit), limit)
@@ -54,11 +55,11 @@ def _update(rule, p, g, m, v):
         v[k] = v1 if use else v[k]
         q = q if use else p[k]
         q = min(max(q, -bound), bound)
-        p[k] = q if abs(p[k]) <= np.float32(3e38) else _F0
+        p[k] = q if is_finite(p[k]) else _F0
     return dropped
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def adam(counter, worker, net, table, d_params, rule_net, rule_table, dropped):
     """One optimiser step.
 

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from edge_server.fields.kernels.intrinsics import FAST, exp32
+from edge_server.fields.kernels.intrinsics import exp32, is_finite
+from edge_server.fields.kernels.jit import kernel
 
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
 # step opaque many times over, the smallest makes a whole ray transparent.
@@ -55,14 +56,14 @@ def harmonic(k, x, y, z):
     return np.float32(0.5462742) * (x * x - y * y)
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def activate(out, a, b):
     """Both of the following."""
     activate_density(out, a, b)
     activate_color(out, a, b)
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def activate_density(out, a, b):
     """Raw density -> density, in place, samples a to b of row 0."""
     sigma = out[0, a:b]
@@ -70,7 +71,7 @@ def activate_density(out, a, b):
         sigma[s] = exp32(min(max(sigma[s], np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def activate_color(out, a, b):
     """Raw colours -> colours in [0, 1], in place, samples a to b of rows 1 to 3."""
     for c in range(1, 4):
@@ -79,7 +80,7 @@ def activate_color(out, a, b):
             row[s] = _F1 / (_F1 + exp32(-row[s]))
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def seen_samples(out, dts, first, end):
     """How many samples of a ray there are until it is opaque: density in row 0 of out."""
     depth = _F0
@@ -90,7 +91,7 @@ def seen_samples(out, dts, first, end):
     return end - first
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def add_harmonics(out, harmonics, first, end, dx, dy, dz):
     """Add the direction's share to the raw colours of samples first to end: rows 1 to 3 of out."""
     for k in range(1, harmonics):
@@ -101,7 +102,7 @@ def add_harmonics(out, harmonics, first, end, dx, dy, dz):
                 base[s] += y * share[s]
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
     """The gradient of ``add_harmonics``: rows 4 on from rows 1 to 3 of d_out."""
     for k in range(1, harmonics):
@@ -112,7 +113,7 @@ def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
                 share[s] = y * base[s]
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
     """Squared colour error of one ray (3.22) and its gradient.
 
@@ -140,7 +141,7 @@ def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
     e_g = shade_g + transmitted * background[1] - target[1]
     e_b = shade_b + transmitted * background[2] - target[2]
     loss = e_r * e_r + e_g * e_g + e_b * e_b
-    if not np.isfinite(loss):
+    if not is_finite(loss):
         d_out[:4, first:end] = _F0
         return np.float32(-1.0)
     d_out[:4, last:end] = _F0

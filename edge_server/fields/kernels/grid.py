@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.intrinsics import FAST, add_pair, fetch_add, weighted_pairs
+from edge_server.fields.kernels.intrinsics import add_pair, fetch_add, weighted_pairs
+from edge_server.fields.kernels.jit import kernel
 
 FEATURES = 2  # a vertex; one 64-bit load
 SEGMENT = 16  # vertices a dirty flag stands for
@@ -87,7 +88,7 @@ def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
         out0[s], out1[s] = weighted_pairs(table, rows, _weights(fx, fy, fz))
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def encode(grid, levels, x, a, b, features):
     """Features of points a to b: x float32 (3, N) in the unit cube -> features float32 (>= 2 L, N).
 
@@ -143,7 +144,7 @@ def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
         _mark(dirty, i6, i7)
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirty):
     """Add the table's gradient of all samples to ``gradient``; a task is a level, so nothing races.
 

@@ -7,7 +7,8 @@ from numba import njit
 
 from edge_server.fields.kernels.composite import RAW_HIGH, RAW_LOW
 from edge_server.fields.kernels.grid import encode
-from edge_server.fields.kernels.intrinsics import FAST, exp32, fetch_add, uniform
+from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
+from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.mlp import forward
 from edge_server.fields.kernels.rays import COARSE
 
@@ -29,7 +30,7 @@ def cell_centre(index, cells, contracted):
     return x, y, z, 1.0
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def count_views(counter, worker, cells, contracted, near, views, mask_first, mask, seen, marked):
     """For each cell, how many cameras see its centre from farther than ``near``.
 
@@ -62,7 +63,7 @@ def count_views(counter, worker, cells, contracted, near, views, mask_first, mas
             seen[cell], marked[cell] = count, flags
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net, cells, contracted, seen,
                    min_views, density, acts, x):  # fmt: skip
     """Refresh every ``phases``-th cell's density: the larger of the faded old one and a new random sample.
@@ -106,11 +107,11 @@ def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net,
             _, _, _, stretch = cell_centre(cell, cells, contracted)
             fresh = sigma * np.float32(stretch)
             # A density that is not finite says nothing: look again, and let training repair it.
-            density[cell] = max(density[cell] * fade, fresh) if np.isfinite(fresh) else np.float32(1e3)
+            density[cell] = max(density[cell] * fade, fresh) if is_finite(fresh) else np.float32(1e3)
             n += 1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def threshold(density, seen, min_views, bound, cells, occupied, coarse):
     """Mark the cells whose density reaches ``bound``, but never more than .7 of the mean over seen cells:
     a bound that is wrong for the scene must not empty it. Fills occupied and coarse (uint8)."""

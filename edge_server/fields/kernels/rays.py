@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.intrinsics import FAST
+from edge_server.fields.kernels.jit import kernel
 
 COARSE = 4  # cells of the occupancy grid a side of one cell of its coarse copy
 HORIZON = 20.0  # contracted scenes end here, in scene units: nothing behind it moves in any picture
@@ -100,7 +100,7 @@ def _exit(u, d, blocks):
     return np.float32(1e9)
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def march(space, ox, oy, oz, dx, dy, dz, t, leave, x, ts, dts, n, limit):
     """Append the ray's samples in occupied cells from distance t on.
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from edge_server.fields.kernels.composite import OPAQUE_DEPTH, activate, add_harmonics
 from edge_server.fields.kernels.grid import encode
-from edge_server.fields.kernels.intrinsics import FAST, exp32, fetch_add
+from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite
+from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.mlp import forward
 from edge_server.fields.kernels.rays import interval, march, pixel_direction
 
@@ -17,7 +17,7 @@ ROUND = 8  # samples a ray gets before the opaque ones are dropped
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, levels, net, harmonics,
                  max_samples, background, acts, x, line, color, depth, opacity):  # fmt: skip
     """pixels: float64 (N, 2), image points. color: float32 (N, 3), depth (scene units) and opacity: (N,),
@@ -98,6 +98,6 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, l
                 depth[pixel] = _F0
             for c in range(3):
                 value = color[pixel, c] + through * background[c]
-                color[pixel, c] = min(max(value, _F0), _F1) if np.isfinite(value) else background[c]
-            if not np.isfinite(depth[pixel]) or not np.isfinite(opacity[pixel]):
+                color[pixel, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
+            if not is_finite(depth[pixel]) or not is_finite(opacity[pixel]):
                 depth[pixel] = opacity[pixel] = _F0

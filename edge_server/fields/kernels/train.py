@@ -17,7 +17,8 @@ from edge_server.fields.kernels.composite import (
     spread_harmonics,
 )
 from edge_server.fields.kernels.grid import encode
-from edge_server.fields.kernels.intrinsics import FAST, fetch_add, uniform
+from edge_server.fields.kernels.intrinsics import fetch_add, uniform
+from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.mlp import backward, forward
 from edge_server.fields.kernels.rays import interval, march, pixel_direction
 
@@ -110,7 +111,7 @@ def _keep(rows, a, b, to):
             row[to + s] = row[a + s]
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first, ray):
     """Fill a chunk with rays, their samples and the net's output at them. Returns (rays, samples).
 
@@ -160,7 +161,7 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
     return rays, n
 
 
-@njit(nogil=True, fastmath=FAST, cache=True)
+@kernel
 def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batch, scratch):
     """Tasks are chunks: everything but the table's own gradient, which ``grid.scatter`` adds up."""
     acts, d_acts, line = scratch.acts[worker], scratch.d_acts[worker], scratch.line[worker]

@@ -50,9 +50,7 @@ def _oracle(raw, line, ray, distortion, sparsity, harmonics):
     sigma, color = ngp_torch.shade(params, harmonics, direction)
     t, delta = (torch.as_tensor(line[k], dtype=torch.float64)[None] for k in (0, 1))
     target, back = (torch.as_tensor(ray[a : a + 3], dtype=torch.float64)[None] for a in (3, 6))
-    error, loss = ngp_torch.ray_losses(
-        sigma[None], color[None], t, delta, target, back, distortion, sparsity
-    )
+    error, loss = ngp_torch.ray_losses(sigma[None], color[None], t, delta, target, back, distortion, sparsity)
     return params, error, loss
 
 

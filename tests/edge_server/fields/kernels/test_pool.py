@@ -10,6 +10,7 @@ import pytest
 from numba import njit
 
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, uniform
+from edge_server.fields.kernels.jit import FAST
 from edge_server.fields.kernels.pool import Pool, shared_pool
 
 
@@ -73,7 +74,7 @@ def test_no_threads_is_refused() -> None:
         Pool(-1)
 
 
-@njit
+@njit(fastmath=FAST)
 def _exp(x):
     out = np.empty_like(x)
     for k in range(x.size):

@@ -31,7 +31,7 @@ def _space(contracted: bool, filled: float, near: float = 0.1) -> Space:
 def _march(space: Space, o, d, jitter: float = 0.0):
     x, ts, dts = np.zeros((3, 500), np.float32), np.zeros(500, np.float32), np.zeros(500, np.float32)
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
-    enter = np.float32(enter + np.float32(jitter) * space.step)
+    enter, leave = np.float32(enter + np.float32(jitter) * space.step), np.float32(leave)
     n, t = march(space, *o.astype(np.float32), *d.astype(np.float32), enter, leave, x, ts, dts, 0, 500)
     return x[:, :n], ts[:n], dts[:n], (t, leave)
 
@@ -89,7 +89,8 @@ def test_empty_space_is_skipped_and_room_is_respected() -> None:
     whole = _march(space, o, d)[1]
     x, ts, dts = np.zeros((3, 9), np.float32), np.zeros(9, np.float32), np.zeros(9, np.float32)
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
-    n, t = march(space, *o.astype(np.float32), *d.astype(np.float32), enter, leave, x, ts, dts, 4, 9)
+    way = (np.float32(v) for v in (*o, *d, enter, leave))
+    n, t = march(space, *way, x, ts, dts, 4, 9)
     assert n == 9 and t < leave and (x[:, :4] == 0).all()
     np.testing.assert_array_equal(ts[4:], whole[:5])
 

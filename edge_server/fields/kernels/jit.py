@@ -1,0 +1,37 @@
+"""How the kernels are compiled: without the GIL, with safe fast mathematics, and cached on disk."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+
+# No "nnan"/"ninf": the kernels test for non-finite numbers, which those flags would optimise away.
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+
+
+def _digest() -> str:
+    """Of all kernel sources."""
+    total = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        total.update(path.name.encode() + path.read_bytes())
+    return total.hexdigest()
+
+
+SOURCES = _digest()
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """``njit`` with a cache that knows what a kernel is made of.
+
+    numba's own cache looks at the file a function stands in; kernels here inline functions of other files,
+    and would go on running yesterday's. The digest of all of them is made part of the cache's stamp.
+    """
+    dispatcher = njit(nogil=True, fastmath=FAST)(function)
+    dispatcher.enable_caching()
+    file = dispatcher._cache._cache_file
+    file._source_stamp = (*file._source_stamp, SOURCES)
+    return dispatcher

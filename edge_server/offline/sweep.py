@@ -1,0 +1,139 @@
+"""What accuracy costs in time, from scratch: effort levels of a field against seconds, Pareto front."""
+
+from __future__ import annotations
+
+import importlib
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from edge_server.fidelity.scorer import PerceptualMetric, Scorer
+from edge_server.fields import Budget, Field
+from edge_server.offline.fitting import evaluate
+from edge_server.offline.still import Still
+from edge_server.offline.usage import Usage
+
+# Where a field keeps its named effort levels: option values by name. A field without any has one level.
+_EFFORTS = {"ngp": "edge_server.fields.ngp_settings:EFFORTS"}
+# What one knob alone buys, against the level "medium" (only in the full sweep).
+_KNOBS: dict[str, dict[str, dict[str, Any]]] = {
+    "ngp": {
+        "fewer samples": {"samples": 96},
+        "more samples": {"samples": 288},
+        "fewer rays": {"batch_samples": 32768, "rays": 4096},
+        "more rays": {"batch_samples": 131072, "rays": 16384},
+        "coarse grid": {"finest_resolution": 128},
+        "fine grid": {"finest_resolution": 512},
+        "more levels": {"levels": 12},
+        "wide network": {"hidden": 64},
+    }
+}
+
+
+@dataclass(frozen=True)
+class Effort:
+    """A named way to spend time. options: of the field."""
+
+    name: str
+    options: dict[str, Any]
+
+
+def efforts(field: str, options: dict[str, Any], knobs: bool) -> list[Effort]:
+    """The field's effort levels, cheapest first; with ``knobs`` also each knob turned alone. ``options``
+    apply to all of them."""
+    levels: list[Effort] = [Effort("default", dict(options))]
+    if field in _EFFORTS:
+        module, _, name = _EFFORTS[field].partition(":")
+        known = getattr(importlib.import_module(module), name)
+        levels = [Effort(level, {"effort": level, **options}) for level in known]
+    if knobs:
+        levels += [Effort(n, {**turned, **options}) for n, turned in _KNOBS.get(field, {}).items()]
+    return levels
+
+
+def fit_from_scratch(
+    field: str, effort: Effort, still: Still, seconds: float, seed: int, lpips: PerceptualMetric | None
+) -> dict[str, Any]:
+    """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost.
+
+    ms_per_step and ms_per_update are what virtual time charges: a step, and an update's fixed part (taking
+    in new images, handing out a snapshot).
+    """
+    from edge_server.fields.registry import make_field
+
+    model = make_field(field, effort.options, seed=seed)
+    warm_up = getattr(model, "warm_up", None)
+    if warm_up is not None:
+        warm_up()
+    usage = Usage("fit")
+    report = model.fit(still.training, Budget(seconds=seconds))
+    row = usage.row(seconds)
+    score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
+    ms_per_step = 1e3 * report.seconds / max(report.steps, 1)
+    return {
+        "effort": effort.name,
+        "seconds": report.seconds,
+        "steps": report.steps,
+        "ms_per_step": ms_per_step,
+        "ms_per_update": max(0.0, _update_ms(model, still) - ms_per_step),
+        "rays_per_s": report.rays / max(report.seconds, 1e-9),
+        "samples_per_s": report.samples / max(report.seconds, 1e-9),
+        "psnr_db": score.psnr_db,
+        "ssim": score.ssim,
+        "lpips": score.lpips,
+        "outside_cores": usage.outside(row),
+    }
+
+
+def _update_ms(model: Field, still: Still, repeats: int = 3) -> float:
+    """Median milliseconds of the shortest update there is: new images, one step, a snapshot."""
+    spent = []
+    for _ in range(repeats):
+        # New objects with images of their own, as decoding makes them: nothing can be found known already.
+        views = [replace(v, image=v.image.copy()) for v in still.training]
+        began = time.perf_counter()
+        model.fit(views, Budget(steps=1))
+        snapshot = getattr(model, "snapshot", None)
+        if snapshot is not None:
+            snapshot()
+        spent.append((time.perf_counter() - began) * 1e3)
+    return statistics.median(spent)
+
+
+def medians(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Points of the same effort and planned seconds (``planned_s``) over seeds, as their medians."""
+    groups: dict[tuple[str, float], list[dict[str, Any]]] = {}
+    for point in points:
+        groups.setdefault((point["effort"], point["planned_s"]), []).append(point)
+    names = ("seconds", "steps", "ms_per_step", "ms_per_update", "rays_per_s", "samples_per_s", "psnr_db",
+             "ssim", "lpips", "outside_cores")  # fmt: skip
+    rows = []
+    for (effort, planned_s), group in groups.items():
+        row: dict[str, Any] = {"effort": effort, "planned_s": planned_s, "seeds": len(group)}
+        for name in names:
+            known = [p[name] for p in group if p[name] is not None]
+            row[name] = statistics.median(known) if known else None
+        rows.append(row)
+    return rows
+
+
+def mark_front(rows: Sequence[dict[str, Any]]) -> None:
+    """Set ``on_front`` of each row: no other row is at least as fast and more accurate (PSNR)."""
+    best = float("-inf")
+    for row in sorted(rows, key=lambda r: (r["seconds"], -r["psnr_db"])):
+        row["on_front"] = row["psnr_db"] > best
+        best = max(best, row["psnr_db"])
+
+
+def costs(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """What virtual time charges, by effort: medians over all points of the effort."""
+    names = list(dict.fromkeys(row["effort"] for row in rows))
+    return {
+        name: {
+            key: statistics.median(row[key] for row in rows if row["effort"] == name)
+            for key in ("ms_per_step", "ms_per_update")
+        }
+        for name in names
+    }

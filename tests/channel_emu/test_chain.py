@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from channel_emu.chain import Chain, ChainError, stationary, transition_matrix, two_state_generator
+from channel_emu.uniforms import Uniforms
+
+THREE = np.array([[-0.3, 0.2, 0.1], [0.05, -0.05, 0.0], [0.4, 0.4, -0.8]])
+
+
+def path(generator, seed: int = 0, initial: int | None = None) -> Chain:
+    return Chain(np.array(generator, float), Uniforms(seed, "", "channel.chain"), initial)
+
+
+def sojourns(chain: Chain, until_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """(lengths in ms, states) of the complete sojourns before an instant."""
+    pairs = chain.recent(0, until_ns)
+    starts, states = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
+    return np.diff(starts) / 1e6, states[:-1]
+
+
+def test_transition_matrix_of_two_states_is_the_thesis_closed_form() -> None:
+    mu1, mu2, u = 1 / 30, 1 / 60, 17.0
+    fading = math.exp(-(mu1 + mu2) * u)
+    expected = [
+        [mu2 / (mu1 + mu2) + mu1 / (mu1 + mu2) * fading, mu1 / (mu1 + mu2) * (1 - fading)],
+        [mu2 / (mu1 + mu2) * (1 - fading), mu1 / (mu1 + mu2) + mu2 / (mu1 + mu2) * fading],
+    ]
+    np.testing.assert_allclose(transition_matrix(two_state_generator(mu1, mu2), u), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("span_ms", [0.0, 1e-6, 0.3, 10.0, 1e5])
+def test_transition_matrix_of_more_states_against_the_matrix_exponential(span_ms: float) -> None:
+    expm = pytest.importorskip("scipy.linalg").expm
+    expected = expm(THREE * span_ms)
+    np.testing.assert_allclose(transition_matrix(THREE, span_ms), expected, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize("span_ms", [0.0, 1e-9, 1.0, 1e9, 1e15])
+def test_stiff_transition_matrices_stay_stochastic(span_ms: float) -> None:
+    for generator in (
+        two_state_generator(1e-9, 1e9),
+        np.array([[-1e9, 1e9, 0], [1e-9, -1 - 1e-9, 1], [0, 1e-9, -1e-9]]),
+    ):
+        p = transition_matrix(generator, span_ms)
+        assert (p >= 0).all()
+        np.testing.assert_allclose(p.sum(1), 1, rtol=1e-12)
+
+
+def test_stationary_distribution_keeps_its_digits() -> None:
+    np.testing.assert_allclose(stationary(two_state_generator(0.2, 0.5)), [5 / 7, 2 / 7], rtol=1e-15)
+    np.testing.assert_allclose(stationary(two_state_generator(1e-9, 1e9)), [1, 1e-18], rtol=1e-12)
+    np.testing.assert_allclose(stationary(THREE) @ THREE, 0, atol=1e-16)
+    # An absorbing state holds everything in the end.
+    np.testing.assert_array_equal(stationary(np.array([[-1.0, 1.0], [0.0, 0.0]])), [0, 1])
+
+
+def test_generators_that_are_none_are_refused() -> None:
+    for wrong, why in (
+        (np.zeros((2, 3)), "square"),
+        (np.array([[-1.0, 1.0], [np.inf, -np.inf]]), "finite"),
+        (np.array([[1.0, -1.0], [1.0, -1.0]]), "not negative"),
+        (np.array([[-1.0, 0.5], [1.0, -1.0]]), "sum to zero"),
+    ):
+        with pytest.raises(ChainError, match=why):
+            stationary(wrong)
+    with pytest.raises(ChainError, match="different states"):
+        stationary(np.zeros((2, 2)))
+
+
+def test_occupancy_sojourns_and_jumps_match_theory() -> None:
+    """One path of 45,000 sojourns. Standard errors are a third of the tolerances or less."""
+    until_ns = 600_000 * 10**6
+    chain = path(THREE)
+    lengths, states = sojourns(chain, until_ns)
+    for state, mean in enumerate((1 / 0.3, 1 / 0.05, 1 / 0.8)):
+        found = lengths[states == state]
+        assert found.mean() == pytest.approx(mean, rel=3 / len(found) ** 0.5)
+        assert found.std() == pytest.approx(mean, rel=0.05)  # exponential: deviation equals mean
+    leaving_third = states[1:][states[:-1] == 2]
+    assert (leaving_third == 0).mean() == pytest.approx(0.5, abs=3 * 0.5 / len(leaving_third) ** 0.5)
+    np.testing.assert_allclose(chain.occupancy(until_ns), stationary(THREE), rtol=0.03)
+
+
+def test_autocorrelation_fades_at_the_sum_of_the_rates() -> None:
+    mu1, mu2 = 1 / 30, 1 / 60
+    chain = path(two_state_generator(mu1, mu2), seed=2)
+    chain.segment(2_000_000 * 10**6)
+    at = np.arange(0, 2_000_000, 5, dtype=np.int64) * 10**6
+    pairs = chain.recent(0, int(at[-1]))
+    starts, states = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
+    series = states[np.searchsorted(starts, at, side="right") - 1].astype(float)
+    series -= series.mean()
+    for lag in (2, 4, 8):
+        correlation = (series[:-lag] * series[lag:]).mean() / series.var()
+        assert correlation == pytest.approx(math.exp(-(mu1 + mu2) * 5 * lag), abs=0.01)
+
+
+def test_initial_state_follows_the_stationary_distribution() -> None:
+    started = [path(two_state_generator(0.2, 0.6), seed).initial for seed in range(4000)]
+    assert np.mean(started) == pytest.approx(0.25, abs=4 * (0.25 * 0.75 / 4000) ** 0.5)
+
+
+def test_path_does_not_depend_on_how_it_is_asked() -> None:
+    at = np.random.default_rng(0).integers(0, 10**11, 500)
+    forwards, anyhow = path(THREE), path(THREE)
+    in_order = {int(t): forwards.state(int(t)) for t in sorted(at)}
+    assert {int(t): anyhow.state(int(t)) for t in at} == in_order
+
+
+def test_forgetting_keeps_memory_bounded_and_shares_exact() -> None:
+    kept, forgetting = path(THREE), path(THREE)
+    for second in range(1, 400):
+        now = second * 10**9
+        assert kept.segment(now) == forgetting.segment(now)
+        forgetting.forget(now - 10**9)
+    assert len(forgetting.recent(0, 399 * 10**9)) < 2500 < len(kept.recent(0, 399 * 10**9))
+    assert forgetting.occupancy(399 * 10**9) == kept.occupancy(399 * 10**9)
+    with pytest.raises(ChainError, match="forgotten"):
+        forgetting.segment(0)
+
+
+def test_kernel_draws_the_same_path() -> None:
+    kernel = pytest.importorskip("channel_emu.kernels.path")
+    for generator in (THREE, two_state_generator(1 / 30, 1 / 60), np.array([[-1.0, 1.0], [0.0, 0.0]])):
+        chain = path(generator, seed=9)
+        key = np.array(Uniforms(9, "", "channel.chain").key, np.uint64)
+        starts, states = kernel.chain_path(chain.rates_per_ms.copy(), chain.jumps, key, chain.initial, 10**11)
+        assert list(zip(starts[:-1].tolist(), states.tolist())) == chain.recent(0, 10**11)

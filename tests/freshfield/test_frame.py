@@ -1,0 +1,180 @@
+"""Frames to the wire and back, and every reason for which one is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from google.protobuf.message import DecodeError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from freshfield import payload
+from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
+from freshfield.geometry import Pinhole, Pose, quaternion_normalise
+from freshfield.v1 import frames_pb2 as pb
+
+IMAGE = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
+DATA = {codec: payload.encode(IMAGE, codec) for codec in payload.CODECS}
+INT64 = st.integers(-(2**63), 2**63 - 1)
+
+
+def frame(**changes) -> Frame:
+    values = {
+        "camera": "cam07",
+        "session": "12-ab",
+        "sequence": 5,
+        "generated_ns": 1_700_000_000_123_456_789,
+        "pose": Pose((0.5, 0.5, -0.5, 0.5), (1.0, -2.0, 3.0)),
+        "intrinsics": Pinhole(16, 12, 20.0, 21.0, 8.0, 6.0, (0.1, -0.01, 0.001, 0.0)),
+        "codec": "png",
+        "payload": DATA["png"],
+        "held_out": True,
+        "clock_offset_ns": -5,
+        "clock_uncertainty_ns": 7,
+        "pose_gap_ns": 11,
+    }
+    return Frame(**{**values, **changes})
+
+
+ids = st.from_regex(r"[A-Za-z0-9._-]{1,64}", fullmatch=True)
+
+
+@given(
+    camera=ids,
+    session=ids,
+    sequence=st.integers(0, 2**64 - 1),
+    generated_ns=INT64,
+    q=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: max(map(abs, q)) > 1e-3),
+    t=st.tuples(*[st.floats(-1e6, 1e6)] * 3),
+    codec=st.sampled_from(payload.CODECS),
+    held_out=st.booleans(),
+    offset_ns=INT64,
+    uncertainty_ns=st.integers(0, 2**63 - 1),
+)
+def test_what_is_sent_is_what_arrives(
+    camera, session, sequence, generated_ns, q, t, codec, held_out, offset_ns, uncertainty_ns
+):
+    sent = frame(
+        camera=camera,
+        session=session,
+        sequence=sequence,
+        generated_ns=generated_ns,
+        pose=Pose(tuple(map(float, quaternion_normalise(q))), t),
+        codec=codec,
+        payload=DATA[codec],
+        held_out=held_out,
+        clock_offset_ns=offset_ns,
+        clock_uncertainty_ns=uncertainty_ns,
+    )
+    wire = to_request(sent).SerializeToString()
+    back = from_request(pb.PushRequest.FromString(wire))
+    np.testing.assert_allclose(back.pose.quaternion, sent.pose.quaternion, atol=1e-15)
+    assert back.pose.translation_m == sent.pose.translation_m
+    assert back == frame(**{**sent.__dict__, "pose": back.pose})
+    assert back.generated_edge_ns == generated_ns + offset_ns
+
+
+@settings(max_examples=300)
+@given(at=st.integers(0, 10**6), bit=st.integers(0, 7))
+def test_a_flipped_bit_never_becomes_another_frame(at, bit):
+    wire = bytearray(to_request(frame()).SerializeToString())
+    wire[at % len(wire)] ^= 1 << bit
+    try:
+        request = pb.PushRequest.FromString(bytes(wire))
+        back = from_request(request)
+    except (FrameRejected, DecodeError):
+        return
+    assert back == from_request(to_request(frame()))
+
+
+def changed(change, checksummed: bool = True) -> pb.PushRequest:
+    """A request that somebody altered, with a checksum that fits unless told otherwise."""
+    request = to_request(frame())
+    change(request)
+    if checksummed:
+        request.crc32c = checksum(request.header, request.payload)
+    return request
+
+
+def set_header(**values):
+    def change(request):
+        for path, value in values.items():
+            *parents, name = path.split("__")
+            target = request.header
+            for parent in parents:
+                target = getattr(target, parent)
+            setattr(target, name, value)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (set_header(camera_id=""), "bad_id"),
+        (set_header(camera_id="../../etc"), "bad_id"),
+        (set_header(camera_id="a\tb"), "bad_id"),
+        (set_header(camera_id="x" * 65), "bad_id"),
+        (set_header(session_id="s s"), "bad_id"),
+        (set_header(codec=99), "unknown_codec"),
+        (set_header(codec=pb.CODEC_UNSPECIFIED), "unknown_codec"),
+        (set_header(role=pb.ROLE_UNSPECIFIED), "bad_header"),
+        (set_header(role=7), "bad_header"),
+        (set_header(clock_uncertainty_ns=-1), "bad_header"),
+        (set_header(pose_gap_ns=-1), "bad_header"),
+        (set_header(pose__qw=math.nan), "bad_pose"),
+        (set_header(pose__tx_m=math.inf), "bad_pose"),
+        (set_header(pose__ty_m=1e7), "bad_pose"),
+        (set_header(pose__qw=0.6), "bad_pose"),
+        (set_header(pose__qw=0.0, pose__qx=0.0, pose__qy=0.0, pose__qz=0.0), "bad_pose"),
+        (set_header(intrinsics__fx=math.nan), "bad_intrinsics"),
+        (set_header(intrinsics__fx=0.0), "bad_intrinsics"),
+        (set_header(intrinsics__fy=-20.0), "bad_intrinsics"),
+        (set_header(intrinsics__fx=1e7), "bad_intrinsics"),
+        (set_header(intrinsics__cx=1e5), "bad_intrinsics"),
+        (set_header(intrinsics__k1=1e3), "bad_intrinsics"),
+        (set_header(width=0), "too_large"),
+        (set_header(height=5000), "too_large"),
+        (set_header(width=17), "size_mismatch"),
+        (set_header(codec=pb.CODEC_JPEG), "bad_payload"),
+        (lambda r: setattr(r, "payload", b""), "bad_payload"),
+    ],
+)
+def test_each_refusal_has_its_reason(change, reason):
+    with pytest.raises(FrameRejected) as error:
+        from_request(changed(change))
+    assert error.value.reason == reason and str(error.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        set_header(sequence=6),
+        set_header(generated_ns=0),
+        set_header(camera_id="cam08"),
+        set_header(session_id="12-ac"),
+        set_header(clock_offset_ns=0),
+        set_header(pose__tz_m=3.0000001),
+        set_header(intrinsics__p2=1e-9),
+        set_header(role=pb.ROLE_TRAIN),
+        lambda r: setattr(r, "payload", r.payload[:-1] + b"\0"),
+    ],
+)
+def test_the_checksum_covers_every_field(change):
+    with pytest.raises(FrameRejected) as error:
+        from_request(changed(change, checksummed=False))
+    assert error.value.reason == "crc_mismatch"
+
+
+def test_an_empty_request_is_refused_and_not_an_error():
+    with pytest.raises(FrameRejected):
+        from_request(pb.PushRequest())
+
+
+@given(st.text(max_size=70))
+def test_valid_ids_are_safe_in_file_names_and_ledgers(text):
+    assert valid_id(text) == (
+        1 <= len(text) <= 64 and all(c.isascii() and (c.isalnum() or c in "._-") for c in text)
+    )

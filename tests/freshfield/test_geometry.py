@@ -1,0 +1,213 @@
+"""Geometry against OpenCV, against SciPy, and against itself."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from freshfield.geometry import (
+    OPENGL_TO_OPENCV,
+    GeometryError,
+    Pinhole,
+    Pose,
+    look_at,
+    matrix_to_quaternion,
+    quaternion_multiply,
+    quaternion_normalise,
+    quaternion_to_matrix,
+    se3_inverse,
+    slerp,
+    so3_exp,
+    so3_log,
+    world_rays,
+)
+
+finite = st.floats(-1e3, 1e3, allow_subnormal=True)
+vectors = st.tuples(finite, finite, finite)
+quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: max(map(abs, q)) > 1e-3)
+unit = st.floats(0, 1)
+
+
+def scipy(q) -> Rotation:
+    return Rotation.from_quat([q[1], q[2], q[3], q[0]])
+
+
+# --- quaternions ------------------------------------------------------------------------------
+
+
+@given(quaternions)
+def test_quaternions_and_matrices_agree_with_scipy(q):
+    m = quaternion_to_matrix(q)
+    np.testing.assert_allclose(m, scipy(q).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(m @ m.T, np.eye(3), atol=1e-12)
+    # Up to sign: a half turn has w = 0, where both are normal.
+    assert abs(matrix_to_quaternion(m) @ quaternion_normalise(q)) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(m)), m, atol=1e-12)
+
+
+@given(quaternions, quaternions)
+def test_products_compose_rotations(a, b):
+    np.testing.assert_allclose(
+        quaternion_to_matrix(quaternion_multiply(a, b)),
+        quaternion_to_matrix(a) @ quaternion_to_matrix(b),
+        atol=1e-9,
+    )
+
+
+@pytest.mark.parametrize("scale", [5e-324, 1e-300, 1e-30, 1.0, 1e30, 1e300])
+def test_normalising_survives_any_scale(scale):
+    q = np.array([0.0, 3.0, -4.0, 0.0]) * scale
+    if scale == 5e-324:
+        q = np.array([0.0, scale, -scale, 0.0])
+    np.testing.assert_allclose(np.linalg.norm(quaternion_normalise(q)), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("q", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]])
+def test_quaternions_without_a_direction_are_refused(q):
+    with pytest.raises(GeometryError):
+        quaternion_normalise(q)
+
+
+@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -2, 3]])
+@pytest.mark.parametrize("angle", [0, 1e-12, 1e-5, 1e-4, 0.1, 3.0, np.pi - 1e-9, np.pi - 1e-5, np.pi])
+def test_half_turns_and_tiny_turns(axis, angle):
+    w = np.array(axis) / np.linalg.norm(axis) * angle
+    m = so3_exp(w)
+    np.testing.assert_allclose(m, Rotation.from_rotvec(w).as_matrix(), atol=1e-9)
+    back = so3_log(m)
+    # At pi both signs are right.
+    assert min(np.abs(back - w).max(), np.abs(back + w).max() if angle > 3.14 else np.inf) < 1e-7
+    np.testing.assert_allclose(so3_exp(back), m, atol=1e-9)
+
+
+@given(quaternions, quaternions, unit)
+def test_slerp_goes_the_shorter_way_at_constant_speed(a, b, fraction):
+    start, end = quaternion_to_matrix(a), quaternion_to_matrix(b)
+    whole = np.linalg.norm(so3_log(start.T @ end))
+    middle = quaternion_to_matrix(slerp(a, b, fraction))
+    assert np.linalg.norm(so3_log(start.T @ middle)) == pytest.approx(fraction * whole, abs=1e-6)
+    np.testing.assert_allclose(quaternion_to_matrix(slerp(a, b, 0)), start, atol=1e-9)
+    np.testing.assert_allclose(quaternion_to_matrix(slerp(a, b, 1)), end, atol=1e-9)
+
+
+# --- poses ------------------------------------------------------------------------------------
+
+
+@given(quaternions, vectors)
+def test_poses_survive_the_way_through_a_matrix(q, t):
+    pose = Pose(tuple(quaternion_normalise(q)), t)
+    back = Pose.from_matrix(pose.matrix())
+    np.testing.assert_allclose(back.matrix(), pose.matrix(), atol=1e-9)
+    np.testing.assert_allclose(se3_inverse(pose.matrix()) @ pose.matrix(), np.eye(4), atol=1e-9)
+    assert Pose.from_matrix(pose.matrix()[:3]) == back
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda m: m * [[-1], [1], [1], [1]],  # mirrored
+        lambda m: m * 1.01,  # scaled
+        lambda m: m + np.triu(np.full((4, 4), 0.01)),  # sheared
+        lambda m: np.where(np.eye(4) > 0, np.nan, m),
+        lambda m: m[:2],
+    ],
+)
+def test_matrices_that_are_no_pose_are_refused(spoil):
+    with pytest.raises(GeometryError):
+        Pose.from_matrix(spoil(look_at([1, 2, 3], [0, 0, 0])))
+
+
+@given(vectors, vectors)
+def test_look_at_looks_at(eye, target):
+    if np.linalg.norm(np.subtract(eye, target)) < 1e-6:
+        return
+    m = look_at(eye, target)
+    Pose.from_matrix(m)  # rigid and right-handed
+    local = se3_inverse(m) @ np.append(target, 1.0)
+    distance = np.linalg.norm(np.subtract(eye, target))
+    np.testing.assert_allclose(local[:3], [0, 0, distance], atol=1e-6 * max(1, distance, *map(abs, eye)))
+    assert m[2, 1] <= 1e-9  # image-down never points up
+
+
+def test_look_at_refuses_a_point_and_survives_straight_down():
+    with pytest.raises(GeometryError):
+        look_at([1, 1, 1], [1, 1, 1])
+    Pose.from_matrix(look_at([0, 0, 5], [0, 0, 0]))
+    Pose.from_matrix(look_at([5, 0, 0], [0, 0, 0], up=(1, 0, 0)))
+
+
+def test_the_opengl_flip_is_its_own_inverse_and_a_rotation():
+    np.testing.assert_array_equal(OPENGL_TO_OPENCV @ OPENGL_TO_OPENCV, np.eye(4))
+    assert np.linalg.det(OPENGL_TO_OPENCV[:3, :3]) == pytest.approx(1)
+
+
+def test_interpolated_poses_move_in_a_straight_line():
+    a, b = Pose.from_matrix(look_at([0, 0, 1], [5, 0, 1])), Pose.from_matrix(look_at([2, 4, 1], [2, 9, 1]))
+    m = a.interpolate(b, 0.25)
+    assert m.translation_m == pytest.approx((0.5, 1.0, 1.0))
+    assert a.interpolate(b, 0.0) == a
+    np.testing.assert_allclose(a.interpolate(b, 1.0).matrix(), b.matrix(), atol=1e-12)
+
+
+# --- cameras ----------------------------------------------------------------------------------
+
+lenses = st.builds(
+    Pinhole,
+    width=st.integers(16, 640),
+    height=st.integers(16, 480),
+    fx=st.floats(200, 600),
+    fy=st.floats(200, 600),
+    cx=st.floats(100, 400),
+    cy=st.floats(100, 300),
+    distortion=st.tuples(
+        st.floats(-0.05, 0.1), st.floats(-0.02, 0.05), st.floats(-0.002, 0.002), st.floats(-0.002, 0.002)
+    ),
+)
+
+
+@given(lenses, st.integers(0, 2**32))
+def test_projection_agrees_with_opencv(camera, seed):
+    """OpenCV counts pixel centres as whole numbers, we the image's corner as zero: half a pixel apart."""
+    points = np.random.default_rng(seed).uniform([-1, -1, 2], [1, 1, 5], (20, 3))
+    k = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), k, np.array(camera.distortion))
+    np.testing.assert_allclose(camera.project(points), theirs[:, 0] + 0.5, atol=1e-6)
+
+
+@given(lenses, st.integers(0, 2**32))
+def test_rays_undo_projection(camera, seed):
+    points = np.random.default_rng(seed).uniform([-0.8, -0.8, 1.6], [0.8, 0.8, 4], (20, 3))
+    rays = camera.rays(camera.project(points))
+    np.testing.assert_allclose(rays, points / np.linalg.norm(points, axis=1, keepdims=True), atol=2e-4)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
+
+
+def test_points_behind_the_camera_have_no_pixel():
+    camera = Pinhole.from_fov(64, 48, 60)
+    assert np.isnan(camera.project([[0, 0, -1.0], [0, 0, 0.0]])).all()
+
+
+@given(st.integers(8, 200), st.integers(8, 200), st.floats(20, 120), st.sampled_from([0.25, 0.5, 1 / 3, 2.0]))
+def test_scaling_leaves_directions_where_they_were(width, height, fov, factor):
+    """The corners of the image look the same way at any size."""
+    camera = Pinhole.from_fov(width, height, fov)
+    small = camera.scaled(factor)
+    corners = np.array([[0, 0], [1, 1], [0.25, 0.75]])
+    np.testing.assert_allclose(
+        small.rays(corners * [small.width, small.height]), camera.rays(corners * [width, height]), atol=1e-12
+    )
+
+
+def test_from_fov_and_world_rays():
+    camera = Pinhole.from_fov(100, 50, 90)
+    assert camera.fx == pytest.approx(50) and (camera.cx, camera.cy) == (50, 25)
+    pose = look_at([0, -3, 1], [0, 0, 1])
+    origin, directions = world_rays(camera, pose)
+    np.testing.assert_array_equal(origin, [0, -3, 1])
+    assert directions.shape == (50, 100, 3)
+    np.testing.assert_allclose(directions[24:26, 49:51].mean((0, 1)), [0, 1, 0], atol=1e-3)
+    assert directions[0, 0] @ [1, 0, 0] < 0 < directions[0, 0] @ [0, 0, 1]  # top left: to -x, upwards

@@ -1,0 +1,101 @@
+"""The ledger: what was written is read, whatever killed the writer."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from freshfield.ledger import Event, Ledger, read, read_all
+
+
+def write(out, events, closed=True):
+    book = Ledger(out, "node", "cam00", 7)
+    for e in events:
+        book.write(e.t_ns, e.camera, e.session, e.sequence, e.event, e.detail)
+    if closed:
+        book.close(99)
+    return book.path
+
+
+EVENTS = [
+    Event(1, "cam00", "s", 0, "captured"),
+    Event(2, "cam00", "s", 0, "answered", "rejected:crc_mismatch"),
+]
+
+
+def test_events_come_back(tmp_path):
+    path = write(tmp_path, EVENTS)
+    file = read(path)
+    assert path.name == "ledger-node-cam00-7.tsv"
+    assert (file.role, file.name, file.closed, file.torn) == ("node", "cam00", True, False)
+    assert file.events == (*EVENTS, Event(99, "", "", 0, "closed"))
+    assert [f.path for f in read_all(tmp_path)] == [path]
+
+
+@given(cut=st.integers(0, 200))
+def test_a_file_cut_anywhere_loses_at_most_its_last_line(tmp_path_factory, cut):
+    path = write(tmp_path_factory.mktemp("ledger"), EVENTS * 2, closed=False)
+    data = path.read_bytes()
+    head = data.index(b"\n") + 1
+    cut = head + cut % (len(data) - head + 1)
+    path.write_bytes(data[:cut])
+    file = read(path)
+    whole = data[head:cut].count(b"\n")
+    assert file.events == tuple((EVENTS * 2)[:whole])
+    assert file.torn == (not data[:cut].endswith(b"\n")) and not file.closed
+
+
+def test_damaged_lines_are_left_out_and_said(tmp_path):
+    path = write(tmp_path, EVENTS)
+    path.write_bytes(path.read_bytes().replace(b"\tanswered\t", b"\0\xff"))
+    file = read(path)
+    assert file.torn and file.events[0] == EVENTS[0] and file.closed
+
+
+def test_other_files_are_refused(tmp_path):
+    for data in (b"", b"hello\n", b"#freshfield-ledger 2 node cam00 1\n", b"\xff\xfe"):
+        (tmp_path / "ledger-x.tsv").write_bytes(data)
+        with pytest.raises(ValueError, match="not a freshfield ledger"):
+            read(tmp_path / "ledger-x.tsv")
+    with pytest.raises(ValueError, match="role"):
+        Ledger(tmp_path, "camera", "x", 1)
+
+
+def test_threads_do_not_tear_each_others_lines(tmp_path):
+    book = Ledger(tmp_path, "emulator", "e", 1)
+
+    def work(camera):
+        for k in range(500):
+            book.write(k, camera, "s" * 40, k, "forwarded", "d" * 40)
+
+    threads = [threading.Thread(target=work, args=(f"cam{i}",)) for i in range(4)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    book.close(0)
+    book.write(1, "late", "s", 1, "forwarded")  # after the end: ignored
+    file = read(book.path)
+    assert not file.torn and len(file.events) == 2001 and file.closed
+
+
+def test_what_was_written_survives_sigkill(tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from freshfield.ledger import Ledger\n"
+        "book, k = Ledger(Path(sys.argv[1]), 'edge', 'e', 1), 0\n"
+        "while True:\n    book.write(k, 'cam00', 's', k, 'delivered'); k += 1\n    print(k, flush=True)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as child:
+        time.sleep(0.5)
+        child.send_signal(signal.SIGKILL)
+        promised = int(child.stdout.read().decode().splitlines()[-1])
+    (file,) = read_all(tmp_path)
+    assert not file.closed and len(file.events) >= promised > 10
+    assert [e.sequence for e in file.events] == list(range(len(file.events)))

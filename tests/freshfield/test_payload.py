@@ -1,0 +1,239 @@
+"""Payloads: what goes in comes out, and hostile bytes are only ever refused."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from freshfield import payload
+from freshfield.payload import MAX_IMAGE_SIDE, PayloadError, check, decode, encode
+
+# --- what is encoded comes back ----------------------------------------------------------------
+
+sizes = st.tuples(st.integers(1, 40), st.integers(1, 40))
+
+
+@given(size=sizes, seed=st.integers(0, 2**32), codec=st.sampled_from(["png", "zstd"]))
+def test_lossless_codecs_give_the_same_pixels(size, seed, codec):
+    image = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    np.testing.assert_array_equal(decode(encode(image, codec), codec, *size), image)
+
+
+@given(size=sizes, seed=st.integers(0, 2**32))
+def test_png_keeps_straight_alpha(size, seed):
+    image = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
+    np.testing.assert_array_equal(decode(encode(image, "png"), "png", *size), image)
+
+
+def test_jpeg_is_rgb_and_close():
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:, :32] = (220, 40, 30)
+    image[:, 32:] = (20, 60, 210)
+    back = decode(encode(image, "jpeg", 95), "jpeg", 64, 48)
+    assert np.abs(back[:, :24].astype(int) - (220, 40, 30)).max() < 6
+    assert np.abs(back[:, 40:].astype(int) - (20, 60, 210)).max() < 6
+
+
+def test_colour_is_not_subsampled_from_quality_90_up():
+    image = np.zeros((32, 32, 3), np.uint8)
+    image[:, ::2] = (255, 0, 0)
+    image[:, 1::2] = (0, 0, 255)  # columns of one luma range that 4:2:0 would mix
+    error = {
+        q: np.abs(decode(encode(image, "jpeg", q), "jpeg", 32, 32).astype(int) - image).mean()
+        for q in (89, 90)
+    }
+    assert error[90] < 0.5 * error[89]
+
+
+def test_a_grey_jpeg_or_png_comes_back_as_rgb():
+    grey = np.random.default_rng(0).integers(0, 256, (16, 16), dtype=np.uint8)
+    for codec, extension in (("jpeg", ".jpg"), ("png", ".png")):
+        data = cv2.imencode(extension, grey)[1].tobytes()
+        back = decode(data, codec, 16, 16)
+        assert back.shape == (16, 16, 3) and np.ptp(back, axis=2).max() == 0
+
+
+def test_exif_orientation_does_not_turn_pixels():
+    image = np.random.default_rng(1).integers(0, 256, (16, 24, 3), dtype=np.uint8)
+    data = encode(image, "jpeg")
+    turned = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # orientation 6
+    marked = data[:2] + b"\xff\xe1" + struct.pack(">H", len(turned) + 2) + turned + data[2:]
+    np.testing.assert_array_equal(decode(marked, "jpeg", 24, 16), decode(data, "jpeg", 24, 16))
+
+
+@pytest.mark.parametrize(
+    ("image", "codec", "reason"),
+    [
+        (np.zeros((4, 4, 3), np.float32), "png", "bad_image"),
+        (np.zeros((4, 4), np.uint8), "png", "bad_image"),
+        (np.zeros((4, 4, 2), np.uint8), "jpeg", "bad_image"),
+        (np.zeros((1, MAX_IMAGE_SIDE + 1, 3), np.uint8), "png", "too_large"),
+        (np.zeros((0, 4, 3), np.uint8), "zstd", "too_large"),
+        (np.zeros((4, 4, 3), np.uint8), "webp", "unknown_codec"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused(image, codec, reason):
+    with pytest.raises(PayloadError) as error:
+        encode(image, codec)
+    assert error.value.reason == reason
+
+
+# --- hostile input ---------------------------------------------------------------------------
+
+
+def png(width: int, height: int, depth: int = 8, kind: int = 2, rows: bytes | None = None) -> bytes:
+    """A PNG with any header, well-formed or not."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    data = zlib.compress(rows if rows is not None else b"\0" * 1000)
+    header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def forge_jpeg(data: bytes, width: int, height: int) -> bytes:
+    """The same JPEG with another size in its frame header."""
+    at = data.index(b"\xff\xc0")
+    return data[: at + 5] + struct.pack(">HH", height, width) + data[at + 9 :]
+
+
+JPEG = encode(np.random.default_rng(2).integers(0, 256, (48, 64, 3), dtype=np.uint8), "jpeg")
+FRAME_HEADER = bytes.fromhex("ffc0000b0800300040010111 00")  # a second one, 64 x 48, of one component
+BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(2**30))
+
+
+@pytest.mark.parametrize(
+    ("data", "codec", "size", "reason"),
+    [
+        (forge_jpeg(JPEG, 30000, 30000), "jpeg", (64, 48), "size_mismatch"),
+        (forge_jpeg(JPEG, 30000, 30000), "jpeg", (30000, 30000), "too_large"),
+        (png(30000, 30000), "png", (64, 48), "size_mismatch"),
+        (png(30000, 30000), "png", (30000, 30000), "too_large"),
+        (png(0, 0), "png", (0, 0), "too_large"),
+        (BOMB, "zstd", (64, 48), "size_mismatch"),
+        (BOMB, "zstd", (30000, 30000), "too_large"),
+        (bytes(payload.MAX_MESSAGE_BYTES + 1), "jpeg", (64, 48), "too_large"),
+        (JPEG, "png", (64, 48), "bad_payload"),
+        (JPEG, "gif", (64, 48), "unknown_codec"),
+        (b"", "jpeg", (64, 48), "bad_payload"),
+        (b"", "zstd", (64, 48), "bad_payload"),
+        (JPEG[:3], "jpeg", (64, 48), "bad_payload"),
+        # Two frame headers: decoders disagree on which one counts.
+        (JPEG[:2] + FRAME_HEADER + JPEG[2:], "jpeg", (64, 48), "bad_payload"),
+    ],
+    ids=lambda v: v[:8].hex() if isinstance(v, bytes) else str(v),
+)  # fmt: skip
+def test_hostile_headers_are_refused_by_check_alone(data, codec, size, reason):
+    with pytest.raises(PayloadError) as error:
+        check(data, codec, *size)
+    assert error.value.reason == reason
+    with pytest.raises(PayloadError):
+        decode(data, codec, *size)
+
+
+def test_a_bomb_of_the_announced_size_is_bounded():
+    """The worst that passes the headers: the largest image there may be, from a few kilobytes."""
+    side = MAX_IMAGE_SIDE
+    row = b"\0" + bytes(side * 3)
+    data = png(side, side, rows=row * side)
+    assert len(data) < 200_000
+    assert decode(data, "png", side, side).shape == (side, side, 3)
+    squeezed = zstandard.ZstdCompressor(level=19).compress(bytes(side * side * 3))
+    assert decode(squeezed, "zstd", side, side).nbytes == side * side * 3
+
+
+@pytest.mark.parametrize("codec", ["jpeg", "png", "zstd"])
+def test_truncated_data_is_refused_or_decoded_to_the_announced_size(codec):
+    image = np.random.default_rng(3).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    data = encode(image, codec)
+    outcomes = set()
+    for length in range(0, len(data), 7):
+        try:
+            assert decode(data[:length], codec, 64, 48).shape == (48, 64, 3)
+            outcomes.add("decoded")
+        except PayloadError as error:
+            outcomes.add(error.reason)
+    assert "bad_payload" in outcomes or "undecodable" in outcomes
+
+
+@given(data=st.binary(max_size=300), codec=st.sampled_from(["jpeg", "png", "zstd"]), start=st.booleans())
+def test_random_bytes_raise_nothing_but_payload_error(data, codec, start):
+    head = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "zstd": b"\x28\xb5\x2f\xfd"}[
+        codec
+    ]
+    try:
+        image = decode((head if start else b"") + data, codec, 8, 8)
+    except PayloadError as error:
+        assert error.reason in ("too_large", "bad_payload", "size_mismatch", "undecodable")
+    else:
+        assert image.shape[:2] == (8, 8) and image.dtype == np.uint8
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data(), codec=st.sampled_from(["jpeg", "png", "zstd"]))
+def test_flipped_bytes_raise_nothing_but_payload_error(data, codec):
+    image = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
+    good = bytearray(encode(image, codec))
+    for _ in range(data.draw(st.integers(1, 4))):
+        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        back = decode(bytes(good), codec, 16, 12)
+    except PayloadError:
+        return
+    assert back.shape[:2] == (12, 16) and back.shape[2] in (3, 4) and back.dtype == np.uint8
+
+
+@given(width=st.integers(-10, 10**6), height=st.integers(-10, 10**6))
+def test_impossible_sizes_are_refused(width, height):
+    if 0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE:
+        return
+    for codec in ("jpeg", "png", "zstd"):
+        with pytest.raises(PayloadError):
+            check(JPEG, codec, width, height)
+
+
+def test_other_depths_never_come_back_as_something_else():
+    """16-bit and palette PNGs are decoded to 8 bits a channel or refused, never passed on as they are."""
+    for depth, kind in ((16, 2), (16, 0), (1, 0), (8, 4), (8, 3), (16, 6)):
+        try:
+            image = decode(png(8, 8, depth, kind, rows=b"\0" * 8 * 70), "png", 8, 8)
+        except PayloadError as error:
+            assert error.reason == "undecodable"
+        else:
+            assert image.dtype == np.uint8 and image.shape[2] in (3, 4)
+
+
+def test_refusing_bombs_takes_no_memory(tmp_path):
+    """In a process of its own: 200 refused bombs raise the peak by less than 20 MB."""
+    (tmp_path / "png").write_bytes(png(30000, 30000))
+    (tmp_path / "jpeg").write_bytes(forge_jpeg(JPEG, 30000, 30000))
+    (tmp_path / "zstd").write_bytes(BOMB)
+    program = """
+import resource, sys
+from freshfield import payload
+from pathlib import Path
+bombs = {c: (Path(sys.argv[1]) / c).read_bytes() for c in ("png", "jpeg", "zstd")}
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for _ in range(200):
+    for codec, data in bombs.items():
+        for size in ((64, 48), (30000, 30000)):
+            try:
+                payload.decode(data, codec, *size)
+            except payload.PayloadError:
+                continue
+            raise SystemExit("a bomb was decoded")
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+    run = [sys.executable, "-c", program, str(tmp_path)]
+    grown_kb = int(subprocess.check_output(run))
+    assert grown_kb < 20_000

@@ -1,0 +1,134 @@
+"""Scenario files: strict, with one clear line for everything that is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from freshfield.scenario import ScenarioError, load, parse, read_section
+
+FILE = Path("s.yaml")
+
+
+def test_a_whole_file(tmp_path):
+    file = tmp_path / "try.yaml"
+    file.write_text("seed: 5\ncameras: {ids: [left, right, top], held_out: [top]}\nsource: {kind: world}\n")
+    s = load(file)
+    assert (s.name, s.seed, s.cameras, s.held_out) == ("try", 5, ("left", "right", "top"), ("top",))
+    assert s.training == ("left", "right") and s.source == {"kind": "world"} and s.channel == {}
+    assert load(file, seed=9).seed == 9
+
+
+def test_shipped_ones_go_by_name():
+    assert len(load("room").cameras) == 13 and load("room").held_out == ("cam00",)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[1, 2]", "expected a mapping"),
+        ("cameras: {count: 2}\nsede: 3", "sede: unknown key; did you mean 'seed'"),
+        ("cameras: {count: 2}\nsource: 3", "source: expected a mapping"),
+        ("{}", "either count"),
+        ("cameras: {count: 0}", "either count"),
+        ("cameras: {count: 1001}", "either count"),
+        ("cameras: {count: 2, ids: [a, b]}", "either count"),
+        ("cameras: {count: two}", "cameras.count: expected a whole number, got 'two'"),
+        ("cameras: {count: 2.0}", "cameras.count: expected a whole number"),
+        ("cameras: {count: true}", "cameras.count: expected a whole number"),
+        ("cameras: {ids: [a, a]}", "same id twice"),
+        ("cameras: {ids: ['a/b']}", "'a/b' is not an id"),
+        ("cameras: {count: 2, held_out: [cam02]}", "'cam02' is not one of the cameras"),
+        ("cameras: {count: 1, held_out: [cam00]}", "every camera is held out"),
+        ("cameras: {count: 2}\nseed: -1", "seed"),
+        ("cameras: {count: 2}\nseed: 1.5", "seed"),
+        ("cameras: {count: 2}\nseed: true", "seed"),
+        ("a: [1", "not YAML"),
+        ("a: !!python/object/apply:os.system [ls]", "not YAML"),
+    ],
+)
+def test_errors_are_one_line_with_the_file(tmp_path, text, message):
+    file = tmp_path / "s.yaml"
+    file.write_text(text)
+    with pytest.raises(ScenarioError, match=message) as error:
+        load(file)
+    assert str(error.value).startswith(str(file)) and "\n" not in str(error.value)
+
+
+def test_a_missing_file_lists_what_is_shipped():
+    with pytest.raises(ScenarioError, match=r"shipped scenarios: .*room"):
+        load("no-such-scenario")
+
+
+@dataclass(frozen=True)
+class Inner:
+    rate: float
+    name: str = "x"
+
+
+@dataclass(frozen=True)
+class Outer:
+    count: int = 1
+    on: bool = False
+    share: float | None = None
+    size: tuple[int, int] = (1, 1)
+    inner: Inner | None = None
+    tags: list[str] = field(default_factory=list)
+    table: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.count < 0:
+            raise ValueError("count cannot be negative")
+
+
+def test_sections_become_dataclasses():
+    given = {"share": 1, "size": [3, 4], "inner": {"rate": 2}, "tags": ["a"], "table": {"k": 0.5}}
+    assert read_section(Outer, given, "s: x") == Outer(1, False, 1.0, (3, 4), Inner(2.0), ["a"], {"k": 0.5})
+    assert read_section(Outer, {"share": None}, "s: x").share is None
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"cuont": 1}, r"s: x\.cuont: unknown key; did you mean 'count'"),
+        ({"count": 1.0}, r"s: x\.count: expected a whole number"),
+        ({"on": 1}, r"s: x\.on: expected true or false"),
+        ({"share": float("nan")}, r"s: x\.share: expected a number"),
+        ({"share": float("inf")}, r"s: x\.share: expected a number"),
+        ({"size": [1, 2, 3]}, r"s: x\.size: expected a list of 2 values"),
+        ({"size": [1, "b"]}, r"s: x\.size\[1\]: expected a whole number"),
+        ({"inner": {}}, r"s: x\.inner\.rate: missing"),
+        ({"inner": {"rate": 1, "nmae": "y"}}, r"s: x\.inner\.nmae: unknown key; did you mean 'name'"),
+        ({"table": {"k": "v"}}, r"s: x\.table\.k: expected a number"),
+        ({"tags": "a"}, r"s: x\.tags: expected a list"),
+        ({"count": -1}, r"s: x: count cannot be negative"),
+        ([], "s: x: expected a mapping"),
+    ],
+)
+def test_sections_refuse_by_name(given, message):
+    with pytest.raises(ScenarioError, match=message):
+        read_section(Outer, given, "s: x")
+
+
+def test_random_streams_are_independent_of_the_number_of_cameras():
+    few, many = (parse({"seed": 3, "cameras": {"count": n}}, FILE) for n in (2, 9))
+    assert (few.rng("noise", "cam01").random(8) == many.rng("noise", "cam01").random(8)).all()
+    draws = {}
+    for seed in (0, 1, 2**32):
+        scenario = parse({"seed": seed, "cameras": {"count": 3}}, FILE)
+        for purpose in ("noise", "noise ", "link"):
+            for camera in ("cam00", "cam01", None):
+                draws[purpose, camera, seed] = tuple(scenario.rng(purpose, camera).random(3))
+    assert len(set(draws.values())) == len(draws) == 27
+    assert np.corrcoef(few.rng("a").random(4000), few.rng("b").random(4000))[0, 1] < 0.06
+
+
+def test_every_shipped_scenario_loads():
+    for file in sorted((Path(__file__).parents[2] / "deploy/scenarios").glob("*.yaml")):
+        scenario = load(file)
+        assert scenario.name == file.stem and scenario.description
+        assert yaml.safe_load(file.read_text())["cameras"]

@@ -1,0 +1,210 @@
+"""Channels and servers: token, TLS, ports, message limits."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import shutil
+import subprocess
+
+import grpc
+import grpc.aio
+import pytest
+
+from freshfield.payload import MAX_MESSAGE_BYTES
+from freshfield.transport import Transport, TransportError, add_arguments, from_arguments
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
+from freshfield.v1 import frames_pb2 as pb
+
+
+class Clock(clock_pb2_grpc.ClockServiceServicer):
+    async def Exchange(self, request, context):
+        return clock_pb2.ExchangeResponse(client_sent_ns=request.client_sent_ns)
+
+
+class Frames(frames_pb2_grpc.FrameStreamServiceServicer):
+    async def Push(self, request_iterator, context):
+        async for request in request_iterator:
+            yield pb.PushResponse(sequence=len(request.payload))
+
+
+async def serve(transport: Transport) -> tuple[grpc.aio.Server, int]:
+    server = transport.aio_server()
+    clock_pb2_grpc.add_ClockServiceServicer_to_server(Clock(), server)
+    frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(Frames(), server)
+    port = transport.bind(server, "localhost:0")
+    await server.start()
+    return server, port
+
+
+async def ask(transport: Transport, port: int) -> int:
+    async with transport.aio_channel(f"localhost:{port}") as channel:
+        call = clock_pb2_grpc.ClockServiceStub(channel).Exchange(
+            clock_pb2.ExchangeRequest(client_sent_ns=42), metadata=transport.metadata(), timeout=5
+        )
+        return (await call).client_sent_ns
+
+
+async def push(transport: Transport, port: int, size: int) -> int:
+    async with transport.aio_channel(f"localhost:{port}") as channel:
+        call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push(metadata=transport.metadata(), timeout=20)
+        await call.write(pb.PushRequest(payload=bytes(size)))
+        response = await call.read()
+        return response.sequence
+
+
+def refusal(work) -> grpc.StatusCode:
+    with pytest.raises(grpc.aio.AioRpcError) as error:
+        asyncio.run(work)
+    return error.value.code()
+
+
+def test_plain_text_and_messages_up_to_the_limit():
+    async def scene():
+        server, port = await serve(Transport())
+        try:
+            assert await ask(Transport(), port) == 42
+            assert await push(Transport(), port, MAX_MESSAGE_BYTES) == MAX_MESSAGE_BYTES
+            with pytest.raises(grpc.aio.AioRpcError):
+                await push(Transport(), port, MAX_MESSAGE_BYTES + 8192)
+            assert await ask(Transport(), port) == 42  # and the server lives on
+        finally:
+            await server.stop(None)
+
+    asyncio.run(scene())
+
+
+def test_a_server_refuses_a_message_that_a_stranger_sends_too_large():
+    async def scene():
+        server, port = await serve(Transport())
+        options = [("grpc.max_send_message_length", -1)]
+        async with grpc.aio.insecure_channel(f"localhost:{port}", options=options) as channel:
+            call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push(timeout=20)
+            try:
+                await call.write(pb.PushRequest(payload=bytes(4 * MAX_MESSAGE_BYTES)))
+                await call.read()
+            finally:
+                await server.stop(None)
+
+    assert refusal(scene()) == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+@pytest.mark.parametrize("token", [None, "wrong", "right "])
+def test_without_the_right_token_nothing_is_served(token):
+    async def scene(call):
+        server, port = await serve(Transport(token="right"))
+        try:
+            assert await ask(Transport(token="right"), port) == 42
+            assert await push(Transport(token="right"), port, 7) == 7
+            await call(port)
+        finally:
+            await server.stop(None)
+
+    stranger = Transport(token=token)
+    assert refusal(scene(lambda port: ask(stranger, port))) == grpc.StatusCode.UNAUTHENTICATED
+    assert refusal(scene(lambda port: push(stranger, port, 7))) == grpc.StatusCode.UNAUTHENTICATED
+
+
+def test_a_port_in_use_is_not_shared():
+    async def scene():
+        server, port = await serve(Transport())
+        try:
+            with pytest.raises(TransportError, match=f"localhost:{port}"):
+                Transport().bind(Transport().aio_server(), f"localhost:{port}")
+        finally:
+            await server.stop(None)
+
+    asyncio.run(scene())
+
+
+@pytest.fixture(scope="module")
+def pem(tmp_path_factory):
+    """An authority, a server's and a client's certificate, and a stranger's."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    folder = tmp_path_factory.mktemp("pem")
+
+    def openssl(*arguments: str) -> None:
+        subprocess.run(["openssl", *arguments], check=True, capture_output=True, cwd=folder)
+
+    for name in ("ca", "stranger"):
+        openssl("req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
+                "-keyout", f"{name}.key", "-out", f"{name}.pem")  # fmt: skip
+    (folder / "ext").write_text("subjectAltName=DNS:localhost")
+    for name in ("server", "client"):
+        openssl("req", "-newkey", "rsa:2048", "-nodes", "-subj", f"/CN={name}",
+                "-keyout", f"{name}.key", "-out", f"{name}.csr")  # fmt: skip
+        openssl("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-days", "2",
+                "-CAcreateserial", "-extfile", "ext", "-out", f"{name}.pem")  # fmt: skip
+    return folder
+
+
+def test_tls_and_mutual_tls(pem):
+    server_tls = Transport(cert=pem / "server.pem", key=pem / "server.key")
+    mutual = Transport(cert=pem / "server.pem", key=pem / "server.key", ca=pem / "ca.pem")
+    trusting = Transport(ca=pem / "ca.pem")
+    known = Transport(cert=pem / "client.pem", key=pem / "client.key", ca=pem / "ca.pem")
+    deceived = Transport(ca=pem / "stranger.pem")
+
+    async def scene(server_side, client):
+        server, port = await serve(server_side)
+        try:
+            return await ask(client, port)
+        finally:
+            await server.stop(None)
+
+    assert asyncio.run(scene(server_tls, trusting)) == 42
+    assert asyncio.run(scene(mutual, known)) == 42
+    for server_side, client in ((server_tls, deceived), (server_tls, Transport()), (mutual, trusting)):
+        assert refusal(scene(server_side, client)) == grpc.StatusCode.UNAVAILABLE
+
+
+def parsed(*arguments: str) -> Transport:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    return from_arguments(parser.parse_args(arguments))
+
+
+def test_options_become_a_transport(tmp_path):
+    token = tmp_path / "token"
+    token.write_text("  secret\n")
+    transport = parsed("--token-file", str(token))
+    assert transport.metadata() == (("authorization", "Bearer secret"),)
+    assert parsed() == Transport()
+    token.write_text("\n")
+    with pytest.raises(TransportError, match="empty"):
+        parsed("--token-file", str(token))
+    with pytest.raises(TransportError, match="cannot read"):
+        parsed("--tls-ca", str(tmp_path / "none.pem"))
+    with pytest.raises(TransportError, match="go together"):
+        parsed("--tls-cert", str(token))
+
+
+def test_a_slow_reader_is_felt_at_once():
+    """bdp_probe=0: a client cannot bury a stalled reader under megabytes of frames, which are age."""
+
+    class Stalled(frames_pb2_grpc.FrameStreamServiceServicer):
+        async def Push(self, request_iterator, context):
+            await asyncio.sleep(30)
+            yield pb.PushResponse()
+
+    async def scene():
+        server = Transport().aio_server()
+        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(Stalled(), server)
+        port = Transport().bind(server, "localhost:0")
+        await server.start()
+        written = 0
+        async with Transport().aio_channel(f"localhost:{port}") as channel:
+            call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push()
+            try:
+                async with asyncio.timeout(2):
+                    while written < 100:
+                        await call.write(pb.PushRequest(payload=bytes(100_000)))
+                        written += 1
+            except TimeoutError:
+                pass
+            call.cancel()
+        await server.stop(None)
+        return written
+
+    assert asyncio.run(scene()) < 20
