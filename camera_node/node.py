@@ -157,7 +157,9 @@ class Node:
             due_ns = tick * per_tick // fps.numerator
             await asyncio.sleep((due_ns - self._clock.now_ns()) * 1e-9)
             try:
-                shot = camera.cached(tick) or await loop.run_in_executor(self._pool, camera.capture, tick)
+                shot = camera.cached(tick)
+                if shot is None:
+                    shot = await loop.run_in_executor(self._pool, camera.capture, tick)
             except ValueError as error:
                 self._failed(camera.name, error)
             else:

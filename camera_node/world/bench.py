@@ -1,9 +1,10 @@
-"""What scenes and effects cost in milliseconds a frame.
+"""What scenes and effects cost in milliseconds of processor time a frame.
 
     python -m camera_node.world.bench --size 128 --json bench.json
 
-Medians over frames spread through a period. Scenes are rendered ahead and cached, so their cost and that
-of world and exposure effects is paid once; only image and clock effects are paid while streaming.
+Medians over frames spread through a period; processor time of all threads, so that what else runs on the
+machine counts little. Scenes are rendered ahead and cached, so their cost and that of world and exposure
+effects is paid once; only image and clock effects are paid while streaming.
 """
 
 from __future__ import annotations
@@ -11,26 +12,31 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
 
 from camera_node.world import effects as fx
+from camera_node.world.render import Image
 from camera_node.world.scene import HELD_OUT, SCENES, make_scene
 
 
-def measure_ms(call: Callable[[int], object], frames: int) -> float:
-    """Median milliseconds of call(k), k = 0 .. frames - 1, after one call that does not count."""
-    call(0)
-    times = []
+def measure_ms(*calls: Callable[[int], object], frames: int) -> list[float]:
+    """Median processor milliseconds of each call(k), k = 0 .. frames - 1, after one that does not count.
+    The calls take turns, so that a change in the machine's load meets all of them."""
+    for call in calls:
+        call(0)
+    times: list[list[float]] = [[] for _ in calls]
     for k in range(frames):
-        start = perf_counter()
-        call(k)
-        times.append(1e3 * (perf_counter() - start))
-    return median(times)
+        for call, row in zip(calls, times):
+            start = process_time()
+            call(k)
+            row.append(1e3 * (process_time() - start))
+    return [median(row) for row in times]
 
 
 def bench_scenes(size: int, frames: int) -> list[dict[str, Any]]:
@@ -39,11 +45,12 @@ def bench_scenes(size: int, frames: int) -> list[dict[str, Any]]:
     for name in SCENES:
         for supersample in (1, 2):
             scene = make_scene(name, {"width": size, "height": size, "supersample": supersample})
-            start = perf_counter()
+            start = process_time()
             render = scene.renderer(HELD_OUT).image
-            setup_ms = 1e3 * (perf_counter() - start)
+            setup_ms = 1e3 * (process_time() - start)
             step = scene.period_s / frames
-            ms = measure_ms(lambda k, render=render, step=step: render(k * step), frames)  # type: ignore[misc]
+            call = partial(_render_at, render, step)
+            (ms,) = measure_ms(call, frames=frames)
             rows.append({"scene": name, "supersample": supersample, "setup_ms": setup_ms, "frame_ms": ms})
     return rows
 
@@ -55,25 +62,28 @@ def bench_effects(size: int, frames: int, scene_name: str = "room") -> list[dict
     plain = scene.renderer(HELD_OUT).image
     step = scene.period_s / frames
     image = plain(0.0)
-    base_ms = measure_ms(lambda k: plain(k * step), frames)
     rows = []
-    for name in fx.NAMES:
-        made = fx.load_effects({name: {}}, lambda _: np.random.default_rng(0))
+    for name in (*fx.NAMES, None):
+        made = fx.load_effects({name: {}} if name else {}, lambda _: np.random.default_rng(0))
         if made.world or made.exposure:
             render = made.exposed(made.extend(scene).renderer(HELD_OUT).image)
-            added = measure_ms(lambda k, render=render: render(k * step), frames) - base_ms  # type: ignore[misc]
-            paid = "ahead"
-        elif made.image:
-            added = measure_ms(lambda k, made=made: made.apply(image, k), frames)  # type: ignore[misc]
-            paid = "streaming"
+            base, full = measure_ms(
+                partial(_render_at, plain, step), partial(_render_at, render, step), frames=frames
+            )
+            rows.append({"effect": name, "added_ms": full - base, "paid": "ahead"})
         else:
-            added = measure_ms(lambda k, made=made: made.node_ns(k), frames)  # type: ignore[misc]
-            paid = "streaming"
-        rows.append({"effect": name, "added_ms": added, "paid": paid})
-    none = fx.load_effects({}, lambda _: np.random.default_rng(0))
-    added = measure_ms(lambda k: none.node_ns(k) and none.apply(image, k), frames)
-    rows.append({"effect": "none listed", "added_ms": added, "paid": "streaming"})
+            (added,) = measure_ms(partial(_stream, made, image), frames=frames)
+            rows.append({"effect": name or "none listed", "added_ms": added, "paid": "streaming"})
     return rows
+
+
+def _render_at(render: Callable[[float], Image], step_s: float, k: int) -> Image:
+    return render(k * step_s)
+
+
+def _stream(effects: fx.Effects, image: Image, k: int) -> Image:
+    effects.node_ns(k)
+    return effects.apply(image, k)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -70,6 +71,12 @@ class NgpSettings:
             raise ValueError(f"ngp: harmonics must be 1, 4 or 9, not {self.harmonics}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"ngp: device must be auto, cpu or cuda, not {self.device!r}")
+        named = self.background in ("auto", "white", "black", "mean", "random")
+        if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
+            raise ValueError(
+                "ngp: background must be auto, white, black, mean, random or a colour like '#80c0ff', "
+                f"not {self.background!r}"
+            )
         for name in ("radius_m", "near_m"):
             if getattr(self, name) is not None and not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"ngp: {name} must be positive, not {getattr(self, name)}")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Rendering
-from edge_server.page import start_page
+from edge_server.page import PageError, start_page
 from edge_server.scheduler import POLICIES, Epoch, Policy, make_policy
 from edge_server.state import CameraView, Comparison, Controls, EdgeState, Publication
 from freshfield import payload
@@ -261,15 +261,15 @@ def _uint8(image: Rendering) -> NDArray[np.uint8]:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=8080)
+    parser.add_argument("--port", "--page-port", type=int, default=8080)
     parser.add_argument("--cameras", type=int, default=CAMERAS)
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for snapshots")
     args = parser.parse_args(arguments)
     try:
         preview = Preview(args.out, args.cameras)
-    except ValueError as error:
+        page = start_page(preview.state, args.host, args.port)
+    except (ValueError, PageError) as error:
         parser.error(str(error))
-    page = start_page(preview.state, args.host, args.port)
     preview.start()
     print(f"page: {page.url}  (Ctrl-C ends it)", flush=True)
     try:

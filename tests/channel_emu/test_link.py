@@ -40,7 +40,8 @@ def test_drop_new_discards_while_busy_and_takes_the_frame_of_the_boundary() -> N
 
 def test_newest_waits_keeps_one_and_the_newest() -> None:
     assert play(link("newest-waits", [10, 5, 7, 5]), [0, 2, 4]) == [
-        ("started", 0, 0), ("superseded", 4, 1), ("delivered", 10, 0), ("started", 10, 2), ("delivered", 17, 2),
+        ("started", 0, 0), ("superseded", 4, 1), ("delivered", 10, 0),
+        ("started", 10, 2), ("delivered", 17, 2),
     ]  # fmt: skip
 
 
@@ -59,7 +60,8 @@ def test_lcfs_preempts_the_frame_in_service() -> None:
 
 def test_parallel_frames_overtake() -> None:
     assert play(link("parallel", [10, 5], queue_limit=2), [0, 2, 3]) == [
-        ("started", 0, 0), ("started", 2, 1), ("dropped_busy", 3, 2), ("delivered", 7, 1), ("delivered", 10, 0),
+        ("started", 0, 0), ("started", 2, 1), ("dropped_busy", 3, 2), ("delivered", 7, 1),
+        ("delivered", 10, 0),
     ]  # fmt: skip
 
 
@@ -71,7 +73,7 @@ def test_zero_delay_delivers_at_once() -> None:
 
 
 def test_a_late_caller_gets_the_punctual_decisions() -> None:
-    """Told of 0..30 ms at once, newest-waits starts the waiting frame when the first was due, not when told."""
+    """Told of 30 ms at once, newest-waits starts the waiting frame when the first was due, not when told."""
     subject = link("newest-waits", [10, 5])
     subject.offer(0)
     subject.offer(2 * MS)
@@ -107,7 +109,8 @@ def test_breaking_off_ends_all_that_is_inside() -> None:
     subject = link("fcfs", [10])
     for at in (0, 1, 2):
         subject.offer(at * MS)
-    assert [(e.kind, e.transit.number) for e in subject.break_off(5 * MS)] == [("broken", n) for n in range(3)]
+    ended = [(e.kind, e.transit.number) for e in subject.break_off(5 * MS)]
+    assert ended == [("broken", n) for n in range(3)]
     assert subject.in_flight == 0
     assert [e.kind for e in subject.offer(6 * MS)[1]] == [Kind.STARTED]
 
@@ -124,15 +127,17 @@ class Story:
     looks_ns: list[int]
 
 
+DELAYS_MS = st.sampled_from([0, 1e-6, 1, 7.5, 1e3, 1e15])
+
+
 @st.composite
 def stories(draw: st.DrawFn, faults: bool = True) -> Story:
     """Any channel, any offers, and any pattern of asking in between."""
     section: dict = {
         "discipline": draw(st.sampled_from(DISCIPLINES)),
         "queue_limit": draw(st.integers(1, 4)),
-        "service": {"law": "trace", "delays_ms": draw(st.lists(st.sampled_from([0, 1e-6, 1, 7.5, 1e3, 1e15]),
-                                                               min_size=1, max_size=5))},
-    }  # fmt: skip
+        "service": {"law": "trace", "delays_ms": draw(st.lists(DELAYS_MS, min_size=1, max_size=5))},
+    }
     if draw(st.booleans()):
         section["chain"] = {"mu1_per_ms": draw(st.sampled_from([1e-9, 0.1, 10.0])), "mu2_per_ms": 0.2}
         section["service"] = {"law": "exponential", "mean_ms": [draw(st.sampled_from([0.0, 1.0, 50.0])), 5.0]}
@@ -167,7 +172,7 @@ def tell(story: Story) -> tuple[list, list[Event]]:
     return transits, events + story.subject.advance(story.offers_ns[-1] + 50 * MS)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=70, deadline=None)
 @given(stories())
 def test_every_frame_ends_exactly_once(story: Story) -> None:
     transits, events = tell(story)
@@ -183,7 +188,7 @@ def test_every_frame_ends_exactly_once(story: Story) -> None:
         assert (t.outcome is None) == (t.number not in ends)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=70, deadline=None)
 @given(stories())
 def test_time_runs_forwards(story: Story) -> None:
     transits, events = tell(story)
@@ -197,7 +202,7 @@ def test_time_runs_forwards(story: Story) -> None:
             assert t.ended_ns is not None and t.ended_ns >= t.offered_ns
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=70, deadline=None)
 @given(stories())
 def test_what_each_discipline_promises(story: Story) -> None:
     _, events = tell(story)
@@ -222,7 +227,7 @@ def test_what_each_discipline_promises(story: Story) -> None:
         assert story.subject.counts[Kind.SUPERSEDED] == 0
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(stories(), st.lists(st.integers(0, 600 * MS), max_size=10))
 def test_decisions_do_not_depend_on_when_one_looks(story: Story, looks_ns: list[int]) -> None:
     import copy
@@ -232,7 +237,7 @@ def test_decisions_do_not_depend_on_when_one_looks(story: Story, looks_ns: list[
     def fates(transits: list) -> list[tuple]:
         return [(t.started_ns, t.due_ns, t.outcome, t.ended_ns, t.state, t.flips) for t in transits]
 
-    end_ns = 10**12
+    end_ns = story.offers_ns[-1] + 5000 * MS
     first, second = tell(story)[0], tell(other)[0]
     story.subject.advance(end_ns)
     other.subject.advance(end_ns)

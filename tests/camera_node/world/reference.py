@@ -33,7 +33,7 @@ def _box(q: Array) -> Array:
 
 def _round_cone(s: RoundCone, p: Array) -> Array:
     # The hull of two balls is the union of the balls of interpolated centre and radius.
-    share = np.linspace(0.0, 1.0, 4001)
+    share = np.linspace(0.0, 1.0, 1001)
     out = np.full(p.shape[1], np.inf)
     for k in share:
         centre = np.array([[0.0], [0.0], [k * s.length]])

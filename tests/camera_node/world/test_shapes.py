@@ -16,8 +16,8 @@ SHAPES = [
     RoundCone(0.15, 0.45, 0.8),
     capsule(0.3, 0.9),
 ]
-# The reference of the round cone is a union of 4001 balls, flat to this much.
-TOLERANCE = 1e-6
+# The reference of the round cone is a union of 1001 balls, flat to this much.
+TOLERANCE = 3e-6
 
 
 def directions(rng: np.random.Generator, n: int) -> np.ndarray:

@@ -59,18 +59,22 @@ def test_up_is_the_cameras_up():
     assert np.allclose(world_up(rolling), (0, -1, 0))
 
 
-@pytest.mark.parametrize("spread_deg", [40, 120, 200])
-def test_the_visitor_sees_the_whole_rig_from_behind_and_above(spread_deg):
+@pytest.mark.parametrize(("spread_deg", "share"), [(40, 1.0), (120, 0.75), (170, 0.5)])
+def test_the_visitor_sees_the_rig_from_behind_and_above(spread_deg, share):
     poses = rig(9, spread_deg)
     view = initial_viewpoint(poses)
     assert np.allclose(view.look_at, TARGET, atol=1e-6)
     assert view.radius_m == pytest.approx(3.0)
     eyes = poses[:, :3, 3]
     assert (view.position - TARGET) @ view.up > eyes.mean(axis=0)[2] - TARGET[2]
+    # Behind the cameras, but not lost in space of which a field knows nothing.
+    assert 1.2 < np.linalg.norm(view.position - TARGET) / view.radius_m < 2.3
     camera = look_at(view.position, view.look_at, view.up)
     local = (eyes - camera[:3, 3]) @ camera[:3, :3]
-    assert (local[:, 2] > 0).all()
-    assert (np.abs(local[:, :2] / local[:, 2:]) < np.tan(VERTICAL_FOV_RAD / 2)).all()
+    seen = (np.abs(local[:, :2] / local[:, 2:]) < np.tan(VERTICAL_FOV_RAD / 2)).all(axis=1) & (
+        local[:, 2] > 0
+    )
+    assert seen.mean() >= share
 
 
 def test_a_ring_has_no_behind_so_the_visitor_stands_behind_its_first_camera():

@@ -20,7 +20,7 @@ def make(**parameters: float) -> Occluder:
 
 @pytest.mark.parametrize("name", ["room", "tile"])
 def test_it_passes_in_front_of_every_camera_once_in_a_while(name):
-    scene = make_scene(name, {**SMALL, "count": 19})
+    scene = make_scene(name, {**SMALL, "count": 7})
     seen = make().extend(scene)
     assert seen.moving and seen.period_s > 1
     for camera in scene.cameras:

@@ -23,8 +23,8 @@ from camera_node.world.cache import FrameCache
 
 listed, folder = {listed!r}, Path({folder!r})
 streams = []
-scene = make_scene("room", dict(width=32, height=32, supersample=1, speed_m_per_s=8.0))
-tracemalloc.start(20)
+scene = make_scene("tile", dict(width=16, height=16, supersample=1))
+tracemalloc.start(4)
 calls = 0
 def count(frame, event, argument):
     global calls

@@ -1,0 +1,56 @@
+"""Fields by name: lazily imported, options checked."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from edge_server.fields.ngp import NgpField
+from edge_server.fields.ngp_settings import EFFORTS, NgpSettings, help_text, make_settings
+from edge_server.fields.registry import field_names, make_field
+
+
+def test_make_field_passes_options_and_seed() -> None:
+    field = make_field("ngp", {"levels": 3, "log2_table": 9, "device": "cpu", "centre_m": [1, 2, 3]}, seed=5)
+    assert isinstance(field, NgpField) and field.settings.levels == 3 and field.settings.seed == 5
+    assert field.settings.centre_m == (1.0, 2.0, 3.0) and "ngp" in field_names()
+
+
+def test_unknown_names_list_the_valid_ones() -> None:
+    with pytest.raises(ValueError, match="there are: ngp"):
+        make_field("gaussians")
+    with pytest.raises(ValueError, match=r"no option levles, rats; it has: effort, levels, .*threads"):
+        make_field("ngp", {"levles": 3, "rats": 4})
+    with pytest.raises(ValueError, match="low, medium, high"):
+        make_field("ngp", {"effort": "heroic"})
+    with pytest.raises(ValueError, match=r"levels must be in 1..24, not 99"):
+        make_field("ngp", {"levels": 99})
+    with pytest.raises(ValueError, match="background"):
+        make_field("ngp", {"background": "blu"})
+
+
+def test_efforts_are_ordered_and_can_be_overridden() -> None:
+    low, medium, high = (make_settings({"effort": e}) for e in EFFORTS)
+    assert low.finest_resolution < medium.finest_resolution < high.finest_resolution
+    assert low.batch_samples < medium.batch_samples < high.batch_samples and medium == NgpSettings()
+    assert make_settings({"effort": "high", "samples": 33}).samples == 33
+
+
+def test_every_option_has_help() -> None:
+    assert all(len(text) > 10 for text in help_text().values())
+
+
+def test_the_registry_imports_no_representation_by_itself() -> None:
+    code = (
+        "import sys, edge_server.fields.registry; print([m for m in sys.modules if m in ('numba', 'torch')])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+    code = (
+        "import sys; from edge_server.fields.registry import make_field;"
+        "make_field('ngp', {'device': 'cpu'}); print('torch' in sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "False"

@@ -1,0 +1,58 @@
+"""Where the scene is, from the cameras alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.fields.scene_box import converging_point, scene_box
+from freshfield.geometry import look_at
+from tests.edge_server.fields.scenes import ring
+
+VIEWS = ring(8, size=8)
+
+
+def test_the_box_is_where_the_axes_meet() -> None:
+    box = scene_box(VIEWS)
+    np.testing.assert_allclose(box.centre_m, [0, 0, 0.4], atol=1e-6)
+    assert box.contracted and 2.0 < box.radius_m < 3.2 and 0.0 < box.near_m < box.distance_m
+    np.testing.assert_allclose(box.normalise(np.array([0, 0, 0.4 + box.radius_m])), [0, 0, 1], atol=1e-6)
+
+
+def test_it_moves_and_scales_with_the_rig() -> None:
+    grown = []
+    for view in VIEWS:
+        pose = view.camera_to_world.copy()
+        pose[:3, 3] = 100.0 * pose[:3, 3] + [5.0, 6.0, 7.0]
+        grown.append(replace(view, camera_to_world=pose))
+    a, b = scene_box(VIEWS), scene_box(grown)
+    assert b.radius_m == pytest.approx(100 * a.radius_m) and b.near_m == pytest.approx(100 * a.near_m)
+    np.testing.assert_allclose(b.centre_m, 100 * np.array(a.centre_m) + [5, 6, 7], atol=1e-6)
+
+
+def test_transparent_pictures_show_an_object() -> None:
+    views = [replace(v, image=np.zeros((8, 8, 4), np.uint8)) for v in VIEWS]
+    box = scene_box(views)
+    assert not box.contracted and 0.5 < box.radius_m < 1.3
+
+
+def test_what_is_given_is_kept() -> None:
+    box = scene_box(VIEWS, (1.0, 2.0, 3.0), 4.0, 0.5, False)
+    assert (box.centre_m, box.radius_m, box.near_m, box.contracted) == ((1.0, 2.0, 3.0), 4.0, 0.5, False)
+
+
+def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
+    pose = VIEWS[0].camera_to_world
+    assert converging_point(np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 0, 1.0]])) is None
+    one = scene_box(VIEWS[:1])
+    ahead = (np.array(one.centre_m) - pose[:3, 3]) @ pose[:3, 2]
+    assert ahead > 1.0
+    outward = [
+        replace(v, camera_to_world=look_at(*[v.camera_to_world[:3, 3] * k for k in (1, 2)])) for v in VIEWS
+    ]
+    box = scene_box(outward)
+    assert np.linalg.norm(np.array(box.centre_m)[:2]) < 0.2 and np.isfinite(box.radius_m)
+    same = [replace(VIEWS[0], camera=str(k)) for k in range(5)]
+    assert np.isfinite(scene_box(same).radius_m) and scene_box(same).radius_m > 0

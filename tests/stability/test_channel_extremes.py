@@ -1,0 +1,170 @@
+"""The channel where numbers are extreme: it stays exact or says why it will not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from channel_emu.chain import Chain, ChainError, two_state_generator
+from channel_emu.channel import Channel
+from channel_emu.config import channel_from_mapping
+from channel_emu.instants import NEVER_NS
+from channel_emu.link import DISCIPLINES, Kind
+from channel_emu.simulate import simulate
+from channel_emu.uniforms import Uniforms
+
+MS = 10**6
+ENGINES = ["python", "kernel"]
+
+
+def run(section: dict, engine: str = "auto", seconds: float = 10, **more):
+    if engine == "kernel":
+        pytest.importorskip("numba")
+    return simulate(channel_from_mapping(section), 2, seconds, 1, engine=engine, **more).summary()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("discipline", DISCIPLINES)
+def test_zero_delays_deliver_everything_with_the_age_of_the_period(discipline: str, engine: str) -> None:
+    found = run({"preset": "ch5", "service": {"mean_ms": 0.0}, "discipline": discipline}, engine)
+    assert found["delivered"] == found["offered"] and found["dropped"] == 0
+    assert found["mean_age_ms"] == pytest.approx(15.0, abs=0.05)
+    assert found["delay_ms"]["mean"] == 0.0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("discipline", DISCIPLINES)
+@pytest.mark.parametrize("mean_ms", [1e12, 1e30, 1e300])
+def test_huge_delays_saturate(discipline: str, engine: str, mean_ms: float) -> None:
+    found = run({"preset": "ch5", "service": {"law": "deterministic", "mean_ms": mean_ms}, "queue_limit": 8,
+                 "discipline": discipline}, engine)  # fmt: skip
+    assert found["delivered"] == 0 and found["mean_age_ms"] is None
+    assert found["in_flight"] <= 2 * 9
+    assert found["offered"] == found["in_flight"] + found["dropped_busy"] + found["superseded"]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("discipline", DISCIPLINES)
+def test_delays_equal_to_the_period_lose_nothing(discipline: str, engine: str) -> None:
+    """Every completion falls on the next arrival's instant: the server is free for it, in every discipline."""
+    section = {"preset": "ch5", "service": {"law": "deterministic", "mean_ms": 30.0}, "discipline": discipline}
+    found = run(section, engine)
+    assert found["offered"] - found["delivered"] - found["in_flight"] == 0
+    assert found["mean_age_ms"] == pytest.approx(45.0, abs=0.1)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_chain_that_never_switches(engine: str) -> None:
+    chain = {"mu1_per_ms": 0.0, "mu2_per_ms": 0.0, "initial": "high"}
+    found = run({"preset": "ch6", "chain": chain}, engine)
+    assert found["state_share"] == {"low": 0.0, "high": 1.0}
+    assert found["delay_ms"]["mean"] == pytest.approx(60, rel=0.25)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_chain_that_always_switches(engine: str) -> None:
+    """500 switches a millisecond: the channel is its average."""
+    section = {"preset": "ch6", "chain": {"mu1_per_ms": 500.0, "mu2_per_ms": 500.0}, "discipline": "parallel",
+               "service_state": "modulated"}  # fmt: skip
+    found = run(section, engine, seconds=2)
+    assert found["state_share"]["low"] == pytest.approx(0.5, abs=0.01)
+    # Speeds 1/30 and 1/60 average to 1/40.
+    expected = 4 * 40 / max(found["delivered"], 1) ** 0.5
+    assert found["delay_ms"]["mean"] == pytest.approx(40, abs=expected)
+
+
+def test_a_chain_faster_than_a_nanosecond_is_noise() -> None:
+    section = {"preset": "ch6", "chain": {"mu1_per_ms": 1e9, "mu2_per_ms": 3e9}, "discipline": "parallel"}
+    found = run({**section, "service_state": "modulated"}, seconds=60)
+    assert found["engine"] == "python"
+    assert found["state_share"] == {"low": 0.75, "high": 0.25}
+    speed = 0.75 / 30 + 0.25 / 60
+    assert found["delay_ms"]["mean"] == pytest.approx(1 / speed, rel=0.15)
+    found = run(section, seconds=60)
+    assert found["delay_ms"]["mean"] == pytest.approx(0.75 * 30 + 0.25 * 60, rel=0.15)
+
+
+def test_chains_too_fast_to_follow_are_refused_with_a_reason() -> None:
+    with pytest.raises(ChainError, match="at most 1000 are"):
+        run({"preset": "ch6", "chain": {"mu1_per_ms": 1e6, "mu2_per_ms": 1e6}})
+    fast = np.array([[-1e9, 1e9, 0.0], [0.0, -1e9, 1e9], [1e9, 0.0, -1e9]])
+    with pytest.raises(ChainError, match="at most 1000 are"):
+        Chain(fast, Uniforms(0, "", "c"))
+    # Named start, closed class only reached later: found out while running, not by hanging.
+    late = np.array([[-1.0, 1.0, 0.0, 0.0], [0.0, -1e9, 1e9, 0.0], [0.0, 1e9, -1e9, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    with pytest.raises(ChainError, match="more than a million times"):
+        Chain(late, Uniforms(0, "", "c"), initial=0).state(10**12)
+
+
+def test_rates_of_1e_minus_9_and_1e9_together() -> None:
+    """Rarely leaves the first state, and is back at once: what happens is the first state's."""
+    chain = Chain(two_state_generator(1e-9, 1e9), Uniforms(0, "", "c"))
+    assert chain.occupancy(10**15) == [1.0, 0.0]
+    found = run({"preset": "ch6", "chain": {"mu1_per_ms": 1e-9, "mu2_per_ms": 1e9}}, seconds=100)
+    assert found["state_share"]["low"] == pytest.approx(1.0)
+    assert found["delay_ms"]["mean"] == pytest.approx(30, rel=0.2)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("rate", [1e-9, 1e9])
+def test_arrival_rates_at_both_ends(rate: float, engine: str) -> None:
+    section = {"preset": "ch6-low", "arrivals": {"rate_per_ms": rate}, "service": {"mean_ms": 1.0}}
+    found = run(section, engine, frame_period_ms=33.0)
+    if rate < 1:  # nothing is ever sampled
+        assert found["skipped"] == found["offered"] - 2 and found["delivered"] == 0
+    else:  # everything is, at once
+        assert found["skipped"] == 0 and found["delivered"] >= found["offered"] - 2
+
+
+def test_service_rates_at_both_ends_under_one_chain() -> None:
+    section = {"preset": "ch6", "service": {"mean_ms": [1e-9, 1e9]}, "service_state": "modulated",
+               "discipline": "drop-new"}  # fmt: skip
+    python, kernel = run(section, "python"), run(section, "auto")
+    assert python["delivered"] == kernel["delivered"] > 0
+    # A frame that starts in the slow state waits for the fast one, half a sojourn of 30 ms and more away.
+    assert 0 < python["delay_ms"]["mean"] < 60
+
+
+def test_a_camera_that_never_reports() -> None:
+    link = Channel(channel_from_mapping({"preset": "ch6"}), 0).link("silent")
+    assert link.next_event_ns == NEVER_NS
+    assert link.advance(10**15) == []
+    assert link.in_flight == 0 and not link.counts
+
+
+def test_a_frame_after_years_of_silence() -> None:
+    link = Channel(channel_from_mapping({"preset": "ch5"}), 0).link("late")
+    transit, _ = link.offer(3 * 365 * 86_400 * 10**9)
+    events = link.advance(NEVER_NS)
+    assert events[-1].kind is Kind.DELIVERED and transit.drawn_ns is not None and transit.drawn_ns < 10**9
+
+
+def test_a_clock_that_jumps() -> None:
+    """Forwards: everything due happens, in order. Backwards: time is held and the jump counted."""
+    link = Channel(channel_from_mapping({"preset": "ch5", "discipline": "fcfs"}), 0).link("a")
+    for at in range(20):
+        link.offer(at * MS)
+    events = link.advance(10**18)
+    assert [e.kind for e in events].count(Kind.DELIVERED) == 20
+    assert [e.at_ns for e in events] == sorted(e.at_ns for e in events)
+    transit, _ = link.offer(5)
+    assert transit.offered_ns == 10**18 and link.clock_backwards == 1
+    assert transit.due_ns is not None and transit.due_ns > 10**18
+
+
+def test_frames_of_the_same_instant() -> None:
+    for discipline in DISCIPLINES:
+        link = Channel(channel_from_mapping({"preset": "ch5", "discipline": discipline}), 0).link("a")
+        for _ in range(50):
+            link.offer(7)
+        link.advance(10**15)
+        assert sum(n for k, n in link.counts.items() if k != Kind.DUPLICATED) == 50
+
+
+def test_ages_keep_nanoseconds_after_a_year() -> None:
+    """Float64 of absolute nanoseconds would be off by 4 ns at 10^16 and by 100 at 10^18."""
+    from channel_emu import ages
+
+    start = 10**18
+    saw = ages.sawtooth(np.array([start + 3, start + 10]), np.array([start, start + 5]), start + 13)
+    assert ages.mean_age_ms(saw) == pytest.approx((7 * 6.5 + 3 * 6.5) / 10 / 1e6, rel=1e-12)
