@@ -79,7 +79,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found: install Python 3.11 or newer, or name one with PYTHON=..."; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "$$($(PYTHON) --version) is too old: freshfield needs 3.11 or newer; name one with PYTHON=..."; exit 1; }
-	@echo "set-up 1/3: virtual environment (.venv)"
+	@echo "set-up 1/2: virtual environment (.venv)"
 	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "cannot make a virtual environment (Debian: apt-get install python3-venv)"; exit 1; }
 	@touch $@
 
@@ -92,19 +92,23 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@$(INSTALL) --no-warn-conflicts -e '.[edge-base,up]'
 	@touch $@
 
-# Side by side: torch is one large archive to unpack, the others are many small ones to look up. What torch
-# itself needs comes last, when pip can see that torch is there.
-.venv/.ok-parts: .venv/.ok-venv pyproject.toml
-	@echo "set-up 2/3: $(TORCH), and beside it what freshfield runs on"
-	@$(MAKE) --no-print-directory -j2 .venv/.ok-torch .venv/.ok-base
+# What torch itself needs comes last, when pip can see that torch is there.
+.venv/.ok-edge: .venv/.ok-torch .venv/.ok-base
+	@$(INSTALL) $(TORCH)
 	@touch $@
 
-.venv/.ok-run: .venv/.ok-parts pyproject.toml
-	@echo "set-up 3/3: freshfield"
-	@$(INSTALL) -e '.[edge,up]'
+# The field's kernels are compiled at their first use, which takes most of a minute: better beside the
+# installation of torch than after it. Should it fail here, the edge server will say why.
+.venv/.ok-kernels: .venv/.ok-base
+	@$(PY) -c 'from edge_server.fields.registry import make_field; make_field("ngp", {"device": "cpu"}).warm_up()' || true
 	@touch $@
 
-.venv/.ok-test: .venv/.ok-parts pyproject.toml
-	@echo "set-up 3/3: freshfield and its test tools"
+.venv/.ok-run: .venv/.ok-venv pyproject.toml
+	@echo "set-up 2/2: $(TORCH) and beside it the rest; the field's kernels are compiled on the way"
+	@$(MAKE) --no-print-directory -j2 .venv/.ok-edge .venv/.ok-kernels
+	@touch $@
+
+.venv/.ok-test: .venv/.ok-run pyproject.toml
+	@echo "test tools"
 	@$(INSTALL) -e '.[edge,up,test,dev]'
-	@touch .venv/.ok-run $@
+	@touch $@

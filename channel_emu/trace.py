@@ -220,7 +220,7 @@ def compare(trace: Trace) -> dict[str, Any]:
     """
     from channel_emu.simulate import replay_offers
 
-    last_ns = max((max(r.offered_ns, r.ended_ns or 0) for r in trace.records), default=0)
+    last_ns = max((max(r.offered_ns, r.started_ns or 0, r.ended_ns or 0) for r in trace.records), default=0)
     again = replay_offers(trace.config, trace.seed, trace.offers(), last_ns)
     different = []
     for camera, records in trace.by_camera().items():

@@ -25,6 +25,7 @@ from freshfield.v1 import frames_pb2_grpc
 # A camera that restarts opens a new session; older ones may still have frames on the way.
 _SESSIONS_PER_CAMERA = 4
 _STREAMS_PER_CAMERA = 4
+_MAX_UNCERTAINTY_NS = 1_000_000_000
 
 
 @dataclass
@@ -52,7 +53,9 @@ class Gate:
             raise FrameRejected("replayed_sequence", f"{frame.sequence} after {session.sequence}")
         if frame.generated_ns <= session.generated_ns:
             raise FrameRejected("time_reversed", "captured before the frame that came before it")
-        ahead = frame.generated_edge_ns - now_ns - frame.clock_uncertainty_ns
+        # A node that has not measured its offset yet says so with a huge uncertainty: that must not let a
+        # frame from tomorrow be the newest until tomorrow.
+        ahead = frame.generated_edge_ns - now_ns - min(frame.clock_uncertainty_ns, _MAX_UNCERTAINTY_NS)
         if ahead > MAX_FUTURE_NS:
             raise FrameRejected(
                 "from_future", f"captured {ahead / 1e6:.0f} ms from now: clock offset unknown?"

@@ -20,8 +20,10 @@ from launch.status import read_json, read_status
 from launch.summary import summarise
 
 TICK_S = 0.25
-READY_WITHIN_S = 240.0
-"""A first start compiles the field's kernels, which takes tens of seconds on a slow machine."""
+READY_WITHIN_S = 600.0
+"""A first start compiles the field's kernels: a minute of work, more on a busy machine."""
+_COMPILING = "compiling"
+"""What the edge is doing, in its own words, before it can make a first update."""
 MAX_RESTARTS = 20
 REPORT_WITHIN_S = 300.0
 
@@ -140,7 +142,10 @@ class Run:
         if not net.is_serving(self.plan.emulator_address):
             return self.plan.emulator
         phases = [read_json(file).get("phase") for file in self.options.out.glob("node-*.json")]
-        return None if phases.count("streaming") == len(self.plan.nodes) else self.plan.nodes[0]
+        if phases.count("streaming") < len(self.plan.nodes):
+            return self.plan.nodes[0]
+        doing = str(read_json(self.options.out / "edge.json").get("doing") or _COMPILING)
+        return self.plan.edge if doing.startswith(_COMPILING) else None
 
     def _all_alive(self, now_s: float) -> bool:
         """Look for the dead; with --restart, start them again after a second. False if the run is over."""
@@ -168,7 +173,7 @@ class Run:
         if self._ready_s is None:
             if self.plan.emulator.process is None:
                 return "starting: the edge server loads, the cameras prepare their frames"
-            return "starting: the channel opens, the cameras prepare their frames"
+            return "starting: the cameras prepare their frames, the field its kernels"
         elapsed = now_s - self._ready_s
         end = f" of {self.options.duration_s:.0f}" if self.options.duration_s else ""
         return (

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.ngp_settings import NgpSettings
-from edge_server.fields.scene_box import SceneBox, scene_box
+from edge_server.fields.scene_box import SceneBox, plain_background, scene_box
 from edge_server.fields.supervision import CameraMemory, check_view, pack_views, remember
 from freshfield.geometry import Pinhole
 
@@ -38,7 +38,7 @@ class Rig:
         self.settings = settings
         self.box: SceneBox | None = None
         self.memory: dict[str, CameraMemory] = {}
-        self.mean_color = np.full(3, 0.5, np.float32)
+        self.behind = np.full(3, 0.5, np.float32)
         self._box_cameras = 0
         self._packed: tuple[tuple[View, ...], Views] | None = None
 
@@ -61,8 +61,7 @@ class Rig:
             if self.box is None or not _alike(box, self.box):
                 self.box, new_box = box, True
             self._box_cameras = len(self.memory)
-            means = [v.image[..., :3].mean(axis=(0, 1)) / 255.0 for v in views]
-            self.mean_color = np.mean(means, axis=0).astype(np.float32)
+            self.behind = _behind(views)
         look = look or any(m.moved is not None for m in self.memory.values())
         data = pack_views(views, self.box, self.memory)
         self._packed = (tuple(views), data)
@@ -73,10 +72,9 @@ class Rig:
         name = self.settings.background
         if name.startswith("#"):
             return np.array([int(name[k : k + 2], 16) / 255 for k in (1, 3, 5)], np.float32)
-        object_alone = self.box is not None and not self.box.contracted
-        if name == "white" or (name in ("auto", "random") and object_alone):
-            return np.ones(3, np.float32)
-        return np.zeros(3, np.float32) if name == "black" else self.mean_color.copy()
+        if name in ("white", "black"):
+            return np.full(3, 1.0 if name == "white" else 0.0, np.float32)
+        return self.behind.copy()
 
     def meta(self) -> dict[str, Any]:
         """The part of the state that is not arrays, ready for JSON."""
@@ -91,7 +89,7 @@ class Rig:
 
     def arrays(self) -> Arrays:
         """The arrays of the state."""
-        arrays: Arrays = {"mean_color": self.mean_color}
+        arrays: Arrays = {"behind": self.behind}
         for k, m in enumerate(self.memory.values()):
             arrays[f"image_{k}"], arrays[f"pose_{k}"] = m.view.image, np.asarray(m.view.camera_to_world)
             if m.moved is not None:
@@ -104,7 +102,7 @@ class Rig:
         self._box_cameras = int(meta["box_cameras"])
         box = meta["box"]
         self.box = SceneBox(**{**box, "centre_m": tuple(box["centre_m"])}) if box else None
-        self.mean_color = np.array(arrays["mean_color"], dtype=np.float32)
+        self.behind = np.array(arrays["behind"], dtype=np.float32)
         for k, entry in enumerate(meta["cameras"]):
             known = dict(entry)
             camera, generated_ns = known.pop("camera"), known.pop("generated_ns")
@@ -115,6 +113,17 @@ class Rig:
 
 def _same(a: Sequence[View], b: Sequence[View]) -> bool:
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
+
+
+def _behind(views: Sequence[View]) -> NDArray[np.float32]:
+    """What is taken to be behind everything: white for cut-out pictures, else the plain colour along the
+    pictures' edges, else the mean colour, which is the smallest mistake where rays find nothing."""
+    if any(v.image.shape[2] == 4 for v in views):
+        return np.ones(3, np.float32)
+    plain = plain_background(views)
+    if plain is not None:
+        return plain
+    return np.mean([v.image.mean(axis=(0, 1)) / 255.0 for v in views], axis=0).astype(np.float32)
 
 
 def _alike(a: SceneBox, b: SceneBox) -> bool:

@@ -30,7 +30,7 @@ class NgpSettings:
     radius_m: float | None = _option(None, "half the side of the scene's box")
     near_m: float | None = _option(None, "no density is seen nearer to a camera than this")
     contracted: bool | None = _option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
-    background: str = _option("auto", "auto, white, black, mean, random, or '#rrggbb': behind everything")
+    background: str = _option("auto", "auto (plain, or the mean colour), white, black, random, or '#rrggbb'")
     min_views: int = _option(2, "no density where fewer cameras than this look (never more than there are)")
     rate: float = _option(2e-2, "learning rate of the hash tables at the start of a fit")
     rate_net: float = _option(1e-2, "learning rate of the network at the start of a fit")
@@ -71,10 +71,10 @@ class NgpSettings:
             raise ValueError(f"ngp: harmonics must be 1, 4 or 9, not {self.harmonics}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"ngp: device must be auto, cpu or cuda, not {self.device!r}")
-        named = self.background in ("auto", "white", "black", "mean", "random")
+        named = self.background in ("auto", "white", "black", "random")
         if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
             raise ValueError(
-                "ngp: background must be auto, white, black, mean, random or a colour like '#80c0ff', "
+                "ngp: background must be auto, white, black, random or a colour like '#80c0ff', "
                 f"not {self.background!r}"
             )
         for name in ("radius_m", "near_m"):

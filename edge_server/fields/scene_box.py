@@ -16,6 +16,9 @@ from edge_server.fields import View
 
 Array = NDArray[np.float64]
 
+NEAR_SHARE = 0.4  # of the cameras' distance to the scene: nothing nearer to a lens, where rooms are found
+PLAIN = 8  # of 255, by which a plain background may vary
+
 
 @dataclass(frozen=True)
 class SceneBox:
@@ -55,9 +58,9 @@ def scene_box(
 ) -> SceneBox:
     """The box for these views; what is given is kept, the rest is found from the cameras.
 
-    Pictures with transparency show an object: the box is what nearly all cameras see around the point
-    they look at. Without it the surroundings belong to the scene: the box reaches from there to the
-    cameras, and space beyond it is contracted.
+    Pictures with transparency or before one plain colour show an object: the box is what nearly all
+    cameras see around the point they look at. Otherwise the surroundings belong to the scene: the box
+    reaches from there to the cameras, and space beyond it is contracted.
     """
     poses = np.stack([v.camera_to_world for v in views])
     origins, axes = poses[:, :3, 3], poses[:, :3, 2]
@@ -75,7 +78,8 @@ def scene_box(
     distance = float(np.median(np.linalg.norm(origins - centre, axis=1)))
     distance = distance if distance > 1e-6 else 1.0
     if contracted is None:
-        contracted = not any(v.image.shape[2] == 4 for v in views)
+        transparent = any(v.image.shape[2] == 4 for v in views)
+        contracted = not transparent and plain_background(views) is None
     if radius_m is None:
         radius_m = distance if contracted else _seen_radius(views, centre)
     if near_m is None:
@@ -84,7 +88,19 @@ def scene_box(
     return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance)
 
 
-NEAR_SHARE = 0.4
+
+
+def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
+    """The colour (3,) in [0, 1] that nearly all pictures have nearly everywhere along their edges, if any."""
+    edges = []
+    for view in views:
+        if view.image.shape[2] == 4:
+            return None
+        image = view.image
+        edges.append(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).astype(np.int16))
+    color = np.median(np.concatenate(edges), axis=0)
+    plain = [(np.abs(edge - color).max(axis=-1) <= PLAIN).mean() for edge in edges]
+    return (color / 255.0).astype(np.float32) if np.percentile(plain, 20) >= 0.6 else None
 
 
 def _seen_radius(views: Sequence[View], centre: Array) -> float:

@@ -26,6 +26,7 @@ SEEN_EVERY_S = 0.25
 # Publications of the first part of a run show the start more than the update time.
 _SETTLED_SHARE = 0.25
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
+SEEN = ("seen_psnr_db", "seen_psnr_moving_db")
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ class Seen:
                 self._scores += [score] if score is not None else []
 
     def means(self) -> dict[str, float | None]:
-        return {f"seen_{name}": _mean([getattr(s, name) for s in self._scores]) for name in METRICS[:2]}
+        return {name: _mean([getattr(s, name[5:]) for s in self._scores]) for name in SEEN}
 
 
 def steps_for(update_s: float, compute: Compute) -> int:
@@ -142,6 +143,25 @@ def best(rows: list[dict[str, Any]], metric: str = "psnr_moving_db") -> dict[str
     """The row with the highest ``metric``."""
     known = [row for row in rows if row[metric] is not None]
     return max(known, key=lambda row: row[metric]) if known else None
+
+
+def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of the same ``speed_m_per_s`` and ``planned_update_s`` as the mean of their seeds, with the
+    standard error of the two PSNRs (None for a single seed)."""
+    groups: dict[tuple[float, float], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["speed_m_per_s"], row["planned_update_s"]), []).append(row)
+    means = []
+    for (speed, _), group in groups.items():
+        row = {"speed_m_per_s": speed, "seeds": len(group)}
+        for name in ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, *SEEN):
+            row[name] = _mean([r[name] for r in group])
+        for name in METRICS[:2]:
+            known = [r[name] for r in group if r[name] is not None]
+            many = len(known) > 1
+            row[f"{name}_error"] = float(np.std(known, ddof=1) / np.sqrt(len(known))) if many else None
+        means.append(row)
+    return means
 
 
 def _view(camera: Camera) -> View:

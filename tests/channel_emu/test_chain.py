@@ -72,36 +72,36 @@ def test_generators_that_are_none_are_refused() -> None:
 
 
 def test_occupancy_sojourns_and_jumps_match_theory() -> None:
-    """One path of 45,000 sojourns. Standard errors are a third of the tolerances or less."""
-    until_ns = 600_000 * 10**6
+    """One path of 15,000 sojourns. Standard errors are a third of the tolerances or less."""
+    until_ns = 200_000 * 10**6
     chain = path(THREE)
     lengths, states = sojourns(chain, until_ns)
     for state, mean in enumerate((1 / 0.3, 1 / 0.05, 1 / 0.8)):
         found = lengths[states == state]
         assert found.mean() == pytest.approx(mean, rel=3 / len(found) ** 0.5)
-        assert found.std() == pytest.approx(mean, rel=0.05)  # exponential: deviation equals mean
+        assert found.std() == pytest.approx(mean, rel=0.08)  # exponential: deviation equals mean
     leaving_third = states[1:][states[:-1] == 2]
     assert (leaving_third == 0).mean() == pytest.approx(0.5, abs=3 * 0.5 / len(leaving_third) ** 0.5)
-    np.testing.assert_allclose(chain.occupancy(until_ns), stationary(THREE), rtol=0.03)
+    np.testing.assert_allclose(chain.occupancy(until_ns), stationary(THREE), rtol=0.05)
 
 
 def test_autocorrelation_fades_at_the_sum_of_the_rates() -> None:
     mu1, mu2 = 1 / 30, 1 / 60
     chain = path(two_state_generator(mu1, mu2), seed=2)
-    chain.segment(2_000_000 * 10**6)
-    at = np.arange(0, 2_000_000, 5, dtype=np.int64) * 10**6
+    chain.segment(1_000_000 * 10**6)
+    at = np.arange(0, 1_000_000, 5, dtype=np.int64) * 10**6
     pairs = chain.recent(0, int(at[-1]))
     starts, states = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     series = states[np.searchsorted(starts, at, side="right") - 1].astype(float)
     series -= series.mean()
     for lag in (2, 4, 8):
         correlation = (series[:-lag] * series[lag:]).mean() / series.var()
-        assert correlation == pytest.approx(math.exp(-(mu1 + mu2) * 5 * lag), abs=0.01)
+        assert correlation == pytest.approx(math.exp(-(mu1 + mu2) * 5 * lag), abs=0.015)
 
 
 def test_initial_state_follows_the_stationary_distribution() -> None:
-    started = [path(two_state_generator(0.2, 0.6), seed).initial for seed in range(4000)]
-    assert np.mean(started) == pytest.approx(0.25, abs=4 * (0.25 * 0.75 / 4000) ** 0.5)
+    started = [path(two_state_generator(0.2, 0.6), seed).initial for seed in range(1000)]
+    assert np.mean(started) == pytest.approx(0.25, abs=4 * (0.25 * 0.75 / 1000) ** 0.5)
 
 
 def test_path_does_not_depend_on_how_it_is_asked() -> None:
@@ -113,12 +113,12 @@ def test_path_does_not_depend_on_how_it_is_asked() -> None:
 
 def test_forgetting_keeps_memory_bounded_and_shares_exact() -> None:
     kept, forgetting = path(THREE), path(THREE)
-    for second in range(1, 400):
+    for second in range(1, 100):
         now = second * 10**9
         assert kept.segment(now) == forgetting.segment(now)
         forgetting.forget(now - 10**9)
-    assert len(forgetting.recent(0, 399 * 10**9)) < 2500 < len(kept.recent(0, 399 * 10**9))
-    assert forgetting.occupancy(399 * 10**9) == kept.occupancy(399 * 10**9)
+    assert len(forgetting.recent(0, 99 * 10**9)) < 2000 < len(kept.recent(0, 99 * 10**9))
+    assert forgetting.occupancy(99 * 10**9) == kept.occupancy(99 * 10**9)
     with pytest.raises(ChainError, match="forgotten"):
         forgetting.segment(0)
 

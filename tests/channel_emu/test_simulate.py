@@ -39,8 +39,8 @@ def test_kernel_and_link_decide_alike(section: dict) -> None:
     pytest.importorskip("numba")
     config = channel_from_mapping(section)
     for period in (None, 33.3):
-        links = simulate(config, 2, 20, 7, engine="python", frame_period_ms=period)
-        kernel = simulate(config, 2, 20, 7, engine="kernel", frame_period_ms=period)
+        links = simulate(config, 2, 10, 7, engine="python", frame_period_ms=period)
+        kernel = simulate(config, 2, 10, 7, engine="kernel", frame_period_ms=period)
         for a, b in zip(links.runs, kernel.runs):
             assert len(a.offered_ns) > 50
             same(a, b)
@@ -62,8 +62,9 @@ def test_adding_and_renaming_cameras_changes_nothing_for_the_others(engine: str,
 
 
 def test_counts_close() -> None:
-    faults = {"loss": {"probability": 0.1}, "reset": {"mean_interval_ms": 500}, "duplication": {"probability": 0.1}}
-    result = simulate(channel_from_mapping({"preset": "ch6", "faults": faults}), 3, 60).summary()
+    chance = {"probability": 0.1}
+    faults = {"loss": chance, "duplication": chance, "reset": {"mean_interval_ms": 500}}
+    result = simulate(channel_from_mapping({"preset": "ch6", "faults": faults}), 3, 30).summary()
     assert result["engine"] == "python"
     assert result["offered"] == sum(result[name] for name in OUTCOMES)
     assert min(result[k] for k in ("lost", "broken", "superseded", "delivered", "duplicated")) > 0

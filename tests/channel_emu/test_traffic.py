@@ -77,10 +77,10 @@ def test_spending_follows_the_state() -> None:
     ids=["exponential", "deterministic", "gamma 4", "gamma 0.5", "lognormal", "recorded"],
 )
 def test_delay_laws_have_their_moments(shape, mean: float, cv: float) -> None:
-    draws = np.array([shape(n) for n in range(30_000)])
+    draws = np.array([shape(n) for n in range(10_000)])
     assert (draws >= 0).all()
-    assert draws.mean() == pytest.approx(mean, rel=4 * max(cv, 1e-9) / 30_000**0.5)
-    assert draws.std() / draws.mean() == pytest.approx(cv, rel=0.05, abs=1e-12)
+    assert draws.mean() == pytest.approx(mean, rel=4 * max(cv, 1e-9) / 10_000**0.5)
+    assert draws.std() / draws.mean() == pytest.approx(cv, rel=0.08, abs=1e-12)
 
 
 @pytest.mark.parametrize(("law", "parameter"), [("gamma", 3.0), ("lognormal", 0.7)])
@@ -94,7 +94,7 @@ def test_delay_laws_have_their_shape(law: str, parameter: float) -> None:
         if law == "gamma"
         else stats.lognorm(parameter, scale=math.exp(-(parameter**2) / 2))
     )
-    assert stats.kstest([shape(n) for n in range(5000)], exact.cdf).pvalue > 1e-3
+    assert stats.kstest([shape(n) for n in range(2000)], exact.cdf).pvalue > 1e-3
 
 
 def test_service_at_start_keeps_the_delay_of_the_state_it_started_in() -> None:

@@ -119,6 +119,13 @@ def test_an_uncertain_clock_is_given_its_uncertainty():
         Gate(["cam01"], []).admit(dataclasses.replace(ahead, clock_uncertainty_ns=0), NOW)
 
 
+def test_an_unknown_clock_cannot_bring_a_frame_from_tomorrow():
+    tomorrow = frame(generated_ns=NOW + 2 * 10**9, clock_uncertainty_ns=3600 * 10**9)
+    with pytest.raises(FrameRejected) as refused:
+        Gate(["cam01"], []).admit(tomorrow, NOW)
+    assert refused.value.reason == "from_future"
+
+
 def test_recent_percentiles_match_numpy_over_the_window():
     recent = Recent(100)
     assert recent.percentile(50) is None

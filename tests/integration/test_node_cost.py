@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -87,5 +88,5 @@ def test_noise_that_cannot_be_kept_is_made_as_it_streams(tmp_path, monkeypatch):
 
     frames = asyncio.run(scene())
     images = [cv2.imdecode(np.frombuffer(f.payload, np.uint8), cv2.IMREAD_COLOR).astype(int) for f in frames]
-    spread = [np.std(a - b) for a, b in zip(images, images[1:])]
+    spread = [np.std(a - b) for a, b in pairwise(images)]
     assert min(spread) > 1.0 and max(spread) < 10.0

@@ -203,10 +203,14 @@ class Browser:
         self.wait_for(lambda: wanted in self.text(), f"the text {wanted!r}", timeout_s)
         return self.text()
 
+    def hover(self, x: float, y: float) -> None:
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=float(x), y=float(y))
+
     def click(self, x: float, y: float) -> None:
-        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left",
-                      clickCount=0 if kind == "mouseMoved" else 1)  # fmt: skip
+        self.hover(x, y)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left",
+                      clickCount=1)  # fmt: skip
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 10) -> None:
         """Press at ``start``, move to ``end``, release: turns the view."""

@@ -9,6 +9,9 @@ import pytest
 
 from edge_server.page import start_page
 from edge_server.page.preview import Preview
+from edge_server.page.scene import FRUSTUM_OF_RADIUS
+from edge_server.page.viewpoint import initial_viewpoint, visitor_camera
+from freshfield.geometry import quaternion_to_matrix, se3_inverse
 from tests.edge_server.page.browser import Browser
 
 pytestmark = pytest.mark.browser
@@ -110,6 +113,35 @@ def test_turning_the_view_renders_from_the_new_place(shown):
     time.sleep(2.0)  # the finer image
     after = browser.screenshot()
     assert np.abs(_centre(before).astype(float) - _centre(after)).mean() > 3
+
+
+def test_clicking_a_camera_looks_through_it(shown):
+    preview, page, browser = shown
+    (client,) = page._server.get_clients().values()
+    frames = [c.newest for c in preview.cameras() if c.newest]
+    poses = np.stack([frame.pose.matrix() for frame in frames])
+    # A picture stands in the middle of its frustum's base; viewer and page scale frustums by their volume.
+    k = frames[0].intrinsics
+    up = k.height / 2 / k.fy
+    size = initial_viewpoint(poses).radius_m * FRUSTUM_OF_RADIUS
+    middles = poses @ [0, 0, size / np.cbrt(up * up * k.width / k.height / 3), 1]
+    canvas = "document.querySelector('canvas[data-engine]').getBoundingClientRect().x"
+
+    width, height = client.camera.image_width, client.camera.image_height
+    window, lens = visitor_camera(
+        client.camera.position, client.camera.wxyz, client.camera.fov, width, height, rows=height
+    )
+    pixels = lens.project((middles @ se3_inverse(window).T)[:, :3])
+    i = int(np.nanargmin(np.linalg.norm(pixels - (width / 2, height / 2), axis=1)))
+    at = pixels[i] + (browser.evaluate(canvas), 0)
+    browser.hover(*at)
+    time.sleep(1.0)  # the viewer notes what is under the pointer at its next image
+    browser.click(*at)
+    browser.wait_for(
+        lambda: np.allclose(client.camera.position, poses[i, :3, 3], atol=1e-3),
+        f"standing at {frames[i].camera}",
+    )
+    assert np.allclose(quaternion_to_matrix(client.camera.wxyz)[:, 2], poses[i, :3, 2], atol=1e-2)
 
 
 def _centre(image: np.ndarray) -> np.ndarray:

@@ -1,0 +1,140 @@
+"""Writes what the frontier found: two CSV files, two figures, a table and a conclusion for people."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from edge_server.offline.update_time import best
+from edge_server.report.style import CYCLE, GREY, INK, figure, label_lines
+
+Row = dict[str, Any]
+_METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
+
+
+def write_output(out: Path, data: Row) -> str:
+    """frontier.csv, frontier.png and, where something moved, updates.csv and updates.png; returns the text
+    for the terminal."""
+    rows, updates = data["from_scratch"], data["updates"]
+    _write_csv(out / "frontier.csv", rows)
+    draw_frontier(out / "frontier.png", rows, data)
+    text = [table(rows)]
+    if updates:
+        _write_csv(out / "updates.csv", updates)
+        draw_updates(out / "updates.png", updates, data)
+        text += [updates_table(updates), conclusion(updates)]
+    return "\n\n".join(["", *text])
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Effort levels by seconds: PSNR, SSIM, LPIPS; a star marks the Pareto front."""
+    lines = [f"{'effort':14} {'seconds':>8} {'steps':>6} {'ms/step':>8} {'PSNR':>7} {'SSIM':>6} {'LPIPS':>6}"]
+    for row in rows:
+        lines.append(
+            f"{row['effort']:14} {row['seconds']:8.2f} {row['steps']:6.0f} {row['ms_per_step']:8.2f} "
+            f"{row['psnr_db']:7.2f} {_n(row['ssim'])} {_n(row['lpips'])} {'*' if row['on_front'] else ''}"
+        )
+    return "\n".join([*lines, "* on the Pareto front: nothing measured is both faster and more accurate"])
+
+
+def updates_table(rows: Sequence[Row]) -> str:
+    """Fidelity at the present by speed and seconds an update takes."""
+    names = ("PSNR", "moving", "seen", "moving")
+    lines = [f"{'speed':>8} {'update':>8} {'steps':>6} {'aAoI':>9} " + " ".join(f"{n:>7}" for n in names)]
+    for row in rows:
+        numbers = [row[k] for k in ("psnr_db", "psnr_moving_db", "seen_psnr_db", "seen_psnr_moving_db")]
+        lines.append(
+            f"{row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
+            f"{row['aaoi_ms']:6.0f} ms " + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
+        )
+    return "\n".join([*lines, "seen: what a viewer sees on average, between publications too"])
+
+
+def conclusion(rows: Sequence[Row]) -> str:
+    """One line: the best update time at each speed, and what the longest one costs."""
+    parts = []
+    for speed in dict.fromkeys(row["speed_m_per_s"] for row in rows):
+        group = [row for row in rows if row["speed_m_per_s"] == speed]
+        whole, moving = best(group, "psnr_db"), best(group, "psnr_moving_db")
+        if whole is None or moving is None:
+            continue
+        longest = max(group, key=lambda row: row["update_s"])
+        lost = moving["psnr_moving_db"] - (longest["psnr_moving_db"] or moving["psnr_moving_db"])
+        parts.append(
+            f"at {speed:g} m/s {whole['update_s']:.2f} s for the whole image and {moving['update_s']:.2f} s "
+            f"where it moves ({longest['update_s']:.1f} s costs {lost:.1f} dB there)"
+        )
+    return "Best time to spend on an update: " + "; ".join(parts) + "."
+
+
+def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
+    """PSNR, SSIM and LPIPS of every effort level against seconds from scratch; the front in PSNR marked."""
+    shown = [(key, label) for key, label in _METRICS if any(row[key] is not None for row in rows)]
+    efforts = list(dict.fromkeys(row["effort"] for row in rows))
+    front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["seconds"])
+    with figure(path, len(shown), height_inch=2.7, sharex=True) as (_, axes):
+        for ax, (key, label) in zip(axes[:, 0], shown):
+            for number, effort in enumerate(efforts):
+                group = sorted((r for r in rows if r["effort"] == effort), key=lambda r: r["seconds"])
+                ax.plot(
+                    [r["seconds"] for r in group], [r[key] for r in group], ".-",
+                    color=CYCLE[number % len(CYCLE)], alpha=1.0 if number < len(CYCLE) else 0.5,
+                    linestyle=("-", "--", ":")[number // len(CYCLE) % 3],
+                    label=f"{effort} ({data['ms_per_step'][effort]:.1f} ms a step)",
+                )  # fmt: skip
+            if key == "psnr_db":
+                ax.plot(
+                    [r["seconds"] for r in front], [r[key] for r in front], "o", markersize=9, mfc="none",
+                    color=INK, label="Pareto front",
+                )  # fmt: skip
+            ax.set_xscale("log")
+            name = f"LPIPS-{data['lpips_network']}" if key == "lpips" else label
+            better = "lower" if key == "lpips" else "higher"
+            last = key == shown[-1][0]
+            title = f"What accuracy costs in time: {data['scene']}" if key == "psnr_db" else None
+            label_lines(ax, f"{name}, {better} is better", "seconds from scratch" if last else None, title)
+            if key != "psnr_db" and ax.get_legend() is not None:
+                ax.get_legend().remove()
+        for ax in axes[:, 0]:
+            ax.xaxis.set_major_formatter("{x:g}")
+
+
+def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
+    """Fidelity at the present against seconds an update takes, for each speed; the best one marked."""
+    speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
+    panels = (("psnr_moving_db", "PSNR where it moves (dB)"), ("psnr_db", "PSNR, whole image (dB)"))
+    with figure(path, len(panels), height_inch=3.0, sharex=True) as (_, axes):
+        for ax, (key, label) in zip(axes[:, 0], panels):
+            for colour, speed in zip(CYCLE, speeds):
+                group = sorted(
+                    (r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None),
+                    key=lambda r: r["update_s"],
+                )
+                x = [r["update_s"] for r in group]
+                ax.plot(x, [r[key] for r in group], ".-", color=colour, label=f"{speed:g} m/s")
+                seen = [r[f"seen_{key}"] for r in group]
+                ax.plot(x, seen, ":", color=colour, linewidth=1.2)
+                top = best(group, key)
+                if top is not None:
+                    ax.plot([top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=colour)
+            ax.plot([], [], ":", color=GREY, label="seen on average,\nbetween updates too")
+            ax.plot([], [], "o", markersize=10, mfc="none", color=GREY, label="best")
+            ax.set_xscale("log")
+            last = key == panels[-1][0]
+            title = None if last else "More is not always better: the world moves while the field is fitted"
+            label_lines(ax, label, "seconds an update takes" if last else None, title)
+        axes[-1, 0].xaxis.set_major_formatter("{x:g}")
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    flat = [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(flat[0]))
+        writer.writeheader()
+        writer.writerows(flat)
+
+
+def _n(value: float | None) -> str:
+    return "     -" if value is None else f"{value:6.3f}"
