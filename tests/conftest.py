@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# A deadline per example measures the machine's load, not the code; one seed, one result holds for tests too.
+settings.register_profile("freshfield", deadline=None, derandomize=True)
+settings.load_profile("freshfield")
 
 ROOT = Path(__file__).resolve().parent.parent
 

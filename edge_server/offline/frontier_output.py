@@ -79,7 +79,7 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
             for number, effort in enumerate(efforts):
                 group = sorted((r for r in rows if r["effort"] == effort), key=lambda r: r["seconds"])
                 ax.plot(
-                    [r["seconds"] for r in group], [r[key] for r in group], ".-",
+                    [r["seconds"] for r in group], [r[key] for r in group], marker=".",
                     color=CYCLE[number % len(CYCLE)], alpha=1.0 if number < len(CYCLE) else 0.5,
                     linestyle=("-", "--", ":")[number // len(CYCLE) % 3],
                     label=f"{effort} ({data['ms_per_step'][effort]:.1f} ms a step)",

@@ -132,6 +132,7 @@ def test_clicking_a_camera_looks_through_it(shown):
         client.camera.position, client.camera.wxyz, client.camera.fov, width, height, rows=height
     )
     pixels = lens.project((middles @ se3_inverse(window).T)[:, :3])
+    browser.screenshot("/tmp/dbg0.png"); print(pixels, browser.evaluate(canvas))
     i = int(np.nanargmin(np.linalg.norm(pixels - (width / 2, height / 2), axis=1)))
     at = pixels[i] + (browser.evaluate(canvas), 0)
     browser.hover(*at)
