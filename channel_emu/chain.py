@@ -112,7 +112,7 @@ def _recurrent(q: NDArray[np.float64]) -> list[int]:
     if len(closed) != 1:
         raise ChainError("the chain ends in different states, so it has no single long-run distribution: "
                          "name the state it starts in (initial)")  # fmt: skip
-    return list(closed.pop())
+    return [int(state) for state in closed.pop()]
 
 
 class Chain:

@@ -88,6 +88,9 @@ def _run(args: argparse.Namespace) -> int:
         priority="normal" if args.no_priority else raise_priority(),
     )  # fmt: skip
 
+    # The event loop takes the interpreter's lock back from a helper thread after this long at most.
+    sys.setswitchinterval(0.0005)
+
     async def live() -> None:
         stop = asyncio.Event()
         for name in (signal.SIGINT, signal.SIGTERM):

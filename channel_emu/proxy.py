@@ -127,9 +127,10 @@ class Proxy:
         """From start to ``stop``. Raises HardLimit where the scenario sets one."""
         await self.start()
         log.info("listening on port %d, sending to %s", self.port, self.options.to)
-        stopping = asyncio.create_task(stop.wait())
+        stopping = asyncio.ensure_future(stop.wait())
+        either: set[asyncio.Future[Any]] = {stopping, self._failure}
         try:
-            await asyncio.wait({stopping, self._failure}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
         finally:
             stopping.cancel()
             await self.stop()

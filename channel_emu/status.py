@@ -51,17 +51,18 @@ def snapshot(
     now = max(now_ns, 0)
     names = channel.config.state_names
     totals: Counter[str] = Counter()
-    by_camera = {}
+    by_camera: dict[str, Any] = {}
     for lane in lanes:
         counts = _counts(lane)
         totals.update(counts)
-        by_camera[lane.camera] = {
+        entry: dict[str, Any] = {
             **counts,
             "connected": lane.upstream is not None and lane.upstream.connected,
             "streams": len(lane.streams),
         }
         if channel.chain is None and lane.link.chain is not None:
-            by_camera[lane.camera]["state"] = names[lane.link.chain.state(now)]
+            entry["state"] = names[lane.link.chain.state(now)]
+        by_camera[lane.camera] = entry
     edge_rejected: Counter[str] = Counter()
     for lane in lanes:
         if lane.upstream is not None:

@@ -29,7 +29,15 @@ from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, S
 from edge_server.fields.ngp_layout import make_grid, make_net
 from edge_server.fields.ngp_occupancy import EVERY, Occupancy
 from edge_server.fields.ngp_rig import Arrays, Rig
-from edge_server.fields.ngp_schedule import BETA1, BETA2, NOMINAL_RAYS, Pace, active_levels, step_key
+from edge_server.fields.ngp_schedule import (
+    BETA1,
+    BETA2,
+    NOMINAL_RAYS,
+    Pace,
+    active_levels,
+    step_key,
+    step_length,
+)
 from edge_server.fields.ngp_settings import NgpSettings, make_settings
 from edge_server.fields.ngp_snapshot import NgpSnapshot
 from edge_server.fields.ngp_state import pack, unpack
@@ -101,7 +109,7 @@ class NgpField:
         with self._turn.mine():
             if self._snapshot is None or self._snapshot.step != self.step:
                 box = self.rig.box or SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0)
-                space = self._occupancy.space()
+                space = self._occupancy.space(step_length(self.settings, self.step))
                 self._snapshot = NgpSnapshot(
                     box=box,
                     grid=self._grid._replace(table=self._grid.table.copy()),
@@ -217,7 +225,7 @@ class NgpField:
                 self.pool, key, self.step // EVERY, self._grid, levels, self._net,
                 self._scratch.acts, self._scratch_x,
             )  # fmt: skip
-        space: Space = self._occupancy.space()
+        space: Space = self._occupancy.space(step_length(self.settings, self.step))
         batch = self._batch
         recipe = Recipe(
             key=np.uint64(key + np.uint64(1)),
@@ -237,6 +245,8 @@ class NgpField:
         self.pool.run(
             scatter, self._grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
         )
+        if batch.dropped.any():
+            self._repair()
         rays = max(int(batch.rays.sum()), 1)
         self._updates += 1
         fall = s.rate_end**progress
@@ -262,6 +272,12 @@ class NgpField:
         )
         self.step += 1
         return float(batch.loss.sum()) / (3 * rays)
+
+    def _repair(self) -> None:
+        """Set to zero whatever is not finite: rays that meet it give no gradient that would lead there."""
+        arrays = (self._grid.table, self._table_m, self._table_v)
+        for array in (*arrays, self._net.params, self._net_m, self._net_v):
+            np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 class _Turn:

@@ -18,16 +18,15 @@ from edge_server.fields.supervision import pack_cameras
 EVERY = 8  # steps between refreshes
 PHASES = 4  # refreshes until every cell has been looked at
 FADE = 0.75  # of a cell's density per look
-OPTICAL_DEPTH = 2e-2  # of one step: less cannot be seen
+EMPTY = 0.5  # density per scene unit that counts as nothing: a step of it dims by a hundredth or two
 
 
 class Occupancy:
     """density: float32 (cells^3,), x fastest; seen: uint16, cameras that look at each cell."""
 
-    def __init__(self, cells: int, contracted: bool, step: float, near: float, min_views: int) -> None:
+    def __init__(self, cells: int, contracted: bool, near: float, min_views: int) -> None:
         self.cells, self.contracted, self.near, self.min_views = cells, contracted, near, min_views
-        self.step = np.float32(step)
-        self.density = np.full(cells**3, 2.0 * self.bound, np.float32)  # unknown: to be looked at
+        self.density = np.full(cells**3, 2.0 * EMPTY, np.float32)  # unknown: to be looked at
         self.seen = np.zeros(cells**3, np.uint16)
         self.occupied = np.zeros(cells**3, np.uint8)
         self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
@@ -37,17 +36,12 @@ class Occupancy:
     def for_box(cls, settings: NgpSettings, box: SceneBox | None) -> Occupancy:
         """An occupancy that knows nothing yet of the scene in ``box``."""
         near = box.near_m / box.radius_m if box else 0.1
-        step = 2.0 * np.sqrt(3.0) / settings.samples
-        return cls(settings.cells, box.contracted if box else False, step, near, settings.min_views)
+        return cls(settings.cells, box.contracted if box else False, near, settings.min_views)
 
-    @property
-    def bound(self) -> float:
-        return OPTICAL_DEPTH / float(self.step)
-
-    def space(self) -> Space:
+    def space(self, step: float) -> Space:
         """The grid as the kernels read it: a view on the living arrays."""
         return Space(
-            self.occupied, self.coarse, self.cells, self.contracted, self.step, np.float32(self.near)
+            self.occupied, self.coarse, self.cells, self.contracted, np.float32(step), np.float32(self.near)
         )
 
     def look(self, pool: Pool, rig: Rig) -> None:
@@ -74,7 +68,7 @@ class Occupancy:
         self.needed = min(self.min_views, len(rig.memory))
         if length:
             moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
-            np.maximum(self.density, np.float32(1.5 * self.bound), out=self.density, where=moving)
+            np.maximum(self.density, np.float32(1.5 * EMPTY), out=self.density, where=moving)
         self.mark()
 
     def refresh(self, pool: Pool, key: np.uint64, turn: int, grid: Grid, levels: int, net: Net,
@@ -88,7 +82,7 @@ class Occupancy:
 
     def mark(self) -> None:
         """Decide anew which cells get samples."""
-        threshold(self.density, self.seen, self.needed, self.bound, self.cells, self.occupied, self.coarse)
+        threshold(self.density, self.seen, self.needed, EMPTY, self.cells, self.occupied, self.coarse)
 
 
 assert CELLS_A_TASK <= 4096, "a task's samples must fit the scratch of a training chunk"

@@ -25,6 +25,13 @@ def active_levels(settings: NgpSettings, step: int) -> int:
     return min(settings.levels, settings.levels_start + step // settings.levels_every)
 
 
+def step_length(settings: NgpSettings, step: int) -> float:
+    """Distance between a ray's samples in scene units: long at first, while there is only fog."""
+    first = min(settings.samples_start, settings.samples)
+    done = min(step / settings.samples_ramp, 1.0) if settings.samples_ramp else 1.0
+    return 2.0 * float(np.sqrt(3.0)) / (first + done * (settings.samples - first))
+
+
 class Pace:
     """Divides a budget into steps. A budget in seconds counts from the making of this object, and is never
     exceeded by more than one step: the next one begins only if a usual one still fits."""

@@ -24,7 +24,9 @@ class NgpSettings:
     harmonics: int = _option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
     rays: int = _option(4096, "rays of one step at most")
     batch_samples: int = _option(16384, "samples of one step at most, in chunks of 4096")
-    samples: int = _option(96, "steps across the scene's box, corner to corner")
+    samples: int = _option(192, "steps across the scene's box, corner to corner")
+    samples_start: int = _option(64, "the same at first: fog is cheaper to see through in long steps")
+    samples_ramp: int = _option(600, "steps after which ``samples`` is reached")
     cells: int = _option(64, "cells a side of the occupancy grid, a multiple of 4")
     centre_m: tuple[float, float, float] | None = _option(None, "centre of the scene's box")
     radius_m: float | None = _option(None, "half the side of the scene's box")
@@ -59,6 +61,8 @@ class NgpSettings:
             ("rays", 1, 1 << 20),
             ("batch_samples", 4096, 1 << 22),
             ("samples", 8, 2048),
+            ("samples_start", 8, 2048),
+            ("samples_ramp", 0, 1 << 30),
             ("cells", 8, 256),
             ("min_views", 0, 1000),
             ("levels_every", 0, 1 << 30),
@@ -83,9 +87,9 @@ class NgpSettings:
 
 
 EFFORTS: dict[str, dict[str, Any]] = {
-    "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 64},
+    "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 96},
     "medium": {},
-    "high": {"finest_resolution": 384, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 160},
+    "high": {"finest_resolution": 384, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 256},
 }
 
 

@@ -21,7 +21,15 @@ from edge_server.fields.kernels.rays import HORIZON, Views
 from edge_server.fields.ngp_layout import make_grid, make_net
 from edge_server.fields.ngp_occupancy import EVERY, FADE, Occupancy
 from edge_server.fields.ngp_rig import Arrays, Rig
-from edge_server.fields.ngp_schedule import BETA1, BETA2, NOMINAL_RAYS, Pace, active_levels, step_key
+from edge_server.fields.ngp_schedule import (
+    BETA1,
+    BETA2,
+    NOMINAL_RAYS,
+    Pace,
+    active_levels,
+    step_key,
+    step_length,
+)
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.ngp_snapshot import surface_points
 from edge_server.fields.ngp_state import pack, unpack
@@ -49,12 +57,13 @@ class TorchModel:
     net: Tensor
     occupied: Tensor
     background: Tensor
+    step: float  # scene units
 
     def march(self, o: Tensor, d: Tensor, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Origins and directions (R, 3), jitter (R,) -> t, delta (R, S), unit-cube points (R, S, 3) and
         which of them lie in occupied cells (R, S): ``kernels.rays.march`` without skipping."""
         box, s = self.box, self.settings
-        step = 2.0 * 3.0**0.5 / s.samples
+        step = self.step
         half = HORIZON if box.contracted else 1.0
         safe = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
         a, b = (-half - o) / safe, (half - o) / safe
@@ -242,6 +251,7 @@ class NgpTorchField:
             net=self._net,
             occupied=occupied,
             background=torch.as_tensor(self.rig.background(), device=self.device),
+            step=step_length(s, self.step),
         )
 
     def _one_step(self, data: Views, progress: float) -> tuple[float, int, int]:

@@ -88,8 +88,6 @@ def scene_box(
     return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance)
 
 
-
-
 def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
     """The colour (3,) in [0, 1] that nearly all pictures have nearly everywhere along their edges, if any."""
     edges = []

@@ -236,7 +236,7 @@ class _Run:
                 "truth_gap_ms": None,
                 "steps": at.steps,
                 "loss": at.loss,
-                "scored_on": "held-out views" if self.data.held_out else "selected",
+                "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else "selected",
             }
         )
         print(progress(at, outside), flush=True)

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
+
 from edge_server.offline.update_time import best
 from edge_server.report.style import CYCLE, GREY, INK, figure, label_lines
 
@@ -89,7 +91,6 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
                     [r["seconds"] for r in front], [r[key] for r in front], "o", markersize=9, mfc="none",
                     color=INK, label="Pareto front",
                 )  # fmt: skip
-            ax.set_xscale("log")
             name = f"LPIPS-{data['lpips_network']}" if key == "lpips" else label
             better = "lower" if key == "lpips" else "higher"
             last = key == shown[-1][0]
@@ -97,8 +98,7 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
             label_lines(ax, f"{name}, {better} is better", "seconds from scratch" if last else None, title)
             if key != "psnr_db" and ax.get_legend() is not None:
                 ax.get_legend().remove()
-        for ax in axes[:, 0]:
-            ax.xaxis.set_major_formatter("{x:g}")
+        _seconds_axis(axes[-1, 0], [row["planned_s"] for row in rows])
 
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
@@ -121,11 +121,18 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
                     ax.plot([top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=colour)
             ax.plot([], [], ":", color=GREY, label="seen on average,\nbetween updates too")
             ax.plot([], [], "o", markersize=10, mfc="none", color=GREY, label="best")
-            ax.set_xscale("log")
             last = key == panels[-1][0]
             title = None if last else "More is not always better: the world moves while the field is fitted"
             label_lines(ax, label, "seconds an update takes" if last else None, title)
-        axes[-1, 0].xaxis.set_major_formatter("{x:g}")
+        _seconds_axis(axes[-1, 0], [row["planned_update_s"] for row in rows])
+
+
+def _seconds_axis(axes: Axes, seconds: Sequence[float]) -> None:
+    """A logarithmic axis, shared by all panels, with a tick at every value that was planned."""
+    axes.set_xscale("log")
+    ticks = sorted(set(seconds))
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
 
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:

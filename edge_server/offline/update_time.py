@@ -152,8 +152,8 @@ def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for row in rows:
         groups.setdefault((row["speed_m_per_s"], row["planned_update_s"]), []).append(row)
     means = []
-    for (speed, _), group in groups.items():
-        row = {"speed_m_per_s": speed, "seeds": len(group)}
+    for (speed, planned_s), group in groups.items():
+        row = {"speed_m_per_s": speed, "planned_update_s": planned_s, "seeds": len(group)}
         for name in ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, *SEEN):
             row[name] = _mean([r[name] for r in group])
         for name in METRICS[:2]:

@@ -60,6 +60,15 @@ def peak_rss_mb() -> float:
     return round(peak * (1 if os.uname().sysname == "Darwin" else 1024) / 1e6, 1)
 
 
+def cpu_s(pid: int) -> float | None:
+    """Processor time that a process has used, in core-seconds; None where /proc does not tell."""
+    try:
+        words = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def _own_s() -> float:
     times = os.times()
     return times.user + times.system

@@ -58,21 +58,25 @@ def draw_fidelity(report: Report, records: Records, path: Path) -> bool:
         for (key, label), dash in zip(flat.items(), ("--", ":")):
             if found["baseline"].get(key) is not None:
                 top.axhline(found["baseline"][key], color=GREY, linestyle=dash, linewidth=1.2, label=label)
-        label_lines(top, "PSNR (dB)", title="Fidelity against the truth at the present")
+        fit = report["kind"] == "fit"
+        title = "Fidelity on held-out views" if fit else "Fidelity against the truth at the present"
+        label_lines(top, "PSNR (dB)", title=title)
         bottom.plot(*ssim, color=GREEN, label="SSIM (higher is better)")
         if len(lpips[0]):
             network = found.get("lpips_network") or "network unknown"
             bottom.plot(*lpips, color=ORANGE, label=f"LPIPS-{network} (lower is better)")
         bottom.set_ylim(0.0, 1.02)
-        label_lines(bottom, "score", "seconds since the edge started")
+        label_lines(bottom, "score", "seconds of fitting" if fit else "seconds since the edge started")
     return True
 
 
 def draw_ages(report: Report, records: Records, path: Path) -> bool:
     """Age over time (median and range over cameras, mean age of what was selected), and by camera."""
     rows = [r for r in records.ages if any(a is not None for a in (r.get("age_ms") or {}).values())]
+    if not rows or report["age_ms"] is None:
+        return False
     spreads = {c: s for c, s in report["age_ms"]["by_camera"].items() if s is not None}
-    if not rows or not spreads:
+    if not spreads:
         return False
     t = [r["t_s"] for r in rows]
     known = [[a for a in r["age_ms"].values() if a is not None] for r in rows]
@@ -102,7 +106,7 @@ def draw_updates(report: Report, records: Records, path: Path) -> bool:
     """Time of every update, and how many views it used."""
     series = report["fidelity"]["series"]
     spent = _points(series, "update_ms")
-    if not len(spent[0]):
+    if not len(spent[0]) or report["kind"] == "fit":
         return False
     counts = [(r["t_s"], _how_many(r.get("selected"))) for r in series]
     with figure(path, 2, height_inch=1.9, sharex=True) as (_, axes):
@@ -119,6 +123,8 @@ def draw_updates(report: Report, records: Records, path: Path) -> bool:
 
 def draw_channel(report: Report, records: Records, path: Path) -> bool:
     """Share of time in each state of the chain, and the histogram of drawn delays."""
+    if report["channel"] is None:
+        return False
     shares = _shares(report["channel"].get("state_share"))
     drawn = report["channel"].get("drawn_delay_ms")
     edges, counts = _histogram(drawn.get("bins") if isinstance(drawn, dict) else None)
@@ -155,7 +161,8 @@ def draw_comparison(report: Report, records: Records, path: Path) -> bool:
     error = np.clip(np.abs(truth - rendered) * _ERROR_GAIN, 0.0, 1.0)
     height = 2.75 * truth.shape[0] / truth.shape[1] + 0.35
     with figure(path, 1, 3, height_inch=height) as (_, axes):
-        titles = ("truth at the present", "the field's rendering", f"error, {_ERROR_GAIN:g} times")
+        truth_is = "held-out truth" if report["kind"] == "fit" else "truth at the present"
+        titles = (truth_is, "the field's rendering", f"error, {_ERROR_GAIN:g} times")
         for ax, image, title in zip(axes[0], (truth, rendered, error), titles):
             ax.imshow(image, interpolation="nearest")
             ax.set_title(title)

@@ -67,6 +67,10 @@ def _head(report: Report) -> str:
         f"field {report['field']}" if report["field"] else None,
         f"policy {policy['name']}{value}" if policy["name"] else None,
     ]
+    if report["kind"] == "fit" and report["data"]:
+        data = report["data"]
+        held_out = len(data["held_out"])
+        facts += [f"{data['training']} views", f"{held_out} held out" if held_out else None, data["instant"]]
     line = " · ".join(escape(f) for f in facts if f)
     return f"<h1>{escape(str(report['scenario'] or 'A run'))}</h1><p class=soft>{line}</p>"
 
@@ -74,15 +78,23 @@ def _head(report: Report) -> str:
 def _tiles(report: Report) -> str:
     final, age, frames = report["fidelity"]["final"], report["age_ms"], report["frames"]
     network = report["fidelity"]["lpips_network"]
-    tiles = [
-        (_n(final["psnr_db"], 1, " dB"), "PSNR at the present, last fifth of the run"),
-        (_n(final["psnr_moving_db"], 1, " dB"), "PSNR where the scene moves"),
+    similarity = [
         (_n(final["ssim"], 3), "SSIM"),
         (_n(final["lpips"], 3), f"LPIPS-{network}" if network else "LPIPS"),
+    ]
+    if report["kind"] == "fit":
+        return _tile_row([(_n(final["psnr_db"], 1, " dB"), "PSNR at the end"), *similarity])
+    return _tile_row([
+        (_n(final["psnr_db"], 1, " dB"), "PSNR at the present, last fifth of the run"),
+        (_n(final["psnr_moving_db"], 1, " dB"), "PSNR where the scene moves"),
+        *similarity,
         (_n(age["mean"], 0, " ms"), f"mean age (95 %: {_n(age['p95'], 0)} ms)"),
         (_n(report["updates"]["ms_p50"], 0, " ms"), f"median of {report['updates']['count']} updates"),
         (f"{frames['delivered']:,}", f"frames delivered of {frames['captured']:,} captured"),
-    ]
+    ])  # fmt: skip
+
+
+def _tile_row(tiles: list[tuple[str, str]]) -> str:
     cells = "".join(f"<div class=tile><b>{b}</b><span>{escape(s)}</span></div>" for b, s in tiles)
     return f"<div class=tiles>{cells}</div>"
 
@@ -91,7 +103,10 @@ def _fidelity_table(report: Report) -> str:
     found = report["fidelity"]
     network = f"LPIPS-{found['lpips_network']}" if found["lpips_network"] else "LPIPS"
     rows = [["", "PSNR (dB)", "PSNR, moving (dB)", "SSIM", network]]
-    for name, label in (("final", "last fifth of the run"), ("mean", "whole run")):
+    fit = report["kind"] == "fit"
+    for name, label in (("final", "at the end" if fit else "last fifth of the run"), ("mean", "whole run")):
+        if fit and name == "mean":
+            continue  # the mean of a learning curve says nothing
         s = found[name]
         rows.append(
             [label, _n(s["psnr_db"], 2), _n(s["psnr_moving_db"], 2), _n(s["ssim"], 4), _n(s["lpips"], 4)]
@@ -103,7 +118,7 @@ def _fidelity_table(report: Report) -> str:
         said.append("No camera is held out: scored on the selected views themselves (6.21-6.22).")
     elif found["scored_on"]:
         said.append(f"Held out: {', '.join(found['scored_on'])}.")
-    if found["series"]:
+    if found["series"] and not fit:
         said.append(f"{found['scored']} of {len(found['series'])} publications have a truth near enough.")
     if found["lpips_missing"]:
         said.append(f"LPIPS: {found['lpips_missing']}.")
@@ -111,6 +126,8 @@ def _fidelity_table(report: Report) -> str:
 
 
 def _age_table(report: Report) -> str:
+    if report["age_ms"] is None:
+        return ""
     rows = [["camera", "mean (ms)", "median (ms)", "95 % (ms)"]]
     for camera, s in report["age_ms"]["by_camera"].items():
         cells = [_n(s[k], 0) for k in ("mean", "p50", "p95")] if s else ["never reported", "", ""]
@@ -120,6 +137,8 @@ def _age_table(report: Report) -> str:
 
 def _updates_line(report: Report) -> str:
     u = report["updates"]
+    if report["kind"] == "fit":
+        return ""
     if not u["count"]:
         return "<p>The field was never updated.</p>"
     first = None if u["first_ms"] is None else u["first_ms"] / 1e3
@@ -132,6 +151,8 @@ def _updates_line(report: Report) -> str:
 
 def _books(report: Report) -> str:
     f = report["frames"]
+    if f is None:
+        return ""
     if not f["ledgers"]:
         return "<p>No ledgers: no frame passed a network in this run.</p>"
     rejected = sum(f["rejected"].values())
@@ -167,15 +188,17 @@ def _books_by_camera(report: Report) -> str:
     names = ("captured", "replaced", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
              "delivered", "in_flight")  # fmt: skip
     rows = [["camera", *(n.replace("_", " ") for n in names), "rejected"]]
-    for camera, f in report["frames"]["by_camera"].items():
+    by_camera = report["frames"]["by_camera"] if report["frames"] is not None else {}
+    for camera, f in by_camera.items():
         rows.append([camera, *(f"{f[n]:,}" for n in names), f"{sum(f['rejected'].values()):,}"])
     return _table(rows) if len(rows) > 1 else ""
 
 
 def _channel_table(report: Report) -> str:
     rows = [["", "mean", "50 %", "95 %", "99 %", "largest"]]
+    channel = report["channel"] or {}
     for name, label in (("drawn_delay_ms", "drawn delay (ms)"), ("delay_error_ms", "delay error (ms)")):
-        found = report["channel"][name]
+        found = channel.get(name)
         if isinstance(found, dict) and any(found.get(k) is not None for k in ("mean", "p50", "p99")):
             rows.append([label, *(_n(found.get(k), 2) for k in ("mean", "p50", "p95", "p99", "max"))])
     return _table(rows) if len(rows) > 1 else ""

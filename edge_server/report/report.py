@@ -41,12 +41,17 @@ def build_report(out_dir: str | Path) -> dict[str, Any]:
 
 
 def assemble(records: Records) -> dict[str, Any]:
-    """The contents of report.json, without writing anything but what the ledgers' reading needs."""
+    """The contents of report.json, without writing anything but what the ledgers' reading needs.
+
+    ``kind``: live, or fit for a recorded data set without a network, whose books, ages and channel are None.
+    """
     edge, series = records.edge, records.series
+    kind = "fit" if edge.get("kind") == "fit" else "live"
     books = close_books(records.out)
     last_s = series[-1]["t_s"] if series else 0.0
     seconds = max(_number(edge.get("seconds", edge.get("uptime_s"))) or 0.0, last_s)
     report = {
+        "kind": kind,
         "scenario": edge.get("scenario"),
         "seed": edge.get("seed"),
         "seconds": seconds,
@@ -64,6 +69,8 @@ def assemble(records: Records) -> dict[str, Any]:
         },
         "notes": records.notes + books.notes,
     }
+    if kind == "fit":
+        report |= {"data": edge.get("data"), "frames": None, "age_ms": None, "channel": None, "notes": []}
     cleaned: dict[str, Any] = _finite(report)
     return cleaned
 

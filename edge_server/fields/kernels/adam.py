@@ -47,12 +47,13 @@ def _update(rule, p, g, m, v):
         dropped += 0 if finite else 1
         use = finite and raw != _F0
         d = min(max(raw, -limit), limit)
-        m1 = rule.beta1 * m[k] + (_F1 - rule.beta1) * d
-        v1 = rule.beta2 * v[k] + (_F1 - rule.beta2) * d * d
+        m0, v0 = m[k] if is_finite(m[k]) else _F0, v[k] if is_finite(v[k]) else _F0
+        m1 = rule.beta1 * m0 + (_F1 - rule.beta1) * d
+        v1 = rule.beta2 * v0 + (_F1 - rule.beta2) * d * d
         root = np.sqrt(v1 * rule.correct2) + rule.epsilon
         q = p[k] - rule.rate * (m1 * rule.correct1 / root + rule.decay * p[k])
-        m[k] = m1 if use else m[k]
-        v[k] = v1 if use else v[k]
+        m[k] = m1 if use else m0
+        v[k] = v1 if use else v0
         q = q if use else p[k]
         q = min(max(q, -bound), bound)
         p[k] = q if is_finite(p[k]) else _F0

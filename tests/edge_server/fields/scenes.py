@@ -1,4 +1,4 @@
-"""A small analytic scene for field tests: a textured ball on a plain ground, ray-cast without any field."""
+"""A small analytic scene for field tests: a striped ball on a checkered plate, ray-cast without any field."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ BALL_M, RADIUS_M = np.array([0.0, 0.0, 0.5]), 0.5
 
 
 def picture(camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M) -> NDArray:
-    """uint8 (H, W, 3): striped ball, checkered ground, blue sky."""
+    """uint8 (H, W, 3): striped ball, checkered plate, plain sky."""
     origin, rays = world_rays(camera, pose)
     color = np.broadcast_to(np.array([0.5, 0.7, 0.9]), rays.shape).copy()
     down = rays[..., 2] < -1e-6
     t_ground = np.where(down, -origin[2] / np.where(down, rays[..., 2], -1.0), np.inf)
     hit = origin + rays * np.where(down, t_ground, 0.0)[..., None]
-    near = down & (np.abs(hit[..., :2]).max(axis=-1) < 1.5)
-    check = (np.floor(hit[..., 0] * 2) + np.floor(hit[..., 1] * 2)) % 2
+    near = down & (np.abs(hit[..., :2]).max(axis=-1) < 0.8)
+    check = (np.floor(hit[..., 0] * 2.5) + np.floor(hit[..., 1] * 2.5)) % 2
     color[near] = np.where(check[near, None] > 0, [0.8, 0.8, 0.7], [0.3, 0.25, 0.2])
     offset = origin - ball_m
     b = rays @ offset

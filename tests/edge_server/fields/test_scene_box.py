@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.fields.scene_box import converging_point, scene_box
+from edge_server.fields.scene_box import converging_point, plain_background, scene_box
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import ring
 
-VIEWS = ring(8, size=8)
+RING = ring(8, size=16)
+NOISE = np.random.default_rng(0).integers(0, 256, (8, 16, 16, 3), dtype=np.uint8)
+VIEWS = [replace(view, image=image) for view, image in zip(RING, NOISE)]  # surroundings everywhere
 
 
 def test_the_box_is_where_the_axes_meet() -> None:
@@ -33,9 +35,16 @@ def test_it_moves_and_scales_with_the_rig() -> None:
 
 
 def test_transparent_pictures_show_an_object() -> None:
-    views = [replace(v, image=np.zeros((8, 8, 4), np.uint8)) for v in VIEWS]
+    views = [replace(v, image=np.zeros((16, 16, 4), np.uint8)) for v in VIEWS]
     box = scene_box(views)
     assert not box.contracted and 0.5 < box.radius_m < 1.3
+
+
+def test_a_plain_background_shows_an_object_too() -> None:
+    color = plain_background(RING)
+    assert color is not None and np.abs(color - RING[0].image[0, 0] / 255.0).max() < 0.01
+    assert plain_background(VIEWS) is None
+    assert not scene_box(RING).contracted
 
 
 def test_what_is_given_is_kept() -> None:
@@ -49,9 +58,8 @@ def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
     one = scene_box(VIEWS[:1])
     ahead = (np.array(one.centre_m) - pose[:3, 3]) @ pose[:3, 2]
     assert ahead > 1.0
-    outward = [
-        replace(v, camera_to_world=look_at(*[v.camera_to_world[:3, 3] * k for k in (1, 2)])) for v in VIEWS
-    ]
+    eyes = [v.camera_to_world[:3, 3] for v in VIEWS]
+    outward = [replace(v, camera_to_world=look_at(eye, 2 * eye)) for v, eye in zip(VIEWS, eyes)]
     box = scene_box(outward)
     assert np.linalg.norm(np.array(box.centre_m)[:2]) < 0.2 and np.isfinite(box.radius_m)
     same = [replace(VIEWS[0], camera=str(k)) for k in range(5)]

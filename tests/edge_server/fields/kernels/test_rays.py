@@ -55,7 +55,7 @@ def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
     none = torch.zeros(0)
     model = TorchModel(
         settings, SceneBox((0, 0, 0), 1.0, 0.1, contracted, 3.0), TorchGrid([], [], [], none), 0, [], none,
-        torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS), none,
+        torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS), none, float(space.step),
     )  # fmt: skip
     rng = np.random.default_rng(6)
     for _ in range(20):

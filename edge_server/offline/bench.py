@@ -1,0 +1,71 @@
+"""``edge-server bench``: what this machine does a second, with how busy others kept it beside each figure."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from edge_server.report.machine import machine, versions
+
+DESCRIPTION = """\
+Measure this machine. Figures are medians; outside_cores says how many cores others kept busy meanwhile.
+
+  edge-server bench                       # everything, several minutes
+  edge-server bench field --quick
+  edge-server bench ingest --json ingest.json
+
+field      steps, rays and samples a second, ms a rendering, compile time, memory, seconds to 22..30 dB
+ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
+fidelity   what scoring one image costs
+"""
+
+PARTS = ("field", "ingest", "fidelity")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server bench", description=DESCRIPTION, formatter_class=raw)
+    parser.add_argument("part", nargs="?", choices=(*PARTS, "all"), default="all", help="[%(default)s]")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    parser.add_argument("--quick", action="store_true", help="fewer repetitions, cached kernels only")
+    parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    args = parser.parse_args(argv)
+    figures: dict[str, Any] = {"machine": machine(), "versions": versions(), "quick": args.quick}
+    for part in PARTS if args.part == "all" else (args.part,):
+        print(f"== {part}", flush=True)
+        with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
+            module = importlib.import_module(f"edge_server.offline.bench_{part}")
+            figures[part] = module.measure(args.quick, Path(folder), args.lpips)
+        for line in lines(figures[part]):
+            print(f"  {line}", flush=True)
+        if args.json is not None:  # after each part: an interrupted bench keeps what it has
+            args.json.parent.mkdir(parents=True, exist_ok=True)
+            args.json.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    return 0
+
+
+def lines(figures: dict[str, Any], prefix: str = "") -> list[str]:
+    """Nested figures as lines ``name  value``."""
+    out = []
+    for name, value in figures.items():
+        if isinstance(value, dict):
+            out += lines(value, f"{prefix}{name}.")
+        else:
+            shown = f"{value:,.3g}" if isinstance(value, float) and abs(value) < 1000 else f"{value}"
+            out.append(f"{prefix + name:42} {f'{value:,.0f}' if _large(value) else shown}")
+    return out
+
+
+def _large(value: Any) -> bool:
+    return isinstance(value, float) and abs(value) >= 1000
+
+
+if __name__ == "__main__":
+    sys.exit(main())

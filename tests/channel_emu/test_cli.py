@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from channel_emu import spell
+from channel_emu.cli import main
+from freshfield import ledger
+from freshfield.transport import Transport
+from tests.channel_emu.test_trace import record
+from tests.integration.peer import Peer
+from tests.ports import free_port
+
+SCENARIO = {"name": "t", "seed": 3, "cameras": {"count": 2}, "channel": {"preset": "ch5"}}
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "t.yaml"
+    path.write_text(json.dumps(SCENARIO))
+    return path
+
+
+def simulate(capsys, *words: str) -> dict:
+    assert main(["simulate", "--json", *words]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_simulate_takes_short_spellings(capsys) -> None:
+    found = simulate(
+        capsys, "--arrivals", "periodic:30ms", "--service-by-state", "exp:30ms,exp:60ms", "--chain",
+        "mu1=1/30,mu2=1/30", "--service-state", "modulated", "--discipline", "drop-new", "--cameras", "3",
+        "--seconds", "120", "--seed", "4",
+    )  # fmt: skip
+    assert found["mean_age_ms"] == pytest.approx(84, abs=4)
+    assert set(found) >= {"mean_age_ms", "mean_age_slotted_ms", "peak_age_ms", "delivered", "dropped"}
+    assert set(found["delay_ms"]) == {"mean", "p50", "p95"}
+    assert sum(found["state_share"].values()) == pytest.approx(1)
+    again = simulate(
+        capsys, "--preset", "ch6", "--arrivals", "periodic:30", "--service-state", "modulated",
+        "--discipline", "drop-new", "--cameras", "3", "--seconds", "120", "--seed", "4",
+    )  # fmt: skip
+    assert again["mean_age_ms"] == found["mean_age_ms"]  # the same channel, spelled otherwise
+
+
+def test_simulate_from_a_scenario_and_for_people(capsys, scenario: Path) -> None:
+    assert main(["simulate", "--scenario", str(scenario), "--seconds", "60", "--cameras", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "mean age" in text and "dropped_busy" in text and "drawn delay" in text
+
+
+def test_delays_from_a_file(capsys, tmp_path: Path) -> None:
+    (tmp_path / "delays.txt").write_text("# ms\n10\n20\n\n60\n")
+    found = simulate(capsys, "--service", f"trace:{tmp_path / 'delays.txt'}", "--seconds", "30",
+                     "--discipline", "parallel", "--arrivals", "periodic:100ms")  # fmt: skip
+    assert found["delay_ms"]["mean"] == pytest.approx(30)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("30ms", 30), ("3s", 3000), ("250us", 0.25), ("7", 7), ("1.5min", 90_000)]
+)
+def test_spans(text: str, value: float) -> None:
+    assert spell.span_ms(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1/30ms", 1 / 30), ("1/30", 1 / 30), ("0.5/ms", 0.5), ("33/s", 0.033), ("2/1s", 0.002)],
+)
+def test_rates(text: str, value: float) -> None:
+    assert spell.rate_per_ms(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--arrivals", "sometimes"], "expected as-offered, periodic:30ms"),
+        (["--arrivals", "periodic:fast"], "is not a span of time"),
+        (["--arrivals", "poisson:1/0ms"], "is not a rate"),
+        (["--service", "exp"], "expected exp:60ms"),
+        (["--service", "gamma:60ms:big"], "expected exp:60ms"),
+        (["--service-by-state", "exp:30ms,det:60ms"], "expected one law"),
+        (["--service", "exp:1ms", "--service-by-state", "exp:1ms,exp:2ms"], "exclude each other"),
+        (["--service-by-state", "exp:1ms,exp:2ms"], "there is no chain"),
+        (["--service", "trace:/no/such/file"], "cannot be read"),
+        (["--chain", "mu3=1"], "expected mu1="),
+        (["--seconds", "0"], "seconds: expected"),
+        (["--scenario", "/no/such.yaml"], "/no/such.yaml"),
+    ],
+)
+def test_mistakes_get_one_line(capsys, words: list[str], why: str) -> None:
+    assert main(["simulate", *words]) == 2
+    error = capsys.readouterr().err
+    assert why in error and error.count("\n") == 1 and error.startswith("channel-emu: ")
+
+
+def test_replay_says_whether_decisions_agree(capsys, tmp_path: Path) -> None:
+    from channel_emu.config import channel_from_mapping
+
+    path = tmp_path / "t.jsonl"
+    record(path, channel_from_mapping({"preset": "ch5"}), frames=50)
+    assert main(["replay", str(path)]) == 0
+    assert "100 frames, 100 decided as recorded" in capsys.readouterr().out
+    path.write_text(path.read_text().replace('"seed":3', '"seed":4'))
+    assert main(["replay", str(path), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["equal"] < 100 and found["different"]
+
+
+def test_run_as_a_process_ends_cleanly_when_told(scenario: Path, tmp_path: Path) -> None:
+    out, port = tmp_path / "out", free_port()
+    words = [sys.executable, "-m", "channel_emu.cli", "run", str(scenario)]
+    words += ["--listen", f"127.0.0.1:{port}", "--to", f"127.0.0.1:{free_port()}", "--out", str(out)]
+    words += ["--trace", str(out / "t.jsonl")]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            deadline = time.monotonic() + 30
+            while not (out / "channel.json").exists():
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.05)
+            # A second emulator on the port is told so.
+            second = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+            assert second.returncode == 2 and "cannot listen on" in second.stderr
+            process.send_signal(signal.SIGTERM)
+            _, log = process.communicate(timeout=20)
+        finally:
+            process.kill()
+    assert process.returncode == 0, log
+    assert json.loads((out / "channel.json").read_text())["running"] is False
+    assert any(file.closed and file.role == "emulator" for file in ledger.read_all(out))
+
+
+def test_a_killed_emulator_leaves_readable_books(scenario: Path, tmp_path: Path) -> None:
+    """SIGKILL in the middle of traffic: every whole line is there, the account is not closed."""
+    from tests.channel_emu.live import Camera
+
+    out, port = tmp_path / "out", free_port()
+
+    async def live() -> None:
+        edge = await Peer().start()
+        words = ["-m", "channel_emu.cli", "run", str(scenario), "--listen", f"127.0.0.1:{port}", "--to",
+                 edge.address, "--out", str(out)]  # fmt: skip
+        process = await asyncio.create_subprocess_exec(sys.executable, *words, stderr=subprocess.DEVNULL)
+        books = ledger.Ledger(out, "node", "n", 1)
+        camera = Camera("cam00", port, Transport(), False, books)
+        try:
+            async with asyncio.timeout(40):
+                await camera.stream(20, 0.01)
+                process.kill()
+                await process.wait()
+        finally:
+            if process.returncode is None:
+                process.kill()
+        await camera.close()
+        await edge.stop()
+
+    asyncio.run(live())
+    (emulator,) = [file for file in ledger.read_all(out) if file.role == "emulator"]
+    assert not emulator.closed
+    assert sum(e.event == "received" for e in emulator.events) == 20
+
+
+def test_bench_loses_nothing_and_reports_its_errors(capsys) -> None:
+    assert main(["bench", "--cameras", "3", "--rate", "20", "--seconds", "1.5", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["lost"] == 0 and found["sent"] == found["arrived"] > 30
+    assert found["delay_error_ms"]["count"] == found["sent"]
+    assert 0 < found["delay_error_ms"]["p50"] <= found["arrival_error_ms"]["p50"]
+    from channel_emu.bench import show
+
+    assert "delay error" in show(found)
