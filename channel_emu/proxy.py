@@ -18,6 +18,7 @@ from typing import Any
 
 import grpc
 import grpc.aio
+import numpy as np
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
@@ -30,6 +31,7 @@ from channel_emu.link import Link
 from channel_emu.status import StatusFile, snapshot
 from channel_emu.timer import LoopTimer
 from channel_emu.trace import ReplayLink, Trace, TraceWriter
+from channel_emu.uniforms import stream_key
 from channel_emu.upstream import Upstream
 from channel_emu.wire import WireError, header_of
 from freshfield.clock import Clock, WallClock
@@ -47,6 +49,8 @@ _EXCHANGE_TIMEOUT_S = 5.0
 _STATUS_EVERY_S = 0.5
 # How much of the chain's path is kept behind the present; events are never later than this.
 _KEEP_PATH_NS = 60 * 10**9
+# After this long without the edge, say so once.
+_PATIENCE_NS = 3 * 10**9
 _STOP_GRACE_S = 0.5
 
 
@@ -172,9 +176,9 @@ class Proxy:
         )  # fmt: skip
 
     def _upstream(self, lane: Lane) -> Upstream:
-        lane.upstream = Upstream(
-            lane.camera, self._edge, self.options.transport.metadata(), lane.on_forwarded, lane.on_broken
-        )
+        jitter = np.random.default_rng(stream_key(self.channel.seed, lane.camera, "channel.backoff"))
+        metadata = self.options.transport.metadata()
+        lane.upstream = Upstream(lane.camera, self._edge, metadata, lane.on_forwarded, lane.on_broken, jitter)
         return lane.upstream
 
     async def _push(self, _: Any, context: grpc.aio.ServicerContext) -> None:
@@ -277,7 +281,13 @@ class Proxy:
         )  # fmt: skip
 
     async def _keep_status(self) -> None:
+        patience_ns = self.clock.now_ns() + _PATIENCE_NS
         while True:
+            if patience_ns and self.clock.now_ns() > patience_ns:
+                patience_ns = 0
+                if not any(lane.upstream and lane.upstream.connected for lane in self.lanes.values()):
+                    log.warning("no answer from the edge at %s yet; frames are broken until it is there",
+                                self.options.to)  # fmt: skip
             state = self._snapshot()
             await asyncio.to_thread(self._status.write, state)
             before_ns = self.clock.now_ns() - self.origin_ns - _KEEP_PATH_NS

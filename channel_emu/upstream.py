@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import random
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 
 import grpc
 import grpc.aio
+import numpy as np
 
 from freshfield.v1 import frames_pb2 as pb
 
@@ -50,6 +50,7 @@ class Upstream:
         metadata: tuple[tuple[str, str], ...],
         forwarded: Callable[[Outgoing], None],
         broken: Callable[[Outgoing], None],
+        jitter: np.random.Generator,
     ) -> None:
         self.camera = camera
         self.connected = False
@@ -60,6 +61,7 @@ class Upstream:
         self._metadata = metadata
         self._forwarded = forwarded
         self._broken = broken
+        self._jitter = jitter
         self._outbox: deque[Outgoing] = deque()
         self._unanswered: deque[Outgoing] = deque()
         self._held: Outgoing | None = None
@@ -97,7 +99,7 @@ class Upstream:
                 self._end()
             backoff = FIRST_BACKOFF_S if answered else min(backoff * 2, MAX_BACKOFF_S)
             # Jitter, so that the cameras do not come back all at once.
-            await asyncio.sleep(backoff * random.uniform(0.5, 1.0))
+            await asyncio.sleep(backoff * self._jitter.uniform(0.5, 1.0))
 
     async def _session(self) -> bool:
         """One stream, until it fails; True if the edge answered anything on it."""

@@ -24,6 +24,8 @@ def header_of(raw: bytes) -> pb.FrameHeader:
         if kind == _BYTES:
             size, at = _varint(raw, at)
             if tag == _HEADER:
+                if header is not None:  # protobuf would merge them, and who sent the frame would be unclear
+                    raise WireError("not a PushRequest: it has two headers")
                 header = view[at : at + size]
             at += size
         elif kind == _VARINT:

@@ -35,7 +35,7 @@ from edge_server.state import CameraView, Comparison, Controls, EdgeState, Publi
 from freshfield.clock import Clock, WallClock
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, ScenarioError
-from freshfield.transport import Transport
+from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 
 log = logging.getLogger(__name__)
@@ -133,9 +133,13 @@ class EdgeServer:
         page = None
         try:
             if self.options.page_port is not None:
-                from edge_server.page import start_page  # the viewer is loaded only where there is a page
+                # The viewer is loaded only where there is a page.
+                from edge_server.page import PageError, start_page
 
-                page = start_page(self.state, self.options.page_host, self.options.page_port)
+                try:
+                    page = start_page(self.state, self.options.page_host, self.options.page_port)
+                except PageError as error:
+                    raise TransportError(f"page: {error}") from None
                 log.info("page: %s", page.url)
             if self.options.metrics_port is not None:
                 from edge_server.metrics import serve_metrics

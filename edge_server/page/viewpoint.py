@@ -24,6 +24,8 @@ DISTANCES = np.linspace(1.3, 2.2, 37)
 _SCATTERED = 0.25
 # Smallest eigenvalue of the mean of I - d d^T at which axes are called parallel (about 3 degrees apart).
 _PARALLEL = 1e-3
+# The same for the x axes of cameras that face nearly one way (about 10 degrees either side).
+_FAN = 0.03
 
 
 @dataclass(frozen=True)
@@ -38,11 +40,20 @@ class Viewpoint:
 
 
 def world_up(poses: Array) -> Array:
-    """Unit vector (3,): mean of the cameras' -y axes. poses: camera-to-world (N, 4, 4), N >= 1."""
-    ups = -poses[:, :3, 1]
+    """Unit vector (3,). poses: camera-to-world (N, 4, 4), N >= 1.
+
+    Cameras are held level: up is what their x axes are all at right angles to. Where those are one line (a
+    single camera, a row of them), it is the mean of their -y axes, which leans with a rig that looks down.
+    """
+    ups, sides = -poses[:, :3, 1], poses[:, :3, 0]
     mean = ups.mean(axis=0)
     if np.linalg.norm(mean) < _SCATTERED:
         mean = ups[0]
+    spread, directions = np.linalg.eigh(sides.T @ sides / len(sides))
+    level = directions[:, 0] * (1.0 if directions[:, 0] @ mean >= 0 else -1.0)
+    # Level cameras that face different ways: sides fill a plane and nearly nothing is across it.
+    if spread[1] > _FAN and spread[0] < 0.1 * spread[1] and level @ mean > _SCATTERED:
+        return level
     return mean / np.linalg.norm(mean)
 
 

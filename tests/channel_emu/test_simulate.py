@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -117,6 +119,14 @@ def test_no_delivery_has_no_age() -> None:
     assert ages.mean_age_ms(nothing) is None and ages.peak_age_ms(nothing) is None
     assert ages.mean_age_slotted_ms(nothing) is None
     assert np.isnan(ages.ages_at(nothing, np.array([5]))).all()
+
+
+def test_without_numba_the_links_themselves_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "numba", None)  # what import finds where it is not installed
+    config = channel_from_mapping({"preset": "ch5"})
+    assert simulate(config, 1, 1).engine == "python"
+    with pytest.raises(SimulationError, match="numba is not installed"):
+        simulate(config, 1, 1, engine="kernel")
 
 
 @pytest.mark.parametrize(

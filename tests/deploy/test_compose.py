@@ -42,6 +42,7 @@ def test_the_only_way_from_a_camera_to_the_edge_is_the_emulator() -> None:
         assert networks and not networks & edge, f"{name} shares a network with the edge"
         assert networks <= emulator
         assert "--to emulator:" in service["command"]
+        assert all(COMPOSE["networks"][n]["internal"] for n in networks), "an engine may route between bridges"
     assert edge <= emulator
     assert not any("network_mode" in s or "links" in s for s in SERVICES.values())
 

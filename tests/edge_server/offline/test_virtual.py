@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any)
         "seed": seed,
         "cameras": {"count": 5, "held_out": ["cam00"]},
         "source": {
-            "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15, "params": {"supersample": 1},
+            "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
+            "params": {"supersample": 1},
         },
         "channel": {"preset": "ch5"} if channel is None else channel,
         "edge": {"field": "ngp", "field_options": SMALL},
@@ -53,7 +55,7 @@ FAULTS = {
         "corruption": {"probability": 0.2},
         "duplication": {"probability": 0.2},
         "reset": {"at_ms": [400.0]},
-        "bandwidth": {"bytes_per_s": 200000.0},
+        "bandwidth": {"megabits_per_s": 2.0},
     },
 }
 
@@ -97,7 +99,7 @@ def test_the_present_is_when_the_charge_is_over():
     deployment = run(scenario())
     assert {p.update_ms for p in deployment.publications} == {100.0}
     ends = [p.published_ns for p in deployment.publications]
-    assert {b - a for a, b in zip(ends, ends[1:])} == {100_000_000}, "the next update starts at once"
+    assert {b - a for a, b in pairwise(ends)} == {100_000_000}, "the next update starts at once"
     assert all(p.psnr_db is not None and p.truth_gap_ms == 0.0 for p in deployment.publications)
 
 
@@ -152,9 +154,10 @@ def test_a_recording_is_scored_against_its_nearest_capture(tmp_path):
 
 
 def test_the_kitchen_in_virtual_time():
+    data = str(data_dir("blender_kitchen") / "transforms.json")
     what = scenario(
         cameras={"ids": ["cam00", "cam01", "cam07", "cam13", "cam18"], "held_out": ["cam00"]},
-        source={"kind": "transforms", "data": str(data_dir("blender_kitchen") / "transforms.json"), "scale": 4},
+        source={"kind": "transforms", "data": data, "scale": 4},
     )
     deployment = run(what)
     assert deployment.publications and closes(deployment.frames())

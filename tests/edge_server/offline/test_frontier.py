@@ -1,0 +1,137 @@
+"""``edge-server frontier``: repeatable, resumable, and its tables and figures say what was measured."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import pytest
+
+from edge_server.cli import main as edge_server
+from edge_server.offline import frontier, sweep
+from edge_server.offline.frontier_output import conclusion
+from edge_server.offline.update_time import Moving, Stage, mean_over_seeds, steps_for
+from edge_server.offline.virtual import Compute
+from tests.edge_server.offline.sets import SMALL, SMALL_WORDS, write_photos
+
+TINY = Moving(cameras=4, size=32)
+COMPUTE = Compute(ms_per_step=30.0, ms_per_update=10.0)
+
+
+def test_an_update_time_point_is_the_same_bit_for_bit():
+    points = []
+    for _ in range(2):
+        stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
+        points.append(stage.run(3, COMPUTE, seconds=1.0))
+    assert points[0] == points[1]
+    assert points[0]["update_s"] == 0.1 and points[0]["updates"] == 9
+    assert points[0]["psnr_db"] is not None and points[0]["psnr_moving_db"] is not None
+
+
+def test_every_point_of_a_stage_starts_from_the_same_warm_field():
+    stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
+    first = stage.run(3, COMPUTE, seconds=0.6)
+    stage.run(9, COMPUTE, seconds=0.6)
+    assert stage.run(3, COMPUTE, seconds=0.6) == first
+
+
+def test_longer_updates_show_older_views():
+    stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=2)
+    short, long = (stage.run(steps, COMPUTE, seconds=1.5) for steps in (1, 12))
+    assert long["aaoi_ms"] - short["aaoi_ms"] == pytest.approx(11 * 30.0, abs=60.0)
+
+
+def test_the_front_is_what_nothing_beats_in_both():
+    rows = [
+        {"seconds": 1.0, "psnr_db": 20.0},
+        {"seconds": 2.0, "psnr_db": 19.0},
+        {"seconds": 2.0, "psnr_db": 25.0},
+        {"seconds": 3.0, "psnr_db": 25.0},
+        {"seconds": 4.0, "psnr_db": 26.0},
+    ]
+    sweep.mark_front(rows)
+    assert [row["on_front"] for row in rows] == [True, False, True, False, True]
+
+
+def test_steps_that_fit_into_an_update():
+    assert steps_for(1.0, COMPUTE) == 33
+    assert steps_for(0.001, COMPUTE) == 1
+
+
+def test_seeds_are_averaged_with_their_standard_error():
+    base = {
+        "speed_m_per_s": 1.0, "planned_update_s": 0.5, "update_s": 0.5, "steps": 4, "updates": 2, "scored": 2,
+        "aaoi_ms": 100.0, "psnr_moving_db": None, "ssim": 0.5, "lpips": None, "seen_psnr_db": 20.0,
+        "seen_psnr_moving_db": None,
+    }  # fmt: skip
+    (row,) = mean_over_seeds([{**base, "psnr_db": 20.0}, {**base, "psnr_db": 22.0}])
+    assert row["psnr_db"] == 21.0 and row["psnr_db_error"] == pytest.approx(1.0)
+    assert row["psnr_moving_db"] is None and row["psnr_moving_db_error"] is None and row["seeds"] == 2
+
+
+def test_the_conclusion_names_the_best_time_of_each_speed():
+    def row(speed, update_s, whole, moving):
+        return {"speed_m_per_s": speed, "update_s": update_s, "psnr_db": whole, "psnr_moving_db": moving}
+
+    said = conclusion(
+        [row(1.0, 0.1, 20, 18), row(1.0, 2.0, 22, 15), row(3.0, 0.1, 20, 17), row(3.0, 2.0, 19, 14)]
+    )
+    assert "at 1 m/s 2.00 s for the whole image and 0.10 s where it moves (2.0 s costs 3.0 dB there)" in said
+    assert "at 3 m/s 0.10 s for the whole image" in said
+
+
+@pytest.fixture
+def tiny_plan(monkeypatch):
+    plan = replace(
+        frontier.QUICK, planned_s=(0.2, 0.4), speeds=(1.0,), update_s=(0.1, 0.4), run_s=0.8, warm_steps=3,
+        size=32, moving=TINY,
+    )  # fmt: skip
+    monkeypatch.setattr(frontier, "QUICK", plan)
+    return plan
+
+
+def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
+    words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
+    assert edge_server(words) == 0
+    first = capsys.readouterr().out
+    assert "(known)" not in first and "Best time to spend on an update: at 1 m/s" in first
+    for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
+        assert (tmp_path / name).stat().st_size > 100, name
+    data = json.loads((tmp_path / "frontier.json").read_text())
+    assert set(data["ms_per_step"]) == {e.name for e in sweep.efforts("ngp", {}, knobs=False)}
+    assert all(ms > 0 for ms in data["ms_per_step"].values())
+    with (tmp_path / "updates.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 2
+
+    # As after Ctrl-C: what is finished is not measured again, the rest is, and nothing else has changed.
+    points = data["points"]
+    gone = next(key for key, point in points.items() if point["settings"]["figure"] == 2)
+    lost = points.pop(gone)
+    (tmp_path / "frontier.json").write_text(json.dumps(data))
+    assert edge_server(words) == 0
+    again = json.loads((tmp_path / "frontier.json").read_text())["points"]
+    assert capsys.readouterr().out.count("(known)") == len(points)
+    assert again[gone] == lost, "virtual time gives the same point again"
+
+
+def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_plan):
+    write_photos(tmp_path / "set", 5)
+    words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]
+    assert edge_server([*words, *SMALL_WORDS]) == 0
+    assert "figure 2 left out" in capsys.readouterr().out
+    assert (tmp_path / "out" / "frontier.png").exists() and not (tmp_path / "out" / "updates.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--policy", "best"], "policy 'best' is not known"),
+        (["--scene", "nowhere"], "no such file or folder"),
+        (["--seeds", "0"], "--seeds 0"),
+        (["--option", "x"], "expected KEY=VALUE"),
+    ],
+)
+def test_what_cannot_work_is_refused(tmp_path, capsys, words, message):
+    assert edge_server(["frontier", "--quick", "--out", str(tmp_path), *words]) == 2
+    assert message in capsys.readouterr().err
