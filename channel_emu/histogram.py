@@ -56,7 +56,3 @@ class Histogram:
         # The cumulative count is known at the logarithmic edges; between them frames are spread evenly.
         below = np.interp(edges, np.append(0.0, upper), np.append(0.0, np.cumsum(self._bins)))
         return edges.round(4).tolist(), np.diff(below).round(2).tolist()
-
-    def bins(self) -> list[tuple[float, int]]:
-        """(upper edge in ms, count) of the bins that are not empty."""
-        return [(_FLOOR_MS * 10 ** (i / _PER_DECADE), n) for i, n in enumerate(self._bins) if n]

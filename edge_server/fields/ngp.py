@@ -40,8 +40,8 @@ from edge_server.fields.ngp_schedule import (
 )
 from edge_server.fields.ngp_settings import NgpSettings, make_settings
 from edge_server.fields.ngp_snapshot import NgpSnapshot
-from edge_server.fields.ngp_state import pack, unpack
-from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.ngp_state import fill, pack, unpack_meta
+from edge_server.fields.scene_box import NOWHERE
 from freshfield.geometry import Pinhole
 
 
@@ -108,7 +108,7 @@ class NgpField:
         """A copy that renders from any thread and never changes."""
         with self._turn.mine():
             if self._snapshot is None or self._snapshot.step != self.step:
-                box = self.rig.box or SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0)
+                box = self.rig.box or NOWHERE
                 space = self._occupancy.space(step_length(self.settings, self.step))
                 self._snapshot = NgpSnapshot(
                     box=box,
@@ -157,12 +157,11 @@ class NgpField:
     def load_state(self, state: Arrays) -> None:
         """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
         with self._turn.mine():
-            meta = unpack(self.settings, state, self._arrays())
+            meta = unpack_meta(self.settings, state)
             self.rig = Rig(self.settings)
             self.rig.load(meta, state)
             self._forget_parameters()
-            for name, array in self._arrays().items():
-                array[...] = state[name]
+            fill(self._arrays(), state)
             self.step, self._updates = int(meta["step"]), int(meta["updates"])
             self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
             self._occupancy.mark()
@@ -188,7 +187,7 @@ class NgpField:
         rng = np.random.default_rng(np.random.SeedSequence(s.seed))
         self.step = 0
         self._updates = 0  # optimiser steps that Adam's bias correction counts
-        self._grid: Grid = make_grid(s, rng)
+        self._grid: Grid = make_grid(s, self.rig.box, rng)
         self._net: Net = make_net(s, rng)
         self._table_m, self._table_v, self._table_g = (np.zeros_like(self._grid.table) for _ in range(3))
         self._dirty = np.zeros(len(self._grid.table) // SEGMENT, np.bool_)

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.kernels.mlp import Net, param_count
 from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.scene_box import SceneBox
 
+FINENESS = 1.0  # cells of the finest level per pixel
 FIRST_DENSITY = 0.3  # a scene unit of fog dims by a quarter: every sample gets a gradient at first
 
 
@@ -18,10 +20,18 @@ def _multiple_of_4(n: int) -> int:
     return (n + 3) // 4 * 4
 
 
-def make_grid(settings: NgpSettings, rng: np.random.Generator) -> Grid:
+def finest_resolution(settings: NgpSettings, box: SceneBox | None) -> int:
+    """As set, or as fine as pictures can tell: finer levels would only learn noise."""
+    if settings.finest_resolution is not None:
+        return settings.finest_resolution
+    pixels = FINENESS * box.pixels_across if box is not None else 256.0
+    return int(np.clip(pixels, settings.base_resolution, 512))
+
+
+def make_grid(settings: NgpSettings, box: SceneBox | None, rng: np.random.Generator) -> Grid:
     """Levels growing geometrically from base to finest resolution, tables near zero."""
     share = np.arange(settings.levels) / max(settings.levels - 1, 1)
-    ratio = settings.finest_resolution / settings.base_resolution
+    ratio = finest_resolution(settings, box) / settings.base_resolution
     resolution = np.round(settings.base_resolution * ratio**share).astype(np.int32)
     most = 1 << settings.log2_table
     vertices = (resolution.astype(np.int64) + 1) ** 3

@@ -18,7 +18,7 @@ class NgpSettings:
     levels: int = _option(8, "levels of the hash grid, coarse to fine")
     log2_table: int = _option(16, "largest number of vertices a level stores, as a power of two")
     base_resolution: int = _option(16, "cells a side of the coarsest level")
-    finest_resolution: int = _option(256, "cells a side of the finest level")
+    finest_resolution: int | None = _option(None, "cells a side of the finest level; None: about a pixel")
     hidden: int = _option(32, "units of each hidden layer, a multiple of 4")
     hidden_layers: int = _option(1, "hidden layers of the network")
     harmonics: int = _option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
@@ -55,7 +55,6 @@ class NgpSettings:
             ("levels", 1, 24),
             ("log2_table", 8, 24),
             ("base_resolution", 2, 512),
-            ("finest_resolution", 2, 4096),
             ("hidden", 4, 256),
             ("hidden_layers", 1, 4),
             ("rays", 1, 1 << 20),
@@ -69,6 +68,8 @@ class NgpSettings:
         ):
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"ngp: {name} must be in {low}..{high}, not {getattr(self, name)}")
+        if self.finest_resolution is not None and not 2 <= self.finest_resolution <= 4096:
+            raise ValueError(f"ngp: finest_resolution must be in 2..4096, not {self.finest_resolution}")
         if self.hidden % 4 or self.cells % 4:
             raise ValueError(f"ngp: hidden ({self.hidden}) and cells ({self.cells}) must be multiples of 4")
         if self.harmonics not in (1, 4, 9):
@@ -89,7 +90,7 @@ class NgpSettings:
 EFFORTS: dict[str, dict[str, Any]] = {
     "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 96},
     "medium": {},
-    "high": {"finest_resolution": 384, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 256},
+    "high": {"log2_table": 17, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 256},
 }
 
 

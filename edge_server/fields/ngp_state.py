@@ -25,8 +25,8 @@ def pack(settings: NgpSettings, rig: Rig, counters: dict[str, int], arrays: Arra
     return {name: np.array(array) for name, array in both.items()}
 
 
-def unpack(settings: NgpSettings, state: Arrays, wanted: Arrays) -> dict[str, Any]:
-    """The facts in ``state``. ValueError unless it fits these settings and has all ``wanted`` arrays."""
+def unpack_meta(settings: NgpSettings, state: Arrays) -> dict[str, Any]:
+    """The facts in ``state``. ValueError unless it is a state and was made with a model of this shape."""
     try:
         meta = json.loads(str(state["meta"]))
         theirs = meta["settings"]
@@ -38,7 +38,13 @@ def unpack(settings: NgpSettings, state: Arrays, wanted: Arrays) -> dict[str, An
                 f"the state was made with {name} = {theirs.get(name)}, "
                 f"this field has {getattr(settings, name)}"
             )
-    for name, like in wanted.items():
-        if name not in state or state[name].shape != like.shape or state[name].dtype != like.dtype:
-            raise ValueError(f"the state lacks {name!r}, {like.dtype} of shape {like.shape}")
     return meta
+
+
+def fill(wanted: Arrays, state: Arrays) -> None:
+    """Copy the arrays of ``state`` into those of the same name; ValueError if one is missing or different."""
+    for name, mine in wanted.items():
+        if name not in state or state[name].shape != mine.shape or state[name].dtype != mine.dtype:
+            raise ValueError(f"the state lacks {name!r}, {mine.dtype} of shape {mine.shape}")
+    for name, mine in wanted.items():
+        mine[...] = state[name]

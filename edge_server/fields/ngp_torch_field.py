@@ -32,9 +32,9 @@ from edge_server.fields.ngp_schedule import (
 )
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.ngp_snapshot import surface_points
-from edge_server.fields.ngp_state import pack, unpack
+from edge_server.fields.ngp_state import fill, pack, unpack_meta
 from edge_server.fields.ngp_torch import TorchGrid, encode, mlp, ray_losses, shade, to_torch, weights_of
-from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.scene_box import NOWHERE, SceneBox
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # at a time
@@ -206,14 +206,16 @@ class NgpTorchField:
 
     def load_state(self, state: Arrays) -> None:
         with self._lock:
-            meta = unpack(self.settings, state, self._arrays())
+            meta = unpack_meta(self.settings, state)
             self.rig = Rig(self.settings)
             self.rig.load(meta, state)
             self._forget_parameters()
+            arrays = {name: array.copy() for name, array in self._arrays().items()}
+            fill(arrays, state)
             for name, tensor in self._tensors().items():
-                tensor.copy_(torch.as_tensor(state[name]))
+                tensor.copy_(torch.as_tensor(arrays[name]))
             for name in ("density", "seen", "occupied"):
-                getattr(self._occupancy, name)[...] = state[name]
+                getattr(self._occupancy, name)[...] = arrays[name]
             self.step, self._updates = int(meta["step"]), int(meta["updates"])
             self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
             self._occupancy.mark()
@@ -232,7 +234,7 @@ class NgpTorchField:
     def _forget_parameters(self) -> None:
         rng = np.random.default_rng(np.random.SeedSequence(self.settings.seed))
         self.step = self._updates = 0
-        self._grid = to_torch(make_grid(self.settings, rng), self.device)
+        self._grid = to_torch(make_grid(self.settings, self.rig.box, rng), self.device)
         net = make_net(self.settings, rng)
         self._widths = net.widths.tolist()
         self._net = torch.as_tensor(net.params, device=self.device)
@@ -244,7 +246,7 @@ class NgpTorchField:
         occupied = torch.as_tensor(o.occupied, device=self.device).view(s.cells, s.cells, s.cells)
         return TorchModel(
             settings=s,
-            box=self.rig.box or SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0),
+            box=self.rig.box or NOWHERE,
             grid=self._grid,
             levels=active_levels(s, self.step),
             widths=self._widths,

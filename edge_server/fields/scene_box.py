@@ -25,6 +25,7 @@ class SceneBox:
     """Scene coordinates are (world - centre_m) / radius_m; contracted: the scene goes on beyond the box.
 
     near_m: how near to a camera density may be. distance_m: median distance of the cameras to the centre.
+    pixel_m: what a pixel of most cameras spans there.
     """
 
     centre_m: tuple[float, float, float]
@@ -32,10 +33,20 @@ class SceneBox:
     near_m: float
     contracted: bool
     distance_m: float
+    pixel_m: float
+
+    @property
+    def pixels_across(self) -> float:
+        """The encoding's cube in pixels: finer detail than that no camera sees."""
+        return (4.0 if self.contracted else 2.0) * self.radius_m / self.pixel_m
 
     def normalise(self, points_m: Array) -> Array:
         """World metres (..., 3) -> scene units."""
         return (points_m - np.asarray(self.centre_m)) / self.radius_m
+
+
+# Stands in for the box of a field that has seen nothing yet.
+NOWHERE = SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0, 0.01)
 
 
 def converging_point(origins: Array, directions: Array) -> Array | None:
@@ -77,6 +88,7 @@ def scene_box(
         centre = origins.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
     distance = float(np.median(np.linalg.norm(origins - centre, axis=1)))
     distance = distance if distance > 1e-6 else 1.0
+    pixel = distance / float(np.median([v.intrinsics.fx for v in views]))
     if contracted is None:
         transparent = any(v.image.shape[2] == 4 for v in views)
         contracted = not transparent and plain_background(views) is None
@@ -85,7 +97,7 @@ def scene_box(
     if near_m is None:
         near_m = NEAR_SHARE * distance if contracted else max(0.05 * distance, distance - 1.8 * radius_m)
     x, y, z = map(float, centre)
-    return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance)
+    return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance, pixel)
 
 
 def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:

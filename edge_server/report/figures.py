@@ -27,7 +27,6 @@ Report = dict[str, Any]
 # Errors are shown this many times as bright, or nobody would see them.
 _ERROR_GAIN = 4.0
 _MOST_LABELS = 24
-_BARS = 40
 
 
 def draw_all(report: Report, records: Records) -> dict[str, Path]:
@@ -127,7 +126,7 @@ def draw_channel(report: Report, records: Records, path: Path) -> bool:
         return False
     shares = _shares(report["channel"].get("state_share"))
     drawn = report["channel"].get("drawn_delay_ms")
-    edges, counts = _histogram(drawn.get("bins") if isinstance(drawn, dict) else None)
+    edges, counts = _histogram(drawn.get("histogram") if isinstance(drawn, dict) else None)
     if not shares and not len(counts):
         return False
     with figure(path, 1, 2, height_inch=2.7, width_ratios=[1, 2]) as (_, axes):
@@ -232,17 +231,18 @@ def _shares(found: Any) -> dict[str, float]:
 
 
 def _histogram(found: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Bin edges (n + 1,) in ms and counts (n,) of ``bins``, a list of (upper edge in ms, count) in bins of
-    any width: redrawn in equal ones, without the last half per cent that would squeeze the rest."""
+    """Bin edges (n + 1,) in ms and counts (n,) of the emulator's ``histogram``; both empty where there is
+    none, or nothing in it."""
+    nothing = (np.zeros(0), np.zeros(0))
+    if not isinstance(found, dict):
+        return nothing
     try:
-        upper, counts = np.array(found, dtype=np.float64).reshape(-1, 2).T
+        edges = np.array(found.get("edges_ms"), dtype=np.float64)
+        counts = np.array(found.get("counts"), dtype=np.float64)
     except (TypeError, ValueError):
-        return np.zeros(0), np.zeros(0)
-    if not counts.sum() > 0:
-        return np.zeros(0), np.zeros(0)
-    last = int(np.searchsorted(np.cumsum(counts), 0.995 * counts.sum()))
-    redrawn, edges = np.histogram(upper, _BARS, (0.0, float(upper[last]) + 1e-9), weights=counts)
-    return edges, redrawn
+        return nothing
+    usable = edges.ndim == counts.ndim == 1 and len(edges) == len(counts) + 1 and counts.sum() > 0
+    return (edges, counts) if usable else nothing
 
 
 def _is_use(value: Any) -> bool:

@@ -23,7 +23,7 @@ COMPOSE = yaml.safe_load(FILE.read_text())
 SERVICES = COMPOSE["services"]
 CAMERAS = {name: s for name, s in SERVICES.items() if "camera-node" in s["command"]}
 BASE_IMAGE = "docker.io/library/python:3.11-slim-bookworm"
-STREAM_S = 60.0
+STREAM_S = 30.0
 
 
 def test_every_camera_of_the_scenario_has_its_container() -> None:

@@ -68,9 +68,9 @@ def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net,
                    min_views, density, acts, x):  # fmt: skip
     """Refresh every ``phases``-th cell's density: the larger of the faded old one and a new random sample.
 
-    density: float32 (cells^3,), per scene unit, times how much longer steps are where space is contracted. seen:
-    uint16 (cells^3,); cells with fewer than min_views are 0. acts: float32 (W, units, CHUNK) and x: float32
-    (W, 3, CHUNK), scratch.
+    density: float32 (cells^3,), per scene unit, times how much longer steps are where space is contracted.
+    seen: uint16 (cells^3,); cells with fewer than min_views are 0. acts: float32 (W, units, CHUNK) and x:
+    float32 (W, 3, CHUNK), scratch.
     """
     per_task = CELLS_A_TASK
     cells_here = (density.size + phases - 1 - phase) // phases

@@ -33,7 +33,7 @@ def test_unknown_names_list_the_valid_ones() -> None:
 
 def test_efforts_are_ordered_and_can_be_overridden() -> None:
     low, medium, high = (make_settings({"effort": e}) for e in EFFORTS)
-    assert low.finest_resolution < medium.finest_resolution < high.finest_resolution
+    assert low.samples < medium.samples < high.samples
     assert low.batch_samples < medium.batch_samples < high.batch_samples and medium == NgpSettings()
     assert make_settings({"effort": "high", "samples": 33}).samples == 33
 

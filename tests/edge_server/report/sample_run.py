@@ -32,7 +32,10 @@ CHANNEL = {
         "mean": 60.2,
         "p50": 41.0,
         "p95": 180.0,
-        "bins": [[1.023**i, int(40 * 1.023**i * 2.718 ** (-(1.023**i) / 60))] for i in range(280)],
+        "histogram": {
+            "edges_ms": [6.0 * i for i in range(51)],
+            "counts": [round(500 * 2.718 ** (-i / 10), 2) for i in range(50)],
+        },
     },
     "delay_error_ms": {"p50": 0.1, "p99": 1.2, "max": 4.0},
 }

@@ -16,7 +16,7 @@ SETTINGS = NgpSettings(levels=5, log2_table=10, base_resolution=4, finest_resolu
 
 def _case(points: int, chunks: int = 2):
     rng = np.random.default_rng(1)
-    grid = make_grid(SETTINGS, rng)
+    grid = make_grid(SETTINGS, None, rng)
     grid.table[:] = rng.normal(size=grid.table.shape)
     x = rng.random((chunks, 3, points), dtype=np.float32)
     x[0, :, 0], x[0, :, 1] = 0.0, np.float32(1.0)  # both ends of the cube

@@ -53,8 +53,9 @@ def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
     space = _space(contracted, filled)
     settings = NgpSettings(cells=CELLS, samples=32)
     none = torch.zeros(0)
+    box = SceneBox((0, 0, 0), 1.0, 0.1, contracted, 3.0, 0.1)
     model = TorchModel(
-        settings, SceneBox((0, 0, 0), 1.0, 0.1, contracted, 3.0), TorchGrid([], [], [], none), 0, [], none,
+        settings, box, TorchGrid([], [], [], none), 0, [], none,
         torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS), none, float(space.step),
     )  # fmt: skip
     rng = np.random.default_rng(6)
