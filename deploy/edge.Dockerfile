@@ -29,6 +29,9 @@ ENV PATH=/venv/bin:$PATH PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/home/freshfield/.cache/numba MPLCONFIGDIR=/home/freshfield/.cache/matplotlib
 WORKDIR /app
 USER freshfield
+# The field's kernels, compiled for this machine's processor; on another kind of processor they are compiled
+# again at the first start.
+RUN python -c 'from edge_server.fields.registry import make_field; make_field("ngp", {"device": "cpu"}).warm_up()'
 VOLUME /runs
 EXPOSE 7000 8080
 HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 \

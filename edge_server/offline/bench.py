@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from edge_server.offline.usage import BenchError
 from edge_server.report.machine import machine, versions
 
 DESCRIPTION = """\
@@ -42,7 +43,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"== {part}", flush=True)
         with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
             module = importlib.import_module(f"edge_server.offline.bench_{part}")
-            figures[part] = module.measure(args.quick, Path(folder), args.lpips)
+            try:
+                figures[part] = module.measure(args.quick, Path(folder), args.lpips)
+            except BenchError as error:
+                print(f"edge-server bench {part}: {error}", file=sys.stderr)
+                return 1
         for line in lines(figures[part]):
             print(f"  {line}", flush=True)
         if args.json is not None:  # after each part: an interrupted bench keeps what it has

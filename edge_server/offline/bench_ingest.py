@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from camera_node.world import Scene, make_scene
-from edge_server.offline.usage import Usage, cpu_s, rss_mb
+from edge_server.offline.usage import BenchError, Usage, cpu_s, rss_mb
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
@@ -36,10 +36,6 @@ _IMAGES = 8  # different frames of a camera, shown in turn
 _START_S = 180.0  # compiling every kernel on a busy machine
 
 
-class IngestBenchError(RuntimeError):
-    """The edge server did not come up or did not survive; the message says what it wrote last."""
-
-
 def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
     """Answers and memory at each frame rate, the field training all the time."""
     del lpips
@@ -52,7 +48,7 @@ def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, A
 def run(
     out: Path, scene: Scene, frames: dict[str, list[bytes]], fps: float, seconds: float
 ) -> dict[str, Any]:
-    """One server, one rate. Raises IngestBenchError."""
+    """One server, one rate. Raises BenchError."""
     out.mkdir(parents=True)
     with _edge_server(out, list(frames), fps) as (process, address):
         return asyncio.run(_drive(process, address, out, scene, frames, fps, seconds))
@@ -157,7 +153,7 @@ async def _until_training(process: subprocess.Popen[bytes], out: Path, cameras: 
             if task.done():
                 task.result()
         if process.poll() is not None or time.perf_counter() - begun > _START_S:
-            raise IngestBenchError(f"the edge server did not begin to train:\n{_last_words(out)}")
+            raise BenchError(f"the edge server did not begin to train:\n{_last_words(out)}")
         await asyncio.sleep(0.25)
 
 
@@ -221,7 +217,7 @@ def _await_port(process: subprocess.Popen[bytes], address: str, out: Path) -> No
         with contextlib.suppress(OSError), socket.create_connection((host, int(port)), 1.0):
             return
         time.sleep(0.1)
-    raise IngestBenchError(f"the edge server does not listen on {address}:\n{_last_words(out)}")
+    raise BenchError(f"the edge server does not listen on {address}:\n{_last_words(out)}")
 
 
 def _updates(out: Path) -> int:

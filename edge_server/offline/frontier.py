@@ -53,7 +53,7 @@ Row = dict[str, Any]
 @dataclass(frozen=True)
 class Plan:
     """What is measured. planned_s: seconds of fitting from scratch. update_s: seconds an update takes.
-    run_s: virtual seconds of a moving run, or four updates where those take longer."""
+    run_s: virtual seconds of a moving run, or six updates where those take longer."""
 
     seeds: int
     knobs: bool
@@ -276,7 +276,7 @@ class Frontier:
     ) -> tuple[Row, Callable[[], Row]]:
         """The settings of one point of figure 2, and how to measure it."""
         plan = self.plan
-        seconds = max(plan.run_s, 4.0 * update_s)
+        seconds = max(plan.run_s, 6.0 * update_s)
         steps = update_time.steps_for(update_s, compute)
         settings: Row = {
             "figure": 2, **asdict(plan.moving), "speed_m_per_s": speed, "field": self.field,

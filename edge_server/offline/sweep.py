@@ -120,9 +120,9 @@ def medians(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mark_front(rows: Sequence[dict[str, Any]]) -> None:
-    """Set ``on_front`` of each row: no other row is at least as fast and more accurate (PSNR)."""
+    """Set ``on_front`` of each row: no other row that was given as little time is as accurate (PSNR)."""
     best = float("-inf")
-    for row in sorted(rows, key=lambda r: (r["seconds"], -r["psnr_db"])):
+    for row in sorted(rows, key=lambda r: (r["planned_s"], -r["psnr_db"])):
         row["on_front"] = row["psnr_db"] > best
         best = max(best, row["psnr_db"])
 

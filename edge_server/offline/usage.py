@@ -11,6 +11,10 @@ from typing import Any
 _PROC = Path("/proc")
 
 
+class BenchError(RuntimeError):
+    """A measurement that could not be taken; the message says what stood in its way."""
+
+
 class Usage:
     """``row()`` tells of the time since the last call: cores that this process and that everybody used.
 

