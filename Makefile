@@ -54,8 +54,11 @@ types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/up.py deploy/healthy.py deploy/check_report.py deploy/launch
 
-bench: .venv/.ok-test  ## measure this machine: kernels, payload, emulator
-	$(PY) -m pytest tests/bench -m "" -s
+bench: .venv/.ok-test  ## measure this machine: field, ingest, fidelity, emulator, world (runs/bench*.json)
+	@mkdir -p runs
+	$(PY) -m edge_server.cli bench all --json runs/bench.json
+	$(PY) -m channel_emu.cli bench --json | tee runs/bench-emulator.json
+	$(PY) -m camera_node.world.bench --json runs/bench-world.json
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	cd proto && ../$(PY) $(call PROTOC,.) freshfield/v1/*.proto

@@ -174,11 +174,10 @@ class Run:
             if self.plan.emulator.process is None:
                 return "starting: the edge server loads, the cameras prepare their frames"
             return "starting: the cameras prepare their frames, the field its kernels"
-        elapsed = now_s - self._ready_s
+        elapsed = int(now_s - self._ready_s)
         end = f" of {self.options.duration_s:.0f}" if self.options.duration_s else ""
-        return (
-            f"{elapsed:.0f}{end} s   http://{net.LOOPBACK}:{self.options.port}   Ctrl-C ends it with a report"
-        )
+        page = f"http://{net.LOOPBACK}:{self.options.port}"
+        return f"{elapsed}{end} s   {page}   Ctrl-C ends it with a report"
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._signals.append(signal.Signals(number).name)

@@ -110,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server frontier", description=DESCRIPTION, formatter_class=raw)
     add = parser.add_argument
-    add("--quick", action="store_true", help="three to four minutes on two cores")
+    add("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
     add("--scene", default="room", metavar="NAME|DATA", help="room, tile or a data set [%(default)s]")
     add("--holdout", default="8", metavar="K|NAME,...", help="of a data set, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="of a data set, as in fit [%(default)g]")

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 import threading
 
 import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
-from edge_server.offline.fitting import marks_s
+from edge_server.offline.fitting import fit_in_slices, marks_s
 from tests.edge_server.offline.sets import SMALL_WORDS, write_photos, write_recording
 
 
@@ -56,13 +57,24 @@ def test_resume_goes_on_where_it_stopped(tmp_path, capsys):
 def test_ctrl_c_ends_early_with_the_report_written(tmp_path, capsys):
     write_photos(tmp_path / "set", 5)
     out = tmp_path / "out"
-    assert fit(tmp_path / "set", tmp_path / "first", "--seconds", "0.2") == 0  # kernels are compiled now
-    interrupt = threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT))
-    interrupt.start()
+    main, ended = threading.main_thread().ident, threading.Event()
+
+    def interrupt_once_it_fits() -> None:
+        while not ended.wait(0.05):
+            frame = sys._current_frames().get(main)
+            while frame is not None and frame.f_code is not fit_in_slices.__code__:
+                frame = frame.f_back
+            if frame is not None and not ended.wait(1.5):
+                os.kill(os.getpid(), signal.SIGINT)
+                return
+
+    watcher = threading.Thread(target=interrupt_once_it_fits)
+    watcher.start()
     try:
         assert fit(tmp_path / "set", out, "--seconds", "60") == 0
     finally:
-        interrupt.cancel()
+        ended.set()
+        watcher.join()
     assert "stopped early" in capsys.readouterr().out
     assert 0.5 < report_of(out)["seconds"] < 30.0
     assert fit(tmp_path / "set", out, "--seconds", "0.5", "--resume") == 2, "it has been fitted for longer"
