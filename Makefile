@@ -26,6 +26,8 @@ PYTEST ?=
 PY := .venv/bin/python
 # Byte code is made by the first import of what is used: compiling all of it ahead doubles the set-up's time.
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
+NUMBA := $(shell sed -n 's/.*"\(numba[^"]*\)".*/\1/p' pyproject.toml | head -n 1)
+WARM_UP := from edge_server.fields.registry import make_field; make_field("ngp", {"device": "cpu"}).warm_up()
 TORCH := $(shell sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml)
 PROTOC = -m grpc_tools.protoc -I . --pyi_out=$(1) --python_out=$(1) --grpc_python_out=$(1)
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
@@ -86,28 +88,28 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "cannot make a virtual environment (Debian: apt-get install python3-venv)"; exit 1; }
 	@touch $@
 
-# torch apart from the rest: TORCH_INDEX decides where it comes from and nothing else does.
+# torch apart from the rest: TORCH_INDEX decides where it comes from and nothing else does. What it needs
+# itself comes with the rest, when pip can see that torch is there.
 .venv/.ok-torch: .venv/.ok-venv pyproject.toml
 	@$(INSTALL) --no-deps $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) $(TORCH)
 	@touch $@
 
-.venv/.ok-base: .venv/.ok-venv pyproject.toml
-	@$(INSTALL) --no-warn-conflicts -e '.[edge-base,up]'
+.venv/.ok-numba: .venv/.ok-venv pyproject.toml
+	@$(INSTALL) --no-warn-conflicts '$(NUMBA)'
 	@touch $@
 
-# What torch itself needs comes last, when pip can see that torch is there.
-.venv/.ok-edge: .venv/.ok-torch .venv/.ok-base
-	@$(INSTALL) $(TORCH)
+.venv/.ok-edge: .venv/.ok-torch .venv/.ok-numba
+	@$(INSTALL) -e '.[edge,up]'
 	@touch $@
 
 # The field's kernels are compiled at their first use, which takes most of a minute: better beside the
-# installation of torch than after it. Should it fail here, the edge server will say why.
-.venv/.ok-kernels: .venv/.ok-base
-	@$(PY) -c 'from edge_server.fields.registry import make_field; make_field("ngp", {"device": "cpu"}).warm_up()' || true
+# installation of everything else than after it. Should it fail here, the edge server will say why.
+.venv/.ok-kernels: .venv/.ok-numba
+	@PYTHONPATH=proto:. $(PY) -c '$(WARM_UP)' || true
 	@touch $@
 
 .venv/.ok-run: .venv/.ok-venv pyproject.toml
-	@echo "set-up 2/2: $(TORCH) and beside it the rest; the field's kernels are compiled on the way"
+	@echo "set-up 2/2: $(TORCH) and the rest; beside it the field's kernels are compiled"
 	@$(MAKE) --no-print-directory -j2 .venv/.ok-edge .venv/.ok-kernels
 	@touch $@
 

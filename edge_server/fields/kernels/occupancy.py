@@ -81,7 +81,7 @@ def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net,
         task = fetch_add(counter, 1)
         if task >= tasks:
             return
-        n = 0
+        start = n = np.int64(0)
         first, end = task * per_task, min((task + 1) * per_task, cells_here)
         for turn in range(first, end):
             cell = turn * phases + phase
@@ -93,9 +93,9 @@ def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net,
             x[worker, 1, n] = (np.float32(j) + uniform(key, k + np.uint64(1))) * size
             x[worker, 2, n] = (np.float32(l) + uniform(key, k + np.uint64(2))) * size
             n += 1
-        encode(grid, levels, x[worker], 0, n, acts[worker])
+        encode(grid, levels, x[worker], start, n, acts[worker])
         acts[worker, 2 * grid.resolution.size : net.widths[0], :n] = np.float32(0.0)
-        forward(net, acts[worker], 0, n)
+        forward(net, acts[worker], start, n)
         raw = acts[worker, out_row]
         n = 0
         for turn in range(first, end):

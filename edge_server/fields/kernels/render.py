@@ -50,7 +50,7 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, l
                 active[count] = r
                 count += 1
         while count > 0:
-            n = 0
+            start = n = np.int64(0)  # typed: numba compiles callees anew for a literal
             first[0] = 0
             for k in range(count):
                 r = active[k]
@@ -61,14 +61,14 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, l
                 way[r, 3] = t
                 taken[r] += n - before
                 first[k + 1] = n
-            encode(grid, levels, x[worker], 0, n, acts[worker])
+            encode(grid, levels, x[worker], start, n, acts[worker])
             acts[worker, 2 * grid.resolution.size : inputs, :n] = _F0
-            forward(net, acts[worker], 0, n)
+            forward(net, acts[worker], start, n)
             if harmonics > 1:
                 for k in range(count):
                     r = active[k]
                     add_harmonics(out, harmonics, first[k], first[k + 1], way[r, 0], way[r, 1], way[r, 2])
-            activate(out, 0, n)
+            activate(out, start, n)
             left = 0
             for k in range(count):
                 r = active[k]

@@ -122,7 +122,8 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
     ts, dts = line[0], line[1]
     inputs, out = net.widths[0], acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
-    n, rays = 0, 0
+    # Typed, since numba would compile the callees once more for every literal.
+    n, rays, room = np.int64(0), np.int64(0), np.int64(CHUNK)
     ray_first[0] = 0
     while rays < limit and CHUNK - n > CHUNK // 8:
         end, drawn = n, rays
@@ -134,7 +135,7 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
             dx, dy, dz = ray[drawn, 0], ray[drawn, 1], ray[drawn, 2]
             enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
             enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
-            more, t = march(space, ox, oy, oz, dx, dy, dz, enter, leave, x, ts, dts, end, CHUNK)
+            more, t = march(space, ox, oy, oz, dx, dy, dz, enter, leave, x, ts, dts, end, room)
             if t < leave:
                 break
             end = more
@@ -179,7 +180,7 @@ def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batc
             for r in range(rays):
                 a, b = ray_first[r], ray_first[r + 1]
                 add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
-        activate_color(out, 0, n)
+        activate_color(out, np.int64(0), n)
         d_out[4:, :n] = _F0
         loss, dropped = 0.0, 0
         for r in range(rays):
