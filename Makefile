@@ -26,9 +26,10 @@ PYTEST ?=
 PY := .venv/bin/python
 # Byte code is made by the first import of what is used: compiling all of it ahead doubles the set-up's time.
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
-NUMBA := $(shell sed -n 's/.*"\(numba[^"]*\)".*/\1/p' pyproject.toml | head -n 1)
 WARM_UP := from edge_server.fields.registry import make_field; make_field("ngp", {"device": "cpu"}).warm_up()
-TORCH := $(shell sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml)
+# The line of pyproject.toml that starts with a name.
+wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
+TORCH := $(call wanted,torch)
 PROTOC = -m grpc_tools.protoc -I . --pyi_out=$(1) --python_out=$(1) --grpc_python_out=$(1)
 BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrome 2>/dev/null))
 
@@ -95,7 +96,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@touch $@
 
 .venv/.ok-numba: .venv/.ok-venv pyproject.toml
-	@$(INSTALL) --no-warn-conflicts '$(NUMBA)'
+	@$(INSTALL) --no-warn-conflicts '$(call wanted,numba)' '$(call wanted,opencv)'
 	@touch $@
 
 .venv/.ok-edge: .venv/.ok-torch .venv/.ok-numba
@@ -103,9 +104,10 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@touch $@
 
 # The field's kernels are compiled at their first use, which takes most of a minute: better beside the
-# installation of everything else than after it. Should it fail here, the edge server will say why.
+# installation of everything else than after it. Should it fail here, the edge server tries again.
 .venv/.ok-kernels: .venv/.ok-numba
-	@PYTHONPATH=proto:. $(PY) -c '$(WARM_UP)' || true
+	@PYTHONPATH=proto:. $(PY) -c '$(WARM_UP)' >.venv/kernels.log 2>&1 || \
+	  echo "the kernels were not compiled ahead (.venv/kernels.log): the edge server will do it at its start"
 	@touch $@
 
 .venv/.ok-run: .venv/.ok-venv pyproject.toml

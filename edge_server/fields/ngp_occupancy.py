@@ -10,6 +10,7 @@ from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.occupancy import CELLS_A_TASK, count_views, sample_density, threshold
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import COARSE, Space
+from edge_server.fields.kernels.train import CHUNK
 from edge_server.fields.ngp_rig import Rig
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import SceneBox
@@ -85,4 +86,4 @@ class Occupancy:
         threshold(self.density, self.seen, self.needed, EMPTY, self.cells, self.occupied, self.coarse)
 
 
-assert CELLS_A_TASK <= 4096, "a task's samples must fit the scratch of a training chunk"
+assert CELLS_A_TASK <= CHUNK, "a task's samples must fit the scratch of a training chunk"

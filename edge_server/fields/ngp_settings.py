@@ -23,7 +23,7 @@ class NgpSettings:
     hidden_layers: int = _option(1, "hidden layers of the network")
     harmonics: int = _option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
     rays: int = _option(4096, "rays of one step at most")
-    batch_samples: int = _option(16384, "samples of one step at most, in chunks of 4096")
+    batch_samples: int = _option(16384, "samples of one step at most, in chunks of 2048")
     samples: int = _option(192, "steps across the scene's box, corner to corner")
     samples_start: int = _option(64, "the same at first: fog is cheaper to see through in long steps")
     samples_ramp: int = _option(600, "steps after which ``samples`` is reached")
@@ -35,7 +35,7 @@ class NgpSettings:
     background: str = _option("auto", "auto (plain, or the mean colour), white, black, random, or '#rrggbb'")
     min_views: int = _option(2, "no density where fewer cameras than this look (never more than there are)")
     rate: float = _option(8e-2, "learning rate of the hash tables at the start of a fit")
-    rate_net: float = _option(1e-2, "learning rate of the network at the start of a fit")
+    rate_net: float = _option(2e-2, "learning rate of the network at the start of a fit")
     rate_end: float = _option(0.1, "share of the learning rate that is left at the end of a fit")
     epsilon: float = _option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
     decay: float = _option(0.0, "pull of the tables' entries towards zero, per step and rate")
@@ -58,7 +58,7 @@ class NgpSettings:
             ("hidden", 4, 256),
             ("hidden_layers", 1, 4),
             ("rays", 1, 1 << 20),
-            ("batch_samples", 4096, 1 << 22),
+            ("batch_samples", 2048, 1 << 22),
             ("samples", 8, 2048),
             ("samples_start", 8, 2048),
             ("samples_ramp", 0, 1 << 30),

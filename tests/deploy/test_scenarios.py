@@ -6,12 +6,12 @@ import re
 from pathlib import Path
 
 import pytest
-from edge_server.fields.registry import make_field
 
 from camera_node.config import source_config
 from camera_node.sources import open_sources
 from channel_emu.config import channel_from_mapping
 from edge_server.config import read_config
+from edge_server.fields.registry import make_field
 from edge_server.scheduler import make_policy
 from freshfield.scenario import SCENARIO_FOLDER, load
 from tests.conftest import data_dir

@@ -12,7 +12,7 @@ from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.mlp import forward
 from edge_server.fields.kernels.rays import COARSE
 
-CELLS_A_TASK = 2048
+CELLS_A_TASK = 2048  # at most train.CHUNK: they share its scratch
 
 
 @njit(inline="always")

@@ -22,8 +22,8 @@ from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.mlp import backward, forward
 from edge_server.fields.kernels.rays import interval, march, pixel_direction
 
-CHUNK = 4096  # samples a chunk has room for; its activations stay in the second-level cache
-CHUNK_RAYS = 1024
+CHUNK = 2048  # samples a chunk has room for; its activations stay in the second-level cache
+CHUNK_RAYS = 512
 
 _F0, _F1, _BYTE = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 255.0)
 
