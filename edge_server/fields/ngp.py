@@ -116,7 +116,11 @@ class NgpField:
                     levels=active_levels(self.settings, self.step),
                     net=Net(self._net.widths, self._net.params.copy()),
                     harmonics=self.settings.harmonics,
-                    space=space._replace(occupied=space.occupied.copy(), coarse=space.coarse.copy()),
+                    space=space._replace(
+                        occupied=space.occupied.copy(),
+                        coarse=space.coarse.copy(),
+                        density=np.zeros(0, np.float32),
+                    ),
                     background=self.rig.background(),
                     cameras=self.rig.views,
                     pool=self.pool,

@@ -42,7 +42,13 @@ class Occupancy:
     def space(self, step: float) -> Space:
         """The grid as the kernels read it: a view on the living arrays."""
         return Space(
-            self.occupied, self.coarse, self.cells, self.contracted, np.float32(step), np.float32(self.near)
+            self.occupied,
+            self.coarse,
+            self.density,
+            self.cells,
+            self.contracted,
+            np.float32(step),
+            np.float32(self.near),
         )
 
     def look(self, pool: Pool, rig: Rig) -> None:

@@ -44,7 +44,7 @@ class NgpSettings:
     near_fade: float = _option(0.0, "share of the cameras' distance over which gradients are held back")
     levels_start: int = _option(4, "levels in use at first; the finer ones follow (coarse to fine)")
     levels_every: int = _option(30, "steps after which one more level is switched on")
-    changed_share: float = _option(0.5, "rays drawn from pixels that changed since the camera's last view")
+    changed_share: float = _option(0.25, "rays drawn from pixels that changed since the camera's last view")
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
     nice: int = _option(10, "how far workers lower their own priority (Linux)")

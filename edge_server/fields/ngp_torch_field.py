@@ -6,7 +6,8 @@ Same settings and the same state as ``NgpField``: a checkpoint of one loads into
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +39,18 @@ from edge_server.fields.scene_box import NOWHERE, SceneBox
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # at a time
+
+
+@contextmanager
+def _repeatable() -> Iterator[None]:
+    """Sums of gradients in a fixed order, where torch has that (on CUDA, cumulative sums may lack it)."""
+    before = torch.are_deterministic_algorithms_enabled()
+    warn = torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before, warn_only=warn)
 
 
 def cuda_present() -> bool:
@@ -76,7 +89,7 @@ class TorchModel:
             delta = step * m.clamp(min=1.0).square() if box.contracted else torch.full_like(t, step)
             ts.append(t)
             deltas.append(delta)
-            t = t + delta
+            t = torch.where(t < leave, t + delta, t)  # or steps that grow with distance overflow
         if not ts:
             ts, deltas = [t], [torch.zeros_like(t)]
         t, delta = torch.stack(ts, -1), torch.stack(deltas, -1)
@@ -271,7 +284,8 @@ class NgpTorchField:
         sigma, color = model.query(d, u, inside)
         error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion, s.sparsity)
         good = torch.isfinite(error)
-        torch.where(good, loss, torch.zeros_like(loss)).sum().backward()
+        with _repeatable():
+            torch.where(good, loss, torch.zeros_like(loss)).sum().backward()
         self.step += 1
         self._updates += 1
         with torch.no_grad():
@@ -282,7 +296,7 @@ class NgpTorchField:
         self._grid.table.requires_grad_(False)
         self._net.requires_grad_(False)
         used = int(inside.sum())
-        return float(error[good].mean()) / 3.0 if bool(good.any()) else 0.0, used, bad
+        return error[good].mean().item() / 3.0 if bool(good.any()) else 0.0, used, bad
 
     def _adam(self, p: Tensor, m: Tensor, v: Tensor, scale: float, rate: float, decay: float) -> int:
         """``kernels.adam``: entries without gradient, or with one that is not finite, stay as they are."""

@@ -20,8 +20,8 @@ from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
 TINY = NgpSettings(
-    levels=4, log2_table=11, finest_resolution=32, hidden=16, rays=512, batch_samples=4096, samples=48,
-    cells=16, threads=2,
+    levels=4, levels_every=10, log2_table=11, finest_resolution=32, hidden=16, rays=512, batch_samples=4096,
+    samples=48, samples_ramp=100, cells=16, threads=2,
 )  # fmt: skip
 VIEWS = ring(9, size=24)
 

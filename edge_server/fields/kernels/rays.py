@@ -16,15 +16,18 @@ from numpy.typing import NDArray
 from edge_server.fields.kernels.jit import kernel
 
 COARSE = 4  # cells of the occupancy grid a side of one cell of its coarse copy
+NEVER = np.float32(1e30)
 HORIZON = 20.0  # contracted scenes end here, in scene units: nothing behind it moves in any picture
 
 
 class Space(NamedTuple):
     """Where samples are taken. occupied: uint8 (cells^3,), x fastest; coarse: the same for blocks of
-    COARSE^3. step, near: float32, scene units; contracted: whether space goes on beyond the box."""
+    COARSE^3. density: float32 (cells^3,), what is known of it (``occupancy``), read only where a ray is to
+    end early. step, near: float32, scene units; contracted: whether space goes on beyond the box."""
 
     occupied: NDArray[np.uint8]
     coarse: NDArray[np.uint8]
+    density: NDArray[np.float32]
     cells: int
     contracted: bool
     step: np.float32
@@ -101,12 +104,15 @@ def _exit(u, d, blocks):
 
 
 @kernel
-def march(space, ox, oy, oz, dx, dy, dz, t, leave, x, ts, dts, n, limit):
+def march(space, ox, oy, oz, dx, dy, dz, t, leave, x, ts, dts, n, limit, most):
     """Append the ray's samples in occupied cells from distance t on.
 
     x: float32 (3, N), unit-cube coordinates; ts, dts: float32 (N,), distance and length of each sample in
-    scene units. Samples n to at most limit are written. Returns (n, t): t < leave if the room ran out.
+    scene units. Samples n to at most limit are written; the ray ends where the density known so far makes
+    an optical depth of ``most`` (NEVER: it does not). Returns (n, t, depth): t < leave if the ray ended
+    early, for lack of room unless depth > most.
     """
+    depth = np.float32(0.0)
     one, half = np.float32(1.0), np.float32(0.5)
     cells, blocks = space.cells, space.cells // COARSE
     f_cells, f_blocks = np.float32(cells), np.float32(blocks)
@@ -137,11 +143,14 @@ def march(space, ox, oy, oz, dx, dy, dz, t, leave, x, ts, dts, n, limit):
                 t += step
             continue
         cx, cy, cz = np.int64(ux * f_cells), np.int64(uy * f_cells), np.int64(uz * f_cells)
-        if space.occupied[cx + cells * (cy + cells * cz)] != 0:
-            if n >= limit:
-                return n, t
+        cell = cx + cells * (cy + cells * cz)
+        if space.occupied[cell] != 0:
+            if n >= limit or depth > most:
+                return n, t, depth
+            if most < NEVER:
+                depth += space.density[cell] * space.step
             x[0, n], x[1, n], x[2, n] = ux, uy, uz
             ts[n], dts[n] = t, step
             n += 1
         t += step
-    return n, t
+    return n, t, depth

@@ -9,7 +9,7 @@ from edge_server.fields.kernels.grid import encode
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite
 from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.mlp import forward
-from edge_server.fields.kernels.rays import interval, march, pixel_direction
+from edge_server.fields.kernels.rays import NEVER, interval, march, pixel_direction
 
 TILE = 256  # rays a task
 ROUND = 8  # samples a ray gets before the opaque ones are dropped
@@ -56,8 +56,8 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, l
                 r = active[k]
                 limit = n + min(ROUND, max_samples - taken[r])
                 before = n
-                n, t = march(space, ox, oy, oz, way[r, 0], way[r, 1], way[r, 2], way[r, 3], way[r, 4],
-                             x[worker], ts, dts, n, limit)  # fmt: skip
+                n, t, _ = march(space, ox, oy, oz, way[r, 0], way[r, 1], way[r, 2], way[r, 3], way[r, 4],
+                             x[worker], ts, dts, n, limit, NEVER)  # fmt: skip
                 way[r, 3] = t
                 taken[r] += n - before
                 first[k + 1] = n

@@ -20,10 +20,12 @@ from edge_server.fields.kernels.grid import encode
 from edge_server.fields.kernels.intrinsics import fetch_add, uniform
 from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.mlp import backward, forward
-from edge_server.fields.kernels.rays import interval, march, pixel_direction
+from edge_server.fields.kernels.rays import NEVER, interval, march, pixel_direction
 
 CHUNK = 2048  # samples a chunk has room for; its activations stay in the second-level cache
 CHUNK_RAYS = 512
+
+GUESS = 20.0  # optical depth of the grid's densities at which a ray is taken to be opaque: twice enough
 
 _F0, _F1, _BYTE = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 255.0)
 
@@ -117,48 +119,71 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
 
     Only samples that can be seen are kept: what lies behind an opaque one would cost a backward pass for
     a gradient of nothing. The room they leave is filled with further rays, so that the number of rays
-    follows the number of samples they need and every step costs about the same.
+    follows the number of samples they need and every step costs about the same. Where a ray will be opaque
+    is guessed from the occupancy grid's densities; where the guess was wrong, the ray is marched to its end
+    in the next round.
     """
     ts, dts = line[0], line[1]
     inputs, out = net.widths[0], acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
+    number, doubtful = np.empty(limit, np.int64), np.empty(limit, np.bool_)  # of the rays of one round
+    again = np.empty(limit, np.int64)
     # Typed, since numba would compile the callees once more for every literal.
     n, rays, room = np.int64(0), np.int64(0), np.int64(CHUNK)
+    fresh, waiting = 0, 0
     ray_first[0] = 0
     while rays < limit and CHUNK - n > CHUNK // 8:
-        end, drawn = n, rays
-        while drawn < limit:
-            index = chunk * CHUNK_RAYS + drawn
+        end, drawn, taken = n, rays, 0
+        while drawn < limit and (taken < waiting or fresh < limit):
+            index, most = chunk * CHUNK_RAYS + fresh, np.float32(GUESS)
+            if taken < waiting:
+                index, most = again[taken], NEVER
             view = _draw(views, recipe, index, ray[drawn])
             o = views.origin[view]
             ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
             dx, dy, dz = ray[drawn, 0], ray[drawn, 1], ray[drawn, 2]
             enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
             enter += uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6)) * space.step
-            more, t = march(space, ox, oy, oz, dx, dy, dz, enter, leave, x, ts, dts, end, room)
-            if t < leave:
-                break
+            more, t, depth = march(space, ox, oy, oz, dx, dy, dz, enter, leave, x, ts, dts, end, room, most)
+            doubtful[drawn] = depth > most
+            if t < leave and not doubtful[drawn]:
+                break  # no room
+            if taken < waiting:
+                taken += 1
+            else:
+                fresh += 1
+            number[drawn] = index
             end = more
             drawn += 1
             ray_first[drawn] = end
         if drawn == rays:
             break
+        for k in range(taken, waiting):
+            again[k - taken] = again[k]
+        waiting -= taken
         encode(grid, recipe.levels, x, n, end, acts)
         acts[2 * grid.resolution.size : inputs, n:end] = _F0
         forward(net, acts, n, end)
         activate_density(out, n, end)
-        begin = n
+        begin, kept_rays = n, rays
         for r in range(rays, drawn):
             stop = ray_first[r + 1]
-            kept = seen_samples(out, dts, begin, stop)
-            if n < begin:
-                _keep(acts, begin, begin + kept, n)
-                _keep(x, begin, begin + kept, n)
-                _keep(line[:2], begin, begin + kept, n)
-            n += kept
+            kept, opaque = seen_samples(out, dts, begin, stop)
+            if doubtful[r] and not opaque:
+                again[waiting] = number[r]
+                waiting += 1
+            else:
+                if n < begin:
+                    _keep(acts, begin, begin + kept, n)
+                    _keep(x, begin, begin + kept, n)
+                    _keep(line[:2], begin, begin + kept, n)
+                if kept_rays < r:
+                    ray[kept_rays] = ray[r]
+                n += kept
+                kept_rays += 1
+                ray_first[kept_rays] = n
             begin = stop
-            ray_first[r + 1] = n
-        rays = drawn
+        rays = kept_rays
     return rays, n
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from numba import njit
 
-from edge_server.fields.kernels.rays import Space, interval, march, pixel_direction
+from edge_server.fields.kernels.rays import NEVER, Space, interval, march, pixel_direction
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.ngp_torch import TorchGrid
 from edge_server.fields.ngp_torch_field import TorchModel
@@ -25,14 +25,16 @@ def _space(contracted: bool, filled: float, near: float = 0.1) -> Space:
     rng = np.random.default_rng(5)
     occupied = (rng.random(CELLS**3) < filled).astype(np.uint8)
     blocks = occupied.reshape([4, 4, 4, 4, 4, 4]).max(axis=(1, 3, 5)).reshape(-1)
-    return Space(occupied, blocks, CELLS, contracted, np.float32(2 * 3**0.5 / 32), np.float32(near))
+    density = np.full(CELLS**3, 1.5, np.float32)
+    return Space(occupied, blocks, density, CELLS, contracted, np.float32(2 * 3**0.5 / 32), np.float32(near))
 
 
 def _march(space: Space, o, d, jitter: float = 0.0):
     x, ts, dts = np.zeros((3, 500), np.float32), np.zeros(500, np.float32), np.zeros(500, np.float32)
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
     enter, leave = np.float32(enter + np.float32(jitter) * space.step), np.float32(leave)
-    n, t = march(space, *o.astype(np.float32), *d.astype(np.float32), enter, leave, x, ts, dts, 0, 500)
+    way = (np.float32(v) for v in (*o, *d, enter, leave))
+    n, t, _ = march(space, *way, x, ts, dts, 0, 500, NEVER)
     return x[:, :n], ts[:n], dts[:n], (t, leave)
 
 
@@ -91,7 +93,7 @@ def test_empty_space_is_skipped_and_room_is_respected() -> None:
     x, ts, dts = np.zeros((3, 9), np.float32), np.zeros(9, np.float32), np.zeros(9, np.float32)
     enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
     way = (np.float32(v) for v in (*o, *d, enter, leave))
-    n, t = march(space, *way, x, ts, dts, 4, 9)
+    n, t, _ = march(space, *way, x, ts, dts, 4, 9, NEVER)
     assert n == 9 and t < leave and (x[:, :4] == 0).all()
     np.testing.assert_array_equal(ts[4:], whole[:5])
 
@@ -99,3 +101,15 @@ def test_empty_space_is_skipped_and_room_is_respected() -> None:
 def test_no_sample_lies_nearer_than_near() -> None:
     o, d = np.zeros(3), np.array([0.6, 0.0, 0.8])
     assert _march(_space(True, 1.0, near=0.4), o, d)[1].min() >= 0.4
+
+
+def test_a_ray_ends_where_the_known_density_makes_it_opaque() -> None:
+    space = _space(False, 1.0)
+    o, d = np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])
+    whole = _march(space, o, d)[1]
+    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
+    x, ts, dts = np.zeros((3, 99), np.float32), np.zeros(99, np.float32), np.zeros(99, np.float32)
+    way = [np.float32(v) for v in (*o, *d, enter, leave)]
+    n, t, depth = march(space, *way, x, ts, dts, 0, 99, np.float32(1.0))
+    assert n == int(np.ceil(1.0 / (1.5 * space.step))) and depth > 1.0 and t < leave
+    np.testing.assert_array_equal(ts[:n], whole[:n])
