@@ -85,7 +85,7 @@ class Camera:
     def capture(self, tick: int) -> Encoded:
         """The tick's shot, made if need be: milliseconds, so not on the event loop.
 
-        Raises ValueError if the source has no such shot or it cannot be sent.
+        Raises ValueError if the source has no such shot or it cannot be sent, OSError if its file is gone.
         """
         return self.cached(tick) or self._make(self.source.content(tick))
 
@@ -96,7 +96,7 @@ class Camera:
             return False
         try:
             shot = self._cache.get(self.name, 0) or self._encode(0)
-        except ValueError:
+        except (ValueError, OSError):
             return False
         self._cache.put(self.name, 0, shot)
         return self._cache.bytes + (contents - 1) * len(shot.payload) <= self._cache.max_bytes

@@ -167,10 +167,13 @@ def _chosen(plan: scenario.Scenario, args: argparse.Namespace) -> tuple[str, ...
 
 
 def _target(text: str) -> str:
-    host, colon, port = text.rpartition(":")
-    if not colon or not port.isdigit() or not 0 < int(port) < 65536:
-        raise UsageError(f"--to: expected HOST:PORT, got {text!r}")
-    return f"{host or '127.0.0.1'}:{port}"
+    try:
+        host, port = transport.host_port(text)
+    except transport.TransportError as error:
+        raise UsageError(f"--to: {error}") from None
+    if port == 0:
+        raise UsageError(f"--to: expected HOST:PORT with a port from 1, got {text!r}")
+    return f"{host}:{port}"
 
 
 if __name__ == "__main__":

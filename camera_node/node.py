@@ -160,7 +160,7 @@ class Node:
                 shot = camera.cached(tick)
                 if shot is None:
                     shot = await loop.run_in_executor(self._pool, camera.capture, tick)
-            except ValueError as error:
+            except (ValueError, OSError) as error:  # OSError: a photo that is gone
                 self._failed(camera.name, error)
             else:
                 # The shot shows the instant the tick was due, however late the loop woke for it.
@@ -185,7 +185,7 @@ class Node:
             pose_gap_ns=shot.pose_gap_ns,
         )
 
-    def _failed(self, camera: str, error: ValueError) -> None:
+    def _failed(self, camera: str, error: Exception) -> None:
         """A capture that could not be had: counted always, said once."""
         if not self._trouble[camera]["failed"]:
             log.warning("%s: no frame: %s (further ones are only counted)", camera, error)

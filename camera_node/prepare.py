@@ -28,7 +28,7 @@ def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:
                 return
             try:
                 camera.fill(content)
-            except ValueError:
+            except (ValueError, OSError):
                 continue  # counted when the capture is due
         camera.source.release()
     return_memory()

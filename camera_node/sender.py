@@ -23,6 +23,9 @@ log = logging.getLogger("camera-node")
 
 FIRST_BACKOFF_S = 0.2
 MAX_BACKOFF_S = 3.0
+# How long the first frame waits for the first clock exchange; a peer that has no clock costs it just once.
+OFFSET_WAIT_S = 2.0
+_OFFSET_POLL_S = 0.01
 # An offset nobody has measured may be anything; zero with no uncertainty would be a lie.
 UNKNOWN_OFFSET = Offset(0, MAX_PAST_NS)
 # A peer that hangs or speaks nonsense must not fill the books with names of its own making.
@@ -68,6 +71,7 @@ class Sender:
         self._jitter = jitter
         self._timeout = response_timeout_s
         self._reasons: dict[str, int] = {}
+        self._offset_awaited = False
 
     async def run(self) -> None:
         """Until cancelled."""
@@ -106,6 +110,7 @@ class Sender:
             await call.wait_for_connection()
             self.connected = True
             self.connections += 1
+            await self._await_offset(call)
             while True:
                 await self.outbox.wait()
                 if call.done():  # before taking a frame that could only be lost
@@ -113,6 +118,21 @@ class Sender:
                 await self._exchange(call, self.outbox.take())
         finally:
             call.cancel()
+
+    async def _await_offset(self, call: grpc.aio.StreamStreamCall) -> None:
+        """Until the peer's clock is known, for a while: frames that nobody can date are of little use. The
+        outbox goes on taking captures meanwhile, so that what leaves first is the newest."""
+        if self._offset_awaited:
+            return
+        try:
+            async with asyncio.timeout(OFFSET_WAIT_S):
+                while self._offset() is None:
+                    if call.done():
+                        return  # the next stream waits again
+                    await asyncio.sleep(_OFFSET_POLL_S)
+        except TimeoutError:
+            pass
+        self._offset_awaited = True
 
     async def _exchange(self, call: grpc.aio.StreamStreamCall, frame: Frame) -> None:
         answered = False

@@ -9,14 +9,14 @@ too slow for) and failed (shots that could not be had).
 
 from __future__ import annotations
 
-import json
-import os
+import contextlib
 from pathlib import Path
 from typing import Any
 
+from freshfield.files import write_json
+
 
 def write_status(path: Path, status: dict[str, Any]) -> None:
-    """Write atomically: a reader sees the old file or the new one, never half."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(status))
-    os.replace(part, path)
+    """Replace the file as a whole. A full disk costs a status, not the node."""
+    with contextlib.suppress(OSError):
+        write_json(path, status)

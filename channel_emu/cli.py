@@ -32,8 +32,8 @@ _HARD_LIMIT_STATUS = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line. Exit status 0; 1: a replay or a bench that did not agree; 2: bad input; 3: the
-    hard limit was exceeded."""
+    """Run the command line. Exit status 0; 1: a replay or a bench that did not agree, or the live emulator
+    broke; 2: bad input; 3: the hard limit was exceeded."""
     parser = argparse.ArgumentParser(
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -76,7 +76,7 @@ def _run(args: argparse.Namespace) -> int:
     from channel_emu import trace
     from channel_emu.lane import HardLimit
     from channel_emu.priority import raise_priority
-    from channel_emu.proxy import Proxy, ProxyOptions
+    from channel_emu.proxy import EmulatorFailed, Proxy, ProxyOptions
 
     plan = scenario.load(args.scenario, args.seed)
     config = channel_from_mapping(plan.channel, f"{plan.path}: channel")
@@ -102,6 +102,9 @@ def _run(args: argparse.Namespace) -> int:
     except HardLimit as error:
         print(f"channel-emu: {error}", file=sys.stderr)
         return _HARD_LIMIT_STATUS
+    except EmulatorFailed as error:
+        print(f"channel-emu: {error}", file=sys.stderr)
+        return 1
     return 0
 
 

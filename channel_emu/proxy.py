@@ -52,6 +52,14 @@ _KEEP_PATH_NS = 60 * 10**9
 # After this long without the edge, say so once.
 _PATIENCE_NS = 3 * 10**9
 _STOP_GRACE_S = 0.5
+# Cameras are let in once the streams to the edge stand, or after this long without them.
+_FIRST_WAIT_S = 2.0
+# Entries that the agenda may hold beside four for each lane before the outdated ones are cleared away.
+_AGENDA_SLACK = 16
+
+
+class EmulatorFailed(RuntimeError):
+    """The emulator cannot go on: its books cannot be written, or a part of it broke."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +111,10 @@ class Proxy:
         self.lanes = {camera: self._lane(camera, config) for camera in cameras}
 
     async def start(self) -> None:
-        """Listen, and look for the edge. Raises TransportError if the address cannot be had."""
+        """Listen, look for the edge, and let the cameras in once it is found or a moment has passed.
+
+        Raises TransportError if the address cannot be had.
+        """
         server, transport = self._server, self.options.transport
         push = {"Push": grpc.stream_stream_rpc_method_handler(self._push)}
         exchange = {"Exchange": grpc.unary_unary_rpc_method_handler(self._pass_exchange)}
@@ -116,19 +127,27 @@ class Proxy:
         names = (SERVICE, CLOCK_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME)
         reflection.enable_server_reflection(names, server)
         self.port = transport.bind(server, self.options.listen)
+        upstreams = [self._upstream(lane) for lane in self.lanes.values()]
+        for work in (*(upstream.run() for upstream in upstreams), self._keep_status()):
+            task = asyncio.create_task(work)
+            task.add_done_callback(self._ended)
+            self._tasks.append(task)
+        for lane in self.lanes.values():
+            self._arm(lane)
+        # Frames that come before the first streams to the edge would be broken for no fault of the channel.
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_FIRST_WAIT_S):
+                for upstream in upstreams:
+                    await upstream.opened.wait()
         await server.start()
         for name in ("", SERVICE, CLOCK_SERVICE):
             await checks.set(name, health_pb2.HealthCheckResponse.SERVING)
-        self._tasks = [asyncio.create_task(self._upstream(lane).run()) for lane in self.lanes.values()]
-        self._tasks.append(asyncio.create_task(self._keep_status()))
-        for lane in self.lanes.values():
-            self._arm(lane)
         # The collector's long pauses come from old objects, and nearly all of those are made by now.
         gc.collect()
         gc.freeze()
 
     async def run(self, stop: asyncio.Event) -> None:
-        """From start to ``stop``. Raises HardLimit where the scenario sets one."""
+        """From start to ``stop``. Raises HardLimit where the scenario sets one, EmulatorFailed if broken."""
         await self.start()
         log.info("listening on port %d, sending to %s", self.port, self.options.to)
         stopping = asyncio.ensure_future(stop.wait())
@@ -137,30 +156,38 @@ class Proxy:
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
         finally:
             stopping.cancel()
-            await self.stop()
-        if self._failure.done() and not self._failure.cancelled():
-            await self._failure
+            try:
+                await self.stop()
+            except OSError as error:
+                self._fail(error)
+        if not self._failure.done():
+            return
+        failure = self._failure.exception()
+        if isinstance(failure, HardLimit):
+            raise failure
+        kind = "" if isinstance(failure, OSError) else f"{type(failure).__name__}: "
+        hint = "; is there room on the disk?" if isinstance(failure, OSError) else ""
+        raise EmulatorFailed(f"stopped, it could not go on: {kind}{failure}{hint}") from failure
 
     async def stop(self) -> None:
-        """Close streams and books. What is inside the links stays ``in_flight``."""
-        for task in self._tasks:
-            task.cancel()
-        for task in self._tasks:
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
-        for lane in self.lanes.values():
-            for stream in lane.streams:
-                stream.cancel()
-        await self._server.stop(_STOP_GRACE_S)
-        await self._edge.close()
-        self._timer.close()
-        now_ns = self.clock.now_ns()
-        for lane in self.lanes.values():
-            lane.close()
-        if self._trace is not None:
-            self._trace.close()
-        self._ledger.close(now_ns)
-        self._status.write(self._snapshot(final=True))
+        """Close streams and books, each whatever becomes of the others. What is inside the links stays
+        ``in_flight``. Raises OSError if the books cannot be closed."""
+        with contextlib.ExitStack() as books:  # closes the last one named first
+            books.callback(lambda: self._status.write(self._snapshot(final=True)))
+            books.callback(lambda: self._ledger.close(self.clock.now_ns()))
+            if self._trace is not None:
+                books.callback(self._trace.close)
+            for lane in self.lanes.values():
+                books.callback(lane.close)
+            books.callback(self._timer.close)
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            for lane in self.lanes.values():
+                for stream in lane.streams:
+                    stream.cancel()
+            await self._server.stop(_STOP_GRACE_S)
+            await self._edge.close()
 
     def _lane(self, camera: str, config: ChannelConfig) -> Lane:
         link: Link | ReplayLink = self.channel.link(camera)
@@ -222,7 +249,11 @@ class Proxy:
         if not valid_id(header.session_id):
             detail = "session ids are 1 to 64 letters, digits, '.', '_', '-'"
             return self._reject(header, "bad_id", detail), lane
-        response = lane.take(raw, header)
+        try:
+            response = lane.take(raw, header)
+        except Exception as error:
+            self._fail(error)
+            raise
         self._arm(lane)
         return response, lane
 
@@ -254,11 +285,26 @@ class Proxy:
             return
         self._order += 1
         heapq.heappush(self._due, (next_ns, self._order, lane))
+        if len(self._due) > 4 * len(self.lanes) + _AGENDA_SLACK:
+            # Where frames preempt each other, outdated entries would stay until their instants far ahead.
+            self._due = [
+                (lane.armed_ns, order, lane)
+                for order, lane in enumerate(self.lanes.values())
+                if 0 <= lane.armed_ns < NEVER_NS
+            ]
+            heapq.heapify(self._due)
         if next_ns < self._armed_ns:
             self._armed_ns = next_ns
             self._timer.arm(next_ns - (self.clock.now_ns() - self.origin_ns))
 
     def _fire(self) -> None:
+        """Called by the timer, where an exception would only be logged and every later frame be stuck."""
+        try:
+            self._advance_due()
+        except Exception as error:
+            self._fail(error)
+
+    def _advance_due(self) -> None:
         now_ns = self.clock.now_ns() - self.origin_ns
         while self._due and self._due[0][0] <= now_ns:
             at_ns, _, lane = heapq.heappop(self._due)
@@ -270,9 +316,17 @@ class Proxy:
         if self._due:
             self._timer.arm(self._armed_ns - (self.clock.now_ns() - self.origin_ns))
 
-    def _fail(self, error: HardLimit) -> None:
-        if not self._failure.done():
-            self._failure.set_exception(error)
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        """End ``run`` with this error; the first one counts."""
+        if self._failure.done():
+            return
+        if not isinstance(error, HardLimit | OSError):
+            log.error("a part of the emulator broke", exc_info=error)
+        self._failure.set_exception(error)
 
     def _snapshot(self, final: bool = False) -> dict[str, Any]:
         return snapshot(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +12,7 @@ from channel_emu.channel import Channel
 from channel_emu.histogram import Histogram
 from channel_emu.lane import Lane, Measures
 from channel_emu.link import Kind
+from freshfield.files import write_json
 
 _SERIES_S = 60.0
 _SERIES_MOST = 600
@@ -28,10 +27,8 @@ class StatusFile:
 
     def write(self, state: dict[str, Any]) -> None:
         """A full disk costs a status, not the emulator."""
-        beside = self.path.with_suffix(f".{os.getpid()}.tmp")
         with contextlib.suppress(OSError):
-            beside.write_text(json.dumps(state))
-            beside.replace(self.path)
+            write_json(self.path, state)
 
 
 def snapshot(

@@ -13,6 +13,7 @@ from typing import Any
 import grpc
 import grpc.aio
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from freshfield.v1 import frames_pb2 as pb
 
@@ -24,6 +25,8 @@ PUSH = "/freshfield.v1.FrameStreamService/Push"
 CREDITS = 8
 FIRST_BACKOFF_S = 0.1
 MAX_BACKOFF_S = 2.0
+# How gRPC says that a stream is over.
+_ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
 
 
 @dataclass(slots=True)
@@ -55,6 +58,8 @@ class Upstream:
         self.camera = camera
         self.connected = False
         self.connections = 0
+        self.opened = asyncio.Event()
+        """Set once the first stream stands."""
         self.rejected: Counter[str] = Counter()
         """The edge's refusals, by reason."""
         self._channel = channel
@@ -86,14 +91,14 @@ class Upstream:
         return len(self._outbox) + len(self._unanswered) + (self._held is not None)
 
     async def run(self) -> None:
-        """Keep a stream open until cancelled."""
+        """Keep a stream open until cancelled. What ``forwarded`` and ``broken`` raise ends it."""
         backoff = FIRST_BACKOFF_S
         while True:
             answered = False
             try:
                 await self._channel.channel_ready()
                 answered = await self._session()
-            except (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError) as error:
+            except _ENDED as error:
                 self._say(error)
             finally:
                 self._end()
@@ -108,8 +113,17 @@ class Upstream:
         writer = asyncio.create_task(self._write(call))
         self.connected = True
         self.connections += 1
+        self.opened.set()
         try:
-            await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                # The stream itself may stand: asking how it ended would take for ever.
+                error = task.exception()
+                if isinstance(error, DecodeError):
+                    self._say("the edge sent bytes that are no answer")
+                    return False
+                if error is not None and not isinstance(error, _ENDED):
+                    raise error
             code, details = await call.code(), await call.details()
             self._say(f"{code.name}: {details}" if details else code.name)
             return reader.done() and not reader.cancelled() and reader.result()
@@ -118,8 +132,7 @@ class Upstream:
             call.cancel()
             for task in (reader, writer):
                 task.cancel()
-                with contextlib.suppress(asyncio.CancelledError, grpc.RpcError, grpc.aio.BaseError,
-                                         asyncio.InvalidStateError):  # fmt: skip
+                with contextlib.suppress(asyncio.CancelledError, DecodeError, *_ENDED):
                     await task
 
     async def _write(self, call: grpc.aio.StreamStreamCall) -> None:
@@ -152,7 +165,7 @@ class Upstream:
                     self._outbox.append(self._held)
                     self._held = None
                     self._wake.set()
-        except (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError):
+        except _ENDED:
             return answered
 
     def _end(self) -> None:

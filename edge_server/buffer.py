@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from freshfield.frame import Frame
+from freshfield.payload import MAX_FUTURE_NS
 
 
 @dataclass(frozen=True)
@@ -40,21 +41,21 @@ class FrameBuffer:
         """Frames that arrived after a younger one of the same camera; delivered, but never newest."""
 
     def put(self, frame: Frame, received_ns: int) -> None:
-        """Keep ``frame`` if no younger one of its camera is here."""
+        """Keep ``frame`` if no younger one of its camera is here.
+
+        A younger one that lies in the future of ``received_ns`` was dated by a clock that has been put right
+        since, and gives way: else its camera would stand still until that future has come.
+        """
         item = Buffered(frame, frame.generated_edge_ns, received_ns)
         with self._arrived:
             known = self._newest.get(frame.camera)
-            if known is not None and known.generated_ns >= item.generated_ns:
+            impossible = known is not None and known.generated_ns > received_ns + MAX_FUTURE_NS
+            if known is not None and not impossible and known.generated_ns >= item.generated_ns:
                 self.stale_on_arrival += 1
             else:
                 self._newest[frame.camera] = item
             self.arrivals += 1
             self._arrived.notify_all()
-
-    def forget(self, camera: str) -> None:
-        """Drop a camera's frame: its clock has jumped, so that age would be meaningless."""
-        with self._arrived:
-            self._newest.pop(camera, None)
 
     def newest(self) -> dict[str, Buffered]:
         """Omega(t): newest frame of every camera that has reported, in the cameras' order."""

@@ -17,7 +17,7 @@ from freshfield.transport import TransportError
 DESCRIPTION = """\
 The edge of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
 
-  edge-server run room --listen 127.0.0.1:7001 --page-port 8080 --out runs/room
+  edge-server run room --listen 127.0.0.1:7000 --page-port 8080 --out runs/room
   edge-server fit ~/data/lego --field ngp --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server frontier --quick --out runs/frontier
   edge-server report runs/room
@@ -71,7 +71,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     )
     run.add_argument("scenario", help="scenario file, or the name of a shipped one")
     run.add_argument(
-        "--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="for frames [%(default)s]"
+        "--listen", default="127.0.0.1:7000", metavar="HOST:PORT", help="for frames [%(default)s]"
     )
     run.add_argument("--page-port", type=int, metavar="PORT", help="serve the live page on this port")
     run.add_argument("--page-host", default="127.0.0.1", metavar="HOST", help="page's address [%(default)s]")
@@ -82,7 +82,7 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (its lpips/ is found)")
     run.add_argument("--resume", type=Path, metavar="FILE", help="start from a checkpoint of an earlier run")
-    run.add_argument("--checkpoint-every", type=float, metavar="S", help="write OUT/field this often")
+    run.add_argument("--checkpoint-every", type=float, metavar="S", help="write OUT/field.npz this often")
     run.add_argument("--seconds", type=float, metavar="S", help="end by itself after this long")
     transport.add_arguments(run)
     run.set_defaults(go=_run)

@@ -91,7 +91,7 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         self.rejected: Counter[str] = Counter()
         self.rejected_by_camera: Counter[str] = Counter()
         self.newest_held_out: dict[str, Frame] = {}
-        self.answer_ms = Recent(4096)
+        self.check_ms = Recent(4096)
         self._streams = 0
         self._max_streams = _STREAMS_PER_CAMERA * (len(buffer.cameras) + len(held_out))
 
@@ -131,7 +131,7 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
             self._buffer.put(frame, now_ns)
         self.delivered[frame.camera] += 1
         self._ledger.write(now_ns, frame.camera, frame.session, frame.sequence, "delivered")
-        self.answer_ms.add((time.perf_counter() - begun) * 1e3)
+        self.check_ms.add((time.perf_counter() - begun) * 1e3)
         return pb.PushResponse(sequence=frame.sequence, outcome=pb.OUTCOME_ACCEPTED)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
+import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -17,30 +17,35 @@ from pathlib import Path
 from typing import Any
 
 from edge_server.state import Publication
+from freshfield.files import Lines, write_json
+
+log = logging.getLogger(__name__)
 
 # A publication whose scores have not come after this many younger ones will not get any.
 _FINAL_AFTER = 8
 
 
-def write_json(path: Path, data: Any) -> None:
-    """Replace ``path`` atomically: a reader never sees half a file."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(data, allow_nan=False))
-    os.replace(temporary, path)
-
-
 class Journal:
-    """Files of one run under ``out``. Thread-safe. ``status`` is asked for the contents of edge.json."""
+    """Files of one run under ``out``. Thread-safe. ``status`` is asked for the contents of edge.json.
 
-    def __init__(self, out: Path, status: Callable[[], dict[str, Any]], append: bool = False) -> None:
+    Lines are added to those of an earlier process of the same run: an edge that was restarted goes on. A full
+    disk costs lines, counted in ``lines_lost``, and statuses, never the edge.
+    """
+
+    def __init__(self, out: Path, status: Callable[[], dict[str, Any]]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         self._out = out
         self._status = status
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
-        mode = "a" if append else "w"
-        self._series = (out / "series.jsonl").open(mode, buffering=1)
-        self._ages = (out / "ages.jsonl").open(mode, buffering=1)
+        self._series = Lines(out / "series.jsonl")
+        self._ages = Lines(out / "ages.jsonl")
+        self._status_failed = False
+
+    @property
+    def lines_lost(self) -> int:
+        """Lines that could not be written so far."""
+        return self._series.lost + self._ages.lost
 
     def published(self, publication: Publication) -> None:
         with self._lock:
@@ -63,11 +68,17 @@ class Journal:
             "t_s": round(t_s, 4),
             "age_ms": {c: a if a is None else round(a, 3) for c, a in ages_ms.items()},
         }
-        with self._lock:
-            self._ages.write(json.dumps(line) + "\n")
+        self._ages.write(json.dumps(line))
 
     def write_status(self) -> None:
-        write_json(self._out / "edge.json", self._status())
+        """Replace edge.json; where that fails, the old one stays."""
+        status = self._status()
+        try:
+            write_json(self._out / "edge.json", status)
+        except OSError as error:
+            if not self._status_failed:
+                log.warning("%s: cannot be written (%s)", self._out / "edge.json", error.strerror or error)
+            self._status_failed = True
 
     def close(self) -> None:
         with self._lock:
@@ -79,4 +90,4 @@ class Journal:
 
     def _write_oldest(self) -> None:
         _, publication = self._open.popitem(last=False)
-        self._series.write(json.dumps(dataclasses.asdict(publication), allow_nan=False) + "\n")
+        self._series.write(json.dumps(dataclasses.asdict(publication), allow_nan=False))

@@ -31,14 +31,14 @@ class EdgeCollector:
         for reason, count in self._ingest.rejected.items():
             rejected.add_metric([reason], count)
         yield from (age, delivered, rejected)
-        answer = GaugeMetricFamily(
-            "freshfield_answer_seconds", "time to check, buffer and answer a frame", labels=["quantile"]
+        check = GaugeMetricFamily(
+            "freshfield_check_seconds", "time to check and buffer a frame", labels=["quantile"]
         )
         for percent in (50, 99):
-            value = self._ingest.answer_ms.percentile(percent)
+            value = self._ingest.check_ms.percentile(percent)
             if value is not None:
-                answer.add_metric([str(percent / 100)], value / 1e3)
-        yield answer
+                check.add_metric([str(percent / 100)], value / 1e3)
+        yield check
         publications = self._state.publications()
         if not publications:
             return

@@ -31,6 +31,7 @@ _NICE = 5
 # Held-out frames that wait while one publication is scored; older ones are not needed any more.
 _INBOX = 256
 _BASELINE_EVERY = 5
+_KEPT_RENDERINGS = 32
 
 
 @dataclass
@@ -126,6 +127,8 @@ class Scoring:
             frame = next(f for f in self._frames[camera] if f.generated_edge_ns == generated_ns)
             image = renderer.render(frame.pose.matrix(), frame.intrinsics).color
             self._rendered[(camera, published_ns)] = image
+            while len(self._rendered) > _KEPT_RENDERINGS:  # of publications whose scoring failed afterwards
+                self._rendered.pop(next(iter(self._rendered)))
             return image
 
         return render

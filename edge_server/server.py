@@ -26,7 +26,7 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, View, checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.ingest import Ingest, Recent
-from edge_server.journal import Journal, write_json
+from edge_server.journal import Journal
 from edge_server.loop import Loop, Updates
 from edge_server.scheduler import POLICIES, make_policy
 from edge_server.scoring import Scoring
@@ -77,8 +77,12 @@ class EdgeServer:
         options.out.mkdir(parents=True, exist_ok=True)
 
         self.field = make_field(config.field, config.field_options, seed=scenario.seed)
+        updates = 0
         if options.resume is not None:
-            self.field.load_state(checkpoint.load(options.resume)[0])
+            state, about = checkpoint.load(options.resume)
+            self.field.load_state(state)
+            # Numbers go on, so that a snapshot does not take the name of an earlier one.
+            updates = max(0, int(about.get("updates", 0)))
         self.buffer = FrameBuffer(scenario.training)
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)
         lpips, self.lpips_missing = (
@@ -95,6 +99,7 @@ class EdgeServer:
         except ValueError as error:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
         self.updates = Updates(self.buffer, policy, self.field, self.start_ns)
+        self.updates.number = updates
         self.loop = Loop(
             self.updates,
             self.clock,
@@ -115,7 +120,7 @@ class EdgeServer:
             channel=_JsonFile(options.out / "channel.json"),
             field_name=config.field,
         )
-        self.journal = Journal(options.out, self.status, append=options.resume is not None)
+        self.journal = Journal(options.out, self.status)
 
     # --- running ----------------------------------------------------------------------------------
 
@@ -306,8 +311,9 @@ class EdgeServer:
                 for c in self._cameras()
             ],
             "rejected": dict(self.ingest.rejected),
+            "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
             "stale_on_arrival": self.buffer.stale_on_arrival,
-            "answer_ms": {f"p{p}": self.ingest.answer_ms.percentile(p) for p in (50, 99)},
+            "check_ms": {f"p{p}": self.ingest.check_ms.percentile(p) for p in (50, 99)},
             "updates": {
                 "count": self.updates.number,
                 "ms_p50": self._update_ms.percentile(50),
@@ -331,15 +337,22 @@ class EdgeServer:
         }  # fmt: skip
 
     def _write_final(self) -> None:
-        self.journal.close()
-        comparison = self.state.comparison
-        if comparison is not None:
-            pair = {"truth": comparison.truth, "rendered": comparison.rendered}
-            for name, image in pair.items():
-                cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        if self.state.started and not self.loop.alive:
-            self._checkpoint(self.options.out / "field.npz")
-        self.ledger.close(self.clock.now_ns())
+        try:
+            comparison = self.state.comparison
+            if comparison is not None:
+                pair = {"truth": comparison.truth, "rendered": comparison.rendered}
+                for name, image in pair.items():
+                    cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+            if self.state.started and not self.loop.alive:
+                self._checkpoint(self.options.out / "field.npz")
+        except OSError as error:
+            log.error("not everything was written at the end: %s", error)
+        finally:
+            # Whatever failed: every frame's account is complete, and the status is the last one.
+            try:
+                self.ledger.close(self.clock.now_ns())
+            finally:
+                self.journal.close()
 
     def _about(self) -> dict[str, Any]:
         return {
@@ -367,6 +380,3 @@ class _JsonFile:
         except (OSError, ValueError):
             return self._data
         return self._data
-
-
-__all__ = ["EdgeServer", "Options", "write_json"]

@@ -58,7 +58,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
                 for c in state.cameras()
             ],
             policy=state.controls.policy,
-            omega_ms=state.controls.value or 0.0,
+            value=state.controls.value,
             paused=state.controls.paused,
             last=decision(publications[-1]) if publications else None,
         )
@@ -101,9 +101,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
                 await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
         if request.HasField("paused"):
             controls.paused = request.paused
-        return edge_pb2.SetPolicyResponse(
-            name=controls.policy, value=controls.value or 0.0, paused=controls.paused
-        )
+        return edge_pb2.SetPolicyResponse(name=controls.policy, value=controls.value, paused=controls.paused)
 
 
 def decision(publication: Publication) -> edge_pb2.Decision:
@@ -117,7 +115,7 @@ def decision(publication: Publication) -> edge_pb2.Decision:
         number=publication.number,
         decided_ns=publication.published_ns - round(publication.update_ms * 1e6),
         published_ns=publication.published_ns,
-        omega_ms=publication.omega_ms or 0.0,
+        omega_ms=publication.omega_ms,
         selected=publication.selected,
         aaoi_ms=publication.aaoi_ms,
         update_ms=publication.update_ms,

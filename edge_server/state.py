@@ -77,7 +77,6 @@ class Controls:
     value: float | None
     paused: bool = False
     reset_requested: bool = False
-    snapshot_requested: bool = False
 
 
 @dataclass

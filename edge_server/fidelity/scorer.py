@@ -12,6 +12,7 @@ the score says so.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,8 @@ from edge_server.fidelity.images import BLACK, Colour, Image, ImageError, same_s
 from edge_server.fidelity.moving import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import TAPS, ssim
+
+log = logging.getLogger(__name__)
 
 # One lag more than the longest, so that the frame nearest to it is still here at ten frames a second.
 HISTORY_MS = LAGS_MS[-1] + 1000.0
@@ -68,7 +71,7 @@ class Score:
     on: Literal["held-out", "selected"] = "held-out"
 
 
-@dataclass
+@dataclass(eq=False)
 class _Frame:
     generated_ns: int
     load: Load
@@ -88,6 +91,16 @@ class _Camera:
     frames: deque[_Frame] = field(default_factory=lambda: deque(maxlen=HISTORY_FRAMES))
     pending: deque[tuple[int, Render]] = field(default_factory=lambda: deque(maxlen=PENDING))
     noise: NoiseEstimate = field(default_factory=NoiseEstimate)
+
+    def pixels(self, frame: _Frame) -> Image | None:
+        """The frame's image; one that cannot be decoded leaves the history, so that it fails once."""
+        try:
+            return frame.pixels()
+        except ValueError as error:
+            log.warning("a held-out frame is left out: %s", error)
+            if frame in self.frames:
+                self.frames.remove(frame)
+            return None
 
 
 class Scorer:
@@ -202,7 +215,11 @@ class Scorer:
             return done  # the first frame cannot tell yet whether it is near enough
         while state.frames and state.pending and state.frames[-1].generated_ns >= state.pending[0][0]:
             published_ns, rendering = state.pending.popleft()
-            score = self._against_nearest(camera, state, period, published_ns, rendering)
+            try:
+                score = self._against_nearest(camera, state, period, published_ns, rendering)
+            except ValueError as error:  # a bad rendering or truth costs this publication, no other
+                log.warning("%s: a publication goes unscored: %s", camera, error)
+                score = None
             if score is None:
                 self.unscored += 1
             else:
@@ -217,12 +234,17 @@ class Scorer:
         nearest = min(range(len(times)), key=lambda i: abs(times[i] - published_ns))
         if abs(times[nearest] - published_ns) > GAP_PERIODS * period_ms * 1e6:
             return None
-        truth = frames[nearest].pixels()
+        truth = state.pixels(frames[nearest])
+        if truth is None:
+            return None
         viewpoint = frames[nearest].viewpoint
         if self._noisy_truth and nearest > 0 and frames[nearest - 1].viewpoint == viewpoint:
-            state.noise.add(frames[nearest - 1].pixels(), truth)
+            before = state.pixels(frames[nearest - 1])
+            if before is not None:
+                state.noise.add(before, truth)
         lags = frames_at_lags(times, times[nearest])
-        earlier = [frames[i].pixels() for i in lags if frames[i].viewpoint == viewpoint]
+        found = [state.pixels(frames[i]) for i in lags if frames[i].viewpoint == viewpoint]
+        earlier = [image for image in found if image is not None]
         bound = state.noise.bound if self._noisy_truth else BOUND
         image = rendering(times[nearest]) if callable(rendering) else rendering
         return self.score(camera, image, published_ns, truth, times[nearest], earlier, bound)

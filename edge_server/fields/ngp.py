@@ -23,7 +23,7 @@ from edge_server.fields.kernels.adam import PART, Rule, adam
 from edge_server.fields.kernels.composite import Weights
 from edge_server.fields.kernels.grid import SEGMENT, Grid, scatter
 from edge_server.fields.kernels.mlp import Net
-from edge_server.fields.kernels.pool import shared_pool
+from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
 from edge_server.fields.kernels.rays import Space, Views
 from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
 from edge_server.fields.ngp_layout import make_grid, make_net
@@ -52,9 +52,9 @@ class NgpField:
     meanwhile: they wait for the end of the present step, some milliseconds.
     """
 
-    def __init__(self, settings: NgpSettings | None = None) -> None:
+    def __init__(self, settings: NgpSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or NgpSettings()
-        self.pool = shared_pool(self.settings.threads, self.settings.nice)
+        self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         self._turn = _Turn()
         self.reset()
 
@@ -131,7 +131,8 @@ class NgpField:
     def warm_up(self) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
 
-        Works on a small field of its own: this field's state is not touched.
+        Works on a small field of its own, in the calling thread and at its priority: the workers' low one
+        would make compiling on a busy machine take minutes. This field's state is not touched.
         """
         start = time.perf_counter()
         tiny = replace(self.settings, batch_samples=CHUNK, cells=16, samples=16, log2_table=10)
@@ -139,7 +140,7 @@ class NgpField:
         pose = np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
-            field = NgpField(replace(tiny, min_views=1, contracted=channels == 3))
+            field = NgpField(replace(tiny, min_views=1, contracted=channels == 3), CallerPool())
             image = np.full((8, 8, channels), 128, np.uint8)
             field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
             field.render(pose, camera)

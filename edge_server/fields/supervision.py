@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.scene_box import SceneBox
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Pinhole, invertible
 
 CHANGE = 16  # of 255, after blurring: above the noise of sensors and of video compression
 MARGIN_PX = 2
@@ -44,6 +44,8 @@ def check_view(view: View) -> None:
         raise ValueError(f"camera {view.camera}: camera_to_world must be a finite (4, 4) matrix")
     if not np.all(np.isfinite(lens_row(camera))) or camera.fx <= 0 or camera.fy <= 0:
         raise ValueError(f"camera {view.camera}: intrinsics must be finite, focal lengths positive")
+    if not invertible(camera):
+        raise ValueError(f"camera {view.camera}: its distortion cannot be undone over the whole image")
 
 
 def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:

@@ -22,11 +22,11 @@ from edge_server.fidelity.images import Colour, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
-from edge_server.journal import write_json
 from edge_server.offline.fitting import Scored, evaluate, fit_in_slices, marks_s
 from edge_server.offline.recorded import Recorded, load_recorded
 from edge_server.offline.usage import Usage
 from edge_server.scoring import to_bytes
+from freshfield.files import write_json
 
 DESCRIPTION = """\
 Fit a recorded data set as fast as this machine can, and measure fidelity on views it never saw.

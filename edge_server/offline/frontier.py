@@ -19,7 +19,6 @@ from camera_node.sources.records import DatasetError
 from camera_node.world.scene import SCENES, SceneError
 from edge_server.fidelity.lpips import Lpips
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.journal import write_json
 from edge_server.offline import sweep, update_time
 from edge_server.offline.fit import FitError, parse_options
 from edge_server.offline.frontier_output import write_output
@@ -27,6 +26,7 @@ from edge_server.offline.still import Still, open_still
 from edge_server.offline.virtual import Compute
 from edge_server.report.machine import machine, versions
 from edge_server.scheduler import make_policy
+from freshfield.files import write_json
 from freshfield.scenario import ScenarioError
 
 DESCRIPTION = """\

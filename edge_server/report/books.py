@@ -19,22 +19,28 @@ never sent is ``replaced`` if the node said so, else ``waiting``. So both sums c
     sent + duplicated = skipped + dropped_busy + superseded + lost + broken + delivered + rejected + in_flight
 
 A frame known to the emulator or the edge alone (its node's ledger lies on another machine) was captured
-and sent as far as anybody can tell, and is counted so with a note. What cannot all be true, such as a frame
+and sent as far as anybody can tell, and is counted so with a note. Where nodes' ledgers are present, a frame
+that was only ever refused, of a camera that no process knows or with a garbled id, is nobody's: a stranger,
+counted apart. What cannot all be true, such as a frame
 both dropped and delivered, is listed in ``contradictions`` and counted once, by the order above. A line
-that a killed process had no time to write is no contradiction: what came after it stands for it.
+that a killed process had no time to write, or a full disk no room for, is no contradiction: what came after
+it stands for it.
+
+Runs are long: ledgers are read a line at a time, and what was written about a frame is kept as the number of
+one of the few histories that frames have, each of which is settled once.
 """
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from freshfield.ledger import LedgerFile, read
+from freshfield.ledger import LedgerReader
 
-Key = tuple[str, str, int]
+Source = tuple[str, str]
 
 # Ends that a link gives a frame; ``broken`` stands apart because a later process may know better.
 LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost")
@@ -44,6 +50,9 @@ _EVENTS = {
     "emulator": {"received", *LINK_ENDS, "rejected", "forwarded", "duplicated", "broken"},
     "edge": {"delivered", "rejected"},
 }
+_ROLES = tuple(_EVENTS)
+# What ingest and emulator write in place of an id that they cannot take.
+_GARBLED = "?"
 # Enough to see what kind of thing went wrong; the count says how often.
 _LISTED = 20
 
@@ -76,13 +85,14 @@ class Account:
         else:
             setattr(self, name, getattr(self, name) + copies)
 
-    def add(self, other: Account) -> None:
-        """Add another account to this one."""
+    def add(self, other: Account, times: int = 1) -> None:
+        """Add another account to this one, ``times`` times."""
         for name, value in vars(other).items():
             if name == "rejected":
-                self.rejected.update(value)
+                for reason, copies in value.items():
+                    self.rejected[reason] += copies * times
             else:
-                setattr(self, name, getattr(self, name) + value)
+                setattr(self, name, getattr(self, name) + value * times)
 
     @property
     def closes(self) -> bool:
@@ -109,6 +119,8 @@ class Books:
     by_camera: dict[str, Account] = field(default_factory=dict)
     contradictions: list[str] = field(default_factory=list)
     contradiction_count: int = 0
+    strangers: Counter[str] = field(default_factory=Counter)
+    """Refused frames that no camera here can have sent, by reason; in no other count."""
     notes: list[str] = field(default_factory=list)
     ledgers: int = 0
 
@@ -119,100 +131,198 @@ class Books:
             "closes": self.total.closes,
             "contradictions": self.contradictions,
             "contradiction_count": self.contradiction_count,
+            "strangers": {
+                "count": self.strangers.total(),
+                "reasons": dict(sorted(self.strangers.items())),
+            },
             "by_camera": {camera: account.as_dict() for camera, account in sorted(self.by_camera.items())},
         }
 
 
-@dataclass
+@dataclass(frozen=True)
 class _History:
     """Everything written about one frame: how often each role wrote each event, and the reasons."""
 
     node: Counter[str] = field(default_factory=Counter)
     emulator: Counter[str] = field(default_factory=Counter)
     edge: Counter[str] = field(default_factory=Counter)
-    cut_short: set[str] = field(default_factory=set)
-    """Roles whose ledger for this frame was never closed: their last lines may be missing."""
+    cut_short: frozenset[str] = frozenset()
+    """Roles whose ledger for this frame lacks lines: killed before their last ones, or a full disk."""
     last_file: int = -1
     last_depth: int = -1
 
-    def note(self, role: str, event: str, detail: str, file: int, closed: bool) -> None:
-        if event == "rejected":
-            event = f"rejected:{detail or 'unknown'}"
-        elif event == "answered":
-            event = f"answered:{detail.lower().replace('-', '_')}"
-        getattr(self, role)[event] += 1
-        if not closed:
-            self.cut_short.add(role)
-        depth = ("node", "emulator", "edge").index(role)
-        if depth >= self.last_depth:
-            self.last_file, self.last_depth = file, depth
+    def after(self, role: str, event: str, file: int, complete: bool) -> _History:
+        """The history with one more event."""
+        depth = _ROLES.index(role)
+        later = (file, depth) if depth >= self.last_depth else (self.last_file, self.last_depth)
+        counts = {name: getattr(self, name) for name in _ROLES}
+        counts[role] = counts[role] + Counter([event])
+        return _History(**counts, cut_short=self.cut_short | (set() if complete else {role}),
+                        last_file=later[0], last_depth=later[1])  # fmt: skip
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for equal histories, and hashable."""
+        counts = (tuple(getattr(self, name).items()) for name in _ROLES)  # in order: the first end counts
+        return (*counts, self.cut_short, self.last_file, self.last_depth)
+
+
+class _Histories:
+    """Every history that some frame has or had, by number; 0 is the empty one. A hundred thousand frames
+    have a few dozen of them, so a frame costs one number and each step is worked out once."""
+
+    def __init__(self) -> None:
+        self.known = [_History()]
+        self._numbers = {self.known[0].key: 0}
+        self._steps: dict[tuple[int, int, str], int] = {}
+
+    def step(self, number: int, role: str, event: str, file: int, complete: bool) -> int:
+        """The number of the history ``number`` with one more event."""
+        step = (number, file, event)
+        after = self._steps.get(step)
+        if after is None:
+            history = self.known[number].after(role, event, file, complete)
+            after = self._numbers.setdefault(history.key, len(self.known))
+            if after == len(self.known):
+                self.known.append(history)
+            self._steps[step] = after
+        return after
+
+
+@dataclass
+class _Heard:
+    """What all ledgers say: the number of its history for each frame, by (camera, session) and sequence."""
+
+    histories: _Histories = field(default_factory=_Histories)
+    frames: dict[Source, dict[int, int]] = field(default_factory=dict)
+    vouched: set[str] = field(default_factory=set)
+    """Cameras of which some process wrote more than that it refused a frame."""
+    garbled: dict[str, Counter[str]] = field(default_factory=dict)
+    """Refusals by reason of what came with an id that cannot be taken, by camera: each is a frame."""
+    unknown: Counter[str] = field(default_factory=Counter)
 
 
 def close_books(out: Path) -> Books:
     """Join every ledger in the folder ``out``. Ledgers that cannot be read are left out and noted."""
-    files, notes = [], []
+    ledgers, notes = [], []
     for path in sorted(out.glob("ledger-*.tsv")):
         try:
-            files.append(read(path))
+            ledgers.append(LedgerReader(path))
         except (ValueError, OSError) as error:
             # Killed before its first line was complete: it had not written about any frame either.
             notes.append(f"{path.name} left out: {error}")
-    books = join(files)
+    books = join(ledgers)
     books.notes = notes + books.notes
     return books
 
 
-def join(files: Iterable[LedgerFile]) -> Books:
-    """Join ledgers that were read already; any order, any number for each role."""
-    books = Books()
-    ledgers = list(files)
-    books.ledgers = len(ledgers)
-    frames: dict[Key, _History] = defaultdict(_History)
-    unknown: Counter[str] = Counter()
+def join(ledgers: Sequence[LedgerReader]) -> Books:
+    """Join ledgers; any order, any number for each role."""
+    books = Books(ledgers=len(ledgers))
+    heard = _Heard()
     for number, ledger in enumerate(ledgers):
-        if ledger.torn:
-            books.notes.append(f"{ledger.path.name}: unreadable line left out (killed while writing)")
-        if not ledger.closed:
-            books.notes.append(f"{ledger.path.name}: not closed (killed, or still running)")
-        known = _EVENTS.get(ledger.role, set())
-        for e in ledger.events:
-            if e.event in known:
-                history = frames[e.camera, e.session, e.sequence]
-                history.note(ledger.role, e.event, e.detail, number, ledger.closed)
-            elif e.event != "closed":
-                unknown[f"{ledger.role} event {e.event!r}"] += 1
-    books.notes += [f"{n} lines with an unknown {what} left out" for what, n in sorted(unknown.items())]
+        books.notes += _hear(heard, number, ledger)
+    books.notes += [f"{n} lines with an unknown {what} left out" for what, n in sorted(heard.unknown.items())]
 
+    nodes_here = any(ledger.role == "node" for ledger in ledgers)
+    settled = [_settle(history) for history in heard.histories.known]
     stuck: Counter[int] = Counter()
-    strangers = 0
-    for key, history in sorted(frames.items()):
-        account = books.by_camera.setdefault(key[0], Account())
-        in_flight = account.in_flight
-        strangers += not history.node
-        for complaint in _settle(history, account):
-            books.contradiction_count += 1
-            if len(books.contradictions) < _LISTED:
-                books.contradictions.append(f"{key[0]} {key[1]} {key[2]}: {complaint}")
-        if account.in_flight > in_flight:
-            stuck[history.last_file] += account.in_flight - in_flight
+    orphans = 0
+    for (camera, session), frames in sorted(heard.frames.items()):
+        stranger = nodes_here and camera not in heard.vouched
+        told: set[int] = set()
+        for number, count in Counter(frames.values()).items():
+            history, (account, complaints) = heard.histories.known[number], settled[number]
+            if stranger and not history.node:
+                for reason, copies in _refusals(history).items():
+                    books.strangers[reason] += copies * count
+                continue
+            books.by_camera.setdefault(camera, Account()).add(account, count)
+            orphans += count * (not history.node)
+            stuck[history.last_file] += account.in_flight * count
+            books.contradiction_count += len(complaints) * count
+            if complaints:
+                told.add(number)
+        if told and len(books.contradictions) < _LISTED:
+            for sequence in sorted(s for s, number in frames.items() if number in told):
+                lines = [f"{camera} {session} {sequence}: {c}" for c in settled[frames[sequence]][1]]
+                books.contradictions += lines[: _LISTED - len(books.contradictions)]
+    for camera, refusals in heard.garbled.items():
+        if nodes_here:
+            books.strangers.update(refusals)
+        else:
+            count = refusals.total()
+            account = Account(captured=count, sent=count, rejected=refusals)
+            books.by_camera.setdefault(camera, Account()).add(account)
+            orphans += count
     for account in books.by_camera.values():
         books.total.add(account)
-    if strangers:
-        books.notes.append(f"{strangers} frames have no node's ledger here: counted as captured and sent")
+    if orphans:
+        books.notes.append(f"{orphans} frames have no node's ledger here: counted as captured and sent")
+    if books.strangers:
+        books.notes.append(f"{books.strangers.total()} frames of unknown origin were refused: counted apart")
     for number, copies in sorted(stuck.items()):
-        books.notes.append(f"{copies} in flight, last written by {ledgers[number].path.name}")
+        if copies:
+            books.notes.append(f"{copies} in flight, last written by {ledgers[number].path.name}")
     return books
 
 
-def _settle(history: _History, account: Account) -> list[str]:
-    """Count one frame in ``account``; returns what cannot be true about it."""
+def _hear(heard: _Heard, number: int, ledger: LedgerReader) -> list[str]:
+    """Read ledger ``number`` into ``heard``; returns notes."""
+    role, name, notes = ledger.role, ledger.path.name, []
+    known = _EVENTS.get(role, set())
+    step, lost = heard.histories.step, 0
+    try:
+        complete, closed = ledger.complete, ledger.closed
+        for e in ledger:
+            event = e.event
+            if event in known:
+                if event == "rejected":
+                    event = f"rejected:{e.detail or 'unknown'}"
+                elif event == "answered":
+                    event = f"answered:{e.detail.lower().replace('-', '_')}"
+                if e.event == "rejected" and _GARBLED in (e.camera, e.session):
+                    heard.garbled.setdefault(e.camera, Counter())[e.detail or "unknown"] += 1
+                    continue
+                if e.event != "rejected":
+                    heard.vouched.add(e.camera)
+                frames = heard.frames.setdefault((e.camera, e.session), {})
+                frames[e.sequence] = step(frames.get(e.sequence, 0), role, event, number, complete)
+            elif event == "lost_lines":
+                lost += int(e.detail) if e.detail.isdecimal() else 1
+            elif event != "closed":
+                heard.unknown[f"{role} event {event!r}"] += 1
+    except OSError as error:
+        return [f"{name}: read in part: {error}"]
+    if ledger.torn:
+        notes.append(f"{name}: unreadable line left out (killed while writing, or a full disk)")
+    if lost:
+        notes.append(f"{name}: {lost} lines were lost while it could not be written (a full disk?)")
+    if not closed:
+        notes.append(f"{name}: not closed (killed, or still running)")
+    return notes
+
+
+def _refusals(history: _History) -> Counter[str]:
+    """Reasons for which copies were rejected, by any process."""
+    refusals: Counter[str] = Counter()
+    for event, count in [*history.emulator.items(), *history.edge.items()]:
+        name, _, reason = event.partition(":")
+        if name == "rejected":
+            refusals[reason] += count
+    return refusals
+
+
+def _settle(history: _History) -> tuple[Account, list[str]]:
+    """The account of one frame, and what cannot be true about it."""
+    account = Account()
     node, emulator, edge = history.node, history.emulator, history.edge
     complaints = _node_complaints(history)
     answers = {e.partition(":")[2]: n for e, n in node.items() if e.startswith("answered:")}
     if not (node["sent"] or node["broken"] or answers or emulator or edge):
         account.captured += 1
         account.end("replaced" if node["replaced"] else "waiting")
-        return complaints
+        return account, complaints
 
     arrived, forwarded = edge.total(), emulator["forwarded"]
     if node:
@@ -253,7 +363,7 @@ def _settle(history: _History, account: Account) -> list[str]:
     broken = min(left, emulator["broken"] or node["broken"])
     account.end("broken", broken)
     account.end("in_flight", left - broken)
-    return complaints
+    return account, complaints
 
 
 def _node_complaints(history: _History) -> list[str]:

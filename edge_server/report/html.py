@@ -181,6 +181,9 @@ def _books(report: Report) -> str:
         verdict += "".join(f"<li><code>{escape(c)}</code></li>" for c in f["contradictions"]) + "</ul>"
     else:
         verdict += f" {f['ledgers']} ledgers joined, no contradictions.</p>"
+    if strangers := f["strangers"]["count"]:
+        why = ", ".join(f"{escape(k)} {v:,}" for k, v in f["strangers"]["reasons"].items())
+        verdict += f"<p>Refused besides, of unknown origin and in no row below: {strangers:,} ({why}).</p>"
     return verdict + _table(rows, left=(0, 2))
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 from edge_server.report.books import close_books
 from edge_server.report.machine import machine, outside_load, versions
 from edge_server.report.records import Records, Row, read_records
+from freshfield.files import write_json, write_text
 
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")
@@ -34,9 +33,9 @@ def build_report(out_dir: str | Path) -> dict[str, Any]:
     out = Path(out_dir)
     records = read_records(out)
     report = assemble(records)
-    _write(out / "report.json", json.dumps(report, allow_nan=False, indent=1) + "\n")
+    write_json(out / "report.json", report, indent=1)
     figures = draw_all(report, records)
-    _write(out / "report.html", render_html(report, figures))
+    write_text(out / "report.html", render_html(report, figures))
     return report
 
 
@@ -46,6 +45,9 @@ def assemble(records: Records) -> dict[str, Any]:
     ``kind``: live, or fit for a recorded data set without a network, whose books, ages and channel are None.
     """
     edge, series = records.edge, records.series
+    notes = list(records.notes)
+    if lost := _number(edge.get("lines_lost")):
+        notes.append(f"the edge could not write {lost:.0f} lines of its account (a full disk?)")
     kind = "fit" if edge.get("kind") == "fit" else "live"
     books = close_books(records.out)
     last_s = series[-1]["t_s"] if series else 0.0
@@ -67,7 +69,7 @@ def assemble(records: Records) -> dict[str, Any]:
         "channel": {
             name: records.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")
         },
-        "notes": records.notes + books.notes,
+        "notes": notes + books.notes,
     }
     if kind == "fit":
         report |= {"data": edge.get("data"), "frames": None, "age_ms": None, "channel": None, "notes": []}
@@ -155,9 +157,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text)
-    os.replace(temporary, path)

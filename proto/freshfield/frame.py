@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import google_crc32c
 
 from freshfield import payload
-from freshfield.geometry import GeometryError, Pinhole, Pose, quaternion_normalise
+from freshfield.geometry import GeometryError, Pinhole, Pose, invertible, quaternion_normalise
 from freshfield.v1 import frames_pb2 as pb
 
 _ID = re.compile(rf"[A-Za-z0-9._-]{{1,{payload.MAX_ID_CHARS}}}")
@@ -168,4 +168,9 @@ def _intrinsics(h: pb.FrameHeader) -> Pinhole:
         raise FrameRejected("bad_intrinsics", "distortion coefficients are beyond any lens")
     if not (-h.width <= k.cx <= 2 * h.width and -h.height <= k.cy <= 2 * h.height):
         raise FrameRejected("bad_intrinsics", "principal point is far outside the image")
-    return Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
+    camera = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
+    if not invertible(camera):
+        raise FrameRejected(
+            "bad_intrinsics", "distortion cannot be undone over the whole image: wrong coefficients or sizes?"
+        )
+    return camera

@@ -13,6 +13,7 @@ Conventions used everywhere in this project (loaders convert at the door):
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -277,3 +278,23 @@ def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Arra
     """Origin (3,) and unit directions (H, W, 3) in world axes of every pixel's centre."""
     m = np.asarray(camera_to_world, dtype=np.float64)
     return m[:3, 3].copy(), camera.rays() @ m[:3, :3].T
+
+
+# How far from where it started a point may come out of undistortion and back.
+_MAX_LENS_ERROR_PX = 1.0
+
+
+# Every frame of a camera brings the same lens. Bounded, because a stranger's frames may not.
+@lru_cache(maxsize=1024)
+def invertible(camera: Pinhole) -> bool:
+    """Whether rays through the corners, edge middles and centre of the image are finite and re-project to
+    where they came from: undistortion diverges for coefficients that no lens has."""
+    if not camera.distorted:
+        return True
+    u, v = np.meshgrid([0.0, camera.width / 2, camera.width], [0.0, camera.height / 2, camera.height])
+    points = np.stack([u.ravel(), v.ravel()], axis=-1)
+    with np.errstate(all="ignore"):
+        rays = camera.rays(points)
+        error_px = np.abs(camera.project(rays) - points)
+    # A NaN compares as False.
+    return bool(np.isfinite(rays).all() and (error_px <= _MAX_LENS_ERROR_PX).all())

@@ -7,7 +7,8 @@ torn (no newline), and readers drop it. Lines are tab-separated::
 
 ``t_ns`` is the writing process's clock. File: ``OUT/ledger-<role>-<name>-<start_ns>.tsv``, first line
 ``#freshfield-ledger 1 <role> <name> <pid>``; roles are ``node``, ``emulator``, ``edge``. A clean exit
-writes the event ``closed`` with empty camera.
+writes the event ``closed`` with empty camera, and as detail how many lines were lost to a full disk, if any;
+``lost_lines``, with a count as detail and empty camera, stands where lines are missing.
 
 Events. Node: ``captured``; then ``replaced`` (a newer frame took its place before it was sent) or ``sent``
 (handed to the stream; a frame neither replaced nor sent was ``waiting`` when the node ended);
@@ -21,16 +22,25 @@ to the upstream stream; a second ``forwarded`` is a duplicate's copy, announced 
 from __future__ import annotations
 
 import os
+import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
+
+from freshfield.files import Lines
 
 VERSION = 1
 ROLES = ("node", "emulator", "edge")
+# Where the last event is looked for without reading the file; thousands of lines.
+_TAIL_BYTES = 1 << 16
+_HEAD_BYTES = 1 << 12
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
+    """One line. t_ns: the writing process's clock."""
+
     t_ns: int
     camera: str
     session: str
@@ -40,32 +50,103 @@ class Event:
 
 
 class Ledger:
-    """Writes one process's events. Thread-safe: each event is a single O_APPEND write."""
+    """Writes one process's events. Thread-safe: each event is a single O_APPEND write. A full disk costs
+    lines, which are counted in ``lines_lost`` and accounted for as soon as there is space again. OSError
+    where the file cannot be begun."""
 
     def __init__(self, out: Path, role: str, name: str, start_ns: int) -> None:
         if role not in ROLES:
             raise ValueError(f"ledger role {role!r} is not one of {', '.join(ROLES)}")
         out.mkdir(parents=True, exist_ok=True)
         self.path = out / f"ledger-{role}-{name}-{start_ns}.tsv"
-        self._fd = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        os.write(self._fd, f"#freshfield-ledger {VERSION} {role} {name} {os.getpid()}\n".encode())
+        self._lines = Lines(self.path, f"#freshfield-ledger {VERSION} {role} {name} {os.getpid()}")
+        self._said = 0
+        self._saying = threading.Lock()
+
+    @property
+    def lines_lost(self) -> int:
+        """Lines that could not be written so far."""
+        return self._lines.lost
 
     def write(
         self, t_ns: int, camera: str, session: str, sequence: int, event: str, detail: str = ""
     ) -> None:
-        if self._fd >= 0:
-            line = f"{t_ns}\t{camera}\t{session}\t{sequence}\t{event}\t{detail}\n"
-            os.write(self._fd, line.encode())
+        written = self._lines.write(f"{t_ns}\t{camera}\t{session}\t{sequence}\t{event}\t{detail}")
+        if written and self._lines.lost > self._said:
+            self._say_lost(t_ns)
 
     def close(self, t_ns: int) -> None:
-        if self._fd >= 0:
-            self.write(t_ns, "", "", 0, "closed")
-            os.close(self._fd)
-            self._fd = -1
+        if self._lines.lost > self._said:
+            self._say_lost(t_ns)
+        self._lines.write(f"{t_ns}\t\t\t0\tclosed\t{self._lines.lost or ''}")
+        self._lines.close()
+
+    def _say_lost(self, t_ns: int) -> None:
+        with self._saying:
+            lost = self._lines.lost
+            if lost > self._said and self._lines.write(f"{t_ns}\t\t\t0\tlost_lines\t{lost - self._said}"):
+                self._said = lost
+
+
+class LedgerReader:
+    """One ledger, read a line at a time, so that its length costs no memory; iterate once or again.
+
+    Raises ValueError if the file is no ledger of this version, OSError if it cannot be read. ``torn`` is
+    True once a line, the last or any other, could not be read and was left out; known after iterating.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.torn = False
+        with path.open("rb") as file:
+            head = file.readline(_HEAD_BYTES)
+            self._body = file.tell()
+        fields = head.decode(errors="replace").rstrip("\n").split(" ")
+        if (
+            len(fields) != 5
+            or fields[:2] != ["#freshfield-ledger", str(VERSION)]
+            or not fields[4].isdecimal()
+        ):
+            raise ValueError(f"{path}: not a freshfield ledger of version {VERSION}")
+        self.role, self.name, self.pid = fields[2], fields[3], int(fields[4])
+
+    def __iter__(self) -> Iterator[Event]:
+        with self.path.open("rb") as file:
+            file.seek(self._body)
+            for line in file:
+                event = _parse(line)
+                if event is None:
+                    self.torn = True
+                else:
+                    yield event
+
+    def last(self) -> Event | None:
+        """The last event that can be read, from the end of the file alone."""
+        with self.path.open("rb") as file:
+            end = file.seek(0, 2)
+            start = max(self._body, end - _TAIL_BYTES)
+            file.seek(start)
+            lines = file.read(end - start).split(b"\n")[:-1]
+        whole = lines if start == self._body else lines[1:]
+        return next((event for line in reversed(whole) if (event := _parse(line + b"\n")) is not None), None)
+
+    @property
+    def complete(self) -> bool:
+        """Ended in order and without a lost line: what is not written here did not happen."""
+        last = self.last()
+        return last is not None and last.event == "closed" and not last.detail
+
+    @property
+    def closed(self) -> bool:
+        """The process ended in order."""
+        last = self.last()
+        return last is not None and last.event == "closed"
 
 
 @dataclass(frozen=True)
 class LedgerFile:
+    """A whole ledger in memory; for long ones see LedgerReader."""
+
     path: Path
     role: str
     name: str
@@ -81,25 +162,25 @@ class LedgerFile:
 
 def read(path: Path) -> LedgerFile:
     """Read one ledger, leaving out torn lines. Raises ValueError if it is no ledger of this version."""
-    data = path.read_bytes()
-    head, _, body = data.partition(b"\n")
-    fields = head.decode(errors="replace").split(" ")
-    if len(fields) != 5 or fields[0] != "#freshfield-ledger" or fields[1] != str(VERSION):
-        raise ValueError(f"{path}: not a freshfield ledger of version {VERSION}")
-    events: list[Event] = []
-    torn = bool(body) and not body.endswith(b"\n")
-    lines = body.split(b"\n")[:-1]
-    for line in lines:
-        parts = line.decode(errors="replace").split("\t")
-        try:
-            t_ns, camera, session, sequence, event, detail = parts
-            events.append(Event(int(t_ns), camera, session, int(sequence), event, detail))
-        except ValueError:
-            torn = True
-    return LedgerFile(path, fields[2], fields[3], int(fields[4]), tuple(events), torn)
+    reader = LedgerReader(path)
+    events = tuple(reader)
+    return LedgerFile(path, reader.role, reader.name, reader.pid, events, reader.torn)
 
 
 def read_all(out: Path) -> Iterator[LedgerFile]:
     """Every ledger under ``out`` (not recursive), in the order of their names."""
     for path in sorted(out.glob("ledger-*.tsv")):
         yield read(path)
+
+
+def _parse(line: bytes) -> Event | None:
+    """The event of one line with its newline; None if it is torn or damaged."""
+    if not line.endswith(b"\n"):
+        return None
+    try:
+        t_ns, camera, session, sequence, event, detail = line[:-1].decode(errors="replace").split("\t")
+        # The same few names stand in every line: keep one of each.
+        names = (sys.intern(camera), sys.intern(session), int(sequence), sys.intern(event))
+        return Event(int(t_ns), *names, detail)
+    except ValueError:
+        return None

@@ -56,6 +56,18 @@ class TransportError(ValueError):
     """A security or address option that cannot work; the message says what to change."""
 
 
+def host_port(text: str) -> tuple[str, int]:
+    """Host and port (0 to 65535) of ``HOST:PORT``; an IPv6 host stands in brackets and keeps them, no host
+    means 127.0.0.1. Raises TransportError naming what was expected."""
+    host, colon, port = text.rpartition(":")
+    bracketed = host.startswith("[") and host.endswith("]")
+    # isdigit alone lets superscripts pass, and a long enough number is an error of its own for int().
+    numeric = port.isascii() and port.isdigit() and len(port) <= 5 and int(port) < 65536
+    if not colon or not numeric or any(c.isspace() or c == "/" for c in host) or (":" in host) != bracketed:
+        raise TransportError(f"expected HOST:PORT, such as 127.0.0.1:7001 or [::1]:7001, got {text!r}")
+    return host or "127.0.0.1", int(port)
+
+
 @dataclass(frozen=True)
 class Transport:
     """How this process talks: files are PEM. Without ``cert`` and ``ca`` everything is plain text.
@@ -92,16 +104,23 @@ class Transport:
         return grpc.aio.server(options=SERVER_OPTIONS, interceptors=interceptors)
 
     def bind(self, server: grpc.aio.Server, address: str) -> int:
-        """Listen on ``host:port`` (port 0 = any) and return the port. Raises TransportError if taken."""
+        """Listen on ``host:port`` (port 0 = any) and return the port. Raises TransportError if that is no
+        address, the port is taken or the host is another machine."""
+        try:
+            host, number = host_port(address)
+        except TransportError as error:
+            raise TransportError(f"cannot listen on {address}: {error}") from None
         try:
             if self.cert is None:
-                port = server.add_insecure_port(address)
+                port = server.add_insecure_port(f"{host}:{number}")
             else:
-                port = server.add_secure_port(address, self._server_credentials())
-        except RuntimeError as error:
-            raise TransportError(f"cannot listen on {address}: {error}") from None
+                port = server.add_secure_port(f"{host}:{number}", self._server_credentials())
+        except RuntimeError:  # its text speaks of gRPC's own debugging
+            port = 0
         if port == 0:
-            raise TransportError(f"cannot listen on {address}: is another process using the port?")
+            raise TransportError(
+                f"cannot listen on {address}: another process has the port, or {host} is not this machine's"
+            )
         return port
 
     def _client_credentials(self) -> grpc.ChannelCredentials:

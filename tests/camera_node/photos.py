@@ -24,13 +24,13 @@ def opencv_pose(index: int) -> np.ndarray:
     return look_at([3 * np.cos(index / 5), 3 * np.sin(index / 5), 1.0], [0, 0, 0])
 
 
-def write_photos(folder: Path, count: int, cameras: int = 0, **top: Any) -> Path:
+def write_photos(folder: Path, count: int, cameras: int = 0, suffix: str = ".png", **top: Any) -> Path:
     """``count`` images (of each camera) and a transforms JSON; with ``cameras`` a recording at 10 frames a
     second. Returns the JSON."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
     for index in range(count * max(1, cameras)):
-        name = f"images/{index:03d}.png"
+        name = f"images/{index:03d}{suffix}"
         (folder / "images").mkdir(exist_ok=True)
         cv2.imwrite(str(folder / name), picture(index))
         frame: dict[str, Any] = {

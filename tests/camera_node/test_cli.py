@@ -24,6 +24,8 @@ def test_mistakes_are_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch):
     assert "FRESHFIELD_DATA" in fails(capsys, "run", "fox", "--all", *to)
     assert "does not exist" in fails(capsys, "run", "fox", "--all", "--data", str(tmp_path), *to)
     assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", "host")
+    for wrong in ("host:0", "host:99999", "::1", "http://host:80"):
+        assert "--to: expected HOST:PORT" in fails(capsys, "run", "room", "--all", "--to", wrong)
     assert "--seconds" in fails(capsys, "run", "room", "--all", "--seconds", "-1", *to)
     assert "cannot read" in fails(capsys, "run", "room", "--all", "--token-file", str(tmp_path / "no"), *to)
     assert "seed" in fails(capsys, "run", "room", "--all", "--seed", "-4", *to)

@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 
-from launch.summary import books_close
 from tests.conftest import ROOT
 
 SMALL = """
@@ -131,7 +130,7 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
     assert re.search(r"\[\d+ of 6 s\] 4/4 cameras, age \d+ ms", run.output)
     assert "the books close" in run.output and str(run.out / "report.html") in run.output
     report = run.report()
-    assert books_close(report["frames"]) and report["frames"]["delivered"] > 20
+    assert report["frames"]["closes"] and report["frames"]["delivered"] > 20
     assert report["updates"]["count"] >= 3
     used = [json.loads(line) for line in (run.out / "processes.jsonl").read_text().splitlines()]
     assert all(used[-1][name]["rss_mb"] > 10 for name in ("node", "emulator", "edge"))
@@ -148,7 +147,7 @@ def test_a_killed_process_is_named_and_the_report_still_closes(
     assert run.end() == 1
     assert f"{role} was killed by SIGKILL" in run.output
     assert "The last lines of" in run.output or "It wrote nothing" in run.output
-    assert books_close(run.report()["frames"])
+    assert run.report()["frames"]["closes"]
     assert not leftovers(run.out)
 
 
@@ -159,7 +158,7 @@ def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
     run.process.send_signal(signal.SIGINT)
     assert run.end() == 0, run.output
     assert "stopping (Ctrl-C)" in run.output and "Traceback" not in run.output
-    assert books_close(run.report()["frames"])
+    assert run.report()["frames"]["closes"]
     assert not leftovers(run.out)
 
 
@@ -179,7 +178,7 @@ def test_with_restart_a_run_survives_the_death_of_any_process(up: Callable[..., 
     )
     run.process.send_signal(signal.SIGTERM)
     assert run.end() == 0, run.output
-    assert books_close(run.report()["frames"])
+    assert run.report()["frames"]["closes"]
 
 
 def refusal(*words: str) -> str:

@@ -22,6 +22,22 @@ def test_a_late_older_frame_never_becomes_newest():
     assert (buffer.stale_on_arrival, buffer.arrivals) == (1, 2)
 
 
+def test_a_frame_from_the_future_gives_way_to_any():
+    buffer = FrameBuffer(["cam01"])
+    buffer.put(frame(sequence=1, generated_ns=1300 * MS), 100 * MS)
+    assert buffer.ages_ms(100 * MS) == {"cam01": -1200.0}
+    buffer.put(frame(sequence=2, generated_ns=120 * MS), 150 * MS)
+    assert buffer.newest()["cam01"].frame.sequence == 2
+    assert buffer.ages_ms(150 * MS) == {"cam01": 30.0} and buffer.stale_on_arrival == 0
+
+
+def test_a_frame_ahead_within_the_tolerance_is_still_the_newest():
+    buffer = FrameBuffer(["cam01"])
+    buffer.put(frame(sequence=2, generated_ns=400 * MS), 150 * MS)
+    buffer.put(frame(sequence=1, generated_ns=120 * MS), 150 * MS)
+    assert buffer.newest()["cam01"].frame.sequence == 2 and buffer.stale_on_arrival == 1
+
+
 def test_memory_is_one_frame_a_camera():
     buffer = FrameBuffer(["cam01", "cam02"])
     for i in range(1000):

@@ -134,7 +134,11 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     _, about = checkpoint.load(out / "field.npz")
     assert about["updates"] == len(series)
     again, _, _ = serve(resume=out / "field.npz")
-    assert again.field.step > 0
+    assert again.field.step > 0 and again.updates.number == len(series)
+    fresh, _, _ = serve()
+    assert fresh.updates.number == 0
+    kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    assert kept[: len(series)] == series  # what the first process wrote is still there
 
 
 def test_operators_see_and_change_a_running_server(serve, tmp_path):
@@ -199,3 +203,17 @@ def test_a_taken_port_is_one_clear_error(serve, tmp_path):
     second = EdgeServer(made, read_config(made), Options(f"127.0.0.1:{port}", tmp_path / "second"))
     with pytest.raises(ValueError, match="cannot listen"):
         second.run()
+
+
+def test_the_ledger_is_closed_even_if_nothing_else_can_be_written(serve, tmp_path):
+    server, port, thread = serve()
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    until(lambda: server.state.publications())
+    feed.stop()
+    (tmp_path / "out" / "field.npz").mkdir()  # the checkpoint cannot take its place
+    server.stop()
+    thread.join(20)
+    (ledger,) = read_all(tmp_path / "out")
+    assert ledger.closed
+    assert json.loads((tmp_path / "out" / "edge.json").read_text())["lines_lost"] == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -14,6 +15,7 @@ from freshfield import payload
 from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
 from freshfield.geometry import Pinhole, Pose, quaternion_normalise
 from freshfield.v1 import frames_pb2 as pb
+from tests.conftest import data_dir
 
 IMAGE = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
 DATA = {codec: payload.encode(IMAGE, codec) for codec in payload.CODECS}
@@ -166,6 +168,71 @@ def test_the_checksum_covers_every_field(change):
     with pytest.raises(FrameRejected) as error:
         from_request(changed(change, checksummed=False))
     assert error.value.reason == "crc_mismatch"
+
+
+def sent_through(camera: Pinhole) -> Pinhole:
+    """The lens as it is admitted; size and payload are those of a real frame."""
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    return from_request(to_request(frame(intrinsics=camera, payload=payload.encode(image, "png")))).intrinsics
+
+
+def nine_points(camera: Pinhole) -> np.ndarray:
+    u, v = np.meshgrid([0, camera.width / 2, camera.width], [0, camera.height / 2, camera.height])
+    return np.stack([u.ravel(), v.ravel()], -1)
+
+
+def test_a_lens_that_cannot_be_undone_is_refused():
+    wild = Pinhole(64, 64, 12.2, 12.2, 32.0, 32.0, (0.0, 0.0, 78.0, 69.6))
+    with np.errstate(all="ignore"):
+        assert not np.isfinite(wild.rays()).all()
+    with pytest.raises(FrameRejected, match="distortion") as error:
+        sent_through(wild)
+    assert error.value.reason == "bad_intrinsics"
+
+
+def test_a_lens_whose_rays_are_finite_but_wrong_is_refused():
+    camera = Pinhole(64, 64, 40.0, 40.0, 32.0, 32.0, (-0.9, 0.0, 0.0, 0.0))
+    points = nine_points(camera)
+    assert np.isfinite(camera.rays(points)).all()
+    assert np.abs(camera.project(camera.rays(points)) - points).max() > 1
+    with pytest.raises(FrameRejected) as error:
+        sent_through(camera)
+    assert error.value.reason == "bad_intrinsics"
+
+
+@settings(max_examples=300)
+@given(
+    f=st.floats(4, 200),
+    centre=st.tuples(st.floats(-64, 128), st.floats(-48, 96)),
+    k=st.tuples(*[st.one_of(st.floats(-0.1, 0.1), st.floats(-100, 100))] * 4),
+)
+def test_every_admitted_lens_has_rays(f, centre, k):
+    camera = Pinhole(64, 48, f, f, *centre, k)
+    try:
+        admitted = sent_through(camera)
+    except FrameRejected as error:
+        assert error.reason == "bad_intrinsics"
+        return
+    points = nine_points(camera)
+    rays = admitted.rays(points)
+    assert np.isfinite(rays).all()
+    np.testing.assert_allclose(admitted.project(rays), points, atol=1.0)
+
+
+def test_the_fox_lens_is_admitted():
+    k = json.loads((data_dir("fox") / "transforms_2.json").read_text())
+    coefficients = tuple(k[name] for name in ("k1", "k2", "p1", "p2"))
+    camera = Pinhole(int(k["w"]), int(k["h"]), k["fl_x"], k["fl_y"], k["cx"], k["cy"], coefficients)
+    assert camera.distorted and sent_through(camera) == camera
+
+
+def test_the_lenses_of_a_recording_are_admitted():
+    file = data_dir("pose2sim_single_person") / "calibration_opencv.json"
+    for lens in json.loads(file.read_text()).values():
+        (fx, _, cx), (_, fy, cy), _ = lens["K"]
+        size = lens["width"], lens["height"]
+        camera = Pinhole(*size, fx, fy, cx + 0.5, cy + 0.5, tuple(lens["dist_k1k2p1p2"]))
+        assert camera.distorted and sent_through(camera) == camera
 
 
 def test_an_empty_request_is_refused_and_not_an_error():

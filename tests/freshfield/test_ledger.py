@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from freshfield.ledger import Event, Ledger, read, read_all
+from freshfield.ledger import Event, Ledger, LedgerReader, read, read_all
+from tests.freshfield.test_files import no_file_longer_than
 
 
 def write(out, events, closed=True):
@@ -99,3 +100,32 @@ def test_what_was_written_survives_sigkill(tmp_path):
     (file,) = read_all(tmp_path)
     assert not file.closed and len(file.events) >= promised > 10
     assert [e.sequence for e in file.events] == list(range(len(file.events)))
+
+
+def test_a_full_disk_costs_lines_and_the_ledger_says_how_many(tmp_path):
+    book = Ledger(tmp_path, "node", "cam00", 7)
+    size = book.path.stat().st_size
+    with no_file_longer_than(size + 70):
+        for k in range(10):
+            book.write(k, "cam00", "s", k, "captured")
+    assert book.lines_lost > 5
+    lost = book.lines_lost
+    book.write(10, "cam00", "s", 10, "captured")
+    book.close(11)
+    file = read(book.path)
+    kept = [e.sequence for e in file.events if e.event == "captured"]
+    assert kept == [*range(10 - lost), 10]
+    assert [e.detail for e in file.events if e.event == "lost_lines"] == [str(lost)]
+    assert file.closed and file.events[-1].detail == str(lost)
+    reader = LedgerReader(book.path)
+    assert reader.closed and not reader.complete
+
+
+def test_the_reader_finds_the_end_without_reading_the_whole(tmp_path):
+    path = write(tmp_path, EVENTS * 3000)
+    assert path.stat().st_size > 2 * 65536
+    reader = LedgerReader(path)
+    assert reader.last() == Event(99, "", "", 0, "closed") and reader.complete
+    assert sum(1 for _ in reader) == 6001 == sum(1 for _ in reader)
+    path.write_bytes(path.read_bytes()[:-3])
+    assert LedgerReader(path).last() == EVENTS[1] and not LedgerReader(path).closed

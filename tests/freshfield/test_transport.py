@@ -12,7 +12,7 @@ import grpc.aio
 import pytest
 
 from freshfield.payload import MAX_MESSAGE_BYTES
-from freshfield.transport import Transport, TransportError, add_arguments, from_arguments
+from freshfield.transport import Transport, TransportError, add_arguments, from_arguments, host_port
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
 
@@ -115,6 +115,50 @@ def test_a_port_in_use_is_not_shared():
             await server.stop(None)
 
     asyncio.run(scene())
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("emu:7001", ("emu", 7001)),
+        (":7001", ("127.0.0.1", 7001)),
+        ("0.0.0.0:0", ("0.0.0.0", 0)),
+        ("[::1]:65535", ("[::1]", 65535)),
+    ],
+)
+def test_host_and_port_are_told_apart(text, expected):
+    assert host_port(text) == expected
+
+
+NO_ADDRESSES = ["", "host", "7001", "host:", "host:x", "host:-1", "host:65536", "host:99999", "host:\u00b2",
+                "::1", "::1:7001", "http://host:80", "ho st:80", "unix:/tmp/s", "host:" + "9" * 5000]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", NO_ADDRESSES)
+def test_what_is_no_address_is_refused_by_name(text):
+    with pytest.raises(TransportError, match="expected HOST:PORT"):
+        host_port(text)
+
+
+@pytest.mark.parametrize("address", ["nonsense", "localhost:99999", "unix:/tmp/s"])
+def test_bind_refuses_what_is_no_address(address):
+    async def scene():
+        with pytest.raises(TransportError, match=f"cannot listen on {address}: expected HOST:PORT") as error:
+            Transport().bind(Transport().aio_server(), address)
+        assert "\n" not in str(error.value)
+
+    asyncio.run(scene())
+
+
+def test_bind_says_why_in_its_own_words():
+    async def scene():
+        with pytest.raises(TransportError) as error:
+            Transport().bind(Transport().aio_server(), "192.0.2.1:7001")
+        return str(error.value)
+
+    said = asyncio.run(scene())
+    assert said.startswith("cannot listen on 192.0.2.1:7001: ") and "this machine" in said
+    assert "GRPC" not in said and "Failed to bind" not in said
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,7 @@ class Peer:
     transport: Transport = field(default_factory=Transport)
     clock: WallClock = field(default_factory=WallClock)
     with_clock_service: bool = True
+    clock_delay_s: float = 0.0
     frames: list[Frame] = field(default_factory=list)
     arrived_ns: list[int] = field(default_factory=list)
     most_unanswered: int = 0
@@ -127,6 +128,7 @@ class _Clock(clock_pb2_grpc.ClockServiceServicer):
         self.peer = peer
 
     async def Exchange(self, request, context):
+        await asyncio.sleep(self.peer.clock_delay_s)
         now = self.peer.clock.now_ns()
         return clock_pb2.ExchangeResponse(
             client_sent_ns=request.client_sent_ns,

@@ -203,6 +203,54 @@ def test_without_a_clock_service_the_offset_is_said_to_be_unknown(tmp_path):
     assert {f.clock_uncertainty_ns for f in peer.frames} == {payload.MAX_PAST_NS}
 
 
+def test_the_first_frame_waits_for_the_clock_and_is_the_newest(tmp_path):
+    async def scene():
+        peer = await Peer(clock=WallClock(offset_ns=7_000_000_000), clock_delay_s=0.4).start()
+        node = make_node(tmp_path, peer.address)
+        await run_while(node, peer.until(20))
+        await peer.stop()
+        return peer
+
+    peer = asyncio.run(scene())
+    assert max(f.clock_uncertainty_ns for f in peer.frames) < 1_000_000_000
+    assert min(f.clock_offset_ns for f in peer.frames) > 6_000_000_000
+    first = {f.camera: f for f in reversed(peer.frames)}
+    assert {f.sequence > 1 for f in first.values()} == {True}  # what was captured meanwhile was replaced
+    check_books(tmp_path / "out")
+
+
+def test_photos_that_are_gone_are_counted_and_the_others_go_on(tmp_path, caplog):
+    data = write_photos(tmp_path / "data", 24, suffix=".jpg")
+    scenario = photo_scenario(data, 3, codec="jpeg")
+    built = build_cameras(scenario, source_config(scenario), scenario.cameras)
+    for index in (0, 3):  # the first of cam00, by which its cache is judged, and the second of cam01
+        (data.parent / f"images/{index:03d}.jpg").unlink()
+
+    async def scene():
+        peer = await Peer().start()
+        node = Node(
+            scenario, built, NodeOptions(to=peer.address, transport=Transport(), out=tmp_path / "out")
+        )
+        status = {}
+
+        async def work():
+            async with asyncio.timeout(20):
+                while not (status and all(status[c]["failed"] for c in ("cam00", "cam01"))):
+                    await peer.until_each(list(scenario.cameras), 3)
+                    status.update(node.status()["cameras"])
+
+        await run_while(node, work())
+        await peer.stop()
+        return status
+
+    with caplog.at_level(logging.WARNING, "camera-node"):
+        status = asyncio.run(scene())
+    assert status["cam02"]["failed"] == 0
+    for camera in ("cam00", "cam01"):
+        assert len([r for r in caplog.records if r.getMessage().startswith(f"{camera}: no frame")]) == 1
+    check_books(tmp_path / "out")
+
+
 def test_the_token_is_needed_and_sent(tmp_path):
     async def scene(token):
         peer = await Peer(transport=Transport(token="right")).start()

@@ -30,7 +30,8 @@ def kernel(function: Callable[..., Any]) -> Any:
     numba's own cache looks at the file a function stands in; kernels here inline functions of other files,
     and would go on running yesterday's. The digest of all of them is made part of the cache's stamp.
     """
-    dispatcher = njit(nogil=True, fastmath=FAST)(function)
+    # numpy's error model: no exception, and no branch, for a division by zero.
+    dispatcher = njit(nogil=True, fastmath=FAST, error_model="numpy", no_cfunc_wrapper=True)(function)
     dispatcher.enable_caching()
     file = dispatcher._cache._cache_file
     file._source_stamp = (*file._source_stamp, SOURCES)

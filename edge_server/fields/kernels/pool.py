@@ -72,6 +72,18 @@ class Pool:
             del job  # or the last job's arrays would live until the next one comes
 
 
+class CallerPool(Pool):
+    """Runs kernels in the calling thread alone, at its own priority."""
+
+    def __init__(self) -> None:
+        super().__init__(threads=1, nice=0)
+        self.close()
+
+    def run(self, kernel: Callable[..., Any], *args: Any) -> None:
+        """Run ``kernel`` here and now."""
+        kernel(np.zeros(1, np.int64), 0, *args)
+
+
 _shared: dict[tuple[int | None, int], Pool] = {}
 _shared_lock = threading.Lock()
 

@@ -84,7 +84,11 @@ def _slab(o, d, half, enter, leave):
 
 @njit(inline="always")
 def interval(space, ox, oy, oz, dx, dy, dz):
-    """Where a ray enters and leaves the scene; leave <= enter where it misses it."""
+    """Where a ray enters and leaves the scene; leave <= enter where it misses it, or is no ray at all: the
+    undistortion of a lens that no glass has diverges, and NaN must not become the number of a cell."""
+    # Not is_finite(): numba loses the name of an inlined function's own inlined callee.
+    if not abs(dx + dy + dz + ox + oy + oz) <= np.float32(3.4e38):
+        return np.float32(0.0), np.float32(-1.0)
     half = np.float32(HORIZON) if space.contracted else np.float32(1.0)
     enter, leave = space.near, np.float32(1e9)
     enter, leave = _slab(ox, dx, half, enter, leave)

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18\x66reshfield/v1/edge.proto\x12\rfreshfield.v1\"\x12\n\x10GetStatusRequest\"x\n\x0c\x43\x61meraStatus\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\x13\n\x06\x61ge_ms\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x11\n\tdelivered\x18\x03 \x01(\x04\x12\x10\n\x08rejected\x18\x04 \x01(\x04\x12\x10\n\x08held_out\x18\x05 \x01(\x08\x42\t\n\x07_age_ms\"\xbe\x01\n\x11GetStatusResponse\x12\x10\n\x08scenario\x18\x01 \x01(\t\x12\x10\n\x08uptime_s\x18\x02 \x01(\x01\x12,\n\x07\x63\x61meras\x18\x03 \x03(\x0b\x32\x1b.freshfield.v1.CameraStatus\x12\x0e\n\x06policy\x18\x04 \x01(\t\x12\x10\n\x08omega_ms\x18\x05 \x01(\x01\x12\x0e\n\x06paused\x18\x06 \x01(\x08\x12%\n\x04last\x18\x07 \x01(\x0b\x32\x17.freshfield.v1.Decision\"\x17\n\x15WatchDecisionsRequest\"\x98\x02\n\x08\x44\x65\x63ision\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x12\n\ndecided_ns\x18\x02 \x01(\x03\x12\x14\n\x0cpublished_ns\x18\x03 \x01(\x03\x12\x10\n\x08omega_ms\x18\x04 \x01(\x01\x12\x10\n\x08selected\x18\x05 \x03(\t\x12\x0f\n\x07\x61\x61oi_ms\x18\x06 \x01(\x01\x12\x11\n\tupdate_ms\x18\x07 \x01(\x01\x12\x14\n\x07psnr_db\x18\x08 \x01(\x01H\x00\x88\x01\x01\x12\x1b\n\x0epsnr_moving_db\x18\t \x01(\x01H\x01\x88\x01\x01\x12\x11\n\x04ssim\x18\n \x01(\x01H\x02\x88\x01\x01\x12\x12\n\x05lpips\x18\x0b \x01(\x01H\x03\x88\x01\x01\x42\n\n\x08_psnr_dbB\x11\n\x0f_psnr_moving_dbB\x07\n\x05_ssimB\x08\n\x06_lpips\"C\n\x16WatchDecisionsResponse\x12)\n\x08\x64\x65\x63ision\x18\x01 \x01(\x0b\x32\x17.freshfield.v1.Decision\"\x13\n\x11ResetFieldRequest\"\x14\n\x12ResetFieldResponse\"\x15\n\x13SaveSnapshotRequest\"$\n\x14SaveSnapshotResponse\x12\x0c\n\x04path\x18\x01 \x01(\t\"^\n\x10SetPolicyRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\x05value\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x13\n\x06paused\x18\x03 \x01(\x08H\x01\x88\x01\x01\x42\x08\n\x06_valueB\t\n\x07_paused\"@\n\x11SetPolicyResponse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01\x12\x0e\n\x06paused\x18\x03 \x01(\x08\x32\xba\x03\n\x0b\x45\x64geService\x12N\n\tGetStatus\x12\x1f.freshfield.v1.GetStatusRequest\x1a .freshfield.v1.GetStatusResponse\x12_\n\x0eWatchDecisions\x12$.freshfield.v1.WatchDecisionsRequest\x1a%.freshfield.v1.WatchDecisionsResponse0\x01\x12Q\n\nResetField\x12 .freshfield.v1.ResetFieldRequest\x1a!.freshfield.v1.ResetFieldResponse\x12W\n\x0cSaveSnapshot\x12\".freshfield.v1.SaveSnapshotRequest\x1a#.freshfield.v1.SaveSnapshotResponse\x12N\n\tSetPolicy\x12\x1f.freshfield.v1.SetPolicyRequest\x1a .freshfield.v1.SetPolicyResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18\x66reshfield/v1/edge.proto\x12\rfreshfield.v1\"\x12\n\x10GetStatusRequest\"x\n\x0c\x43\x61meraStatus\x12\x11\n\tcamera_id\x18\x01 \x01(\t\x12\x13\n\x06\x61ge_ms\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x11\n\tdelivered\x18\x03 \x01(\x04\x12\x10\n\x08rejected\x18\x04 \x01(\x04\x12\x10\n\x08held_out\x18\x05 \x01(\x08\x42\t\n\x07_age_ms\"\xca\x01\n\x11GetStatusResponse\x12\x10\n\x08scenario\x18\x01 \x01(\t\x12\x10\n\x08uptime_s\x18\x02 \x01(\x01\x12,\n\x07\x63\x61meras\x18\x03 \x03(\x0b\x32\x1b.freshfield.v1.CameraStatus\x12\x0e\n\x06policy\x18\x04 \x01(\t\x12\x12\n\x05value\x18\x05 \x01(\x01H\x00\x88\x01\x01\x12\x0e\n\x06paused\x18\x06 \x01(\x08\x12%\n\x04last\x18\x07 \x01(\x0b\x32\x17.freshfield.v1.DecisionB\x08\n\x06_value\"\x17\n\x15WatchDecisionsRequest\"\xaa\x02\n\x08\x44\x65\x63ision\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x12\n\ndecided_ns\x18\x02 \x01(\x03\x12\x14\n\x0cpublished_ns\x18\x03 \x01(\x03\x12\x15\n\x08omega_ms\x18\x04 \x01(\x01H\x00\x88\x01\x01\x12\x10\n\x08selected\x18\x05 \x03(\t\x12\x0f\n\x07\x61\x61oi_ms\x18\x06 \x01(\x01\x12\x11\n\tupdate_ms\x18\x07 \x01(\x01\x12\x14\n\x07psnr_db\x18\x08 \x01(\x01H\x01\x88\x01\x01\x12\x1b\n\x0epsnr_moving_db\x18\t \x01(\x01H\x02\x88\x01\x01\x12\x11\n\x04ssim\x18\n \x01(\x01H\x03\x88\x01\x01\x12\x12\n\x05lpips\x18\x0b \x01(\x01H\x04\x88\x01\x01\x42\x0b\n\t_omega_msB\n\n\x08_psnr_dbB\x11\n\x0f_psnr_moving_dbB\x07\n\x05_ssimB\x08\n\x06_lpips\"C\n\x16WatchDecisionsResponse\x12)\n\x08\x64\x65\x63ision\x18\x01 \x01(\x0b\x32\x17.freshfield.v1.Decision\"\x13\n\x11ResetFieldRequest\"\x14\n\x12ResetFieldResponse\"\x15\n\x13SaveSnapshotRequest\"$\n\x14SaveSnapshotResponse\x12\x0c\n\x04path\x18\x01 \x01(\t\"^\n\x10SetPolicyRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\x05value\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x13\n\x06paused\x18\x03 \x01(\x08H\x01\x88\x01\x01\x42\x08\n\x06_valueB\t\n\x07_paused\"O\n\x11SetPolicyResponse\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\x05value\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\x0e\n\x06paused\x18\x03 \x01(\x08\x42\x08\n\x06_value2\xba\x03\n\x0b\x45\x64geService\x12N\n\tGetStatus\x12\x1f.freshfield.v1.GetStatusRequest\x1a .freshfield.v1.GetStatusResponse\x12_\n\x0eWatchDecisions\x12$.freshfield.v1.WatchDecisionsRequest\x1a%.freshfield.v1.WatchDecisionsResponse0\x01\x12Q\n\nResetField\x12 .freshfield.v1.ResetFieldRequest\x1a!.freshfield.v1.ResetFieldResponse\x12W\n\x0cSaveSnapshot\x12\".freshfield.v1.SaveSnapshotRequest\x1a#.freshfield.v1.SaveSnapshotResponse\x12N\n\tSetPolicy\x12\x1f.freshfield.v1.SetPolicyRequest\x1a .freshfield.v1.SetPolicyResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -36,25 +36,25 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_CAMERASTATUS']._serialized_start=63
   _globals['_CAMERASTATUS']._serialized_end=183
   _globals['_GETSTATUSRESPONSE']._serialized_start=186
-  _globals['_GETSTATUSRESPONSE']._serialized_end=376
-  _globals['_WATCHDECISIONSREQUEST']._serialized_start=378
-  _globals['_WATCHDECISIONSREQUEST']._serialized_end=401
-  _globals['_DECISION']._serialized_start=404
-  _globals['_DECISION']._serialized_end=684
-  _globals['_WATCHDECISIONSRESPONSE']._serialized_start=686
-  _globals['_WATCHDECISIONSRESPONSE']._serialized_end=753
-  _globals['_RESETFIELDREQUEST']._serialized_start=755
-  _globals['_RESETFIELDREQUEST']._serialized_end=774
-  _globals['_RESETFIELDRESPONSE']._serialized_start=776
-  _globals['_RESETFIELDRESPONSE']._serialized_end=796
-  _globals['_SAVESNAPSHOTREQUEST']._serialized_start=798
-  _globals['_SAVESNAPSHOTREQUEST']._serialized_end=819
-  _globals['_SAVESNAPSHOTRESPONSE']._serialized_start=821
-  _globals['_SAVESNAPSHOTRESPONSE']._serialized_end=857
-  _globals['_SETPOLICYREQUEST']._serialized_start=859
-  _globals['_SETPOLICYREQUEST']._serialized_end=953
-  _globals['_SETPOLICYRESPONSE']._serialized_start=955
-  _globals['_SETPOLICYRESPONSE']._serialized_end=1019
-  _globals['_EDGESERVICE']._serialized_start=1022
-  _globals['_EDGESERVICE']._serialized_end=1464
+  _globals['_GETSTATUSRESPONSE']._serialized_end=388
+  _globals['_WATCHDECISIONSREQUEST']._serialized_start=390
+  _globals['_WATCHDECISIONSREQUEST']._serialized_end=413
+  _globals['_DECISION']._serialized_start=416
+  _globals['_DECISION']._serialized_end=714
+  _globals['_WATCHDECISIONSRESPONSE']._serialized_start=716
+  _globals['_WATCHDECISIONSRESPONSE']._serialized_end=783
+  _globals['_RESETFIELDREQUEST']._serialized_start=785
+  _globals['_RESETFIELDREQUEST']._serialized_end=804
+  _globals['_RESETFIELDRESPONSE']._serialized_start=806
+  _globals['_RESETFIELDRESPONSE']._serialized_end=826
+  _globals['_SAVESNAPSHOTREQUEST']._serialized_start=828
+  _globals['_SAVESNAPSHOTREQUEST']._serialized_end=849
+  _globals['_SAVESNAPSHOTRESPONSE']._serialized_start=851
+  _globals['_SAVESNAPSHOTRESPONSE']._serialized_end=887
+  _globals['_SETPOLICYREQUEST']._serialized_start=889
+  _globals['_SETPOLICYREQUEST']._serialized_end=983
+  _globals['_SETPOLICYRESPONSE']._serialized_start=985
+  _globals['_SETPOLICYRESPONSE']._serialized_end=1064
+  _globals['_EDGESERVICE']._serialized_start=1067
+  _globals['_EDGESERVICE']._serialized_end=1509
 # @@protoc_insertion_point(module_scope)

@@ -25,22 +25,22 @@ class CameraStatus(_message.Message):
     def __init__(self, camera_id: _Optional[str] = ..., age_ms: _Optional[float] = ..., delivered: _Optional[int] = ..., rejected: _Optional[int] = ..., held_out: _Optional[bool] = ...) -> None: ...
 
 class GetStatusResponse(_message.Message):
-    __slots__ = ("scenario", "uptime_s", "cameras", "policy", "omega_ms", "paused", "last")
+    __slots__ = ("scenario", "uptime_s", "cameras", "policy", "value", "paused", "last")
     SCENARIO_FIELD_NUMBER: _ClassVar[int]
     UPTIME_S_FIELD_NUMBER: _ClassVar[int]
     CAMERAS_FIELD_NUMBER: _ClassVar[int]
     POLICY_FIELD_NUMBER: _ClassVar[int]
-    OMEGA_MS_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
     PAUSED_FIELD_NUMBER: _ClassVar[int]
     LAST_FIELD_NUMBER: _ClassVar[int]
     scenario: str
     uptime_s: float
     cameras: _containers.RepeatedCompositeFieldContainer[CameraStatus]
     policy: str
-    omega_ms: float
+    value: float
     paused: bool
     last: Decision
-    def __init__(self, scenario: _Optional[str] = ..., uptime_s: _Optional[float] = ..., cameras: _Optional[_Iterable[_Union[CameraStatus, _Mapping]]] = ..., policy: _Optional[str] = ..., omega_ms: _Optional[float] = ..., paused: _Optional[bool] = ..., last: _Optional[_Union[Decision, _Mapping]] = ...) -> None: ...
+    def __init__(self, scenario: _Optional[str] = ..., uptime_s: _Optional[float] = ..., cameras: _Optional[_Iterable[_Union[CameraStatus, _Mapping]]] = ..., policy: _Optional[str] = ..., value: _Optional[float] = ..., paused: _Optional[bool] = ..., last: _Optional[_Union[Decision, _Mapping]] = ...) -> None: ...
 
 class WatchDecisionsRequest(_message.Message):
     __slots__ = ()

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
-from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
 from edge_server.fidelity.scorer import PENDING, Scorer, mean_score
@@ -150,13 +151,14 @@ def test_lpips_is_scored_where_the_image_is_large_enough():
     assert small.lpips is None and small.ssim == pytest.approx(1.0)
 
 
-def test_a_poisoned_rendering_is_an_error_that_says_where():
+def test_a_poisoned_rendering_goes_unscored_and_the_log_says_where(caplog):
     rendering = np.full((48, 48, 3), 0.5, np.float32)
     rendering[3, 4, 1] = np.nan
     scorer = Scorer()
     feed(scorer, 400)
-    with pytest.raises(ImageError, match=r"rendering: 1 of 6912 .* row 3, column 4, channel 1"):
-        scorer.publish("h", rendering, 390 * MS)
+    assert scorer.publish("h", rendering, 390 * MS) == []
+    assert scorer.unscored == 1
+    assert re.search(r"rendering: 1 of 6912 .* row 3, column 4, channel 1", caplog.text)
     # The poisoned one is gone; the next is scored.
     assert len(scorer.publish("h", np.full((48, 48, 3), 0.5, np.float32), 391 * MS)) == 1
 
@@ -195,3 +197,37 @@ def test_frames_from_another_viewpoint_tell_nothing_about_motion_or_noise():
         (score,) = scorer.publish("h", np.zeros((48, 48, 3), np.float32), 790 * MS)
         assert (score.psnr_moving_db is not None) == moves
         assert bool(scorer._cameras["h"].noise.pairs) == moves
+
+
+def test_one_damaged_held_out_frame_costs_only_its_own_publication():
+    scorer = Scorer(period_ms=30.0)
+    calls = []
+
+    def damaged():
+        calls.append(1)
+        raise ValueError("the jpeg data is damaged")
+
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (32, 32, 3), np.uint8)
+    rendering = image.astype(np.float32) / 255
+    period = 30_000_000
+    scorer.held_out("cam00", image, 0)
+    scorer.publish("cam00", rendering, period)
+    scorer.publish("cam00", rendering, 4 * period)
+    scores = scorer.held_out("cam00", damaged, period)
+    for k in range(2, 7):
+        scores += scorer.held_out("cam00", image, k * period)
+    assert [s.published_ns for s in scores] == [4 * period]
+    assert scorer.unscored == 1
+    assert len(calls) == 1  # it has left the history: nobody decodes it again
+
+
+def test_a_bad_rendering_loses_no_other_score():
+    scorer = Scorer(period_ms=30.0)
+    image = np.full((32, 32, 3), 90, np.uint8)
+    good = image.astype(np.float32) / 255
+    scorer.held_out("cam00", image, 0)
+    scorer.publish("cam00", good, 10)
+    scorer.publish("cam00", np.full_like(good, np.nan), 20)
+    scorer.publish("cam00", good, 30)
+    assert [s.published_ns for s in scorer.held_out("cam00", image, 40)] == [10, 30]

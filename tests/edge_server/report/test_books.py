@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import pytest
 
 from edge_server.report.books import close_books
@@ -243,3 +245,51 @@ def test_cameras_add_up_to_the_total(tmp_path):
     assert found["by_camera"]["a"]["delivered"] == 1 and found["by_camera"]["b"]["rejected"] == {"crc": 1}
     for name in ("captured", "sent", "in_flight", "delivered"):
         assert found[name] == sum(camera[name] for camera in found["by_camera"].values())
+
+
+def test_frames_of_unknown_origin_stand_apart(tmp_path):
+    write(tmp_path, "node", sent(0, 1))
+    write(tmp_path, "emulator", [("intruder", "x", 0, "rejected", "unknown_camera")])
+    edge = [("?", "?", 0, "rejected", "bad_id")] * 3
+    edge += [("a", "?", 7, "rejected", "bad_id"), ("mars", "s", 1, "rejected", "unknown_camera")]
+    # Camera b's node wrote its ledger elsewhere: the edge took its frames, so it is no stranger.
+    edge += [(0, "delivered"), ("b", "s", 0, "delivered"), ("b", "s", 1, "rejected", "too_old")]
+    write(tmp_path, "edge", edge)
+    books = counts(tmp_path, captured=4, sent=4, delivered=2, rejected={"too_old": 1}, in_flight=1)
+    found = books.as_dict()
+    assert found["strangers"] == {"count": 6, "reasons": {"bad_id": 4, "unknown_camera": 2}}
+    assert set(found["by_camera"]) == {"a", "b"}
+    assert any("6 frames of unknown origin" in note for note in books.notes)
+
+
+def test_lines_lost_to_a_full_disk_are_noted_and_no_contradiction(tmp_path):
+    write(tmp_path, "node", sent(0))
+    path = write(tmp_path, "emulator", [(0, "received")], closed=False)
+    with path.open("a") as file:
+        file.write("5\t\t\t0\tlost_lines\t12\n6\t\t\t0\tclosed\t12\n")
+    write(tmp_path, "edge", [(0, "delivered")])
+    books = counts(tmp_path, captured=1, sent=1, delivered=1)
+    assert books.contradictions == [] and any("12 lines were lost" in note for note in books.notes)
+
+
+def test_a_long_run_is_joined_in_little_memory(tmp_path):
+    frames = 50_000
+    files = {
+        "node": ("captured", "sent", "answered"),
+        "emulator": ("received", "forwarded"),
+        "edge": ("delivered",),
+    }
+    for role, events in files.items():
+        path = write(tmp_path, role, [], closed=False)
+        with path.open("a") as file:
+            for i in range(frames):
+                detail = "accepted"
+                for event in events:
+                    file.write(f"{i}\tcam{i % 8:02}\tsession\t{i // 8}\t{event}\t{detail}\n")
+            file.write("9\t\t\t0\tclosed\t\n")
+    tracemalloc.start()
+    books = close_books(tmp_path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert books.total.delivered == books.total.captured == frames and books.contradictions == []
+    assert peak < 300 * frames, f"{peak / frames:.0f} bytes a frame"
