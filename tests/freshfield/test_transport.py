@@ -131,7 +131,8 @@ def test_host_and_port_are_told_apart(text, expected):
 
 
 NO_ADDRESSES = ["", "host", "7001", "host:", "host:x", "host:-1", "host:65536", "host:99999", "host:\u00b2",
-                "::1", "::1:7001", "http://host:80", "ho st:80", "unix:/tmp/s", "host:" + "9" * 5000]  # fmt: skip
+                "::1", "::1:7001", "http://host:80", "ho st:80", "unix:/tmp/s",
+                "host:" + "9" * 5000]  # fmt: skip
 
 
 @pytest.mark.parametrize("text", NO_ADDRESSES)

@@ -75,6 +75,19 @@ class Recipe(NamedTuple):
 
 
 @njit(inline="always")
+def _view_of(first, pixel):
+    """The last k with first[k] <= pixel. (np.searchsorted would compile seconds of string handling.)"""
+    low, high = 0, first.size - 1
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if first[middle] <= pixel:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@njit(inline="always")
 def _draw(views, recipe, n, ray):
     """Choose the n-th ray of the step: fills ray (9,), returns its view's number."""
     key, k = recipe.key, np.uint64(n) * np.uint64(8)
@@ -85,7 +98,7 @@ def _draw(views, recipe, n, ray):
         pixel = views.changed[min(np.int64(choice * views.changed.size), views.changed.size - 1)]
     else:
         pixel = min(np.int64(choice * total), total - 1)
-    view = np.searchsorted(views.first, pixel, side="right") - 1
+    view = _view_of(views.first, pixel)
     local = pixel - views.first[view]
     width = views.size[view, 0]
     u, v = np.float64(local % width) + 0.5, np.float64(local // width) + 0.5
