@@ -61,7 +61,7 @@ def arrivals(text: str) -> dict[str, Any]:
 
 
 def service(text: str) -> dict[str, Any]:
-    """``exp:60ms``, ``det:10ms``, ``gamma:60ms:SHAPE``, ``lognormal:60ms:SIGMA``, ``trace:FILE``, ``none``."""
+    """``exp:60ms``, ``det:10ms``, ``gamma:60ms:SHAPE``, ``lognormal:60ms:SIGMA``, ``trace:FILE`` or none."""
     short, _, rest = text.partition(":")
     law = _LAWS.get(short)
     if law == "none":
