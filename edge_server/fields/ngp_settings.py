@@ -47,7 +47,7 @@ class NgpSettings:
     changed_share: float = _option(0.25, "rays drawn from pixels that changed since the camera's last view")
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
-    nice: int = _option(10, "how far workers lower their own priority (Linux)")
+    nice: int = _option(5, "how far workers lower their own priority (Linux)")
     device: str = _option("auto", "cpu (numba), cuda (torch) or auto")
 
     def __post_init__(self) -> None:

@@ -282,16 +282,17 @@ def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Arra
 
 # How far from where it started a point may come out of undistortion and back.
 _MAX_LENS_ERROR_PX = 1.0
+_RASTER = 33
 
 
 # Every frame of a camera brings the same lens. Bounded, because a stranger's frames may not.
 @lru_cache(maxsize=1024)
 def invertible(camera: Pinhole) -> bool:
-    """Whether rays through the corners, edge middles and centre of the image are finite and re-project to
+    """Whether rays through a raster over the whole image, its edges included, are finite and re-project to
     where they came from: undistortion diverges for coefficients that no lens has."""
     if not camera.distorted:
         return True
-    u, v = np.meshgrid([0.0, camera.width / 2, camera.width], [0.0, camera.height / 2, camera.height])
+    u, v = np.meshgrid(np.linspace(0.0, camera.width, _RASTER), np.linspace(0.0, camera.height, _RASTER))
     points = np.stack([u.ravel(), v.ravel()], axis=-1)
     with np.errstate(all="ignore"):
         rays = camera.rays(points)

@@ -190,8 +190,8 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
                     _keep(acts, begin, begin + kept, n)
                     _keep(x, begin, begin + kept, n)
                     _keep(line[:2], begin, begin + kept, n)
-                if kept_rays < r:
-                    ray[kept_rays] = ray[r]
+                for k in range(ray.shape[1]):
+                    ray[kept_rays, k] = ray[r, k]
                 n += kept
                 kept_rays += 1
                 ray_first[kept_rays] = n
@@ -236,6 +236,9 @@ def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batc
                 spread_harmonics(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
         batch.d_params[chunk] = _F0
         backward(net, acts, d_acts, n, batch.d_params[chunk])
-        batch.d_features[chunk, :, :n] = d_acts[:inputs, :n]
+        for k in range(inputs):  # a slice assigned to a slice would compile seconds of error messages
+            d_features, d = batch.d_features[chunk, k], d_acts[k]
+            for s in range(n):
+                d_features[s] = d[s]
         batch.samples[chunk], batch.rays[chunk] = n, rays
         batch.dropped[chunk], batch.loss[chunk] = dropped, loss

@@ -40,14 +40,14 @@ def test_states_travel_both_ways() -> None:
 
 
 def test_it_learns_and_repeats_itself() -> None:
-    views = ring(7, size=32)
+    views = ring(5, size=24)
     states = []
     for _ in range(2):
-        field = NgpTorchField(replace(SMALL, rays=512), "cpu")
-        first = field.fit(views, Budget(steps=5))
-        last = field.fit(views, Budget(steps=45))
+        field = NgpTorchField(replace(SMALL, rays=256, samples=32, levels=4, cells=16), "cpu")
+        first = field.fit(views, Budget(steps=3))
+        last = field.fit(views, Budget(steps=60))
         states.append(field.state())
-        assert last.loss < 0.5 * first.loss and last.samples > 0
+        assert last.loss < 0.8 * first.loss and last.samples > 0
     np.testing.assert_array_equal(states[0]["table"], states[1]["table"])
     points, colors = field.points(50)
     assert len(points) == len(colors) > 5

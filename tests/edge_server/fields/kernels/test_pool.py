@@ -10,8 +10,9 @@ import pytest
 from numba import njit
 
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, uniform
-from edge_server.fields.kernels.jit import FAST
-from edge_server.fields.kernels.pool import Pool, shared_pool
+from edge_server.fields.kernels.jit import FAST, SOURCES
+from edge_server.fields.kernels.mlp import forward
+from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
 
 
 @njit(nogil=True)
@@ -67,6 +68,17 @@ def test_workers_lower_their_own_priority_and_nobody_elses() -> None:
 
 def test_a_pool_is_shared_by_equal_settings() -> None:
     assert shared_pool(1, 3) is shared_pool(1, 3) and shared_pool(1, 3) is not shared_pool(1, 4)
+
+
+def test_a_caller_pool_stays_in_the_calling_thread() -> None:
+    seen = []
+    CallerPool().run(lambda counter, worker: seen.append((threading.get_ident(), worker, int(counter[0]))))
+    assert seen == [(threading.get_ident(), 0, 0)]
+
+
+def test_cached_kernels_depend_on_all_kernel_sources() -> None:
+    """Or an edit to one file would leave yesterday's code running where it is inlined into another."""
+    assert SOURCES in forward._cache._cache_file._source_stamp
 
 
 def test_no_threads_is_refused() -> None:
