@@ -41,6 +41,7 @@ class Stage:
 # too little to be worth its fixed cost, which is waiting for a training step of the field to end.
 STAGES = (Stage(0.08, 0.5, 64, 240), Stage(0.20, 0.2, 120, 480), Stage(1.2, 0.15, 200, 720))
 BAND_S = 0.1
+LEAST_GAP_S = 0.05
 SETTLE_S = 0.25
 POINTS = 8000
 POINTS_SHARE = 0.05
@@ -202,7 +203,8 @@ class RenderLoop:
             image = self._render(renderer, pose, camera, visitor, serial, stage)
         finally:
             spent = perf_counter() - began
-            self._not_before[stage] = began + spent / STAGES[stage].share
+            # The second bound counts where rendering is cheap: the network and the browser have a share, too.
+            self._not_before[stage] = began + max(spent / STAGES[stage].share, LEAST_GAP_S)
         if image is None:
             return
         self._adapt(stage, spent)

@@ -36,7 +36,7 @@ def write_rig(folder: Path, cameras: int = 2, width: int = 64, height: int = 48)
         rig[f"cam{c:02d}"] = {
             "width": width,
             "height": height,
-            "K": [[50.0, 0, 31.5], [0, 51.0, 23.5], [0, 0, 1]],
+            "K": [[50 * width / 64, 0, width / 2 - 0.5], [0, 51 * width / 64, height / 2 - 0.5], [0, 0, 1]],
             "dist_k1k2p1p2": [0.01, 0, 0, 0],
             "R_world_to_cam": world_to_camera[:3, :3].tolist(),
             "t_world_to_cam": world_to_camera[:3, 3].tolist(),
