@@ -156,13 +156,6 @@ class Link:
             inside.append(self._unsampled)
         return sorted(inside, key=lambda t: t.number)
 
-    def break_off(self, at_ns: int) -> list[Event]:
-        """The stream is gone: everything inside ends ``broken``."""
-        at_ns = self._hold(at_ns)
-        self._run_to(at_ns)
-        self._break(at_ns)
-        return self._take_events()
-
     def _hold(self, at_ns: int) -> int:
         if at_ns < self.now_ns:
             self.clock_backwards += 1

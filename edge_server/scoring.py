@@ -12,7 +12,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,7 +161,7 @@ class Scoring:
             if image is not None:
                 comparison = self._compare(score, image, entry.publication.number)
             final = len(entry.scores) == len(self._held_out)
-            self._on_scored(_with_score(entry.publication, mean_score(entry.scores)), comparison, final)
+            self._on_scored(entry.publication.scored(mean_score(entry.scores)), comparison, final)
             if final:
                 self._open.pop(entry.publication.number, None)
 
@@ -187,21 +187,9 @@ class Scoring:
             return
         camera, image, truth = renderings[0]
         comparison = Comparison(camera, truth[..., :3], to_bytes(image), publication.number)
-        self._on_scored(_with_score(publication, score), comparison, True)
+        self._on_scored(publication.scored(score), comparison, True)
 
 
 def to_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     """float (H, W, 3) in [0, 1] -> uint8, rounded."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-
-
-def _with_score(publication: Publication, score: Score) -> Publication:
-    return replace(
-        publication,
-        psnr_db=score.psnr_db,
-        psnr_moving_db=score.psnr_moving_db,
-        ssim=score.ssim,
-        lpips=score.lpips,
-        truth_gap_ms=score.truth_gap_ms,
-        scored_on=score.camera if score.on == "held-out" else "selected",
-    )

@@ -9,12 +9,13 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fidelity.scorer import Score
 from edge_server.fields import Renderer
 from freshfield.frame import Frame
 
@@ -45,6 +46,18 @@ class Publication:
     truth_gap_ms: float | None = None
     scored_on: str | None = None
     """Held-out camera id, or "selected" where nothing is held out (6.21-6.22)."""
+
+    def scored(self, score: Score) -> Publication:
+        """The same publication with its fidelity."""
+        return replace(
+            self,
+            psnr_db=score.psnr_db,
+            psnr_moving_db=score.psnr_moving_db,
+            ssim=score.ssim,
+            lpips=score.lpips,
+            truth_gap_ms=score.truth_gap_ms,
+            scored_on=score.camera if score.on == "held-out" else "selected",
+        )
 
 
 @dataclass(frozen=True)

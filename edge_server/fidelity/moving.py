@@ -46,12 +46,11 @@ def frames_at_lags(
     times_ns: Sequence[int],
     present_ns: int,
     lags_ms: Sequence[float] = LAGS_MS,
-    slack_ms: float | None = None,
 ) -> list[int]:
     """Indices into ``times_ns`` of the frames nearest to each lag before ``present_ns``, without repeats.
 
-    Only frames before the present count. slack_ms: how far a frame may lie from its lag; None takes
-    whatever exists, so that two frames a second still tell what moved.
+    Only frames before the present count, however far from their lag: two frames a second still tell what
+    moved.
     """
     past = [i for i, t in enumerate(times_ns) if t < present_ns]
     chosen: list[int] = []
@@ -60,8 +59,7 @@ def frames_at_lags(
             break
         wanted = present_ns - round(lag * 1e6)
         best = min(past, key=lambda i: abs(times_ns[i] - wanted))
-        close = slack_ms is None or abs(times_ns[best] - wanted) <= slack_ms * 1e6
-        if close and best not in chosen:
+        if best not in chosen:
             chosen.append(best)
     return chosen
 

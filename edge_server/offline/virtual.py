@@ -296,12 +296,4 @@ class VirtualDeployment:
         if score is None:
             return publication
         self._scored_ns = present_ns
-        return dataclasses.replace(
-            publication,
-            psnr_db=score.psnr_db,
-            psnr_moving_db=score.psnr_moving_db,
-            ssim=score.ssim,
-            lpips=score.lpips,
-            truth_gap_ms=score.truth_gap_ms,
-            scored_on=score.camera,
-        )
+        return publication.scored(score)

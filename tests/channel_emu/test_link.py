@@ -105,16 +105,6 @@ def test_a_clock_that_runs_backwards_is_held_and_counted() -> None:
     assert [e.at_ns for e in subject.advance(60 * MS)] == [60 * MS]
 
 
-def test_breaking_off_ends_all_that_is_inside() -> None:
-    subject = link("fcfs", [10])
-    for at in (0, 1, 2):
-        subject.offer(at * MS)
-    ended = [(e.kind, e.transit.number) for e in subject.break_off(5 * MS)]
-    assert ended == [("broken", n) for n in range(3)]
-    assert subject.in_flight == 0
-    assert [e.kind for e in subject.offer(6 * MS)[1]] == [Kind.STARTED]
-
-
 def test_unknown_discipline_is_refused() -> None:
     with pytest.raises(ValueError, match="drop-new, newest-waits"):
         Link("a", "lifo", link("fcfs", [1])._service)
