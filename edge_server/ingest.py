@@ -24,7 +24,7 @@ from freshfield.v1 import frames_pb2_grpc
 
 # A camera that restarts opens a new session; older ones may still have frames on the way.
 # A session that is forgotten could be replayed, so many are remembered.
-_SESSIONS_PER_CAMERA = 256
+_SESSIONS_PER_CAMERA = 64
 _STREAMS_PER_CAMERA = 4
 _MAX_UNCERTAINTY_NS = 1_000_000_000
 

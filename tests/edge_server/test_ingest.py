@@ -109,7 +109,7 @@ def test_a_thousand_sessions_do_not_grow_the_gate():
     gate = Gate(["cam01"], [])
     for i in range(1000):
         gate.admit(good(session=f"s{i}"), NOW)
-    assert len(gate._sessions["cam01"]) == 4
+    assert len(gate._sessions["cam01"]) <= 64
 
 
 def test_an_uncertain_clock_is_given_its_uncertainty():
