@@ -23,7 +23,10 @@ class EdgeConfig:
     """The edge section of a scenario.
 
     field, field_options: the representation and its settings (edge_server.fields.registry).
-    update_ms: what one update may spend fitting. grace_ms: how long the first update waits for cameras
+    update_ms: what one update may spend fitting. deadline_ms: instead of it, from decision to publication:
+    the best way to spend it is looked up in ``frontier`` (a frontier.json of ``edge-server frontier``,
+    relative to the scenario; None: the one shipped), and the time to fit follows how busy the machine is.
+    grace_ms: how long the first update waits for cameras
     that have not reported. lpips: network scored with, where its weights are installed; none turns it off.
     noisy_truth: held-out frames are real or noisy video, so that the bound of moving pixels follows
     their noise.
@@ -33,6 +36,8 @@ class EdgeConfig:
     field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     update_ms: float = 800.0
+    deadline_ms: float | None = None
+    frontier: str | None = None
     grace_ms: float = 3000.0
     lpips: str = "alex"
     noisy_truth: bool = False
@@ -40,6 +45,10 @@ class EdgeConfig:
     def __post_init__(self) -> None:
         if not 10.0 <= self.update_ms <= 3_600_000.0:
             raise ValueError(f"update_ms: expected 10 to 3600000, got {self.update_ms:g}")
+        if self.deadline_ms is not None and not 20.0 <= self.deadline_ms <= 3_600_000.0:
+            raise ValueError(f"deadline_ms: expected 20 to 3600000, got {self.deadline_ms:g}")
+        if self.frontier is not None and self.deadline_ms is None:
+            raise ValueError("frontier: it is read for a deadline_ms, which is not given")
         if self.grace_ms < 0:
             raise ValueError("grace_ms: expected zero or more")
         if self.lpips not in ("alex", "squeeze", "none"):

@@ -19,6 +19,7 @@ import numpy as np
 
 from edge_server.buffer import Buffered, FrameBuffer
 from edge_server.fields import Budget, Field, FitReport, Renderer, View
+from edge_server.pacing import Pacing
 from edge_server.scheduler import Epoch, Plan, Policy
 from edge_server.state import Publication
 from edge_server.views import Decoder
@@ -103,7 +104,7 @@ class Loop:
         self,
         updates: Updates,
         clock: Clock,
-        budget: Budget,
+        pacing: Pacing,
         grace_ms: float,
         on_published: Callable[[Publication, Renderer, list[View]], None],
         on_status: Callable[[str], None],
@@ -111,7 +112,7 @@ class Loop:
     ) -> None:
         self._updates = updates
         self._clock = clock
-        self._budget = budget
+        self._pacing = pacing
         self._grace_ns = round(grace_ms * 1e6)
         self._on_published = on_published
         self._on_status = on_status
@@ -195,13 +196,15 @@ class Loop:
         if selection is None:
             return
         self._on_status(f"fitting {len(selection.items)} views")
-        fitted = self._updates.fit(selection, self._budget)
+        budget = self._pacing.budget()
+        fitted = self._updates.fit(selection, budget)
         if fitted is None:
             self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come
             return
         views, report = fitted
         renderer = self._updates.field.snapshot()
         publication = self._updates.publication(selection, views, report, self._clock.now_ns())
+        self._pacing.done(budget, publication.update_ms)
         self._on_published(publication, renderer, views)
 
     def _write_checkpoints(self) -> None:

@@ -23,11 +23,12 @@ from edge_server.buffer import FrameBuffer
 from edge_server.config import EdgeConfig
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
-from edge_server.fields import Budget, View, checkpoint
+from edge_server.fields import View, checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.ingest import Ingest, Recent
 from edge_server.journal import Journal
 from edge_server.loop import Loop, Updates
+from edge_server.pacing import Deadline, Fixed, Pacing, choose, read_points
 from edge_server.scheduler import POLICIES, make_policy
 from edge_server.scoring import Scoring
 from edge_server.service import ClockService, EdgeService
@@ -39,6 +40,9 @@ from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 
 log = logging.getLogger(__name__)
+
+# A person walking: what a scene that does not tell its speed is taken to move at.
+_USUAL_SPEED_M_PER_S = 1.0
 
 _STATUS_S = 0.5
 _AGES_S = 0.2
@@ -76,7 +80,8 @@ class EdgeServer:
         self._first_ms: float | None = None
         options.out.mkdir(parents=True, exist_ok=True)
 
-        self.field = make_field(config.field, config.field_options, seed=scenario.seed)
+        self.pacing, field_options = _pacing(scenario, config)
+        self.field = make_field(config.field, field_options, seed=scenario.seed)
         updates = 0
         if options.resume is not None:
             state, about = checkpoint.load(options.resume)
@@ -103,7 +108,7 @@ class EdgeServer:
         self.loop = Loop(
             self.updates,
             self.clock,
-            Budget(seconds=config.update_ms / 1e3),
+            self.pacing,
             config.grace_ms,
             self._published,
             self._say,
@@ -319,6 +324,7 @@ class EdgeServer:
                 "ms_p50": self._update_ms.percentile(50),
                 "ms_p95": self._update_ms.percentile(95),
                 "first_ms": self._first_ms,
+                "deadline_ms": self.config.deadline_ms,
                 "undecodable": self.updates.decoder.undecodable + self.scoring.undecodable,
             },
             "baseline": {
@@ -362,6 +368,25 @@ class EdgeServer:
             "seed": self.scenario.seed,
             "updates": self.updates.number,
         }
+
+
+def _pacing(scenario: Scenario, config: EdgeConfig) -> tuple[Pacing, dict[str, Any]]:
+    """How long updates may be, and the field's options: the scenario's own, over those of the measured point
+    that a deadline leads to. ValueError where the frontier cannot be read."""
+    if config.deadline_ms is None:
+        return Fixed(config.update_ms), config.field_options
+    path = None if config.frontier is None else scenario.path.parent / config.frontier
+    points = read_points(path, config.field)
+    speed = scenario.source.get("speed_m_per_s", _USUAL_SPEED_M_PER_S)
+    point = choose(points, config.deadline_ms, float(speed))
+    log.info(
+        "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB, %.1f where it moves)",
+        config.deadline_ms, point.effort, point.update_ms, point.speed_m_per_s, point.psnr_db,
+        point.psnr_moving_db,
+    )  # fmt: skip
+    if point.update_ms > config.deadline_ms:
+        log.warning("no measured update is as short as that: what fits is done")
+    return Deadline(config.deadline_ms, point.update_ms), {**point.options, **config.field_options}
 
 
 class _JsonFile:

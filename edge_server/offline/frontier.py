@@ -42,6 +42,9 @@ What accuracy costs in time, in two figures.
    deployment runs in virtual time, one that charges every step what figure 1 measured, so the second figure
    is the same bit for bit for one seed. It says how long an update should take at each speed.
 
+A scenario with a deadline_ms chooses the effort and the time of its updates from figure 2: of the file it
+names (frontier: OUT/frontier.json), else of one that was measured once and is shipped.
+
 Every finished point is saved in OUT/frontier.json. After Ctrl-C the same command goes on where it stopped;
 with other settings, points are measured anew. --fresh measures everything anew.
 """
@@ -53,7 +56,8 @@ Row = dict[str, Any]
 @dataclass(frozen=True)
 class Plan:
     """What is measured. planned_s: seconds of fitting from scratch. update_s: seconds an update takes.
-    run_s: virtual seconds of a moving run, or six updates where those take longer."""
+    run_s: virtual seconds of a moving run, or six updates where those take longer. efforts: of the levels,
+    those that moving runs are made with."""
 
     seeds: int
     knobs: bool
@@ -61,6 +65,7 @@ class Plan:
     speeds: tuple[float, ...]
     update_s: tuple[float, ...]
     run_s: float
+    efforts: tuple[str, ...]
     warm_steps: int
     size: int
     moving: update_time.Moving
@@ -73,6 +78,7 @@ QUICK = Plan(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.1, 0.25, 0.5, 1.0, 2.0),
     run_s=4.0,
+    efforts=("low", "medium"),
     warm_steps=150,
     size=128,
     moving=update_time.Moving(cameras=13, size=64),
@@ -84,6 +90,7 @@ FULL = Plan(
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0),
     run_s=20.0,
+    efforts=("low", "medium", "high"),
     warm_steps=600,
     size=128,
     moving=update_time.Moving(cameras=19, size=128),
@@ -121,6 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", type=int, metavar="N", help="repetitions [1 with --quick, else 3]")
     add("--seed", type=int, default=0, metavar="N", help="the first one [%(default)s]")
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    add("--points", type=Path, metavar="FILE", help="figure 2 there, too: what deadline_ms chooses from")
     add("--fresh", action="store_true", help="forget the points that OUT holds")
     add("--out", type=Path, default=Path("runs/frontier"), metavar="DIR", help="[%(default)s]")
     return parser
@@ -139,7 +147,9 @@ def _job(args: argparse.Namespace, plan: Plan) -> Frontier:
     args.out.mkdir(parents=True, exist_ok=True)
     store = Store(args.out / "frontier.json", args.fresh)
     lpips, missing = open_lpips(args.lpips)
-    return Frontier(args.out, store, plan, still, args.scene, args.field, levels, lpips, missing, args.seed)
+    return Frontier(
+        args.out, store, plan, still, args.scene, args.field, levels, lpips, missing, args.seed, args.points
+    )
 
 
 class Store:
@@ -184,6 +194,7 @@ class Frontier:
     lpips: Lpips | None
     lpips_missing: str | None
     seed: int
+    points: Path | None = None
 
     def run(self) -> None:
         begun = time.perf_counter()
@@ -211,6 +222,9 @@ class Frontier:
             updates=updates,
         )
         print(write_output(self.out, self.store.data), flush=True)
+        if self.points is not None:
+            whence = {key: self.store.data[key] for key in ("scene", "field", "policy", "channel", "machine")}
+            write_json(self.points, {**whence, "updates": updates})
         print(f"{self.store.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
 
     @property
@@ -238,28 +252,42 @@ class Frontier:
         return points
 
     def _updates(self, costs: dict[str, dict[str, float]]) -> list[Row]:
-        effort = next((e for e in self.levels if e.name == "medium"), self.levels[0])
-        compute = Compute(**{name: round(value, 3) for name, value in costs[effort.name].items()})
-        print(
-            f"moving scene in virtual time: a step is charged {compute.ms_per_step:.1f} ms, an update "
-            f"{compute.ms_per_update:.1f} ms",
-            flush=True,
-        )
-        stages = [(speed, seed) for speed in self.plan.speeds for seed in self._seeds]
-        rows, total = [], len(stages) * len(self.plan.update_s)
-        for speed, seed in stages:
-            # Made with its first new point: a resumed sweep makes only what it still needs.
-            stage = cache(partial(self._stage, speed, effort, seed))
-            for update_s in self.plan.update_s:
-                settings, measure = self._update_point(stage, speed, effort, seed, update_s, compute)
-                point, new = self.store.get(settings, measure)
-                rows.append({**point, "speed_m_per_s": speed, "planned_update_s": update_s, "seed": seed})
-                print(
-                    f"[{len(rows)}/{total}] {speed:g} m/s, update {point['update_s']:5.2f} s  "
-                    f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
-                    flush=True,
-                )
+        efforts = [e for e in self.levels if e.name in self.plan.efforts] or self.levels[:1]
+        rows: list[Row] = []
+        total = len(efforts) * len(self.plan.speeds) * len(self._seeds) * len(self.plan.update_s)
+        for effort in efforts:
+            compute = Compute(**{name: round(value, 3) for name, value in costs[effort.name].items()})
+            print(
+                f"moving scene in virtual time, {effort.name}: a step is charged "
+                f"{compute.ms_per_step:.1f} ms, an update {compute.ms_per_update:.1f} ms",
+                flush=True,
+            )
+            for speed in self.plan.speeds:
+                for seed in self._seeds:
+                    rows += self._moving(effort, compute, speed, seed, len(rows), total)
         return update_time.mean_over_seeds(rows)
+
+    def _moving(
+        self, effort: sweep.Effort, compute: Compute, speed: float, seed: int, done: int, total: int
+    ) -> list[Row]:
+        """Every update time of one effort, speed and seed."""
+        # Made with its first new point: a resumed sweep makes only what it still needs.
+        stage = cache(partial(self._stage, speed, effort, seed))
+        rows: list[Row] = []
+        for update_s in self.plan.update_s:
+            settings, measure = self._update_point(stage, speed, effort, seed, update_s, compute)
+            point, new = self.store.get(settings, measure)
+            rows.append({
+                **point, "effort": effort.name, "options": effort.options, "speed_m_per_s": speed,
+                "planned_update_s": update_s, "seed": seed,
+            })  # fmt: skip
+            print(
+                f"[{done + len(rows)}/{total}] {effort.name:8} {speed:g} m/s, "
+                f"update {point['update_s']:5.2f} s  "
+                f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
+                flush=True,
+            )
+        return rows
 
     def _stage(self, speed: float, effort: sweep.Effort, seed: int) -> update_time.Stage:
         plan = self.plan

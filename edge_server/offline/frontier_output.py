@@ -44,11 +44,14 @@ def table(rows: Sequence[Row]) -> str:
 def updates_table(rows: Sequence[Row]) -> str:
     """Fidelity at the present by speed and seconds an update takes."""
     names = ("PSNR", "moving", "seen", "moving")
-    lines = [f"{'speed':>8} {'update':>8} {'steps':>6} {'aAoI':>9} " + " ".join(f"{n:>7}" for n in names)]
+    lines = [
+        f"{'effort':10} {'speed':>8} {'update':>8} {'steps':>6} {'aAoI':>9} "
+        + " ".join(f"{n:>7}" for n in names)
+    ]
     for row in rows:
         numbers = [row[k] for k in ("psnr_db", "psnr_moving_db", "seen_psnr_db", "seen_psnr_moving_db")]
         lines.append(
-            f"{row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
+            f"{row['effort']:10} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
             f"{row['aaoi_ms']:6.0f} ms " + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
         )
     return "\n".join([*lines, "seen: what a viewer sees on average, between publications too"])
@@ -62,11 +65,12 @@ def conclusion(rows: Sequence[Row]) -> str:
         whole, moving = best(group, "psnr_db"), best(group, "psnr_moving_db")
         if whole is None or moving is None:
             continue
-        longest = max(group, key=lambda row: row["update_s"])
+        longest = max((r for r in group if r["effort"] == moving["effort"]), key=lambda row: row["update_s"])
         lost = moving["psnr_moving_db"] - (longest["psnr_moving_db"] or moving["psnr_moving_db"])
         parts.append(
-            f"at {speed:g} m/s {whole['update_s']:.2f} s for the whole image and {moving['update_s']:.2f} s "
-            f"where it moves ({longest['update_s']:.1f} s costs {lost:.1f} dB there)"
+            f"at {speed:g} m/s {whole['update_s']:.2f} s ({whole['effort']}) for the whole image and "
+            f"{moving['update_s']:.2f} s ({moving['effort']}) where it moves "
+            f"({longest['update_s']:.1f} s costs {lost:.1f} dB there)"
         )
     return "Best time to spend on an update: " + "; ".join(parts) + "."
 
@@ -102,23 +106,30 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """Fidelity at the present against seconds an update takes, for each speed; the best one marked."""
+    """Fidelity at the present against seconds an update takes, for each speed; the best one marked. The
+    highest effort measured is drawn out, others dashed and without what is seen between updates."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
+    efforts = list(dict.fromkeys(row["effort"] for row in rows))
+    main = efforts[-1] if "medium" not in efforts else "medium"
     panels = (("psnr_moving_db", "PSNR where it moves (dB)"), ("psnr_db", "PSNR, whole image (dB)"))
     with figure(path, len(panels), height_inch=3.0, sharex=True) as (_, axes):
         for ax, (key, label) in zip(axes[:, 0], panels):
             for colour, speed in zip(CYCLE, speeds):
-                group = sorted(
-                    (r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None),
-                    key=lambda r: r["update_s"],
-                )
-                x = [r["update_s"] for r in group]
-                ax.plot(x, [r[key] for r in group], ".-", color=colour, label=f"{speed:g} m/s")
-                seen = [r[f"seen_{key}"] for r in group]
-                ax.plot(x, seen, ":", color=colour, linewidth=1.2)
-                top = best(group, key)
+                here = [r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None]
+                for effort in efforts:
+                    group = sorted((r for r in here if r["effort"] == effort), key=lambda r: r["update_s"])
+                    x = [r["update_s"] for r in group]
+                    y = [r[key] for r in group]
+                    if effort == main:
+                        ax.plot(x, y, ".-", color=colour, label=f"{speed:g} m/s")
+                        ax.plot(x, [r[f"seen_{key}"] for r in group], ":", color=colour, linewidth=1.2)
+                    else:
+                        ax.plot(x, y, "--", color=colour, linewidth=1.0, alpha=0.6)
+                top = best(here, key)
                 if top is not None:
                     ax.plot([top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=colour)
+            for effort in efforts:
+                ax.plot([], [], "-" if effort == main else "--", color=GREY, label=f"{effort} effort")
             ax.plot([], [], ":", color=GREY, label="seen on average,\nbetween updates too")
             ax.plot([], [], "o", markersize=10, mfc="none", color=GREY, label="best")
             last = key == panels[-1][0]

@@ -93,16 +93,22 @@ def ages(rows: Sequence[Row]) -> dict[str, Any]:
 
 def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     """{count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication,
-    undecodable}. ``edge``: the same as the edge knew it, for lines that were not written any more."""
+    undecodable}, and where the scenario sets one deadline_ms and met_share, of the updates within it.
+    ``edge``: the same as the edge knew it, for lines that were not written any more."""
     spent = _known(row.get("update_ms") for row in series)
     first = series[0]["t_s"] * 1e3 if series else None
-    return {
+    deadline_ms = _number(edge.get("deadline_ms"))
+    told = {
         "count": max(len(series), int(_number(edge.get("count")) or 0)),
         "ms_p50": float(np.percentile(spent, 50)) if spent else edge.get("ms_p50"),
         "ms_p95": float(np.percentile(spent, 95)) if spent else edge.get("ms_p95"),
         "first_ms": edge.get("first_ms", first),
         "undecodable": edge.get("undecodable"),
     }
+    if deadline_ms is not None:
+        met = [ms <= deadline_ms for ms in spent]
+        told |= {"deadline_ms": deadline_ms, "met_share": float(np.mean(met)) if met else None}
+    return told
 
 
 def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import pytest
 from edge_server.buffer import FrameBuffer
 from edge_server.fields import Budget
 from edge_server.loop import Loop, Updates
+from edge_server.pacing import Fixed
 from edge_server.scheduler import make_policy
 from freshfield.clock import WallClock
 from tests.edge_server.fields_for_tests import tiny_field
@@ -56,11 +57,11 @@ def test_an_empty_buffer_selects_nothing():
 class Running:
     """A loop on the wall clock, with what it published and said."""
 
-    def __init__(self, u: Updates, grace_ms: float = 0.0) -> None:
+    def __init__(self, u: Updates, grace_ms: float = 0.0, pacing=None) -> None:
         self.published, self.lines, self.saved = [], [], []
         self.clock = WallClock()
         self.loop = Loop(
-            u, self.clock, Budget(seconds=0.1), grace_ms,
+            u, self.clock, pacing or Fixed(100.0), grace_ms,
             lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append,
         )  # fmt: skip
 

@@ -13,6 +13,7 @@ from edge_server.offline import frontier, sweep
 from edge_server.offline.frontier_output import conclusion
 from edge_server.offline.update_time import Moving, Stage, mean_over_seeds, steps_for
 from edge_server.offline.virtual import Compute
+from edge_server.pacing import read_points
 from tests.edge_server.offline.sets import SMALL, SMALL_WORDS, write_photos
 
 TINY = Moving(cameras=4, size=32)
@@ -63,7 +64,7 @@ def test_seeds_are_averaged_with_their_standard_error():
     base = {
         "speed_m_per_s": 1.0, "planned_update_s": 0.5, "update_s": 0.5, "steps": 4, "updates": 2, "scored": 2,
         "aaoi_ms": 100.0, "psnr_moving_db": None, "ssim": 0.5, "lpips": None, "seen_psnr_db": 20.0,
-        "seen_psnr_moving_db": None,
+        "seen_psnr_moving_db": None, "effort": "low", "options": {"effort": "low"},
     }  # fmt: skip
     (row,) = mean_over_seeds([{**base, "psnr_db": 20.0}, {**base, "psnr_db": 22.0}])
     assert row["psnr_db"] == 21.0 and row["psnr_db_error"] == pytest.approx(1.0)
@@ -72,13 +73,19 @@ def test_seeds_are_averaged_with_their_standard_error():
 
 def test_the_conclusion_names_the_best_time_of_each_speed():
     def row(speed, update_s, whole, moving):
-        return {"speed_m_per_s": speed, "update_s": update_s, "psnr_db": whole, "psnr_moving_db": moving}
+        return {
+            "effort": "low", "speed_m_per_s": speed, "update_s": update_s, "psnr_db": whole,
+            "psnr_moving_db": moving,
+        }  # fmt: skip
 
     said = conclusion(
         [row(1.0, 0.1, 20, 18), row(1.0, 2.0, 22, 15), row(3.0, 0.1, 20, 17), row(3.0, 2.0, 19, 14)]
     )
-    assert "at 1 m/s 2.00 s for the whole image and 0.10 s where it moves (2.0 s costs 3.0 dB there)" in said
-    assert "at 3 m/s 0.10 s for the whole image" in said
+    assert (
+        "at 1 m/s 2.00 s (low) for the whole image and 0.10 s (low) where it moves (2.0 s costs 3.0 dB"
+        in said
+    )
+    assert "at 3 m/s 0.10 s (low) for the whole image" in said
 
 
 @pytest.fixture
@@ -102,7 +109,8 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
     assert set(data["ms_per_step"]) == {e.name for e in sweep.efforts("ngp", {}, knobs=False)}
     assert all(ms > 0 for ms in data["ms_per_step"].values())
     with (tmp_path / "updates.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 2
+        assert len(list(csv.DictReader(file))) == 4  # two efforts, two update times
+    assert {p.effort for p in read_points(tmp_path / "frontier.json", "ngp")} == {"low", "medium"}
 
     # As after Ctrl-C: what is finished is not measured again, the rest is, and nothing else has changed.
     points = data["points"]

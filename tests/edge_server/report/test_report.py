@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.report import build_report
 from edge_server.report.records import read_records
-from edge_server.report.report import METRICS, SERIES, assemble, fidelity
+from edge_server.report.report import METRICS, SERIES, assemble, fidelity, updates
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
 
 
@@ -177,3 +177,10 @@ def test_importing_the_books_loads_neither_matplotlib_nor_torch():
     code = "import sys, edge_server.report.report; print({'matplotlib', 'torch'} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "set()"
+
+
+def test_a_deadline_is_told_with_the_share_of_updates_that_met_it():
+    series = [{"t_s": float(i), "update_ms": ms} for i, ms in enumerate((80.0, 90.0, 100.0, 130.0))]
+    told = updates(series, {"deadline_ms": 100.0})
+    assert (told["deadline_ms"], told["met_share"]) == (100.0, 0.75)
+    assert "deadline_ms" not in updates(series, {})
