@@ -22,11 +22,12 @@ Measure this machine. Figures are medians; outside_cores says how many cores oth
   edge-server bench ingest --json ingest.json
 
 field      steps, rays and samples a second, ms a rendering, compile time, memory, seconds to 22..30 dB
+limits     what this machine allows (random reads and additions, multiply-adds), and how near each kernel gets
 ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
 fidelity   what scoring one image costs
 """
 
-PARTS = ("field", "ingest", "fidelity")
+PARTS = ("field", "limits", "ingest", "fidelity")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

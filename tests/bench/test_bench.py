@@ -37,6 +37,20 @@ def test_field(tmp_path):
 
 
 @pytest.mark.slow
+def test_limits(tmp_path):
+    found = bench("limits", tmp_path / "bench.json")
+    limits = found["machine"]
+    assert limits["reads_1mb_m_per_s"] > limits["reads_64mb_m_per_s"] > 0.0
+    assert limits["gemm_g_per_s"] > 1.0
+    for scene in ("tile", "room"):
+        kernels = found[scene]["kernels"]
+        assert sum(k["share"] for k in kernels.values()) == pytest.approx(
+            1.0 - found[scene]["outside_kernels_share"]
+        )
+        assert 0.0 < kernels["train_chunks"]["floor_share"] < 1.0  # faster than possible: a wrong count
+
+
+@pytest.mark.slow
 def test_ingest_answers_while_the_field_trains(tmp_path):
     found = bench("ingest", tmp_path / "bench.json")
     for figures in found.values():
