@@ -25,16 +25,22 @@ field      steps, rays and samples a second, ms a rendering, compile time, memor
 limits     what this machine allows (random reads and additions, multiply-adds), and how near each kernel gets
 ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
 fidelity   what scoring one image costs
+peer       seconds to 20 and 25 dB on lego and kitchen, beside nerfstudio's nerfacto where it is installed and
+           the same field in plain torch; needs FRESHFIELD_DATA; not part of all
 """
 
 PARTS = ("field", "limits", "ingest", "fidelity")
+# Not part of "all": needs recorded data, and patience.
+MORE = ("peer",)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server bench", description=DESCRIPTION, formatter_class=raw)
-    parser.add_argument("part", nargs="?", choices=(*PARTS, "all"), default="all", help="[%(default)s]")
+    parser.add_argument(
+        "part", nargs="?", choices=(*PARTS, *MORE, "all"), default="all", help="[%(default)s]"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions, cached kernels only")
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")

@@ -7,7 +7,9 @@ import json
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.offline import bench_peer
 from edge_server.offline.bench_ingest import CAMERAS, TARGET_P99_MS
+from tests.conftest import data_dir
 
 
 def bench(part: str, path) -> dict:
@@ -48,6 +50,16 @@ def test_limits(tmp_path):
             1.0 - found[scene]["outside_kernels_share"]
         )
         assert 0.0 < kernels["train_chunks"]["floor_share"] < 1.0  # faster than possible: a wrong count
+
+
+@pytest.mark.slow
+def test_peers_are_raced_on_recorded_data(tmp_path, monkeypatch):
+    monkeypatch.setenv("FRESHFIELD_DATA", str(data_dir("lego_synthetic").parent))
+    monkeypatch.setattr(bench_peer, "QUICK_S", 5.0)
+    monkeypatch.setattr(bench_peer, "_SCENES", {"lego": ("lego_synthetic", "8", 8.0)})
+    found = bench("peer", tmp_path / "bench.json")
+    assert found["lego"]["ngp"]["20_db_s"] < 5.0
+    assert found["lego"]["plain_torch"]["20_db_ratio"] > 1.0
 
 
 @pytest.mark.slow
