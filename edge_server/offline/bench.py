@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from edge_server.fields.registry import field_names
 from edge_server.offline.usage import BenchError
 from edge_server.report.machine import machine, versions
 
@@ -41,17 +42,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "part", nargs="?", choices=(*PARTS, *MORE, "all"), default="all", help="[%(default)s]"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write figures there; plot and table beside"
+    )
+    parser.add_argument(
+        "--field", action="append", default=[], metavar="NAME", help="of `field` [all there are]"
+    )
     parser.add_argument("--quick", action="store_true", help="fewer repetitions, cached kernels only")
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     args = parser.parse_args(argv)
+    if unknown := set(args.field) - set(field_names()):
+        parser.error(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
     figures: dict[str, Any] = {"machine": machine(), "versions": versions(), "quick": args.quick}
     for part in PARTS if args.part == "all" else (args.part,):
         print(f"== {part}", flush=True)
         with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
             module = importlib.import_module(f"edge_server.offline.bench_{part}")
             try:
-                figures[part] = module.measure(args.quick, Path(folder), args.lpips)
+                more = {"fields": args.field} if part == "field" else {}
+                figures[part] = module.measure(args.quick, Path(folder), args.lpips, **more)
             except BenchError as error:
                 print(f"edge-server bench {part}: {error}", file=sys.stderr)
                 return 1
@@ -60,6 +69,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.json is not None:  # after each part: an interrupted bench keeps what it has
             args.json.parent.mkdir(parents=True, exist_ok=True)
             args.json.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+            if hasattr(module, "draw"):
+                module.draw(figures[part], args.json.with_suffix(".png"))
+                args.json.with_suffix(".md").write_text(module.table(figures[part]) + "\n")
     return 0
 
 

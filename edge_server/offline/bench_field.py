@@ -1,4 +1,9 @@
-"""How fast the field is: steps, rays, samples, renderings, compilation, memory, seconds to a quality."""
+"""How fast each representation is: seconds to a quality from scratch, rates, renderings, compilation, memory.
+
+Every point is a field of its own, fitted from scratch for a planned time, since a fit plans its learning
+rate by its time; the score is of cameras that were held out. Beside every scene stands what no field is
+needed for: the mean colour of the training images, and the training image nearest to each held-out camera.
+"""
 
 from __future__ import annotations
 
@@ -8,78 +13,162 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from edge_server.fidelity.psnr import psnr
+from camera_node.sources.records import DatasetError
+from edge_server.fidelity.baselines import baseline
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field
-from edge_server.offline.still import Still, synthetic
+from edge_server.fields.registry import field_names, make_field
+from edge_server.offline.fitting import evaluate
+from edge_server.offline.still import Still, open_still, synthetic
 from edge_server.offline.usage import Usage, peak_rss_mb
 from freshfield.geometry import Pinhole
 
-FIELD = "ngp"
 VIEWS, SIZE = 18, 128
 TARGETS_DB = (22, 25, 28, 30)
-_FIRST_SLICE_S, _GROWTH = 0.25, 1.25
 
 
-def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
-    """All figures of the field; ``folder`` takes a fresh kernel cache."""
-    del lpips  # fidelity is not measured here
-    figures: dict[str, Any] = {"start": _start_up(quick, folder)}
-    for name in ("tile", "room"):
-        still = synthetic(name, cameras=VIEWS + 1, size=SIZE)
-        figures[name] = {
-            **_speed(still, repeats=3 if quick else 9),
-            "seconds_to_db": _seconds_to(still, limit_s=8.0 if quick else 40.0),
+@dataclass(frozen=True)
+class Effort:
+    """planned_s: fitting times, each from scratch, on the synthetic scenes and on the recorded ones."""
+
+    seeds: int
+    planned_s: tuple[float, ...]
+    recorded_s: tuple[float, ...]
+    rate_repeats: int
+
+
+FULL = Effort(5, (0.25, 0.5, 1.0, 1.5, 2.5, 4.0, 8.0, 15.0), (2.0, 5.0, 15.0, 60.0), 9)
+QUICK = Effort(1, (0.5, 1.0, 2.5, 8.0), (2.0, 5.0), 3)
+
+# Under the data folder: file or folder, what is held out, by what its images are divided.
+_RECORDED = {
+    "kitchen": ("blender_kitchen/transforms.json", "cam00", 1.0),
+    "lego": ("lego_synthetic", "8", 1.0),
+    "fox": ("fox/transforms_2.json", "8", 2.0),
+}
+
+
+def measure(
+    quick: bool, folder: Path, lpips: Path | None = None, fields: Sequence[str] = ()
+) -> dict[str, Any]:
+    """All figures of ``fields`` (default: all there are); ``folder`` takes a fresh kernel cache.
+
+    {start: {field: jit, memory}, SCENE: {scene, baseline, FIELD: {series, seconds_to_db, rates}}}; recorded
+    scenes where FRESHFIELD_DATA names their folder.
+    """
+    effort, names = QUICK if quick else FULL, tuple(fields) or field_names()
+    scorer_lpips, missing = open_lpips(lpips)
+    figures: dict[str, Any] = {"lpips_missing": missing}
+    figures["start"] = {name: _start_up(name, quick, folder / name) for name in names}
+    for scene in ("tile", "room"):
+        still = synthetic(scene, cameras=VIEWS + 1, size=SIZE)
+        rows = {
+            name: {
+                **_curve(name, still, effort.planned_s, effort.seeds, scorer_lpips),
+                **_rates(name, still, effort.rate_repeats),
+            }
+            for name in names
         }
+        figures[scene] = {"scene": still.describe(), "baseline": _baseline(still), **rows}
+    for scene, still in _recorded_scenes():
+        rows = {name: _curve(name, still, effort.recorded_s, 1, scorer_lpips) for name in names}
+        figures[scene] = {"scene": still.describe(), "baseline": _baseline(still), **rows}
     return figures
 
 
-def _new_field() -> Field:
-    from edge_server.fields.registry import make_field
+def _recorded_scenes() -> Iterable[tuple[str, Still]]:
+    data = os.environ.get("FRESHFIELD_DATA")
+    if not data:
+        print("  FRESHFIELD_DATA is not set: recorded scenes are left out", flush=True)
+        return
+    for scene, (path, holdout, scale) in _RECORDED.items():
+        try:
+            yield scene, open_still(str(Path(data) / path), holdout=holdout, scale=scale)
+        except DatasetError as error:
+            print(f"  {scene} left out: {error}", flush=True)
 
-    return make_field(FIELD)
 
-
-def _start_up(quick: bool, folder: Path) -> dict[str, Any]:
+def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
     """Compile times and memory, each in a process of its own, cold with an empty kernel cache."""
     usage = Usage("bench")
     figures = {}
     if not quick:
-        figures["jit_cold_s"] = _child(folder / "numba")["jit_s"]
-        cached = _child(folder / "numba")
+        cold = _child(field, folder)
+        figures["jit_cold_s"], figures["jit_cold_cpu_s"] = cold["jit_s"], cold["jit_cpu_s"]
+        cached = _child(field, folder)
     else:
-        _child(None)  # fills the cache if nobody has
-        cached = _child(None)
+        _child(field, None)  # fills the cache if nobody has
+        cached = _child(field, None)
     figures["jit_cached_s"] = cached["jit_s"]
     figures["peak_rss_mb"] = cached["peak_rss_mb"]
     figures["machine_cores_busy"] = usage.row(0.0).get("machine", {}).get("cpu")
     return figures
 
 
-def _child(cache: Path | None) -> dict[str, float]:
+def _child(field: str, cache: Path | None) -> dict[str, float]:
     environment = dict(os.environ) if cache is None else {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, "-m", "edge_server.offline.bench_field"]
+    command = [sys.executable, "-m", "edge_server.offline.bench_field", field]
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 
-def _speed(still: Still, repeats: int) -> dict[str, Any]:
+def _curve(field: str, still: Still, planned_s: Sequence[float], seeds: int, lpips: Any) -> dict[str, Any]:
+    """Fidelity against seconds from scratch: medians over seeds, and the first planned time whose median
+    reaches each quality (None: none did)."""
+    make_field(field).warm_up()
+    usage, series = Usage("bench"), []
+    for seconds in planned_s:
+        points = [_point(field, still, seconds, seed, lpips) for seed in range(seeds)]
+        row: dict[str, Any] = {"seconds": seconds}
+        for name in ("fitted_s", "steps", "psnr_db", "ssim", "lpips"):
+            known = [p[name] for p in points if p[name] is not None]
+            row[name] = statistics.median(known) if known else None
+        row["psnr_db_range"] = max(p["psnr_db"] for p in points) - min(p["psnr_db"] for p in points)
+        series.append(row)
+        print(f"  {field:10} {still.name:8} {seconds:6.2f} s  PSNR {row['psnr_db']:5.2f} dB", flush=True)
+    return {
+        "seeds": seeds,
+        "series": {f"{row['seconds']:g}_s": row for row in series},
+        "seconds_to_db": {
+            f"{target}_db": next((r["seconds"] for r in series if r["psnr_db"] >= target), None)
+            for target in TARGETS_DB
+        },
+        "best_db": max(row["psnr_db"] for row in series),
+        "outside_cores": usage.outside(usage.row(0.0)),
+    }
+
+
+def _point(field: str, still: Still, seconds: float, seed: int, lpips: Any) -> dict[str, Any]:
+    model = make_field(field, seed=seed)
+    report = model.fit(still.training, Budget(seconds=seconds))
+    score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
+    return {
+        "fitted_s": report.seconds, "steps": report.steps, "psnr_db": score.psnr_db, "ssim": score.ssim,
+        "lpips": score.lpips,
+    }  # fmt: skip
+
+
+def _rates(field: str, still: Still, repeats: int) -> dict[str, Any]:
     """Rates of a field that has settled, and milliseconds of a rendering."""
-    field = _new_field()
-    field.fit(still.training, Budget(seconds=3.0))
+    model = make_field(field)
+    model.fit(still.training, Budget(seconds=3.0))
     usage = Usage("bench")
-    reports = [field.fit(still.training, Budget(seconds=1.0)) for _ in range(repeats)]
+    reports = [model.fit(still.training, Budget(seconds=1.0)) for _ in range(repeats)]
     outside = usage.outside(usage.row(0.0))
     pose, lens = still.held_out[0].camera_to_world, still.held_out[0].intrinsics
     return {
         "steps_per_s": statistics.median(r.steps / r.seconds for r in reports),
         "rays_per_s": statistics.median(r.rays / r.seconds for r in reports),
         "samples_per_s": statistics.median(r.samples / r.seconds for r in reports),
-        "outside_cores": outside,
-        **{f"render_{w}_ms": _render_ms(field, pose, lens.scaled(w / lens.width)) for w in (128, 256)},
+        "rates_outside_cores": outside,
+        **{f"render_{w}_ms": _render_ms(model, pose, lens.scaled(w / lens.width)) for w in (128, 256)},
     }
 
 
@@ -92,42 +181,61 @@ def _render_ms(field: Field, pose: Any, lens: Pinhole, repeats: int = 11) -> flo
     return statistics.median(spent)
 
 
-def _seconds_to(still: Still, limit_s: float) -> dict[str, Any]:
-    """Seconds of fitting from scratch until the held-out view first reaches each quality; None: not within
-    ``limit_s``. Fitted in growing slices, each of which ends with a settled field."""
-    field, truth = _new_field(), still.held_out[0]
-    usage = Usage("bench")
-    reached: dict[int, float | None] = dict.fromkeys(TARGETS_DB)
-    spent, slice_s, best = 0.0, _FIRST_SLICE_S, 0.0
-    while spent < limit_s and best < TARGETS_DB[-1]:
-        spent += field.fit(still.training, Budget(seconds=slice_s)).seconds
-        slice_s *= _GROWTH
-        score = psnr(field.render(truth.camera_to_world, truth.intrinsics).color, truth.image)
-        best = max(best, score or 0.0)
-        for target in TARGETS_DB:
-            if best >= target and reached[target] is None:
-                reached[target] = spent
+def _baseline(still: Still) -> dict[str, float | None]:
+    """Means over the held-out cameras."""
+    found = [baseline(still.training, v.image, v.camera_to_world, still.background) for v in still.held_out]
     return {
-        **{f"{target}_db": seconds for target, seconds in reached.items()},
-        "best_db": best,
-        "within_s": spent,
-        "outside_cores": usage.outside(usage.row(0.0)),
+        name: statistics.fmean(getattr(b, name) for b in found)
+        for name in ("mean_colour_db", "nearest_view_db")
     }
 
 
-def _main() -> None:
+def draw(figures: dict[str, Any], path: Path) -> None:
+    """PSNR against seconds from scratch, a panel a scene, a line a representation, to ``path`` (PNG)."""
+    from edge_server.report.style import CYCLE, GREY, figure, label_lines
+
+    scenes = [name for name, part in figures.items() if isinstance(part, dict) and "baseline" in part]
+    with figure(path, len(scenes), height_inch=2.4) as (_, axes):
+        for ax, scene in zip(axes[:, 0], scenes):
+            part = figures[scene]
+            names = [n for n, rows in part.items() if isinstance(rows, dict) and "series" in rows]
+            for colour, name in zip(CYCLE, names):
+                rows = list(part[name]["series"].values())
+                ax.plot(
+                    [r["seconds"] for r in rows], [r["psnr_db"] for r in rows], ".-", color=colour, label=name
+                )
+            known = [v for v in part["baseline"].values() if v is not None]
+            ax.axhline(max(known), color=GREY, linestyle=":", linewidth=1.2, label="needs no field")
+            ax.set_xscale("log")
+            last = scene == scenes[-1]
+            label_lines(ax, "PSNR (dB)", "seconds of fitting from scratch" if last else None, part["scene"])
+
+
+def table(figures: dict[str, Any]) -> str:
+    """The scenes' curves as one Markdown table."""
+    lines = ["| scene | representation | seconds: PSNR dB | baselines dB |", "|---|---|---|---|"]
+    for scene, part in figures.items():
+        if not isinstance(part, dict) or "baseline" not in part:
+            continue
+        bases = ", ".join("-" if v is None else f"{v:.1f}" for v in part["baseline"].values())
+        for name, rows in part.items():
+            if isinstance(rows, dict) and "series" in rows:
+                points = ", ".join(f"{r['seconds']:g}: {r['psnr_db']:.1f}" for r in rows["series"].values())
+                lines.append(f"| {scene} | {name} | {points} | {bases} |")
+    return "\n".join(lines)
+
+
+def _main(field: str) -> None:
     """In a process of its own: the time until kernels are ready, and what fitting takes of memory."""
-    field = _new_field()
-    began = time.perf_counter()
-    warm_up = getattr(field, "warm_up", None)
-    if warm_up is not None:
-        warm_up()
-    jit_s = time.perf_counter() - began
+    model = make_field(field)
+    began, cpu = time.perf_counter(), time.process_time()
+    model.warm_up()
+    jit_s, jit_cpu_s = time.perf_counter() - began, time.process_time() - cpu
     still = synthetic("tile", cameras=VIEWS + 1, size=SIZE)
-    field.fit(still.training, Budget(steps=20))
-    field.render(still.held_out[0].camera_to_world, still.held_out[0].intrinsics)
-    print(json.dumps({"jit_s": jit_s, "peak_rss_mb": peak_rss_mb()}))
+    model.fit(still.training, Budget(steps=20))
+    model.render(still.held_out[0].camera_to_world, still.held_out[0].intrinsics)
+    print(json.dumps({"jit_s": jit_s, "jit_cpu_s": jit_cpu_s, "peak_rss_mb": peak_rss_mb()}))
 
 
 if __name__ == "__main__":
-    _main()
+    _main(sys.argv[1])

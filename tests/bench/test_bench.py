@@ -7,13 +7,13 @@ import json
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.offline import bench_peer
+from edge_server.offline import bench_field, bench_peer
 from edge_server.offline.bench_ingest import CAMERAS, TARGET_P99_MS
 from tests.conftest import data_dir
 
 
-def bench(part: str, path) -> dict:
-    assert edge_server(["bench", part, "--quick", "--json", str(path)]) == 0
+def bench(part: str, path, *words: str) -> dict:
+    assert edge_server(["bench", part, "--quick", "--json", str(path), *words]) == 0
     found: dict = json.loads(path.read_text())
     assert found["machine"]["cores"] >= 1 and found["quick"] is True
     return found[part]
@@ -27,15 +27,25 @@ def test_fidelity(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_field(tmp_path):
-    found = bench("field", tmp_path / "bench.json")
-    assert found["start"]["peak_rss_mb"] > 50.0
+def test_field(tmp_path, monkeypatch):
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(1, (0.3, 2.0), (2.0,), 1))
+    found = bench("field", tmp_path / "bench.json", "--field", "ngp")
+    assert found["start"]["ngp"]["peak_rss_mb"] > 50.0
     for scene in ("tile", "room"):
-        assert (
-            found[scene]["steps_per_s"] > 0.0 and found[scene]["samples_per_s"] > found[scene]["rays_per_s"]
-        )
-        assert found[scene]["render_128_ms"] < found[scene]["render_256_ms"]
-    assert found["tile"]["seconds_to_db"]["best_db"] > 20.0
+        row = found[scene]["ngp"]
+        assert row["steps_per_s"] > 0.0 and row["samples_per_s"] > row["rays_per_s"]
+        assert row["render_128_ms"] < row["render_256_ms"]
+        assert row["best_db"] > found[scene]["baseline"]["mean_colour_db"]
+    assert found["tile"]["ngp"]["best_db"] > 18.0
+    assert (tmp_path / "bench.png").stat().st_size > 1000
+    assert "| tile | ngp | 0.3: " in (tmp_path / "bench.md").read_text()
+
+
+def test_a_field_that_does_not_exist_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        edge_server(["bench", "field", "--field", "splot"])
+    assert "no field is called splot; there are: ngp" in capsys.readouterr().err
 
 
 @pytest.mark.slow
