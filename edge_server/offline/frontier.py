@@ -19,6 +19,7 @@ from camera_node.sources.records import DatasetError
 from camera_node.world.scene import SCENES, SceneError
 from edge_server.fidelity.lpips import Lpips
 from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fields.registry import field_names
 from edge_server.offline import sweep, update_time
 from edge_server.offline.fit import FitError, parse_options
 from edge_server.offline.frontier_output import write_output
@@ -34,7 +35,7 @@ What accuracy costs in time, in two figures.
 
   edge-server frontier --quick --out runs/frontier
   edge-server frontier --scene room --seeds 3 --lpips ~/data/lpips
-  edge-server frontier --scene ~/data/lego --scale 2 --holdout 8
+  edge-server frontier --scene ~/data/lego --scale 2 --holdout 8 --field all
 
 1. From scratch: effort levels of the field against seconds of fitting, on a camera that was held out: PSNR,
    SSIM and LPIPS, the Pareto front marked. What a step costs on this machine is measured on the way.
@@ -122,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--holdout", default="8", metavar="K|NAME,...", help="of a data set, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="of a data set, as in fit [%(default)g]")
     add("--frame", type=int, default=0, metavar="N", help="of a data set, as in fit [%(default)s]")
-    add("--field", default="ngp", help="representation [%(default)s]")
+    add("--field", metavar="NAME,...|all", default="ngp", help="representations [%(default)s]")
     add("--option", action="append", default=[], metavar="KEY=VALUE", help="setting of the field")
     add("--policy", default="all", metavar="NAME[:VALUE]", help="of figure 2 [%(default)s]")
     add("--seeds", type=int, metavar="N", help="repetitions [1 with --quick, else 3]")
@@ -142,13 +143,17 @@ def _job(args: argparse.Namespace, plan: Plan) -> Frontier:
         if args.seeds < 1:
             raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
         plan = replace(plan, seeds=args.seeds)
-    levels = sweep.efforts(args.field, parse_options(args.option), plan.knobs)
+    fields = field_names() if args.field == "all" else tuple(args.field.split(","))
+    if unknown := set(fields) - set(field_names()):
+        raise ValueError(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
+    options = parse_options(args.option)
+    levels = [level for field in fields for level in sweep.efforts(field, options, plan.knobs)]
     still = open_still(args.scene, plan.size, args.holdout, args.scale, args.frame)
     args.out.mkdir(parents=True, exist_ok=True)
     store = Store(args.out / "frontier.json", args.fresh)
     lpips, missing = open_lpips(args.lpips)
     return Frontier(
-        args.out, store, plan, still, args.scene, args.field, levels, lpips, missing, args.seed, args.points
+        args.out, store, plan, still, args.scene, fields, levels, lpips, missing, args.seed, args.points
     )
 
 
@@ -189,7 +194,7 @@ class Frontier:
     plan: Plan
     still: Still
     scene: str
-    field: str
+    fields: tuple[str, ...]
     levels: list[sweep.Effort]
     lpips: Lpips | None
     lpips_missing: str | None
@@ -209,7 +214,7 @@ class Frontier:
             print(f"figure 2 left out: {_why_still(self.scene)}", flush=True)
         self.store.write(
             scene=self.still.describe(),
-            field=self.field,
+            fields=list(self.fields),
             policy=self.plan.moving.policy,
             channel=self.plan.moving.channel,
             lpips_network=self.lpips.network if self.lpips else None,
@@ -223,7 +228,8 @@ class Frontier:
         )
         print(write_output(self.out, self.store.data), flush=True)
         if self.points is not None:
-            whence = {key: self.store.data[key] for key in ("scene", "field", "policy", "channel", "machine")}
+            told = ("scene", "fields", "policy", "channel", "machine")
+            whence = {key: self.store.data[key] for key in told}
             write_json(self.points, {**whence, "updates": updates})
         print(f"{self.store.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
 
@@ -236,29 +242,28 @@ class Frontier:
         points = []
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
-                "figure": 1, "scene": self.still.describe(), "field": self.field, "options": effort.options,
+                "figure": 1, "scene": self.still.describe(), "field": effort.field,
+                "options": effort.options, "divided": effort.divided,
                 "seconds": planned_s, "seed": seed, "lpips": self.lpips is not None,
             }  # fmt: skip
-            measure = partial(
-                sweep.fit_from_scratch, self.field, effort, self.still, planned_s, seed, self.lpips
-            )
+            measure = partial(sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
             point, new = self.store.get(settings, measure)
-            points.append({**point, "planned_s": planned_s, "effort": effort.name})
+            points.append({**point, "planned_s": planned_s, "effort": effort.label})
             print(
-                f"[{number}/{len(todo)}] {effort.name:14} {planned_s:5.2f} s {point['steps']:6d} steps  "
+                f"[{number}/{len(todo)}] {effort.label:22} {planned_s:5.2f} s {point['steps']:6d} steps  "
                 f"PSNR {_db(point['psnr_db'])}{_known(new)}",
                 flush=True,
             )
         return points
 
     def _updates(self, costs: dict[str, dict[str, float]]) -> list[Row]:
-        efforts = [e for e in self.levels if e.name in self.plan.efforts] or self.levels[:1]
+        efforts = [e for e in self.levels if e.live and e.name in (*self.plan.efforts, "default")]
         rows: list[Row] = []
         total = len(efforts) * len(self.plan.speeds) * len(self._seeds) * len(self.plan.update_s)
         for effort in efforts:
-            compute = Compute(**{name: round(value, 3) for name, value in costs[effort.name].items()})
+            compute = Compute(**{name: round(value, 3) for name, value in costs[effort.label].items()})
             print(
-                f"moving scene in virtual time, {effort.name}: a step is charged "
+                f"moving scene in virtual time, {effort.label}: a step is charged "
                 f"{compute.ms_per_step:.1f} ms, an update {compute.ms_per_update:.1f} ms",
                 flush=True,
             )
@@ -278,11 +283,11 @@ class Frontier:
             settings, measure = self._update_point(stage, speed, effort, seed, update_s, compute)
             point, new = self.store.get(settings, measure)
             rows.append({
-                **point, "effort": effort.name, "options": effort.options, "speed_m_per_s": speed,
-                "planned_update_s": update_s, "seed": seed,
+                **point, "field": effort.field, "effort": effort.name, "options": effort.options,
+                "speed_m_per_s": speed, "planned_update_s": update_s, "seed": seed,
             })  # fmt: skip
             print(
-                f"[{done + len(rows)}/{total}] {effort.name:8} {speed:g} m/s, "
+                f"[{done + len(rows)}/{total}] {effort.label:16} {speed:g} m/s, "
                 f"update {point['update_s']:5.2f} s  "
                 f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
                 flush=True,
@@ -291,7 +296,7 @@ class Frontier:
 
     def _stage(self, speed: float, effort: sweep.Effort, seed: int) -> update_time.Stage:
         plan = self.plan
-        return update_time.Stage(plan.moving, speed, self.field, effort.options, seed, plan.warm_steps)
+        return update_time.Stage(plan.moving, speed, effort.field, effort.options, seed, plan.warm_steps)
 
     def _update_point(
         self,
@@ -307,7 +312,7 @@ class Frontier:
         seconds = max(plan.run_s, 6.0 * update_s)
         steps = update_time.steps_for(update_s, compute)
         settings: Row = {
-            "figure": 2, **asdict(plan.moving), "speed_m_per_s": speed, "field": self.field,
+            "figure": 2, **asdict(plan.moving), "speed_m_per_s": speed, "field": effort.field,
             "options": effort.options, "warm_steps": plan.warm_steps, "steps": steps, "seed": seed,
             "seconds": seconds, "compute": asdict(compute), "lpips": self.lpips is not None,
         }  # fmt: skip

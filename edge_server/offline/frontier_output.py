@@ -32,10 +32,10 @@ def write_output(out: Path, data: Row) -> str:
 
 def table(rows: Sequence[Row]) -> str:
     """Effort levels by seconds: PSNR, SSIM, LPIPS; a star marks the Pareto front."""
-    lines = [f"{'effort':14} {'seconds':>8} {'steps':>6} {'ms/step':>8} {'PSNR':>7} {'SSIM':>6} {'LPIPS':>6}"]
+    lines = [f"{'effort':22} {'seconds':>8} {'steps':>6} {'ms/step':>8} {'PSNR':>7} {'SSIM':>6} {'LPIPS':>6}"]
     for row in rows:
         lines.append(
-            f"{row['effort']:14} {row['seconds']:8.2f} {row['steps']:6.0f} {row['ms_per_step']:8.2f} "
+            f"{row['effort']:22} {row['seconds']:8.2f} {row['steps']:6.0f} {row['ms_per_step']:8.2f} "
             f"{row['psnr_db']:7.2f} {_n(row['ssim'])} {_n(row['lpips'])} {'*' if row['on_front'] else ''}"
         )
     return "\n".join([*lines, "* on the Pareto front: nothing measured is both faster and more accurate"])
@@ -45,13 +45,13 @@ def updates_table(rows: Sequence[Row]) -> str:
     """Fidelity at the present by speed and seconds an update takes."""
     names = ("PSNR", "moving", "seen", "moving")
     lines = [
-        f"{'effort':10} {'speed':>8} {'update':>8} {'steps':>6} {'aAoI':>9} "
+        f"{'field, effort':16} {'speed':>8} {'update':>8} {'steps':>6} {'aAoI':>9} "
         + " ".join(f"{n:>7}" for n in names)
     ]
     for row in rows:
         numbers = [row[k] for k in ("psnr_db", "psnr_moving_db", "seen_psnr_db", "seen_psnr_moving_db")]
         lines.append(
-            f"{row['effort']:10} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
+            f"{_who(row):16} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
             f"{row['aaoi_ms']:6.0f} ms " + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
         )
     return "\n".join([*lines, "seen: what a viewer sees on average, between publications too"])
@@ -65,11 +65,11 @@ def conclusion(rows: Sequence[Row]) -> str:
         whole, moving = best(group, "psnr_db"), best(group, "psnr_moving_db")
         if whole is None or moving is None:
             continue
-        longest = max((r for r in group if r["effort"] == moving["effort"]), key=lambda row: row["update_s"])
+        longest = max((r for r in group if _who(r) == _who(moving)), key=lambda row: row["update_s"])
         lost = moving["psnr_moving_db"] - (longest["psnr_moving_db"] or moving["psnr_moving_db"])
         parts.append(
-            f"at {speed:g} m/s {whole['update_s']:.2f} s ({whole['effort']}) for the whole image and "
-            f"{moving['update_s']:.2f} s ({moving['effort']}) where it moves "
+            f"at {speed:g} m/s {whole['update_s']:.2f} s ({_who(whole)}) for the whole image and "
+            f"{moving['update_s']:.2f} s ({_who(moving)}) where it moves "
             f"({longest['update_s']:.1f} s costs {lost:.1f} dB there)"
         )
     return "Best time to spend on an update: " + "; ".join(parts) + "."
@@ -109,15 +109,15 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
     """Fidelity at the present against seconds an update takes, for each speed; the best one marked. The
     highest effort measured is drawn out, others dashed and without what is seen between updates."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
-    efforts = list(dict.fromkeys(row["effort"] for row in rows))
-    main = efforts[-1] if "medium" not in efforts else "medium"
+    efforts = list(dict.fromkeys(_who(row) for row in rows))
+    main = next((name for name in efforts if name.endswith("medium")), efforts[-1])
     panels = (("psnr_moving_db", "PSNR where it moves (dB)"), ("psnr_db", "PSNR, whole image (dB)"))
     with figure(path, len(panels), height_inch=3.0, sharex=True) as (_, axes):
         for ax, (key, label) in zip(axes[:, 0], panels):
             for colour, speed in zip(CYCLE, speeds):
                 here = [r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None]
                 for effort in efforts:
-                    group = sorted((r for r in here if r["effort"] == effort), key=lambda r: r["update_s"])
+                    group = sorted((r for r in here if _who(r) == effort), key=lambda r: r["update_s"])
                     x = [r["update_s"] for r in group]
                     y = [r[key] for r in group]
                     if effort == main:
@@ -129,7 +129,7 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
                 if top is not None:
                     ax.plot([top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=colour)
             for effort in efforts:
-                ax.plot([], [], "-" if effort == main else "--", color=GREY, label=f"{effort} effort")
+                ax.plot([], [], "-" if effort == main else "--", color=GREY, label=effort)
             ax.plot([], [], ":", color=GREY, label="seen on average,\nbetween updates too")
             ax.plot([], [], "o", markersize=10, mfc="none", color=GREY, label="best")
             last = key == panels[-1][0]
@@ -152,6 +152,10 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer = csv.DictWriter(file, list(flat[0]))
         writer.writeheader()
         writer.writerows(flat)
+
+
+def _who(row: Row) -> str:
+    return f"{row['field']} {row['effort']}"
 
 
 def _n(value: float | None) -> str:

@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
+import numpy as np
+
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
-from edge_server.fields import Budget, Field
+from edge_server.fields import Budget, Field, View
 from edge_server.offline.fitting import evaluate
 from edge_server.offline.still import Still
 from edge_server.offline.usage import Usage
@@ -34,27 +37,57 @@ _KNOBS: dict[str, dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Effort:
-    """A named way to spend time. options: of the field."""
+    """A named way to spend time. field: the representation. options: its settings. divided: training images
+    are divided by this; the score is always of the full ones. live: tried on the moving scene, too."""
 
+    field: str
     name: str
     options: dict[str, Any]
+    divided: float = 1.0
+    live: bool = True
+
+    @property
+    def label(self) -> str:
+        return f"{self.field} {self.name}"
 
 
 def efforts(field: str, options: dict[str, Any], knobs: bool) -> list[Effort]:
-    """The field's effort levels, cheapest first; with ``knobs`` also each knob turned alone. ``options``
-    apply to all of them."""
-    levels: list[Effort] = [Effort("default", dict(options))]
+    """The field's effort levels, cheapest first; with ``knobs`` also images of half the size, and each knob
+    turned alone. ``options`` apply to all of them."""
+    levels: list[Effort] = [Effort(field, "default", dict(options))]
     if field in _EFFORTS:
         module, _, name = _EFFORTS[field].partition(":")
         known = getattr(importlib.import_module(module), name)
-        levels = [Effort(level, {"effort": level, **options}) for level in known]
+        levels = [Effort(field, level, {"effort": level, **options}) for level in known]
     if knobs:
-        levels += [Effort(n, {**turned, **options}) for n, turned in _KNOBS.get(field, {}).items()]
+        levels += [replace(e, name=f"{e.name}, half size", divided=2.0, live=False) for e in levels]
+        levels += [
+            Effort(field, n, {**turned, **options}, live=False) for n, turned in _KNOBS.get(field, {}).items()
+        ]
     return levels
 
 
+def shrunk(views: Sequence[View], divided: float) -> tuple[View, ...]:
+    """The same views with images and lenses divided by ``divided``; alpha weighs what it covers."""
+    if divided == 1.0:
+        return tuple(views)
+    small = []
+    for view in views:
+        lens = view.intrinsics.scaled(1.0 / divided)
+        image = view.image.astype(np.float32)
+        if image.shape[2] == 4:
+            image[..., :3] *= image[..., 3:] / 255.0
+        size = (lens.width, lens.height)
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        if image.shape[2] == 4:
+            image[..., :3] *= 255.0 / np.maximum(image[..., 3:], 1e-3)
+        pixels = np.clip(image + 0.5, 0.0, 255.0).astype(np.uint8)
+        small.append(replace(view, image=pixels, intrinsics=lens))
+    return tuple(small)
+
+
 def fit_from_scratch(
-    field: str, effort: Effort, still: Still, seconds: float, seed: int, lpips: PerceptualMetric | None
+    effort: Effort, still: Still, seconds: float, seed: int, lpips: PerceptualMetric | None
 ) -> dict[str, Any]:
     """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost.
 
@@ -63,7 +96,8 @@ def fit_from_scratch(
     """
     from edge_server.fields.registry import make_field
 
-    model = make_field(field, effort.options, seed=seed)
+    model = make_field(effort.field, effort.options, seed=seed)
+    still = replace(still, training=shrunk(still.training, effort.divided))
     warm_up = getattr(model, "warm_up", None)
     if warm_up is not None:
         warm_up()
@@ -73,7 +107,7 @@ def fit_from_scratch(
     score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
     ms_per_step = 1e3 * report.seconds / max(report.steps, 1)
     return {
-        "effort": effort.name,
+        "effort": effort.label,
         "seconds": report.seconds,
         "steps": report.steps,
         "ms_per_step": ms_per_step,

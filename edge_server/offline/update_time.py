@@ -146,16 +146,16 @@ def best(rows: list[dict[str, Any]], metric: str = "psnr_moving_db") -> dict[str
 
 
 def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of the same ``effort``, ``speed_m_per_s`` and ``planned_update_s`` as the mean of their seeds,
-    with the standard error of the two PSNRs (None for a single seed)."""
-    groups: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
+    """Rows of the same field, effort, speed and planned update time as the mean of their seeds, with the
+    standard error of the two PSNRs (None for a single seed)."""
+    groups: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
     for row in rows:
-        key = (row["effort"], row["speed_m_per_s"], row["planned_update_s"])
+        key = (row["field"], row["effort"], row["speed_m_per_s"], row["planned_update_s"])
         groups.setdefault(key, []).append(row)
     means = []
-    for (effort, speed, planned_s), group in groups.items():
+    for (field, effort, speed, planned_s), group in groups.items():
         row = {
-            "effort": effort, "options": group[0]["options"], "speed_m_per_s": speed,
+            "field": field, "effort": effort, "options": group[0]["options"], "speed_m_per_s": speed,
             "planned_update_s": planned_s, "seeds": len(group),
         }  # fmt: skip
         for name in ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, *SEEN):

@@ -6,11 +6,13 @@ import csv
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.offline import frontier, sweep
 from edge_server.offline.frontier_output import conclusion
+from edge_server.offline.still import synthetic
 from edge_server.offline.update_time import Moving, Stage, mean_over_seeds, steps_for
 from edge_server.offline.virtual import Compute
 from edge_server.pacing import read_points
@@ -64,7 +66,8 @@ def test_seeds_are_averaged_with_their_standard_error():
     base = {
         "speed_m_per_s": 1.0, "planned_update_s": 0.5, "update_s": 0.5, "steps": 4, "updates": 2, "scored": 2,
         "aaoi_ms": 100.0, "psnr_moving_db": None, "ssim": 0.5, "lpips": None, "seen_psnr_db": 20.0,
-        "seen_psnr_moving_db": None, "effort": "low", "options": {"effort": "low"},
+        "seen_psnr_moving_db": None, "field": "ngp", "effort": "low",
+        "options": {"effort": "low"},
     }  # fmt: skip
     (row,) = mean_over_seeds([{**base, "psnr_db": 20.0}, {**base, "psnr_db": 22.0}])
     assert row["psnr_db"] == 21.0 and row["psnr_db_error"] == pytest.approx(1.0)
@@ -74,18 +77,30 @@ def test_seeds_are_averaged_with_their_standard_error():
 def test_the_conclusion_names_the_best_time_of_each_speed():
     def row(speed, update_s, whole, moving):
         return {
-            "effort": "low", "speed_m_per_s": speed, "update_s": update_s, "psnr_db": whole,
+            "field": "ngp", "effort": "low", "speed_m_per_s": speed, "update_s": update_s, "psnr_db": whole,
             "psnr_moving_db": moving,
         }  # fmt: skip
 
     said = conclusion(
         [row(1.0, 0.1, 20, 18), row(1.0, 2.0, 22, 15), row(3.0, 0.1, 20, 17), row(3.0, 2.0, 19, 14)]
     )
-    assert (
-        "at 1 m/s 2.00 s (low) for the whole image and 0.10 s (low) where it moves (2.0 s costs 3.0 dB"
-        in said
-    )
-    assert "at 3 m/s 0.10 s (low) for the whole image" in said
+    assert "at 1 m/s 2.00 s (ngp low) for the whole image and 0.10 s (ngp low) where it moves (2.0 s" in said
+    assert "at 3 m/s 0.10 s (ngp low) for the whole image" in said
+
+
+def test_images_of_half_the_size_keep_what_a_camera_sees():
+    still = synthetic("tile", cameras=3, size=32)
+    (small, *_) = sweep.shrunk(still.training, 2.0)
+    view = still.training[0]
+    assert small.image.shape == (16, 16, 3) and small.intrinsics.fx == view.intrinsics.fx / 2
+    assert np.allclose(small.image, view.image.reshape(16, 2, 16, 2, 3).mean(axis=(1, 3)), atol=1.0)
+    see_through = np.zeros((4, 4, 4), np.uint8)
+    see_through[:2, :, :] = (200, 100, 50, 255)
+    see_through[2:, :, :3] = 255  # what a transparent pixel is coloured must not bleed
+    lens = view.intrinsics.scaled(4 / 32)
+    (small,) = sweep.shrunk([replace(view, image=see_through, intrinsics=lens)], 4.0)
+    assert small.image.tolist() == [[[200, 100, 50, 128]]]
+    assert sweep.shrunk(still.training, 1.0) == still.training
 
 
 @pytest.fixture
@@ -106,7 +121,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
     for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     data = json.loads((tmp_path / "frontier.json").read_text())
-    assert set(data["ms_per_step"]) == {e.name for e in sweep.efforts("ngp", {}, knobs=False)}
+    assert set(data["ms_per_step"]) == {e.label for e in sweep.efforts("ngp", {}, knobs=False)}
     assert all(ms > 0 for ms in data["ms_per_step"].values())
     with (tmp_path / "updates.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 4  # two efforts, two update times
@@ -137,6 +152,7 @@ def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_plan):
         (["--policy", "best"], "policy 'best' is not known"),
         (["--scene", "nowhere"], "no such file or folder"),
         (["--seeds", "0"], "--seeds 0"),
+        (["--field", "splot"], "no field is called splot; there are: ngp"),
         (["--option", "x"], "expected KEY=VALUE"),
     ],
 )
