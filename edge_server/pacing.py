@@ -17,9 +17,9 @@ from typing import Any, Protocol
 
 from edge_server.fields import Budget
 
-# The rest of an update is taken to be as long as the longest of the last 64 was: of a rest that varies without
-# trend, the next is longer once in 65 times. Load comes in bursts, so that a smaller share of misses than the
-# one in 20 that is promised is aimed at; what a hiccup costs is 64 updates that are shorter by it.
+# The rest of an update is taken to be as long as the longest of the last 64 was: without a trend, the next is
+# longer once in 65 times. Load comes in bursts, so fewer misses than one in 20 are aimed at; what a hiccup
+# costs is 64 updates that are shorter by it.
 _WINDOW = 64
 _MARGIN_MS = 1.0
 # Below this a fit is not worth the decoding of its views.
