@@ -1,316 +1,59 @@
 """Instant-NGP style radiance field on CPUs: hash grid, small network, numba kernels (thesis 3.1, 4.4.4).
 
-One step: chunks of rays are drawn, sampled, rendered and differentiated side by side
-(``kernels.train``); the hash tables' gradients are added up level by level (``kernels.grid``); Adam touches
-what received a gradient (``kernels.adam``). Every 16 steps the occupancy grid is refreshed.
+``trained_field`` does everything; here is what is particular to the hash grid.
 """
 
 from __future__ import annotations
 
-import threading
-import time
-from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from edge_server.fields import Budget, Field, FitReport, Rendering, View
-from edge_server.fields.kernels.adam import PART, Rule, adam
-from edge_server.fields.kernels.composite import Weights
-from edge_server.fields.kernels.grid import SEGMENT, Grid, scatter
+from edge_server.fields import Field
+from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid, scatter
 from edge_server.fields.kernels.mlp import Net
-from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
-from edge_server.fields.kernels.rays import Space, Views
-from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
+from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.ngp_layout import make_grid, make_net
-from edge_server.fields.ngp_occupancy import EVERY, Occupancy
-from edge_server.fields.ngp_rig import Arrays, Rig
-from edge_server.fields.ngp_schedule import (
-    BETA1,
-    BETA2,
-    NOMINAL_RAYS,
-    Pace,
-    active_levels,
-    step_key,
-    step_length,
-)
+from edge_server.fields.ngp_schedule import active_levels
 from edge_server.fields.ngp_settings import NgpSettings, make_settings
-from edge_server.fields.ngp_snapshot import NgpSnapshot
-from edge_server.fields.ngp_state import fill, pack, unpack_meta
-from edge_server.fields.scene_box import NOWHERE
-from freshfield.geometry import Pinhole
+from edge_server.fields.trained_field import DIRTY, TINY, TrainedField
+
+assert SEGMENT * FEATURES == DIRTY, "scatter and adam must mean the same by a dirty flag"
 
 
-class NgpField:
-    """A radiance field that learns while it is used. See ``fields.Field`` for the protocol.
+class NgpField(TrainedField):
+    """A multiresolution hash grid and a small network. See ``fields.Field`` for the protocol."""
 
-    ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
-    meanwhile: they wait for the end of the present step, some milliseconds.
-    """
+    name = "ngp"
+    shape = (
+        "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers",
+        "harmonics", "cells", "samples",
+    )  # fmt: skip
+    settings: NgpSettings
 
     def __init__(self, settings: NgpSettings | None = None, pool: Pool | None = None) -> None:
-        self.settings = settings or NgpSettings()
-        self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
-        self._turn = _Turn()
-        self.reset()
+        super().__init__(settings or NgpSettings(), pool)
 
-    # --- the protocol -------------------------------------------------------------------------
+    @property
+    def _grid(self) -> Grid:
+        grid: Grid = self._encoding
+        return grid
 
-    def reset(self) -> None:
-        """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        with self._turn.mine():
-            self.dropped = 0
-            self.rig = Rig(self.settings)
-            self._snapshot: NgpSnapshot | None = None
-            self._forget_parameters()
+    def _make(self, rng: np.random.Generator) -> tuple[Grid, Net]:
+        return make_grid(self.settings, self.rig.box, rng), make_net(self.settings, rng)
 
-    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Train on ``views`` from the present parameters. Raises ValueError for a view that cannot be one.
+    def _tiny(self) -> NgpSettings:
+        return replace(self.settings, **TINY, log2_table=10)
 
-        A budget in seconds (0.1 at least makes sense) is kept within 10 per cent, whatever the load; the
-        learning rate falls over the budget, so every fit ends with a settled field.
-        """
-        if not views:
-            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace = Pace(budget)
-        with self._turn.mine():
-            intake = self.rig.take_in(views)
-            if intake.new_box:
-                self._forget_parameters()
-            if intake.look:
-                self._occupancy.look(self.pool, self.rig)
-        rays = samples = dropped = 0
-        losses: deque[float] = deque(maxlen=32)
-        while (progress := pace.begin()) is not None:
-            with self._turn.mine():
-                losses.append(self._one_step(intake.data, progress))
-                rays += int(self._batch.rays.sum())
-                samples += int(self._batch.samples.sum())
-                dropped += int(self._batch.dropped.sum() + self._dropped_by_task.sum())
-            pace.end()
-        self.dropped += dropped
-        loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped)
+    def _levels(self) -> int:
+        return active_levels(self.settings, self.step)
 
-    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """The picture of a camera, from the present parameters."""
-        return self.snapshot().render(camera_to_world, intrinsics)
-
-    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world metres and their colours; none before the first fit."""
-        return self.snapshot().points(count)
-
-    def snapshot(self) -> NgpSnapshot:
-        """A copy that renders from any thread and never changes."""
-        with self._turn.mine():
-            if self._snapshot is None or self._snapshot.step != self.step:
-                box = self.rig.box or NOWHERE
-                space = self._occupancy.space(step_length(self.settings, self.step))
-                self._snapshot = NgpSnapshot(
-                    box=box,
-                    grid=self._grid._replace(table=self._grid.table.copy()),
-                    levels=active_levels(self.settings, self.step),
-                    net=Net(self._net.widths, self._net.params.copy()),
-                    harmonics=self.settings.harmonics,
-                    space=space._replace(
-                        occupied=space.occupied.copy(),
-                        coarse=space.coarse.copy(),
-                        density=np.zeros(0, np.float32),
-                    ),
-                    background=self.rig.background(),
-                    cameras=self.rig.views,
-                    pool=self.pool,
-                    step=self.step,
-                )
-            return self._snapshot
-
-    def warm_up(self) -> float:
-        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
-
-        Works on a small field of its own, in the calling thread and at its priority: the workers' low one
-        would make compiling on a busy machine take minutes. This field's state is not touched.
-        """
-        start = time.perf_counter()
-        tiny = replace(self.settings, batch_samples=CHUNK, cells=16, samples=16, log2_table=10)
-        camera = Pinhole.from_fov(8, 8, 60.0)
-        pose = np.eye(4)
-        pose[2, 3] = -3.0
-        for channels in (3, 4):
-            field = NgpField(replace(tiny, min_views=1, contracted=channels == 3), CallerPool())
-            image = np.full((8, 8, channels), 128, np.uint8)
-            field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
-            field.render(pose, camera)
-        return time.perf_counter() - start
-
-    # --- state --------------------------------------------------------------------------------
-
-    def state(self) -> Arrays:
-        """Everything needed to go on bit for bit: parameters, moments, occupancy, cameras, counters."""
-        with self._turn.mine():
-            counters = {
-                "step": self.step,
-                "updates": self._updates,
-                "dropped": self.dropped,
-                "needed": self._occupancy.needed,
-            }
-            return pack(self.settings, self.rig, counters, self._arrays())
-
-    def load_state(self, state: Arrays) -> None:
-        """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        with self._turn.mine():
-            meta = unpack_meta(self.settings, state)
-            self.rig = Rig(self.settings)
-            self.rig.load(meta, state)
-            self._forget_parameters()
-            fill(self._arrays(), state)
-            self.step, self._updates = int(meta["step"]), int(meta["updates"])
-            self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
-            self._occupancy.mark()
-            self._snapshot = None
-
-    def _arrays(self) -> Arrays:
-        return {
-            "table": self._grid.table,
-            "table_m": self._table_m,
-            "table_v": self._table_v,
-            "net": self._net.params,
-            "net_m": self._net_m,
-            "net_v": self._net_v,
-            "density": self._occupancy.density,
-            "seen": self._occupancy.seen,
-            "occupied": self._occupancy.occupied,
-        }
-
-    # --- inside -------------------------------------------------------------------------------
-
-    def _forget_parameters(self) -> None:
-        s = self.settings
-        rng = np.random.default_rng(np.random.SeedSequence(s.seed))
-        self.step = 0
-        self._updates = 0  # optimiser steps that Adam's bias correction counts
-        self._grid: Grid = make_grid(s, self.rig.box, rng)
-        self._net: Net = make_net(s, rng)
-        self._table_m, self._table_v, self._table_g = (np.zeros_like(self._grid.table) for _ in range(3))
-        self._dirty = np.zeros(len(self._grid.table) // SEGMENT, np.bool_)
-        self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
-        self._occupancy = Occupancy.for_box(s, self.rig.box)
-        chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
-        inputs, units = int(self._net.widths[0]), int(self._net.widths.sum())
-        self._batch = Batch(
-            x=np.zeros((chunks, 3, CHUNK), np.float32),
-            d_features=np.zeros((chunks, inputs, CHUNK), np.float32),
-            d_params=np.zeros((chunks, self._net.params.size), np.float32),
-            samples=np.zeros(chunks, np.int64),
-            rays=np.zeros(chunks, np.int64),
-            dropped=np.zeros(chunks, np.int64),
-            loss=np.zeros(chunks),
-        )
-        self._scratch = Scratch(
-            acts=np.zeros((workers, units, CHUNK), np.float32),
-            d_acts=np.zeros((workers, units, CHUNK), np.float32),
-            line=np.zeros((workers, 3, CHUNK), np.float32),
-            ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
-            ray=np.zeros((workers, CHUNK_RAYS, 9), np.float32),
-        )
-        self._scratch_x = np.zeros((workers, 3, CHUNK), np.float32)
-        self._dropped_by_task = np.zeros(1 + -(-self._dirty.size // PART), np.int64)
-
-    def _one_step(self, data: Views, progress: float) -> float:
-        """One optimiser step; returns its mean squared error. progress: of the fit, in [0, 1]."""
-        s, levels, box = self.settings, active_levels(self.settings, self.step), self.rig.box
-        assert box is not None
-        key = step_key(s.seed, self.step)
-        if self.step % EVERY == 0:
-            self._occupancy.refresh(
-                self.pool, key, self.step // EVERY, self._grid, levels, self._net,
-                self._scratch.acts, self._scratch_x,
-            )  # fmt: skip
-        space: Space = self._occupancy.space(step_length(self.settings, self.step))
+    def _gather(self, levels: int, scale: float) -> None:
         batch = self._batch
-        recipe = Recipe(
-            key=np.uint64(key + np.uint64(1)),
-            chunk_rays=max(s.rays // batch.samples.size, 1),
-            levels=levels,
-            harmonics=s.harmonics,
-            changed_share=np.float32(s.changed_share),
-            background=self.rig.background(),
-            random_background=s.background == "random",
-        )
-        weights = Weights(
-            distortion=np.float32(s.distortion),
-            sparsity=np.float32(s.sparsity),
-            near=np.float32(s.near_fade * box.distance_m / box.radius_m),
-        )
-        self.pool.run(train_chunks, data, recipe, space, self._grid, self._net, weights, batch, self._scratch)
         self.pool.run(
             scatter, self._grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
         )
-        if batch.dropped.any():
-            self._repair()
-        rays = max(int(batch.rays.sum()), 1)
-        self._updates += 1
-        fall = s.rate_end**progress
-        rule = Rule(
-            rate=np.float32(s.rate * fall),
-            beta1=np.float32(BETA1),
-            beta2=np.float32(BETA2),
-            epsilon=np.float32(s.epsilon),
-            scale=np.float32(NOMINAL_RAYS / rays),
-            decay=np.float32(s.decay),
-            correct1=np.float32(1.0 / (1.0 - BETA1**self._updates)),
-            correct2=np.float32(1.0 / (1.0 - BETA2**self._updates)),
-        )
-        rule_net = rule._replace(rate=np.float32(s.rate_net * fall), decay=np.float32(0.0))
-        self.pool.run(
-            adam,
-            (self._net.params, self._net_m, self._net_v, self._net_g),
-            (self._grid.table, self._table_m, self._table_v, self._table_g, self._dirty),
-            batch.d_params,
-            rule_net,
-            rule,
-            self._dropped_by_task,
-        )
-        self.step += 1
-        return float(batch.loss.sum()) / (3 * rays)
-
-    def _repair(self) -> None:
-        """Set to zero whatever is not finite: rays that meet it give no gradient that would lead there."""
-        arrays = (self._grid.table, self._table_m, self._table_v)
-        for array in (*arrays, self._net.params, self._net_m, self._net_v):
-            np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-class _Turn:
-    """A lock that is handed over in the order of asking: a training loop must not starve a page."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._waiting: deque[threading.Lock] = deque()
-        self._taken = False
-
-    @contextmanager
-    def mine(self) -> Iterator[None]:
-        gate = None
-        with self._lock:
-            if self._taken:
-                gate = threading.Lock()
-                gate.acquire()
-                self._waiting.append(gate)
-            self._taken = True
-        if gate is not None:
-            gate.acquire()  # released by whoever had the turn, which passes to us
-        try:
-            yield
-        finally:
-            with self._lock:
-                if self._waiting:
-                    self._waiting.popleft().release()
-                else:
-                    self._taken = False
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:

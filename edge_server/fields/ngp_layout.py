@@ -11,6 +11,7 @@ from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.kernels.mlp import Net, param_count
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.trainer_settings import TrainerSettings
 
 FINENESS = 1.0  # cells of the finest level per pixel
 FIRST_DENSITY = 0.3  # a scene unit of fog dims by a quarter: every sample gets a gradient at first
@@ -42,16 +43,22 @@ def make_grid(settings: NgpSettings, box: SceneBox | None, rng: np.random.Genera
     return Grid(resolution, first, dense, table)
 
 
-def net_widths(settings: NgpSettings) -> NDArray[np.int64]:
-    """Widths of the layers: features in; density, colour and the colour's harmonics out; padded to 4."""
-    inputs = _multiple_of_4(FEATURES * settings.levels)
+def net_widths(inputs: int, settings: TrainerSettings) -> NDArray[np.int64]:
+    """Widths of the layers: ``inputs`` features in; density, colour and the colour's harmonics out; padded
+    to 4."""
     outputs = _multiple_of_4(1 + 3 * settings.harmonics)
-    return np.array([inputs, *[settings.hidden] * settings.hidden_layers, outputs], dtype=np.int64)
+    hidden = [settings.hidden] * settings.hidden_layers
+    return np.array([_multiple_of_4(inputs), *hidden, outputs], dtype=np.int64)
 
 
 def make_net(settings: NgpSettings, rng: np.random.Generator) -> Net:
+    """The network of a hash-grid field."""
+    return first_net(FEATURES * settings.levels, settings, rng)
+
+
+def first_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator) -> Net:
     """He initialisation, small output; a thin grey fog everywhere."""
-    widths = net_widths(settings)
+    widths = net_widths(inputs, settings)
     params = np.zeros(param_count(widths), np.float32)
     first = 0
     for layer, (n_in, n_out) in enumerate(pairwise(widths)):

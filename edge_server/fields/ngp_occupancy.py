@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.grid import Grid
 from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.occupancy import CELLS_A_TASK, count_views, sample_density, threshold
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import COARSE, Space
 from edge_server.fields.kernels.train import CHUNK
 from edge_server.fields.ngp_rig import Rig
-from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.supervision import pack_cameras
+from edge_server.fields.trainer_settings import TrainerSettings
 
 EVERY = 8  # steps between refreshes
 PHASES = 4  # refreshes until every cell has been looked at
@@ -34,7 +35,7 @@ class Occupancy:
         self.needed = 1
 
     @classmethod
-    def for_box(cls, settings: NgpSettings, box: SceneBox | None) -> Occupancy:
+    def for_box(cls, settings: TrainerSettings, box: SceneBox | None) -> Occupancy:
         """An occupancy that knows nothing yet of the scene in ``box``."""
         near = box.near_m / box.radius_m if box else 0.1
         return cls(settings.cells, box.contracted if box else False, near, settings.min_views)
@@ -78,11 +79,11 @@ class Occupancy:
             np.maximum(self.density, np.float32(1.5 * EMPTY), out=self.density, where=moving)
         self.mark()
 
-    def refresh(self, pool: Pool, key: np.uint64, turn: int, grid: Grid, levels: int, net: Net,
+    def refresh(self, pool: Pool, key: np.uint64, turn: int, encoding: Any, levels: int, net: Net,
                 acts: NDArray[np.float32], x: NDArray[np.float32]) -> None:  # fmt: skip
         """Look at a part of the cells again."""
         pool.run(
-            sample_density, key, turn % PHASES, PHASES, np.float32(FADE), grid, levels, net, self.cells,
+            sample_density, key, turn % PHASES, PHASES, np.float32(FADE), encoding, levels, net, self.cells,
             self.contracted, self.seen, self.needed, self.density, acts, x,
         )  # fmt: skip
         self.mark()

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.kernels.rays import Views
-from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import SceneBox, plain_background, scene_box
 from edge_server.fields.supervision import CameraMemory, check_view, pack_views, remember
+from edge_server.fields.trainer_settings import TrainerSettings
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
@@ -34,7 +34,7 @@ class Intake:
 class Rig:
     """The cameras of one field."""
 
-    def __init__(self, settings: NgpSettings) -> None:
+    def __init__(self, settings: TrainerSettings) -> None:
         self.settings = settings
         self.box: SceneBox | None = None
         self.memory: dict[str, CameraMemory] = {}

@@ -8,6 +8,7 @@ import numpy as np
 
 from edge_server.fields import Budget
 from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.trainer_settings import TrainerSettings
 
 BETA1, BETA2 = 0.9, 0.99
 NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
@@ -25,7 +26,7 @@ def active_levels(settings: NgpSettings, step: int) -> int:
     return min(settings.levels, settings.levels_start + step // settings.levels_every)
 
 
-def step_length(settings: NgpSettings, step: int) -> float:
+def step_length(settings: TrainerSettings, step: int) -> float:
     """Distance between a ray's samples in scene units: long at first, while there is only fog."""
     first = min(settings.samples_start, settings.samples)
     done = min(step / settings.samples_ramp, 1.0) if settings.samples_ramp else 1.0

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
-from edge_server.fields.kernels.grid import Grid
 from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import Space
@@ -27,7 +26,7 @@ class NgpSnapshot:
     """Parameters, occupancy and cameras of one instant. Nothing in it is written after it is made."""
 
     box: SceneBox
-    grid: Grid
+    encoding: Any
     levels: int
     net: Net
     harmonics: int
@@ -69,7 +68,7 @@ class NgpSnapshot:
             self.box.normalise(pose[:3, 3]),
             np.ascontiguousarray(pixels, dtype=np.float64),
             self.space,
-            self.grid,
+            self.encoding,
             self.levels,
             self.net,
             self.harmonics,

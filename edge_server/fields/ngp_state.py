@@ -1,4 +1,4 @@
-"""The state of an ngp field as plain arrays: the same for every device."""
+"""The state of a trained field as plain arrays: the same for every device."""
 
 from __future__ import annotations
 
@@ -9,34 +9,32 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields.ngp_rig import Arrays, Rig
-from edge_server.fields.ngp_settings import NgpSettings
-
-# A state fits a field that agrees in these; all other settings may differ.
-_SHAPE = (
-    "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers", "harmonics",
-    "cells", "samples",
-)  # fmt: skip
 
 
-def pack(settings: NgpSettings, rig: Rig, counters: dict[str, int], arrays: Arrays) -> Arrays:
+def pack(name: str, settings: Any, rig: Rig, counters: dict[str, Any], arrays: Arrays) -> Arrays:
     """Everything in one dictionary of copies."""
-    meta = {"version": 1, "settings": asdict(settings), **counters, **rig.meta()}
+    meta = {"version": 1, "field": name, "settings": asdict(settings), **counters, **rig.meta()}
     both = {"meta": np.array(json.dumps(meta)), **arrays, **rig.arrays()}
     return {name: np.array(array) for name, array in both.items()}
 
 
-def unpack_meta(settings: NgpSettings, state: Arrays) -> dict[str, Any]:
-    """The facts in ``state``. ValueError unless it is a state and was made with a model of this shape."""
+def unpack_meta(settings: Any, state: Arrays, name: str, shape: tuple[str, ...]) -> dict[str, Any]:
+    """The facts in ``state``. ValueError unless it is a state of a field called ``name`` and was made with
+    settings that agree in ``shape``; all others may differ."""
     try:
         meta = json.loads(str(state["meta"]))
         theirs = meta["settings"]
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"not a state of an ngp field: {error!r}") from None
-    for name in _SHAPE:
-        if getattr(settings, name) != theirs.get(name):
+        raise ValueError(f"not a state of a field called {name}: {error!r}") from None
+    made_by = meta.get("field", name)
+    if made_by != name:
+        raise ValueError(f"the state is that of a field called {made_by}, this one is {name}")
+    for option in shape:
+        mine = getattr(settings, option)
+        mine = list(mine) if isinstance(mine, tuple) else mine  # as JSON has it
+        if mine != theirs.get(option):
             raise ValueError(
-                f"the state was made with {name} = {theirs.get(name)}, "
-                f"this field has {getattr(settings, name)}"
+                f"the state was made with {option} = {theirs.get(option)}, this field has {mine}"
             )
     return meta
 

@@ -19,6 +19,7 @@ from edge_server.fields import Budget, FitReport, Rendering, View
 from edge_server.fields.kernels.adam import GRADIENT_LIMIT, PARAMETER_LIMIT
 from edge_server.fields.kernels.pool import shared_pool
 from edge_server.fields.kernels.rays import HORIZON, Views
+from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_layout import make_grid, make_net
 from edge_server.fields.ngp_occupancy import EVERY, FADE, Occupancy
 from edge_server.fields.ngp_rig import Arrays, Rig
@@ -215,11 +216,11 @@ class NgpTorchField:
         with self._lock:
             counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
             counters["needed"] = self._occupancy.needed
-            return pack(self.settings, self.rig, counters, self._arrays())
+            return pack(NgpField.name, self.settings, self.rig, counters, self._arrays())
 
     def load_state(self, state: Arrays) -> None:
         with self._lock:
-            meta = unpack_meta(self.settings, state)
+            meta = unpack_meta(self.settings, state, NgpField.name, NgpField.shape)
             self.rig = Rig(self.settings)
             self.rig.load(meta, state)
             self._forget_parameters()

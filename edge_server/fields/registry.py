@@ -11,6 +11,7 @@ from edge_server.fields import Field
 # name -> "module:function"; the function takes (options, seed) and raises ValueError for a wrong option
 _FIELDS: dict[str, str] = {
     "ngp": "edge_server.fields.ngp:make",
+    "tensorf": "edge_server.fields.tensorf:make",
 }
 
 

@@ -19,7 +19,10 @@ from edge_server.offline.still import Still
 from edge_server.offline.usage import Usage
 
 # Where a field keeps its named effort levels: option values by name. A field without any has one level.
-_EFFORTS = {"ngp": "edge_server.fields.ngp_settings:EFFORTS"}
+_EFFORTS = {
+    "ngp": "edge_server.fields.ngp_settings:EFFORTS",
+    "tensorf": "edge_server.fields.tensorf_settings:EFFORTS",
+}
 # What one knob alone buys, against the level "medium" (only in the full sweep).
 _KNOBS: dict[str, dict[str, dict[str, Any]]] = {
     "ngp": {

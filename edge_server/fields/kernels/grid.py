@@ -10,10 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import add_pair, fetch_add, weighted_pairs
 from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.mlp import backward, forward
+from edge_server.fields.kernels.model import is_a, query_back, query_color, query_density
 
 FEATURES = 2  # a vertex; one 64-bit load
 SEGMENT = 16  # vertices a dirty flag stands for
@@ -167,3 +170,40 @@ def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirt
                 _scatter_level(True, res, mask, x[c], d0, d1, level_gradient, level_dirty)
             else:
                 _scatter_level(False, res, mask, x[c], d0, d1, level_gradient, level_dirty)
+
+
+@overload(query_density)
+def _query_density(encoding, levels, net, x, start, end, acts):
+    if not is_a(encoding, Grid):
+        return None
+
+    def run(encoding, levels, net, x, start, end, acts):
+        encode(encoding, levels, x, start, end, acts)
+        for k in range(2 * encoding.resolution.size, net.widths[0]):  # loops: slices compile for seconds
+            padding = acts[k, start:end]
+            for s in range(padding.size):
+                padding[s] = np.float32(0.0)
+        forward(net, acts, start, end)
+
+    return run
+
+
+@overload(query_color)
+def _query_color(encoding, levels, net, x, start, end, acts):
+    """The network has said it already."""
+    return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, Grid) else None
+
+
+@overload(query_back)
+def _query_back(encoding, net, acts, d_acts, n, d_params, d_features):
+    if not is_a(encoding, Grid):
+        return None
+
+    def run(encoding, net, acts, d_acts, n, d_params, d_features):
+        backward(net, acts, d_acts, n, d_params)
+        for k in range(net.widths[0]):
+            to, d = d_features[k], d_acts[k]
+            for s in range(n):
+                to[s] = d[s]
+
+    return run

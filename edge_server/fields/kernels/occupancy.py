@@ -6,10 +6,9 @@ import numpy as np
 from numba import njit
 
 from edge_server.fields.kernels.composite import RAW_HIGH, RAW_LOW
-from edge_server.fields.kernels.grid import encode
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
 from edge_server.fields.kernels.jit import kernel
-from edge_server.fields.kernels.mlp import forward
+from edge_server.fields.kernels.model import query_density
 from edge_server.fields.kernels.rays import COARSE
 
 CELLS_A_TASK = 2048  # at most train.CHUNK: they share its scratch
@@ -64,7 +63,7 @@ def count_views(counter, worker, cells, contracted, near, views, mask_first, mas
 
 
 @kernel
-def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net, cells, contracted, seen,
+def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, net, cells, contracted, seen,
                    min_views, density, acts, x):  # fmt: skip
     """Refresh every ``phases``-th cell's density: the larger of the faded old one and a new random sample.
 
@@ -93,9 +92,7 @@ def sample_density(counter, worker, key, phase, phases, fade, grid, levels, net,
             x[worker, 1, n] = (np.float32(j) + uniform(key, k + np.uint64(1))) * size
             x[worker, 2, n] = (np.float32(l) + uniform(key, k + np.uint64(2))) * size
             n += 1
-        encode(grid, levels, x[worker], start, n, acts[worker])
-        acts[worker, 2 * grid.resolution.size : net.widths[0], :n] = np.float32(0.0)
-        forward(net, acts[worker], start, n)
+        query_density(encoding, levels, net, x[worker], start, n, acts[worker])
         raw = acts[worker, out_row]
         n = 0
         for turn in range(first, end):

@@ -40,7 +40,7 @@ class Views(NamedTuple):
     first: int64 (V + 1,), each view's first pixel. size: int64 (V, 2), width and height. lens: float64
     (V, 8), fx fy cx cy k1 k2 p1 p2. rotation: float64 (V, 3, 3), camera to world. origin: float64 (V, 3),
     scene units. pixels: uint8 (N, 3 or 4). changed: int64 (M,), pixels that moved since the camera's
-    previous view.
+    previous view. exposure: float32 (V, 3, 2), gain and bias that pixels are corrected by; V = 0: none.
     """
 
     first: NDArray[np.int64]
@@ -50,6 +50,7 @@ class Views(NamedTuple):
     origin: NDArray[np.float64]
     pixels: NDArray[np.uint8]
     changed: NDArray[np.int64]
+    exposure: NDArray[np.float32] = np.zeros((0, 3, 2), np.float32)
 
 
 @njit(inline="always")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.kernels.composite import OPAQUE_DEPTH, activate, add_harmonics
-from edge_server.fields.kernels.grid import encode
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite
 from edge_server.fields.kernels.jit import kernel
-from edge_server.fields.kernels.mlp import forward
+from edge_server.fields.kernels.model import query_color, query_density
 from edge_server.fields.kernels.rays import NEVER, interval, march, pixel_direction
 
 TILE = 256  # rays a task
@@ -18,13 +17,12 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 @kernel
-def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, levels, net, harmonics,
+def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, harmonics,
                  max_samples, background, acts, x, line, color, depth, opacity):  # fmt: skip
     """pixels: float64 (N, 2), image points. color: float32 (N, 3), depth (scene units) and opacity: (N,),
     all written. max_samples: a ray's samples at most. acts: float32 (W, units, TILE ROUND), x: (W, 3, same),
     line: (W, 2, same), scratch."""
     out_row = acts.shape[1] - net.widths[-1]
-    inputs = net.widths[0]
     ts, dts = line[worker, 0], line[worker, 1]
     out = acts[worker, out_row:]
     way = np.empty((TILE, 6), np.float32)  # direction, distance reached, distance of leaving, optical depth
@@ -61,9 +59,8 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, grid, l
                 way[r, 3] = t
                 taken[r] += n - before
                 first[k + 1] = n
-            encode(grid, levels, x[worker], start, n, acts[worker])
-            acts[worker, 2 * grid.resolution.size : inputs, :n] = _F0
-            forward(net, acts[worker], start, n)
+            query_density(encoding, levels, net, x[worker], start, n, acts[worker])
+            query_color(encoding, levels, net, x[worker], start, n, acts[worker])
             if harmonics > 1:
                 for k in range(count):
                     r = active[k]

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.composite import (
+    OPAQUE_DEPTH,
     activate_color,
     activate_density,
     add_harmonics,
@@ -16,10 +17,9 @@ from edge_server.fields.kernels.composite import (
     seen_samples,
     spread_harmonics,
 )
-from edge_server.fields.kernels.grid import encode
 from edge_server.fields.kernels.intrinsics import fetch_add, uniform
 from edge_server.fields.kernels.jit import kernel
-from edge_server.fields.kernels.mlp import backward, forward
+from edge_server.fields.kernels.model import query_back, query_color, query_density
 from edge_server.fields.kernels.rays import NEVER, interval, march, pixel_direction
 
 CHUNK = 2048  # samples a chunk has room for; its activations stay in the second-level cache
@@ -33,8 +33,9 @@ _F0, _F1, _BYTE = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 255.0)
 class Batch(NamedTuple):
     """What the chunks of a step leave behind, C of them.
 
-    x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, inputs, CHUNK). d_params: float32 (C, P).
+    x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, rows, CHUNK). d_params: float32 (C, P).
     samples, rays, dropped: int64 (C,). loss: float64 (C,), squared error summed over rays and channels.
+    exposure: float64 (C, V, 3, 5), see ``_compare``; V = 0 where exposures are not asked for.
     """
 
     x: NDArray[np.float32]
@@ -44,13 +45,15 @@ class Batch(NamedTuple):
     rays: NDArray[np.int64]
     dropped: NDArray[np.int64]
     loss: NDArray[np.float64]
+    exposure: NDArray[np.float64]
 
 
 class Scratch(NamedTuple):
     """Memory of each worker, W of them, R = CHUNK_RAYS.
 
     acts, d_acts: float32 (W, units, CHUNK). line: float32 (W, 3, CHUNK): distance, length and weight of
-    each sample. ray_first: int64 (W, R + 1). ray: float32 (W, R, 9): direction, target, background.
+    each sample. ray_first: int64 (W, R + 1). ray: float32 (W, R, 10): direction, target,
+    background, view.
     """
 
     acts: NDArray[np.float32]
@@ -89,7 +92,7 @@ def _view_of(first, pixel):
 
 @njit(inline="always")
 def _draw(views, recipe, n, ray):
-    """Choose the n-th ray of the step: fills ray (9,), returns its view's number."""
+    """Choose the n-th ray of the step: fills ray (10,), returns its view's number."""
     key, k = recipe.key, np.uint64(n) * np.uint64(8)
     total = views.pixels.shape[0]
     # 53 bits, because float32 cannot count the pixels of a hundred pictures.
@@ -114,6 +117,10 @@ def _draw(views, recipe, n, ray):
         ray[3 + c] = np.float32(views.pixels[pixel, c]) * np.float32(1.0 / 255.0) * alpha + back * (
             _F1 - alpha
         )
+    if views.exposure.shape[0] > 0:
+        ray[9] = np.float32(view)
+        for c in range(3):
+            ray[3 + c] = views.exposure[view, c, 0] * ray[3 + c] + views.exposure[view, c, 1]
     return view
 
 
@@ -127,8 +134,9 @@ def _keep(rows, a, b, to):
 
 
 @kernel
-def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first, ray):
-    """Fill a chunk with rays, their samples and the net's output at them. Returns (rays, samples).
+def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_first, ray):
+    """Fill a chunk with rays, their samples and what ``query_density`` says of them.
+    Returns (rays, samples).
 
     Only samples that can be seen are kept: what lies behind an opaque one would cost a backward pass for
     a gradient of nothing. The room they leave is filled with further rays, so that the number of rays
@@ -137,7 +145,7 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
     in the next round.
     """
     ts, dts = line[0], line[1]
-    inputs, out = net.widths[0], acts[acts.shape[0] - net.widths[-1] :]
+    out = acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
     number, doubtful = np.empty(limit, np.int64), np.empty(limit, np.bool_)  # of the rays of one round
     again = np.empty(limit, np.int64)
@@ -174,9 +182,7 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
         for k in range(taken, waiting):
             again[k - taken] = again[k]
         waiting -= taken
-        encode(grid, recipe.levels, x, n, end, acts)
-        acts[2 * grid.resolution.size : inputs, n:end] = _F0
-        forward(net, acts, n, end)
+        query_density(encoding, recipe.levels, net, x, n, end, acts)
         activate_density(out, n, end)
         begin, kept_rays = n, rays
         for r in range(rays, drawn):
@@ -201,19 +207,45 @@ def fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first,
 
 
 @kernel
-def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batch, scratch):
-    """Tasks are chunks: everything but the table's own gradient, which ``grid.scatter`` adds up."""
+def _compare(out, w, dts, first, end, ray, sums):
+    """Add one ray to what ``refinement.Exposures`` learns from: its number, target t, t^2, error e and e t
+    per channel; sums: float64 (views, 3, 5). After ``ray_loss``."""
+    depth, last = _F0, end
+    for s in range(first, end):
+        depth += out[0, s] * dts[s]
+        if depth > np.float32(OPAQUE_DEPTH):
+            last = s + 1
+            break
+    view = np.int64(ray[9])
+    for c in range(3):
+        color, left = _F0, _F1
+        for s in range(first, last):
+            color += w[s] * out[1 + c, s]
+            left -= w[s]
+        t = np.float64(ray[3 + c])
+        e = np.float64(color + left * ray[6 + c]) - t
+        sums[view, c, 0] += 1.0
+        sums[view, c, 1] += t
+        sums[view, c, 2] += t * t
+        sums[view, c, 3] += e
+        sums[view, c, 4] += e * t
+
+
+@kernel
+def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, batch, scratch):
+    """Tasks are chunks: everything but the encoding's own gradient, which its scatter kernel adds up."""
     acts, d_acts, line = scratch.acts[worker], scratch.d_acts[worker], scratch.line[worker]
     ts, dts, w = line[0], line[1], line[2]
     ray_first, ray = scratch.ray_first[worker], scratch.ray[worker]
-    inputs, outputs = net.widths[0], net.widths[-1]
+    outputs = net.widths[-1]
     out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
     while True:
         chunk = fetch_add(counter, 1)
         if chunk >= batch.samples.size:
             return
         x = batch.x[chunk]
-        rays, n = fill_chunk(views, recipe, space, grid, net, chunk, x, line, acts, ray_first, ray)
+        rays, n = fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_first, ray)
+        query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
         if recipe.harmonics > 1:
             for r in range(rays):
                 a, b = ray_first[r], ray_first[r + 1]
@@ -230,15 +262,13 @@ def train_chunks(counter, worker, views, recipe, space, grid, net, weights, batc
                 acts[:, a:b] = _F0
             else:
                 loss += error
+                if batch.exposure.shape[1] > 0:
+                    _compare(out, w, dts, a, b, ray[r], batch.exposure[chunk])
         if recipe.harmonics > 1:
             for r in range(rays):
                 a, b = ray_first[r], ray_first[r + 1]
                 spread_harmonics(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
         batch.d_params[chunk] = _F0
-        backward(net, acts, d_acts, n, batch.d_params[chunk])
-        for k in range(inputs):  # a slice assigned to a slice would compile seconds of error messages
-            d_features, d = batch.d_features[chunk, k], d_acts[k]
-            for s in range(n):
-                d_features[s] = d[s]
+        query_back(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
         batch.samples[chunk], batch.rays[chunk] = n, rays
         batch.dropped[chunk], batch.loss[chunk] = dropped, loss

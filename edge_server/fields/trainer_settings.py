@@ -1,0 +1,124 @@
+"""Settings that all representations of ``trained_field`` share; their texts become help and messages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, TypeVar
+
+
+def option(default: Any, text: str) -> Any:
+    """A field of a settings class with its help text."""
+    return field(default=default, metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """Lengths in metres; None means: found from the cameras."""
+
+    name: ClassVar[str]
+
+    hidden: int = option(32, "units of each hidden layer, a multiple of 4")
+    hidden_layers: int = option(1, "hidden layers of the network")
+    harmonics: int = option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
+    rays: int = option(4096, "rays of one step at most")
+    batch_samples: int = option(16384, "samples of one step at most, in chunks of 2048")
+    samples: int = option(192, "steps across the scene's box, corner to corner")
+    samples_start: int = option(64, "the same at first: fog is cheaper to see through in long steps")
+    samples_ramp: int = option(600, "steps after which ``samples`` is reached")
+    cells: int = option(64, "cells a side of the occupancy grid, a multiple of 4")
+    centre_m: tuple[float, float, float] | None = option(None, "centre of the scene's box")
+    radius_m: float | None = option(None, "half the side of the scene's box")
+    near_m: float | None = option(None, "no density is seen nearer to a camera than this")
+    contracted: bool | None = option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
+    background: str = option("auto", "auto (plain, or the mean colour), white, black, random, or '#rrggbb'")
+    min_views: int = option(2, "no density where fewer cameras than this look (never more than there are)")
+    rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
+    rate_end: float = option(0.1, "share of the learning rate that is left at the end of a fit")
+    epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
+    distortion: float = option(1e-2, "weight of the distortion loss: gathers each ray's density")
+    sparsity: float = option(0.0, "weight of the loss on optical depth: empties what no picture needs")
+    near_fade: float = option(0.0, "share of the cameras' distance over which gradients are held back")
+    changed_share: float = option(0.25, "rays drawn from pixels that changed since the camera's last view")
+    exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias a channel)")
+    refine_m: float = option(0.0, "by how much a camera's given position may be corrected; 0: not at all")
+    refine_deg: float = option(0.0, "by how much a camera's given rotation may be corrected; 0: not at all")
+    seed: int = option(0, "seed of initial values and of all sampling")
+    threads: int | None = option(None, "worker threads; results do not depend on it. None: all cores")
+    nice: int = option(5, "how far workers lower their own priority (Linux)")
+    device: str = option("auto", "cpu (numba), cuda (torch) or auto")
+
+    def __post_init__(self) -> None:
+        name = self.name
+        self._within(
+            ("hidden", 4, 256),
+            ("hidden_layers", 1, 4),
+            ("rays", 1, 1 << 20),
+            ("batch_samples", 2048, 1 << 22),
+            ("samples", 8, 2048),
+            ("samples_start", 8, 2048),
+            ("samples_ramp", 0, 1 << 30),
+            ("cells", 8, 256),
+            ("min_views", 0, 1000),
+            ("refine_m", 0.0, 1.0),
+            ("refine_deg", 0.0, 20.0),
+        )
+        if self.hidden % 4 or self.cells % 4:
+            raise ValueError(
+                f"{name}: hidden ({self.hidden}) and cells ({self.cells}) must be multiples of 4"
+            )
+        if self.harmonics not in (1, 4, 9):
+            raise ValueError(f"{name}: harmonics must be 1, 4 or 9, not {self.harmonics}")
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise ValueError(f"{name}: device must be auto, cpu or cuda, not {self.device!r}")
+        named = self.background in ("auto", "white", "black", "random")
+        if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
+            raise ValueError(
+                f"{name}: background must be auto, white, black, random or a colour like '#80c0ff', "
+                f"not {self.background!r}"
+            )
+        for length in ("radius_m", "near_m"):
+            if getattr(self, length) is not None and not 0 < getattr(self, length) < float("inf"):
+                raise ValueError(f"{name}: {length} must be positive, not {getattr(self, length)}")
+
+    def _within(self, *bounds: tuple[str, float, float]) -> None:
+        """ValueError where an option is not in low..high: (option, low, high) each."""
+        for key, low, high in bounds:
+            if not low <= getattr(self, key) <= high:
+                raise ValueError(f"{self.name}: {key} must be in {low}..{high}, not {getattr(self, key)}")
+
+
+Settings = TypeVar("Settings", bound=TrainerSettings)
+
+
+def option_names(kind: type[TrainerSettings]) -> list[str]:
+    """The options of a settings class, its own before those that all have."""
+    common = [f.name for f in fields(TrainerSettings)]
+    return [f.name for f in fields(kind) if f.name not in common] + common
+
+
+def settings_from(
+    kind: type[Settings], efforts: Mapping[str, Mapping[str, Any]], options: Mapping[str, Any], seed: int
+) -> Settings:
+    """Settings from plain options (a scenario's ``field`` section). ``effort``, a name of ``efforts``,
+    chooses a preset that the other options override. ValueError names an unknown option and lists the
+    valid ones."""
+    given = dict(options)
+    effort = given.pop("effort", "medium")
+    if effort not in efforts:
+        raise ValueError(f"{kind.name}: effort must be one of {', '.join(efforts)}, not {effort!r}")
+    valid = option_names(kind)
+    if unknown := sorted(set(given) - set(valid)):
+        raise ValueError(
+            f"{kind.name} has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}"
+        )
+    if given.get("centre_m") is not None:
+        given["centre_m"] = tuple(float(c) for c in given["centre_m"])
+    return replace(kind(), **{"seed": seed, **efforts[effort], **given})
+
+
+def help_of(kind: type[TrainerSettings], names: Iterable[str] | None = None) -> dict[str, str]:
+    """Option name -> what it means, for command lines and documentation."""
+    texts = {f.name: f.metadata["help"] for f in fields(kind)}
+    return {name: texts[name] for name in names or option_names(kind)}
