@@ -12,6 +12,7 @@ from edge_server.fields import Field
 _FIELDS: dict[str, str] = {
     "ngp": "edge_server.fields.ngp:make",
     "tensorf": "edge_server.fields.tensorf:make",
+    "splat": "edge_server.fields.splat:make",
 }
 
 

@@ -1,0 +1,335 @@
+"""From a Gaussian in space to one in the picture (Kerbl et al. 2023, after Zwicker et al. 2001), and back.
+
+Everything is in scene units and float32. A lens with distortion is part of the projection: the mean is
+distorted, and the Jacobian that flattens the covariance is that of the distorted projection, so pictures
+need no undistortion at intake and any camera can be rendered.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.composite import harmonic
+from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite
+from edge_server.fields.kernels.jit import kernel
+
+# Columns of a Gaussian's parameters; from COLOR + 3 on, three for each further spherical harmonic.
+POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
+BASE = 14
+# Columns of a projected Gaussian.
+MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 12
+# Columns of a camera.
+ORIGIN, LENS, LIMITS, NEAR, SIZE, CAMERA = 9, 12, 20, 24, 25, 28
+
+TILE = 8  # pixels a side
+BLOCK = 128  # Gaussians a task
+
+LOW_PASS = 0.3  # of a pixel squared: nothing is sharper than a pixel
+ALPHA_LEAST = 1.0 / 255.0  # a Gaussian ends where it adds less than this
+# Bounds of raw parameters, applied forward; where they bind the gradient is 0.
+SCALE_LOW, SCALE_HIGH = -12.0, 4.0
+RAW_OPACITY = 12.0
+FAR = 1e5  # scene units: beyond it float32 squares lose their meaning
+_NO_DIRECTION = 1e-20  # squared length of a quaternion that has none
+
+_F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
+
+
+class Gaussians(NamedTuple):
+    """params: float32 (N, BASE + 3 (harmonics - 1)). harmonics: 1, 4 or 9."""
+
+    params: NDArray[np.float32]
+    harmonics: int
+
+
+@njit(inline="always")
+def _bent(cams, b, x, y):
+    """Distorted normalised coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
+    its derivatives xxx, xxy, xyy, yyy."""
+    k1, k2, p1, p2 = cams[b, LENS + 4], cams[b, LENS + 5], cams[b, LENS + 6], cams[b, LENS + 7]
+    six, eight = np.float32(6.0), np.float32(8.0)
+    r2 = x * x + y * y
+    radial = _F1 + r2 * (k1 + r2 * k2)
+    g = k1 + _F2 * k2 * r2
+    u = x * radial + _F2 * p1 * x * y + p2 * (r2 + _F2 * x * x)
+    v = y * radial + p1 * (r2 + _F2 * y * y) + _F2 * p2 * x * y
+    dxx = radial + _F2 * x * x * g + _F2 * p1 * y + six * p2 * x
+    dxy = _F2 * x * y * g + _F2 * p1 * x + _F2 * p2 * y
+    dyy = radial + _F2 * y * y * g + six * p1 * y + _F2 * p2 * x
+    xxx = six * x * g + eight * k2 * x * x * x + six * p2
+    xxy = _F2 * y * g + eight * k2 * x * x * y + _F2 * p1
+    xyy = _F2 * x * g + eight * k2 * x * y * y + _F2 * p2
+    yyy = six * y * g + eight * k2 * y * y * y + six * p1
+    return u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy
+
+
+@njit(inline="always")
+def _unit_quaternion(params, i):
+    """The quaternion's direction and 1 / length; (1, 0, 0, 0) and 0 where it has none."""
+    w, x = params[i, QUATERNION], params[i, QUATERNION + 1]
+    y, z = params[i, QUATERNION + 2], params[i, QUATERNION + 3]
+    square = w * w + x * x + y * y + z * z
+    if not (square > np.float32(_NO_DIRECTION) and square < np.float32(1e20)):
+        return _F1, _F0, _F0, _F0, _F0
+    inverse = _F1 / np.sqrt(square)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@njit(inline="always")
+def _rotation(w, x, y, z):
+    return (
+        _F1 - _F2 * (y * y + z * z), _F2 * (x * y - w * z), _F2 * (x * z + w * y),
+        _F2 * (x * y + w * z), _F1 - _F2 * (x * x + z * z), _F2 * (y * z - w * x),
+        _F2 * (x * z - w * y), _F2 * (y * z + w * x), _F1 - _F2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@njit(inline="always")
+def _scale(params, i, k):
+    return exp32(min(max(params[i, SCALE + k], np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
+
+
+@njit(inline="always")
+def _camera_point(cams, b, params, i):
+    x = params[i, 0] - cams[b, ORIGIN]
+    y = params[i, 1] - cams[b, ORIGIN + 1]
+    z = params[i, 2] - cams[b, ORIGIN + 2]
+    return (
+        cams[b, 0] * x + cams[b, 1] * y + cams[b, 2] * z,
+        cams[b, 3] * x + cams[b, 4] * y + cams[b, 5] * z,
+        cams[b, 6] * x + cams[b, 7] * y + cams[b, 8] * z,
+    )
+
+
+@njit(inline="always")
+def _flattener(cams, b, x, y, z):
+    """What takes world axes to pixels at a camera point: mean (u, v), the rows of J W (2 x 3), and what its
+    gradient needs. The ratios x / z and y / z are held to 1.3 of the field of view, where J is taken."""
+    inverse = _F1 / z
+    a, c = x * inverse, y * inverse
+    ta = min(max(a, cams[b, LIMITS]), cams[b, LIMITS + 1])
+    tc = min(max(c, cams[b, LIMITS + 2]), cams[b, LIMITS + 3])
+    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = _bent(cams, b, ta, tc)
+    # Beyond the limits the lens goes on straight: its polynomial folds back into the picture out there.
+    u += dxx * (a - ta) + dxy * (c - tc)
+    v += dxy * (a - ta) + dyy * (c - tc)
+    return a, c, ta, tc, u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse
+
+
+@njit(inline="always")
+def _times(cams, b, j0, j1, j2):
+    """A row of camera axes -> of world axes."""
+    return (
+        j0 * cams[b, 0] + j1 * cams[b, 3] + j2 * cams[b, 6],
+        j0 * cams[b, 1] + j1 * cams[b, 4] + j2 * cams[b, 7],
+        j0 * cams[b, 2] + j1 * cams[b, 5] + j2 * cams[b, 8],
+    )
+
+
+@kernel
+def project_one(cams, b, params, harmonics, i, projected, tiles):
+    """Fill projected[b, i] (PROJECTED,) and tiles[b, i] (x0, x1, y0, y1: tiles it may touch; x1 <= x0:
+    none). conic: the inverse of the picture covariance, upper triangle."""
+    tiles[b, i, 0] = tiles[b, i, 1] = tiles[b, i, 2] = tiles[b, i, 3] = 0
+    x, y, z = _camera_point(cams, b, params, i)
+    raw = params[i, OPACITY]
+    if not (z > cams[b, NEAR] and z < np.float32(FAR)) or not is_finite(raw):
+        return
+    fx, fy = cams[b, LENS], cams[b, LENS + 1]
+    _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = _flattener(cams, b, x, y, z)
+    gx, gy = fx * inverse, fy * inverse
+    t0, t1, t2 = _times(cams, b, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
+    t3, t4, t5 = _times(cams, b, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
+    qw, qx, qy, qz, _ = _unit_quaternion(params, i)
+    r0, r1, r2, r3, r4, r5, r6, r7, r8 = _rotation(qw, qx, qy, qz)
+    s0, s1, s2 = _scale(params, i, 0), _scale(params, i, 1), _scale(params, i, 2)
+    v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
+        t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
+    w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
+        t3 * r2 + t4 * r5 + t5 * r8) * s2  # fmt: skip
+    low = np.float32(LOW_PASS)
+    # The covariance is V V^T + low-pass: symmetric, and its determinant a sum of squares by Lagrange's
+    # identity, which a difference of products would lose for needles.
+    e, g = v0 * v0 + v1 * v1 + v2 * v2, w0 * w0 + w1 * w1 + w2 * w2
+    n0, n1, n2 = v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0
+    determinant = max(n0 * n0 + n1 * n1 + n2 * n2 + low * (e + g) + low * low, np.float32(1e-10))
+    e, g, f = e + low, g + low, v0 * w0 + v1 * w1 + v2 * w2
+    alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY)), np.float32(RAW_OPACITY))))
+    px, py = fx * u + cams[b, LENS + 2], fy * v + cams[b, LENS + 3]
+    if not is_finite(determinant) or not abs(px) + abs(py) < np.float32(1e6) or not is_finite(e + g):
+        return
+    if alpha <= np.float32(ALPHA_LEAST):
+        return
+    reach = _F2 * np.log(alpha * np.float32(1.0 / ALPHA_LEAST))
+    rx, ry = np.sqrt(reach * e), np.sqrt(reach * g)
+    width, height = cams[b, SIZE], cams[b, SIZE + 1]
+    if px + rx <= _F0 or px - rx >= width or py + ry <= _F0 or py - ry >= height:
+        return
+    over = np.float32(1.0 / TILE)
+    x0, y0 = max(px - rx, _F0), max(py - ry, _F0)
+    x1, y1 = min(px + rx, width - _HALF), min(py + ry, height - _HALF)
+    tiles[b, i, 0], tiles[b, i, 1] = np.int32(x0 * over), np.int32(x1 * over) + 1
+    tiles[b, i, 2], tiles[b, i, 3] = np.int32(y0 * over), np.int32(y1 * over) + 1
+    inv = _F1 / determinant
+    row = projected[b, i]
+    row[MX], row[MY], row[DEPTH] = px, py, z
+    row[QA], row[QB], row[QC] = g * inv, -f * inv, e * inv
+    row[ALPHA], row[RADIUS] = alpha, np.sqrt(max(e, g))
+    for k in range(3):
+        row[RED + k] = params[i, COLOR + k]
+    if harmonics > 1:
+        ox, oy, oz = params[i, 0] - cams[b, ORIGIN], params[i, 1] - cams[b, ORIGIN + 1], (
+            params[i, 2] - cams[b, ORIGIN + 2])  # fmt: skip
+        length = _F1 / max(np.sqrt(ox * ox + oy * oy + oz * oz), np.float32(1e-9))
+        ox, oy, oz = ox * length, oy * length, oz * length
+        for h in range(1, harmonics):
+            value = harmonic(h, ox, oy, oz)
+            for k in range(3):
+                row[RED + k] += value * params[i, BASE + 3 * (h - 1) + k]
+    if not is_finite(row[RED] + row[RED + 1] + row[RED + 2]):
+        tiles[b, i, 1] = tiles[b, i, 0]
+
+
+@njit(inline="always")
+def _harmonic_slope(h, x, y, z):
+    """Derivatives of harmonic h by x, y and z."""
+    a, b, c = np.float32(0.4886025), np.float32(1.0925485), np.float32(0.3153916)
+    if h == 1:
+        return _F0, a, _F0
+    if h == 2:
+        return _F0, _F0, a
+    if h == 3:
+        return a, _F0, _F0
+    if h == 4:
+        return b * y, b * x, _F0
+    if h == 5:
+        return _F0, b * z, b * y
+    if h == 6:
+        return _F0, _F0, np.float32(6.0) * c * z
+    if h == 7:
+        return b * z, _F0, b * x
+    d = np.float32(2.0 * 0.5462742)
+    return d * x, -d * y, _F0
+
+
+@kernel
+def project_back(cams, b, params, harmonics, i, sums, projected, out):
+    """Add to out (BASE + ...,) the gradient of what ``project_one`` made of Gaussian i.
+
+    sums: float32 (9,), over the pixels it covers: d loss / d power (h), h dx, h dy, h dx^2, h dx dy, h dy^2
+    with (dx, dy) from the mean to the pixel, and d loss / d colour. Returns the length of the gradient of
+    the mean in the picture (pixels)."""
+    row = projected[b, i]
+    x, y, z = _camera_point(cams, b, params, i)
+    fx, fy = cams[b, LENS], cams[b, LENS + 1]
+    a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = _flattener(cams, b, x, y, z)
+    gx, gy = fx * inverse, fy * inverse
+    j0, j1, j2 = gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc)
+    j3, j4, j5 = gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc)
+    t0, t1, t2 = _times(cams, b, j0, j1, j2)
+    t3, t4, t5 = _times(cams, b, j3, j4, j5)
+    qw, qx, qy, qz, q_inverse = _unit_quaternion(params, i)
+    r0, r1, r2, r3, r4, r5, r6, r7, r8 = _rotation(qw, qx, qy, qz)
+    s0, s1, s2 = _scale(params, i, 0), _scale(params, i, 1), _scale(params, i, 2)
+    v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
+        t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
+    w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
+        t3 * r2 + t4 * r5 + t5 * r8) * s2  # fmt: skip
+    # mean and conic
+    qa, qb, qc = row[QA], row[QB], row[QC]
+    du, dv = qa * sums[1] + qb * sums[2], qb * sums[1] + qc * sums[2]
+    ga, gb, gc = -_HALF * sums[3], -_HALF * sums[4], -_HALF * sums[5]
+    # d cov = - Q G Q
+    m0, m1 = qa * ga + qb * gb, qa * gb + qb * gc
+    m2, m3 = qb * ga + qc * gb, qb * gb + qc * gc
+    e, f, g = -(m0 * qa + m1 * qb), -(m0 * qb + m1 * qc), -(m2 * qb + m3 * qc)
+    # cov = V V^T
+    a0, a1, a2 = _F2 * (e * v0 + f * w0), _F2 * (e * v1 + f * w1), _F2 * (e * v2 + f * w2)
+    b0, b1, b2 = _F2 * (f * v0 + g * w0), _F2 * (f * v1 + g * w1), _F2 * (f * v2 + g * w2)
+    for k, d in enumerate((a0 * v0 + b0 * w0, a1 * v1 + b1 * w1, a2 * v2 + b2 * w2)):
+        raw = params[i, SCALE + k]
+        if raw > np.float32(SCALE_LOW) and raw < np.float32(SCALE_HIGH):
+            out[SCALE + k] += d
+    a0, a1, a2, b0, b1, b2 = a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2
+    # rotation: T^T dU, then the quaternion and its normalisation
+    if q_inverse > _F0:
+        d0, d1, d2 = t0 * a0 + t3 * b0, t0 * a1 + t3 * b1, t0 * a2 + t3 * b2
+        d3, d4, d5 = t1 * a0 + t4 * b0, t1 * a1 + t4 * b1, t1 * a2 + t4 * b2
+        d6, d7, d8 = t2 * a0 + t5 * b0, t2 * a1 + t5 * b1, t2 * a2 + t5 * b2
+        hw = _F2 * (qx * (d7 - d5) + qy * (d2 - d6) + qz * (d3 - d1))
+        hx = _F2 * (qy * (d1 + d3) + qz * (d2 + d6) + qw * (d7 - d5) - _F2 * qx * (d4 + d8))
+        hy = _F2 * (qx * (d1 + d3) + qz * (d5 + d7) + qw * (d2 - d6) - _F2 * qy * (d0 + d8))
+        hz = _F2 * (qx * (d2 + d6) + qy * (d5 + d7) + qw * (d3 - d1) - _F2 * qz * (d0 + d4))
+        along = hw * qw + hx * qx + hy * qy + hz * qz
+        out[QUATERNION] += (hw - along * qw) * q_inverse
+        out[QUATERNION + 1] += (hx - along * qx) * q_inverse
+        out[QUATERNION + 2] += (hy - along * qy) * q_inverse
+        out[QUATERNION + 3] += (hz - along * qz) * q_inverse
+    # dT = dU R^T, then dJ = dT W^T
+    c0, c1, c2 = a0 * r0 + a1 * r1 + a2 * r2, a0 * r3 + a1 * r4 + a2 * r5, a0 * r6 + a1 * r7 + a2 * r8
+    c3, c4, c5 = b0 * r0 + b1 * r1 + b2 * r2, b0 * r3 + b1 * r4 + b2 * r5, b0 * r6 + b1 * r7 + b2 * r8
+    k0 = c0 * cams[b, 0] + c1 * cams[b, 1] + c2 * cams[b, 2]
+    k1 = c0 * cams[b, 3] + c1 * cams[b, 4] + c2 * cams[b, 5]
+    k2 = c0 * cams[b, 6] + c1 * cams[b, 7] + c2 * cams[b, 8]
+    k3 = c3 * cams[b, 0] + c4 * cams[b, 1] + c5 * cams[b, 2]
+    k4 = c3 * cams[b, 3] + c4 * cams[b, 4] + c5 * cams[b, 5]
+    k5 = c3 * cams[b, 6] + c4 * cams[b, 7] + c5 * cams[b, 8]
+    dz = -inverse * (k0 * j0 + k1 * j1 + k2 * j2 + k3 * j3 + k4 * j4 + k5 * j5)
+    # J by the ratios: J = D P with P = (1, 0, -ta; 0, 1, -tc) / z
+    dda = fx * du * dxx + fy * dv * dxy
+    ddc = fx * du * dxy + fy * dv * dyy
+    p0, p1 = gx * (k0 - ta * k2), gx * (k1 - tc * k2)  # by dxx and dxy through the first row
+    p2, p3 = gy * (k3 - ta * k5), gy * (k4 - tc * k5)  # by dxy and dyy through the second
+    if a == ta:
+        dda += p0 * xxx + (p1 + p2) * xxy + p3 * xyy - (gx * dxx * k2 + gy * dxy * k5)
+    if c == tc:
+        ddc += p0 * xxy + (p1 + p2) * xyy + p3 * yyy - (gx * dxy * k2 + gy * dyy * k5)
+    dx, dy = dda * inverse, ddc * inverse
+    dz -= (dda * a + ddc * c) * inverse
+    o0 = cams[b, 0] * dx + cams[b, 3] * dy + cams[b, 6] * dz
+    o1 = cams[b, 1] * dx + cams[b, 4] * dy + cams[b, 7] * dz
+    o2 = cams[b, 2] * dx + cams[b, 5] * dy + cams[b, 8] * dz
+    if abs(params[i, OPACITY]) < np.float32(RAW_OPACITY):
+        out[OPACITY] += sums[0] * (_F1 - row[ALPHA])
+    for k in range(3):
+        out[COLOR + k] += sums[6 + k]
+    if harmonics > 1:
+        nx, ny, nz = params[i, 0] - cams[b, ORIGIN], params[i, 1] - cams[b, ORIGIN + 1], (
+            params[i, 2] - cams[b, ORIGIN + 2])  # fmt: skip
+        length = _F1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-9))
+        nx, ny, nz = nx * length, ny * length, nz * length
+        lx, ly, lz = _F0, _F0, _F0
+        for h in range(1, harmonics):
+            value = harmonic(h, nx, ny, nz)
+            hx, hy, hz = _harmonic_slope(h, nx, ny, nz)
+            share = _F0
+            for k in range(3):
+                out[BASE + 3 * (h - 1) + k] += value * sums[6 + k]
+                share += params[i, BASE + 3 * (h - 1) + k] * sums[6 + k]
+            lx, ly, lz = lx + share * hx, ly + share * hy, lz + share * hz
+        along = lx * nx + ly * ny + lz * nz
+        o0 += (lx - along * nx) * length
+        o1 += (ly - along * ny) * length
+        o2 += (lz - along * nz) * length
+    out[0] += o0
+    out[1] += o1
+    out[2] += o2
+    return np.sqrt(du * du + dv * dv)
+
+
+@kernel
+def project(counter, worker, cams, gaussians, count, projected, tiles):
+    """Tasks are blocks of Gaussians of one camera. cams: float32 (B, CAMERA). projected: float32
+    (B, >= count, PROJECTED), tiles: int32 (B, >= count, 4), both written."""
+    blocks = (count + BLOCK - 1) // BLOCK
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= blocks * cams.shape[0]:
+            return
+        b, block = task // blocks, task % blocks
+        for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
+            project_one(cams, b, gaussians.params, gaussians.harmonics, i, projected, tiles)

@@ -1,0 +1,258 @@
+"""Compositing a tile's Gaussians front to back (thesis 3.20 with alphas in place of densities) and back.
+
+A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with offsets that
+are constants, which is what lets LLVM vectorise it without tests for overlap.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
+from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.splat_project import (
+    ALPHA,
+    ALPHA_LEAST,
+    DEPTH,
+    MX,
+    MY,
+    QA,
+    QB,
+    QC,
+    RED,
+    TILE,
+)
+
+PIXELS = TILE * TILE
+# One constant in both passes: no Gaussian hides everything, and one that would has no gradient.
+ALPHA_MOST = 0.99
+STOP = 1e-4  # of the light: what lies behind is not seen
+SUMS = 9
+
+# Rows of a tile's memory.
+_X, _Y, _T, _R, _G, _B, _Z = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * PIXELS, 6 * PIXELS
+_ER, _EG, _EB, _BEHIND = 7 * PIXELS, 8 * PIXELS, 9 * PIXELS, 10 * PIXELS
+ROWS = 11
+KEPT = 2 * PIXELS  # floats kept of a pair between the passes: alphas, and the light that reached it
+
+_F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
+_BYTE = np.float32(1.0 / 255.0)
+_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # of SSIM
+
+
+class Loss(NamedTuple):
+    """What is minimised, per pixel and summed. absolute: L1 rather than squared errors. dssim: weight of
+    (1 - SSIM) / 2 over the tile as one window. background: float32 (3,); random: another one for each tile,
+    from stream ``key``."""
+
+    absolute: bool
+    dssim: np.float32
+    background: NDArray[np.float32]
+    random: bool
+    key: np.uint64
+
+
+@njit(inline="always")
+def _begin(s, x0, y0):
+    for k in range(PIXELS):
+        s[_X + k] = np.float32(x0 + k % TILE) + _HALF
+        s[_Y + k] = np.float32(y0 + k // TILE) + _HALF
+        s[_T + k] = _F1
+        s[_R + k] = s[_G + k] = s[_B + k] = s[_Z + k] = _F0
+
+
+@kernel
+def blend(s, kept, at, row):
+    """Lay one Gaussian (projected row) behind what tile memory ``s`` holds; its alphas and the light that
+    reached it go to kept[at : at + KEPT]. Returns in how many pixels light is left."""
+    mx, my, qa, qb, qc = row[MX], row[MY], row[QA], row[QB], row[QC]
+    alpha, r, g, b, z = row[ALPHA], row[RED], row[RED + 1], row[RED + 2], row[DEPTH]
+    most, least, stop = np.float32(ALPHA_MOST), np.float32(ALPHA_LEAST), np.float32(STOP)
+    qa, qc = -_HALF * qa, -_HALF * qc
+    alive = _F0
+    out = kept[at : at + KEPT]
+    for k in range(PIXELS):
+        dx, dy, t = s[_X + k] - mx, s[_Y + k] - my, s[_T + k]
+        a = min(alpha * exp32(dx * (qa * dx - qb * dy) + qc * dy * dy), most)
+        a = a if a >= least and t >= stop else _F0
+        w = a * t
+        out[k] = a
+        out[PIXELS + k] = t
+        s[_R + k] += w * r
+        s[_G + k] += w * g
+        s[_B + k] += w * b
+        s[_Z + k] += w * z
+        t -= w
+        s[_T + k] = t
+        alive += _F1 if t >= stop else _F0
+    return alive
+
+
+@kernel
+def unblend(s, kept, at, row, sums):
+    """The gradient of ``blend``, back to front: rows ER, EG, EB of ``s`` hold d loss / d colour, row BEHIND
+    what the pixel's colour behind this Gaussian has to do with it. sums: float32 (9,), written; see
+    ``project_back``."""
+    mx, my, r, g, b = row[MX], row[MY], row[RED], row[RED + 1], row[RED + 2]
+    most = np.float32(ALPHA_MOST)
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _F0
+    back = kept[at : at + KEPT]
+    for k in range(PIXELS):
+        a, t = back[k], back[PIXELS + k]
+        er, eg, eb, behind = s[_ER + k], s[_EG + k], s[_EB + k], s[_BEHIND + k]
+        dx, dy = s[_X + k] - mx, s[_Y + k] - my
+        w, shade = a * t, er * r + eg * g + eb * b
+        h = a * (t * shade - behind / (_F1 - a))
+        h = h if a < most else _F0
+        s[_BEHIND + k] = behind + w * shade
+        hx, hy = h * dx, h * dy
+        s0 += h
+        s1 += hx
+        s2 += hy
+        s3 += hx * dx
+        s4 += hx * dy
+        s5 += hy * dy
+        s6 += w * er
+        s7 += w * eg
+        s8 += w * eb
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = s0, s1, s2, s3, s4, s5
+    sums[6], sums[7], sums[8] = s6, s7, s8
+
+
+@kernel
+def dissimilarity(s, row, error_row, target, count, weight):
+    """Add the gradient of weight * count * (1 - SSIM) / 2 between a colour row of ``s`` and target (PIXELS,)
+    over their first ``count`` pixels that lie in the picture; returns that loss."""
+    n = _F1 / np.float32(count)
+    mx = my = xx = yy = xy = _F0
+    for k in range(PIXELS):
+        inside = target[k] >= _F0
+        x, y = s[row + k] if inside else _F0, target[k] if inside else _F0
+        mx += x
+        my += y
+        xx += x * x
+        yy += y * y
+        xy += x * y
+    mx, my = mx * n, my * n
+    # Rounding can make a variance negative.
+    xx, yy, xy = max(xx * n - mx * mx, _F0), max(yy * n - my * my, _F0), xy * n - mx * my
+    a1, a2, b1, b2 = _F2 * mx * my + _C1, _F2 * xy + _C2, mx * mx + my * my + _C1, xx + yy + _C2
+    ssim = min(max(a1 * a2 / (b1 * b2), -_F1), _F1)
+    by_mean = _F2 * my * a2 / (b1 * b2) - _F2 * mx * ssim / b1
+    by_xy, by_xx = _F2 * a1 / (b1 * b2), -ssim / b2
+    scale = -_HALF * weight
+    for k in range(PIXELS):
+        if target[k] >= _F0:
+            x, y = s[row + k], target[k]
+            s[error_row + k] += scale * (by_mean + by_xy * (y - my) + _F2 * by_xx * (x - mx))
+    return _HALF * weight * np.float32(count) * (_F1 - ssim)
+
+
+@njit(inline="always")
+def _target(views, view, x0, y0, loss, task, target, back):
+    """Fill target (3, PIXELS), -1 outside the picture; back (3,). Returns how many pixels are inside."""
+    width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
+    for c in range(3):
+        back[c] = loss.background[c]
+        if loss.random:
+            back[c] = uniform(loss.key, np.uint64(3 * task + c))
+    count = 0
+    transparent = views.pixels.shape[1] == 4
+    for k in range(PIXELS):
+        x, y = x0 + k % TILE, y0 + k // TILE
+        if x >= width or y >= height:
+            target[0, k] = target[1, k] = target[2, k] = -_F1
+            continue
+        count += 1
+        pixel = first + y * width + x
+        opaque = np.float32(views.pixels[pixel, 3]) * _BYTE if transparent else _F1
+        for c in range(3):
+            target[c, k] = np.float32(views.pixels[pixel, c]) * _BYTE * opaque + back[c] * (_F1 - opaque)
+    return count
+
+
+@kernel
+def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, kept,
+                sums, losses):  # fmt: skip
+    """Render, compare, differentiate. views: ``rays.Views``; picked: int64 (B,), the view of each camera
+    slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), kept: float32
+    (W, longest * KEPT), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written. losses:
+    float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not finite."""
+    s, store = memory[worker], kept[worker]
+    target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= tasks.shape[0]:
+            return
+        b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
+        x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
+        count = _target(views, picked[b], x0, y0, loss, task, target, back)
+        _begin(s, x0, y0)
+        begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
+        last = end
+        for j in range(begin, end):
+            i = lists.owner[b, lists.pair[b, j]]
+            if blend(s, store, (j - begin) * KEPT, projected[b, i]) == _F0:
+                last = j + 1
+                break
+        total, square = _F0, _F0
+        for c in range(3):
+            for k in range(PIXELS):
+                s[_R + c * PIXELS + k] += s[_T + k] * back[c]
+                inside = target[c, k] >= _F0
+                e = s[_R + c * PIXELS + k] - target[c, k] if inside else _F0
+                square += e * e
+                total += abs(e) if loss.absolute else e * e
+                sign = _F1 if e > _F0 else (-_F1 if e < _F0 else _F0)
+                s[_ER + c * PIXELS + k] = sign if loss.absolute else _F2 * e
+        if loss.dssim > _F0:
+            for c in range(3):
+                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], count, loss.dssim)
+        finite = is_finite(total)
+        losses[task, 0], losses[task, 1] = total if finite else 0.0, square if finite else 0.0
+        losses[task, 2] = 0.0 if finite else 1.0
+        if not finite:
+            last = begin
+        for j in range(last, end):
+            rest = sums[b, lists.pair[b, j]]
+            for k in range(SUMS):
+                rest[k] = _F0
+        for k in range(PIXELS):
+            s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
+        for j in range(last - 1, begin - 1, -1):
+            p = lists.pair[b, j]
+            unblend(s, store, (j - begin) * KEPT, projected[b, lists.owner[b, p]], sums[b, p])
+
+
+@kernel
+def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, kept,
+                 color, depth, opacity):  # fmt: skip
+    """The picture of camera slot 0. color: float32 (H, W, 3), depth (z) and opacity (H, W), all written."""
+    s, store = memory[worker], kept[worker]
+    while True:
+        t = fetch_add(counter, 1)
+        if t >= columns * rows:
+            return
+        x0, y0 = TILE * (t % columns), TILE * (t // columns)
+        _begin(s, x0, y0)
+        for j in range(lists.first[0, t], lists.first[0, t + 1]):
+            i = lists.owner[0, lists.pair[0, j]]
+            if blend(s, store, np.int64(0), projected[0, i]) == _F0:
+                break
+        for k in range(PIXELS):
+            x, y = x0 + k % TILE, y0 + k // TILE
+            if x >= width or y >= height:
+                continue
+            left = s[_T + k]
+            for c in range(3):
+                value = s[_R + c * PIXELS + k] + left * background[c]
+                color[y, x, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
+            seen = _F1 - left
+            far = s[_Z + k] / max(seen, np.float32(1e-3))
+            healthy = is_finite(far) and is_finite(seen)
+            depth[y, x] = far if healthy and seen > np.float32(1e-3) else _F0
+            opacity[y, x] = min(max(seen, _F0), _F1) if healthy else _F0

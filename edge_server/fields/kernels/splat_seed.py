@@ -1,0 +1,138 @@
+"""Where surfaces are likely, before anything is known: cells whose colour the cameras agree on, and for each
+pixel the best of the cells its ray passes (plane sweep by votes, after Seitz and Dyer's voxel colouring)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from edge_server.fields.kernels.intrinsics import fetch_add
+from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.rays import HORIZON, pixel_direction
+from edge_server.fields.kernels.splat_project import LENS, NEAR, ORIGIN, _bent
+
+MOST_VIEWS = 32  # that vote
+NOT_SEEN = -2.0
+_EMPTY_VIEWS = 2  # that see plain background through a cell suffice to empty it
+
+_F0, _F1 = np.float32(0.0), np.float32(1.0)
+
+
+@njit(inline="always")
+def _spread(u):
+    """A coordinate of contracted space [-2, 2] whose largest is m -> factor to scene units."""
+    return _F1 / ((np.float32(2.0) - u) * u) if u > _F1 else _F1
+
+
+@kernel
+def score_cells(counter, worker, cams, views, blurred, plain, plain_color, tolerance, contracted, cells,
+                min_views, scores):  # fmt: skip
+    """scores: float32 (cells^3,), x fastest: how well the cameras agree on a colour there, up to 1; NOT_SEEN
+    where fewer than min_views look or background shows. Tasks are layers along z.
+
+    views: ``rays.Views`` of at most MOST_VIEWS cameras, rows of ``cams``; blurred: uint8 (pixels, 3 or 4),
+    their pictures at the cells' sharpness. plain: whether plain_color (3,) is an empty background;
+    tolerance: of a colour, summed over channels, in [0, 3].
+    """
+    total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
+    colors = np.empty((MOST_VIEWS, 3), np.float32)
+    while True:
+        layer = fetch_add(counter, 1)
+        if layer >= cells:
+            return
+        for iy in range(cells):
+            for ix in range(cells):
+                size = np.float32(2.0) * half / np.float32(cells)
+                x = (np.float32(ix) + np.float32(0.5)) * size - half
+                y = (np.float32(iy) + np.float32(0.5)) * size - half
+                z = (np.float32(layer) + np.float32(0.5)) * size - half
+                if contracted:
+                    s = _spread(max(abs(x), max(abs(y), abs(z))))
+                    x, y, z = x * s, y * s, z * s
+                n, empty = 0, 0
+                for v in range(total):
+                    dx, dy, dz = x - cams[v, ORIGIN], y - cams[v, ORIGIN + 1], z - cams[v, ORIGIN + 2]
+                    depth = cams[v, 6] * dx + cams[v, 7] * dy + cams[v, 8] * dz
+                    if depth <= cams[v, NEAR]:
+                        continue
+                    a = (cams[v, 0] * dx + cams[v, 1] * dy + cams[v, 2] * dz) / depth
+                    b = (cams[v, 3] * dx + cams[v, 4] * dy + cams[v, 5] * dz) / depth
+                    if not (abs(a) < np.float32(4.0) and abs(b) < np.float32(4.0)):
+                        continue
+                    bent = _bent(cams, v, a, b)
+                    px = cams[v, LENS] * bent[0] + cams[v, LENS + 2]
+                    py = cams[v, LENS + 1] * bent[1] + cams[v, LENS + 3]
+                    width, height = views.size[v, 0], views.size[v, 1]
+                    if not (px >= _F0 and py >= _F0 and px < width and py < height):
+                        continue
+                    pixel = views.first[v] + np.int64(py) * width + np.int64(px)
+                    away = _F0
+                    for c in range(3):
+                        colors[n, c] = np.float32(blurred[pixel, c]) * np.float32(1.0 / 255.0)
+                        away += abs(colors[n, c] - plain_color[c])
+                    if blurred.shape[1] == 4:
+                        empty += 1 if blurred[pixel, 3] < 16 else 0
+                    elif plain and away < np.float32(0.06):
+                        empty += 1
+                    n += 1
+                best = 0
+                for j in range(n):
+                    agree = 0
+                    for k in range(n):
+                        apart = (
+                            abs(colors[j, 0] - colors[k, 0])
+                            + abs(colors[j, 1] - colors[k, 1])
+                            + abs(colors[j, 2] - colors[k, 2])
+                        )
+                        agree += 1 if apart < tolerance else 0
+                    best = max(best, agree)
+                score = np.float32(best - 1) / np.float32(n + 1)
+                if n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
+                    score = np.float32(NOT_SEEN)
+                scores[ix + cells * (iy + cells * layer)] = score
+
+
+@kernel
+def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted, cells, scores, distance):
+    """For ray n, through pixel ``pixels[n]`` (int64, within the view) of view ``view_of[n]`` (int64), the
+    distance in scene units of the best cell on it; 0 where there is none. Tasks are runs of 256 rays.
+
+    middle: the distance that is taken where nothing speaks for another one."""
+    half = np.float32(2.0) if contracted else _F1
+    size = np.float32(2.0) * half / np.float32(cells)
+    horizon = np.float32(HORIZON) if contracted else _F1
+    scale = np.float32(cells) / (np.float32(2.0) * half)
+    while True:
+        base = fetch_add(counter, 1) * 256
+        if base >= pixels.size:
+            return
+        for n in range(base, min(base + 256, pixels.size)):
+            v = view_of[n]
+            width = views.size[v, 0]
+            dx, dy, dz = pixel_direction(
+                views.lens[v], views.rotation[v],
+                np.float64(pixels[n] % width) + 0.5, np.float64(pixels[n] // width) + 0.5,
+            )  # fmt: skip
+            ox, oy, oz = (
+                np.float32(views.origin[v, 0]), np.float32(views.origin[v, 1]), np.float32(views.origin[v, 2])
+            )  # fmt: skip
+            best, at, t = np.float32(NOT_SEEN), _F0, max(near, size)
+            while t < np.float32(2.0) * horizon + middle:
+                x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+                m = max(abs(x), max(abs(y), abs(z)))
+                step = np.float32(0.5) * size
+                if m < horizon:
+                    s = _F1
+                    if contracted and m > _F1:
+                        s = (np.float32(2.0) - _F1 / m) / m
+                        step *= m * m
+                    ix = min(np.int64((x * s + half) * scale), cells - 1)
+                    iy = min(np.int64((y * s + half) * scale), cells - 1)
+                    iz = min(np.int64((z * s + half) * scale), cells - 1)
+                    score = scores[ix + cells * (iy + cells * iz)]
+                    if score > np.float32(NOT_SEEN):
+                        score -= np.float32(0.03) * abs(np.log(t / middle))
+                        if score > best:
+                            best, at = score, t
+                t += step
+            distance[n] = at

@@ -1,0 +1,115 @@
+"""Which Gaussians a tile sees, front to back: sorted by depth once per camera, then dealt out to tiles."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.intrinsics import fetch_add
+from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.splat_project import DEPTH
+
+RADIX = 2048
+
+
+class Lists(NamedTuple):
+    """A pair is a Gaussian and a tile it may touch; those of one Gaussian follow each other. B cameras,
+    T tiles at most, N Gaussians, P pairs.
+
+    wanted: uint8 (B, T), tiles that are looked at. first: int32 (B, T + 1) into ``pair``: int32 (B, P),
+    the tile's pairs front to back. owner: int32 (B, P), a pair's Gaussian. own_first, own_count: int32
+    (B, N), a Gaussian's pairs. needed, longest: int64 (B,), pairs there are (more than P: the farthest were
+    left out) and the longest list. order: int32 (B, 2, N), keys: uint32 (B, 2, N), scratch.
+    """
+
+    wanted: NDArray[np.uint8]
+    first: NDArray[np.int32]
+    pair: NDArray[np.int32]
+    owner: NDArray[np.int32]
+    own_first: NDArray[np.int32]
+    own_count: NDArray[np.int32]
+    needed: NDArray[np.int64]
+    longest: NDArray[np.int64]
+    order: NDArray[np.int32]
+    keys: NDArray[np.uint32]
+
+
+@kernel
+def _sort(keys, order, n):
+    """Stable radix sort of order[0, :n] by keys[0, :n], 33 bits in three passes; ends in row 1."""
+    counts = np.empty(RADIX + 1, np.int64)
+    for turn in range(3):
+        shift = np.uint32(11 * turn)
+        a, b = turn & 1, 1 - (turn & 1)
+        counts[:] = 0
+        for k in range(n):
+            counts[np.int64((keys[a, k] >> shift) & np.uint32(RADIX - 1)) + 1] += 1
+        for k in range(RADIX):
+            counts[k + 1] += counts[k]
+        for k in range(n):
+            digit = np.int64((keys[a, k] >> shift) & np.uint32(RADIX - 1))
+            to = counts[digit]
+            counts[digit] = to + 1
+            keys[b, to], order[b, to] = keys[a, k], order[a, k]
+
+
+@kernel
+def deal(counter, worker, columns, rows, count, projected, tiles, lists):
+    """Tasks are cameras. columns, rows: int64 (B,), tiles across and down. See ``Lists``."""
+    while True:
+        b = fetch_add(counter, 1)
+        if b >= columns.size:
+            return
+        keys, order, across = lists.keys[b], lists.order[b], columns[b]
+        wanted, first = lists.wanted[b], lists.first[b]
+        own_first, own_count, owner, pair = (
+            lists.own_first[b], lists.own_count[b], lists.owner[b], lists.pair[b])  # fmt: skip
+        total = across * rows[b]
+        n = 0
+        for i in range(count):
+            own_count[i] = 0
+            if tiles[b, i, 1] > tiles[b, i, 0]:
+                # Depths are positive: their bits sort as they do. 2^-6 of the mantissa's steps suffice.
+                keys[0, n] = np.uint32(projected[b, i, DEPTH] * np.float32(16384.0))
+                order[0, n] = i
+                n += 1
+        _sort(keys, order, n)
+        for t in range(total + 1):
+            first[t] = 0
+        made, needed, room = 0, 0, owner.size
+        for k in range(n):
+            i = order[1, k]
+            own_first[i] = made
+            for ty in range(tiles[b, i, 2], tiles[b, i, 3]):
+                for tx in range(tiles[b, i, 0], tiles[b, i, 1]):
+                    t = ty * across + tx
+                    if wanted[t]:
+                        if made < room:
+                            owner[made] = i
+                            first[t + 1] += 1
+                            made += 1
+                        needed += 1
+            own_count[i] = made - own_first[i]
+        longest = 0
+        for t in range(total):
+            longest = max(longest, first[t + 1])
+            first[t + 1] += first[t]
+        # first[t] serves as the tile's cursor and ends up where the next tile's list began.
+        made = 0
+        for k in range(n):
+            i = order[1, k]
+            if own_count[i] == 0:
+                continue
+            for ty in range(tiles[b, i, 2], tiles[b, i, 3]):
+                for tx in range(tiles[b, i, 0], tiles[b, i, 1]):
+                    t = ty * across + tx
+                    if wanted[t] and made < room:
+                        pair[first[t]] = made
+                        first[t] += 1
+                        made += 1
+        for t in range(total, 0, -1):
+            first[t] = first[t - 1]
+        first[0] = 0
+        lists.needed[b], lists.longest[b] = needed, longest

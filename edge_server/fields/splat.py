@@ -1,0 +1,348 @@
+"""3D Gaussian splatting on CPUs (Kerbl et al. 2023): tile kernels in numba, forward and backward.
+
+One step: the Gaussians are projected into a few cameras (``kernels.splat_project``), dealt out to tiles
+front to back (``kernels.splat_tiles``), tiles are rendered, compared and differentiated side by side
+(``kernels.splat_raster``), and every Gaussian gathers the gradients of its tiles in a fixed order and makes
+an Adam step (``kernels.splat_update``). Every now and then Gaussians are split and pruned.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Budget, Field, FitReport, Rendering, View
+from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
+from edge_server.fields.kernels.splat_project import BASE, BLOCK, COLOR, OPACITY, QUATERNION, SCALE, TILE
+from edge_server.fields.kernels.splat_raster import Loss, train_tiles
+from edge_server.fields.kernels.splat_update import Rule, bound_all, update
+from edge_server.fields.ngp_rig import Arrays, Rig
+from edge_server.fields.ngp_schedule import BETA1, BETA2, Pace, step_key
+from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.scene_box import NOWHERE
+from edge_server.fields.splat_growth import Cloud, grow_and_prune
+from edge_server.fields.splat_motion import changed_tiles, forget_what_moved
+from edge_server.fields.splat_passes import Passes, camera_rows
+from edge_server.fields.splat_seeds import seeds
+from edge_server.fields.splat_settings import SplatSettings, make_settings
+from edge_server.fields.splat_snapshot import SplatSnapshot
+from edge_server.fields.turn import Turn
+from freshfield.geometry import Pinhole
+
+_AGES = 1024  # steps after which Adam's bias correction no longer matters
+CHANGED_SLOTS = 4  # pictures whose changed tiles one step looks at, at most
+
+
+class SplatField:
+    """A cloud of Gaussians that learns while it is used. See ``fields.Field`` for the protocol.
+
+    ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
+    meanwhile: they wait for the end of the present step, some milliseconds.
+    """
+
+    def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
+        self.settings = settings or SplatSettings()
+        self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
+        age = np.maximum(np.arange(_AGES), 1)
+        corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age)], axis=-1)
+        self._corrections = corrections.astype(np.float32)
+        self._turn = Turn()
+        self._snapshot: SplatSnapshot | None = None
+        self.reset()
+
+    # --- the protocol -------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
+        s = self.settings
+        with self._turn.mine():
+            self.dropped = 0
+            self.rig = Rig(NgpSettings(
+                centre_m=s.centre_m, radius_m=s.radius_m, near_m=s.near_m, contracted=s.contracted,
+                background=s.background,
+            ))  # fmt: skip
+            self._forget_gaussians()
+
+    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
+        """Train on ``views`` from the present Gaussians. Raises ValueError for a view that cannot be one.
+
+        A budget in seconds (0.1 at least makes sense) is kept within 10 per cent, whatever the load; the
+        learning rates fall over the budget, so every fit ends with a settled field.
+        """
+        if not views:
+            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
+        pace = Pace(budget)
+        with self._turn.mine():
+            self._take_in(views)
+        rays = samples = dropped = 0
+        losses: deque[float] = deque(maxlen=32)
+        while (progress := pace.begin()) is not None:
+            with self._turn.mine():
+                loss, seen, pairs, lost = self._one_step(progress)
+            losses.append(loss)
+            rays, samples, dropped = rays + seen, samples + pairs, dropped + lost
+            pace.end()
+        self.dropped += dropped
+        loss = float(np.mean(losses)) if losses else 0.0
+        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped)
+
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """The picture of a camera, from the present Gaussians."""
+        return self.snapshot().render(camera_to_world, intrinsics)
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Surface points in world metres and their colours; none before the first fit."""
+        return self.snapshot().points(count)
+
+    def snapshot(self) -> SplatSnapshot:
+        """A copy that renders from any thread and never changes."""
+        with self._turn.mine():
+            if self._snapshot is None or self._snapshot.step != self.step:
+                self._snapshot = SplatSnapshot(
+                    box=self.rig.box or NOWHERE,
+                    gaussians=self.cloud.gaussians(self.settings.harmonics)._replace(
+                        params=self.cloud.params.copy()
+                    ),
+                    background=self.rig.background(),
+                    cameras=self.rig.views,
+                    pool=self.pool,
+                    step=self.step,
+                )
+            return self._snapshot
+
+    def warm_up(self) -> float:
+        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
+
+        Works on a small field of its own, in the calling thread and at its priority: the workers' low one
+        would make compiling on a busy machine take minutes. This field's state is not touched.
+        """
+        start = time.perf_counter()
+        tiny = replace(self.settings, gaussians=16, start=8, min_views=1, seed_cells=8, contracted=False)
+        camera = Pinhole.from_fov(8, 8, 60.0)
+        pose = np.eye(4)
+        pose[2, 3] = -3.0
+        for channels in (3, 4):
+            field = SplatField(tiny, CallerPool())
+            image = np.full((8, 8, channels), 128, np.uint8)
+            image[2:6, 2:6] = 255
+            field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
+            field.render(pose, camera)
+        return time.perf_counter() - start
+
+    # --- state --------------------------------------------------------------------------------
+
+    def state(self) -> Arrays:
+        """Everything needed to go on bit for bit: Gaussians, moments, cameras, counters."""
+        with self._turn.mine():
+            meta = {
+                "version": 1, "field": "splat", "settings": asdict(self.settings), "step": self.step,
+                "grown": self._grown, "dropped": self.dropped, **self.rig.meta(),
+            }  # fmt: skip
+            cloud = {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
+            both = {"meta": np.array(json.dumps(meta)), **cloud, **self.rig.arrays()}
+            return {name: np.array(array) for name, array in both.items()}
+
+    def load_state(self, state: Arrays) -> None:
+        """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
+        meta, cloud = _unpack(self.settings, state)
+        with self._turn.mine():
+            self.rig.load(meta, state)
+            self._forget_gaussians()
+            self.cloud = cloud
+            self.step, self._grown, self.dropped = (int(meta[k]) for k in ("step", "grown", "dropped"))
+
+    # --- inside -------------------------------------------------------------------------------
+
+    def _forget_gaussians(self) -> None:
+        self.step = 0
+        self._grown = 0  # step of the last splitting and pruning
+        self.cloud = Cloud.empty(self.settings)
+        self._passes = Passes(self.pool)
+        self._snapshot = None
+        self._views: tuple[View, ...] = ()
+        self._epoch = -1
+
+    def _rng(self, purpose: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.settings.seed, self.step, purpose]))
+
+    def _take_in(self, views: Sequence[View]) -> None:
+        """Learn of new pictures; begin a cloud, or make it anew where they show that something moved."""
+        s = self.settings
+        if len(views) != len(self._views) or any(a is not b for a, b in zip(views, self._views)):
+            news = [v for v in views if v.camera not in self.rig.memory
+                    or self.rig.memory[v.camera].view is not v]  # fmt: skip
+            intake = self.rig.take_in(views)
+            if intake.new_box:
+                self._forget_gaussians()
+            assert self.rig.box is not None
+            self._data = intake.data
+            self._cams = camera_rows(
+                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.rig.box
+            )
+            moved = [self.rig.memory[v.camera].moved for v in views]
+            self._changed = changed_tiles(moved)
+            self._views, self._epoch = tuple(views), -1
+            if len(self.cloud) and news and any(m is not None for m in moved):
+                forget_what_moved(s, self.pool, self.rig.box, self.cloud, views, moved, self._cams,
+                                  self._rng(2))  # fmt: skip
+        if len(self.cloud) == 0:
+            self._begin()
+        self._snapshot = None
+
+    def _choose(self) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
+        """The views of this step and which of their tiles."""
+        s, n = self.settings, len(self._views)
+        rng = self._rng(3)
+        slots = min(s.views_a_step, n)
+        first = self.step * s.views_a_step
+        if self._epoch != first // n:
+            self._epoch = first // n
+            pick = np.random.SeedSequence([s.seed, self._epoch, 4])
+            self._order = np.random.default_rng(pick).permutation(n)
+        picked = self._order[(first + np.arange(slots)) % n]
+        moving = [k for k, tiles in enumerate(self._changed) if tiles is not None]
+        if moving and rng.random() < s.changed_share:
+            some = np.array(moving)[(first + np.arange(min(CHANGED_SLOTS, len(moving)))) % len(moving)]
+            return some, [self._changed[k] for k in some]
+        if s.tile_share >= 1.0:
+            return picked, [None] * slots
+        wanted: list[NDArray[np.uint8] | None] = []
+        for k in picked:
+            size = self._data.size[k]
+            total = int(-(-size[0] // TILE) * -(-size[1] // TILE))
+            mask = np.zeros(total, np.uint8)
+            mask[rng.permutation(total)[: max(int(s.tile_share * total), 1)]] = 1
+            wanted.append(mask)
+        return picked, wanted
+
+    def _one_step(self, progress: float) -> tuple[float, int, int, int]:
+        """One optimiser step; returns its mean squared error, pixels, pairs of a Gaussian and a tile, and
+        how many tiles and gradients were not finite. progress: of the fit, in [0, 1]."""
+        s, box = self.settings, self.rig.box
+        assert box is not None
+        picked, wanted = self._choose()
+        cams, cloud = np.ascontiguousarray(self._cams[picked]), self.cloud
+        gaussians = cloud.gaussians(s.harmonics)
+        passes = self._passes
+        passes.look(cams, gaussians, wanted)
+        tasks = np.concatenate([
+            np.stack(np.broadcast_arrays(np.int32(b), np.flatnonzero(
+                passes.lists.wanted[b, : int(passes.columns[b] * passes.rows[b])]).astype(np.int32)), axis=-1)
+            for b in range(len(picked))
+        ])  # fmt: skip
+        losses = np.zeros((len(tasks), 3))
+        loss = Loss(
+            absolute=s.loss == "l1",
+            dssim=np.float32(s.dssim),
+            background=self.rig.background(),
+            random=s.background == "random",
+            key=step_key(s.seed, self.step),
+        )
+        self.pool.run(
+            train_tiles, self._data, picked.astype(np.int64), tasks, passes.columns, passes.projected,
+            passes.lists, loss, passes.memory, passes.kept, passes.sums, losses,
+        )  # fmt: skip
+        dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
+        self.pool.run(
+            update, cams, gaussians, len(cloud), passes.projected, passes.lists.own_first,
+            passes.lists.own_count, passes.sums, cloud.moments(), self._rule(progress), dropped,
+        )  # fmt: skip
+        lost = int(losses[:, 2].sum() + dropped.sum())
+        if losses[:, 2].any():
+            self._repair()
+        self._count_step()
+        pixels = TILE * TILE * len(tasks)
+        pairs = int(np.minimum(passes.lists.needed, passes.lists.pair.shape[1])[: len(picked)].sum())
+        return float(losses[:, 1].sum()) / (3 * pixels), pixels, pairs, lost
+
+    def _count_step(self) -> None:
+        """A step is made: grow and prune when it is time, after a look at every view at least."""
+        s = self.settings
+        self.step += 1
+        if self.step - self._grown >= max(s.densify_every, -(-len(self._views) // s.views_a_step)):
+            self._grow()
+
+    def _rule(self, progress: float) -> Rule:
+        s, box = self.settings, self.rig.box
+        assert box is not None
+        rates = np.full(BASE + 3 * (s.harmonics - 1), 0.1 * s.rate_color)
+        rates[:SCALE] = s.rate_position * box.pixel_m / box.radius_m
+        rates[SCALE:QUATERNION] = s.rate_scale
+        rates[QUATERNION:OPACITY] = s.rate_rotation
+        rates[OPACITY], rates[COLOR:BASE] = s.rate_opacity, s.rate_color
+        return Rule(
+            rates=(rates * s.rate_end**progress).astype(np.float32),
+            corrections=self._corrections,
+            beta1=np.float32(BETA1),
+            beta2=np.float32(BETA2),
+            epsilon=np.float32(s.epsilon),
+            fade=np.float32(s.fade),
+            largest=np.float32(s.largest),
+            thinnest=np.float32(np.log(s.aspect)),
+        )
+
+    def _grow(self) -> None:
+        s = self.settings
+        grow_and_prune(self.cloud, s, float(self._data.size[:, 0].mean()), self._rng(5))
+        if s.opacity_reset and self.step // s.opacity_reset != self._grown // s.opacity_reset:
+            # To a tenth: what pictures need grows back, what they do not is pruned (Kerbl et al. 5.2).
+            self.cloud.params[:, OPACITY] = np.minimum(self.cloud.params[:, OPACITY], np.float32(-2.2))
+        self._grown = self.step
+        if len(self.cloud) == 0:  # everything faded away: begin again rather than never
+            self._begin()
+
+    def _begin(self) -> None:
+        """First Gaussians, from the views at hand."""
+        assert self.rig.box is not None
+        s = self.settings
+        first = min(s.start, s.gaussians)
+        self.cloud = Cloud.of(seeds(s, self.pool, self.rig.box, self._views, None, first, self._rng(1)))
+
+    def _repair(self) -> None:
+        """Bring back what is not finite; such Gaussians become invisible and are pruned."""
+        s = self.settings
+        bound_all(self.cloud.params, np.float32(s.largest), np.float32(np.log(s.aspect)))
+        for array in (self.cloud.m, self.cloud.v):
+            np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], Cloud]:
+    """The facts and the Gaussians in ``state``; ValueError unless a field with ``settings`` made them."""
+    try:
+        meta = json.loads(str(state["meta"]))
+        if meta["field"] != "splat":
+            raise ValueError(f"it is of a field called {meta['field']!r}")
+        theirs = int(meta["settings"]["harmonics"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"not a state of a splat field: {error!r}") from None
+    if theirs != settings.harmonics:
+        raise ValueError(f"the state was made with harmonics = {theirs}, this field has {settings.harmonics}")
+    empty = Cloud.empty(settings)
+    count = len(state["params"]) if "params" in state else 0
+    arrays = {}
+    for f in fields(Cloud):
+        mine = getattr(empty, f.name)
+        shape = (count, *mine.shape[1:])
+        if f.name not in state or state[f.name].shape != shape or state[f.name].dtype != mine.dtype:
+            raise ValueError(f"the state lacks {f.name!r}, {mine.dtype} of shape {shape}")
+        arrays[f.name] = np.array(state[f.name])
+    if count > settings.gaussians:
+        raise ValueError(f"the state has {count} Gaussians, this field holds {settings.gaussians} at most")
+    return meta, Cloud(**arrays)
+
+
+def make(options: dict[str, Any], seed: int = 0) -> Field:
+    """A field from plain options (``splat_settings``), for the device they ask for."""
+    settings = make_settings(options, seed)
+    if settings.device != "cuda":
+        return SplatField(settings)
+    from edge_server.fields.splat_gsplat import make_cuda  # torch and gsplat, only where they are asked for
+
+    return make_cuda(settings)

@@ -1,0 +1,119 @@
+"""How Gaussians come and go: split where pictures pull at them, removed where they add nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.splat_project import BASE, OPACITY, QUATERNION, SCALE, Gaussians
+from edge_server.fields.kernels.splat_update import DEAD, Moments, bound_all
+from edge_server.fields.splat_settings import SplatSettings
+from freshfield.geometry import quaternion_to_matrix
+
+SHRINK = 1.6  # of both halves of a split Gaussian (Kerbl et al.)
+SHARP_PX = 1.0  # what is about a pixel wide is doubled without shrinking
+
+
+@dataclass
+class Cloud:
+    """The Gaussians and all that is known of each: arrays of equal length, at most ``settings.gaussians``."""
+
+    params: NDArray[np.float32]
+    m: NDArray[np.float32]
+    v: NDArray[np.float32]
+    age: NDArray[np.int32]
+    slope: NDArray[np.float32]
+    looks: NDArray[np.float32]
+    reach: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, params: NDArray[np.float32]) -> Cloud:
+        """New Gaussians, without a history."""
+        n = len(params)
+        flat = [np.zeros(n, np.float32) for _ in range(3)]
+        return cls(params, np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
+
+    @classmethod
+    def empty(cls, settings: SplatSettings) -> Cloud:
+        """None at all."""
+        return cls.of(np.zeros((0, BASE + 3 * (settings.harmonics - 1)), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.params)
+
+    def gaussians(self, harmonics: int) -> Gaussians:
+        """As the kernels read them."""
+        return Gaussians(self.params, harmonics)
+
+    def moments(self) -> Moments:
+        """As the kernels read them."""
+        return Moments(self.m, self.v, self.age, self.slope, self.looks, self.reach)
+
+    def keep(self, which: NDArray[np.bool_]) -> None:
+        """Remove the others."""
+        for f in fields(self):
+            setattr(self, f.name, np.ascontiguousarray(getattr(self, f.name)[which]))
+
+    def add(self, params: NDArray[np.float32]) -> None:
+        """Append new ones."""
+        new = Cloud.of(params)
+        for f in fields(self):
+            setattr(self, f.name, np.concatenate([getattr(self, f.name), getattr(new, f.name)]))
+
+
+def opacity(params: NDArray[np.float32]) -> NDArray[np.float32]:
+    """In [0, 1], (N,)."""
+    return (1.0 / (1.0 + np.exp(-params[:, OPACITY]))).astype(np.float32)
+
+
+def raw_opacity(alpha: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The inverse of ``opacity``."""
+    alpha = np.clip(alpha, 1e-4, 1.0 - 1e-4)
+    return np.log(alpha / (1.0 - alpha)).astype(np.float32)
+
+
+def grow_and_prune(cloud: Cloud, settings: SplatSettings, pixels: float, rng: np.random.Generator) -> None:
+    """Remove what no picture shows, then split the Gaussians whose place in the picture is pulled at most.
+
+    pixels: of a picture's width. The two halves together let through as much light as the one did (Bulo et
+    al. 2024): without that, every split would darken what lies behind.
+    """
+    seen = cloud.looks > 0
+    cloud.keep(seen & (opacity(cloud.params) >= settings.prune) & (cloud.params[:, OPACITY] > DEAD + 1e-3))
+    n = len(cloud)
+    want = min(settings.gaussians - n, int(np.ceil(settings.grow * n)))
+    if want > 0 and n > 0:
+        pull = cloud.slope / np.maximum(cloud.looks, 1.0)
+        pull = np.where(cloud.reach > settings.widest, np.inf, pull)
+        # Stable, so that equal ones are taken in one order on every machine.
+        chosen = np.sort(np.argsort(-pull, kind="stable")[:want])
+        chosen = chosen[pull[chosen] > 0]
+        _split(cloud, chosen, pixels, settings, rng)
+    cloud.slope[:] = 0.0
+    cloud.looks[:] = 0.0
+    cloud.reach[:] = 0.0
+
+
+def _split(
+    cloud: Cloud, chosen: NDArray[np.int64], pixels: float, settings: SplatSettings, rng: np.random.Generator
+) -> None:
+    one = cloud.params[chosen].copy()
+    size = np.exp(one[:, SCALE : SCALE + 3])
+    turn = quaternion_to_matrix(one[:, QUATERNION : QUATERNION + 4])
+    offset = np.einsum("nij,nj->ni", turn, rng.standard_normal((len(chosen), 3)) * size)
+    wide = cloud.reach[chosen] * pixels > SHARP_PX
+    one[:, SCALE : SCALE + 3] -= np.where(wide, np.log(SHRINK), 0.0)[:, None]
+    one[:, OPACITY] = raw_opacity(1.0 - np.sqrt(1.0 - opacity(one)))
+    two = one.copy()
+    one[:, :3] += 0.5 * offset
+    two[:, :3] -= 0.5 * offset
+    largest, thinnest = np.float32(settings.largest), np.float32(np.log(settings.aspect))
+    for half in (one, two):
+        bound_all(half, largest, thinnest)
+    cloud.params[chosen] = one
+    cloud.m[chosen] = 0.0
+    cloud.v[chosen] = 0.0
+    cloud.age[chosen] = 0
+    cloud.add(two)

@@ -1,0 +1,120 @@
+"""First Gaussians without structure-from-motion: pixels placed where the cameras agree on their colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.kernels.pool import Pool
+from edge_server.fields.kernels.rays import Views
+from edge_server.fields.kernels.splat_project import BASE, COLOR, OPACITY, QUATERNION, SCALE
+from edge_server.fields.kernels.splat_seed import MOST_VIEWS, score_cells, sweep_rays
+from edge_server.fields.kernels.splat_update import bound_all
+from edge_server.fields.scene_box import SceneBox, plain_background
+from edge_server.fields.splat_passes import camera_rows
+from edge_server.fields.splat_settings import SplatSettings
+from edge_server.fields.supervision import pack_cameras
+
+TOLERANCE = 0.08  # summed over the channels: more and walls are taken to be where they are not
+_CANDIDATES = 4  # rays a Gaussian: those without a surface are left out
+_PLAIN = 0.06
+
+
+def seeds(
+    settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
+    masks: Sequence[NDArray[np.bool_] | None] | None, count: int, rng: np.random.Generator,
+) -> NDArray[np.float32]:  # fmt: skip
+    """Parameters of up to ``count`` new Gaussians, float32 (N, P). masks: for each view bool (H, W), where
+    they may begin (None in the list: nowhere); no list at all: anywhere."""
+    width = BASE + 3 * (settings.harmonics - 1)
+    data = pack_cameras(views, box)
+    where = _pixels(settings, views, data, masks)
+    if count <= 0 or where.size == 0:
+        return np.zeros((0, width), np.float32)
+    drawn = rng.choice(where, min(_CANDIDATES * count, where.size), replace=False)
+    view_of = np.searchsorted(data.first, drawn, side="right") - 1
+    local = drawn - data.first[view_of]
+    middle = np.float32(box.distance_m / box.radius_m)
+    distance = np.zeros(drawn.size, np.float32)
+    cells = max(settings.seed_cells, 8)
+    scores = np.zeros(cells**3, np.float32)
+    near = np.float32(max(0.01, box.near_m / box.radius_m))
+    if settings.seed_cells:
+        _score(settings, pool, box, views, scores, cells)
+        pool.run(sweep_rays, data, view_of, local, near, middle, box.contracted, cells, scores, distance)
+    else:
+        distance[:] = np.maximum(near, middle * rng.uniform(0.4, 1.6, drawn.size))
+    found = np.flatnonzero(distance > 0)[:count]
+    params = np.zeros((found.size, width), np.float32)
+    if found.size == 0:
+        return params
+    focal = data.lens[:, 0]
+    # Several views see each place: the spacing in space is that of all their rays together.
+    spacing = np.sqrt(where.size / found.size / min(max(len(views) / 3.0, 1.0), 6.0))
+    view_of, local, distance = view_of[found], local[found], distance[found]
+    for v in np.unique(view_of):
+        mine, lens = np.flatnonzero(view_of == v), views[v].intrinsics
+        x, y = local[mine] % lens.width, local[mine] // lens.width
+        rays = lens.rays(np.stack([x + 0.5, y + 0.5], axis=-1)) @ data.rotation[v].T
+        params[mine, :3] = data.origin[v] + rays * distance[mine, None]
+        params[mine, COLOR : COLOR + 3] = views[v].image[y, x, :3] / 255.0
+        size = settings.seed_scale * spacing * distance[mine] / focal[v]
+        params[mine, SCALE : SCALE + 3] = np.log(size)[:, None]
+    params[:, QUATERNION] = 1.0
+    params[:, OPACITY] = np.log(settings.seed_opacity / (1.0 - settings.seed_opacity))
+    bound_all(params, np.float32(settings.largest), np.float32(np.log(settings.aspect)))
+    return params
+
+
+def _pixels(
+    settings: SplatSettings, views: Sequence[View], data: Views,
+    masks: Sequence[NDArray[np.bool_] | None] | None,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Numbers of the pixels that show something, over all views."""
+    plain = _empty_color(settings, views)
+    parts = [np.zeros(0, np.int64)]
+    for k, view in enumerate(views):
+        image = view.image
+        if image.shape[2] == 4:
+            shows = image[..., 3] >= 16  # as in ``score_cells``
+        elif plain is not None:
+            shows = np.abs(image / 255.0 - plain).sum(axis=2) >= _PLAIN
+        else:
+            shows = np.ones(image.shape[:2], bool)
+        if masks is not None:
+            mask = masks[k]
+            shows = shows & mask if mask is not None else np.zeros_like(shows)
+        parts.append(data.first[k] + np.flatnonzero(shows))
+    return np.concatenate(parts).astype(np.int64)
+
+
+def _empty_color(settings: SplatSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
+    """The plain colour (3,) that is rendered where nothing is, if pictures have one: with a background of
+    the user's choice, a plain sky has to be made of Gaussians like everything else."""
+    return plain_background(views) if settings.background == "auto" else None
+
+
+def _score(settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
+           scores: NDArray[np.float32], cells: int) -> None:  # fmt: skip
+    some = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, MOST_VIEWS).astype(int))]
+    cams = camera_rows([v.camera_to_world for v in some], [v.intrinsics for v in some], box)
+    data = pack_cameras(some, box)
+    channels = max(v.image.shape[2] for v in some)
+    blurred = np.full((int(data.first[-1]), channels), 255, np.uint8)
+    for k, view in enumerate(some):
+        footprint = (4.0 if box.contracted else 2.0) * box.radius_m / cells / box.distance_m
+        size = 2 * (max(int(0.5 * footprint * view.intrinsics.fx), 1) // 2) + 1
+        a, b = data.first[k], data.first[k + 1]
+        image = cv2.blur(view.image, (size, size)) if size > 1 else view.image
+        blurred[a:b, : image.shape[2]] = image.reshape(int(b - a), -1)
+    plain = _empty_color(settings, some)
+    needed = min(settings.min_views, len(some))
+    pool.run(
+        score_cells, cams, data, blurred, plain is not None,
+        plain if plain is not None else np.zeros(3, np.float32), np.float32(TOLERANCE), box.contracted, cells,
+        needed, scores,
+    )  # fmt: skip

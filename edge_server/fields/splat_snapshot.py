@@ -1,0 +1,62 @@
+"""An immutable copy of a Gaussian field: renders from any thread while the field itself trains on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Rendering, View
+from edge_server.fields.kernels.pool import Pool
+from edge_server.fields.kernels.splat_project import Gaussians
+from edge_server.fields.kernels.splat_raster import render_tiles
+from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.splat_passes import Passes, camera_rows, ray_lengths
+from freshfield.geometry import Pinhole
+
+SOLID = 0.5  # opacity from which on a pixel shows a surface
+
+
+@dataclass(frozen=True)
+class SplatSnapshot:
+    """Gaussians and cameras of one instant. Nothing in it is written after it is made."""
+
+    box: SceneBox
+    gaussians: Gaussians
+    background: NDArray[np.float32]
+    cameras: tuple[View, ...]
+    pool: Pool
+    step: int
+
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """The picture a camera at this pose would take."""
+        w, h = intrinsics.width, intrinsics.height
+        passes = Passes(self.pool)
+        cams = camera_rows([camera_to_world], [intrinsics], self.box)
+        passes.look(cams, self.gaussians, [None], differentiate=False)
+        color, depth = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
+        opacity = np.empty((h, w), np.float32)
+        self.pool.run(
+            render_tiles, int(passes.columns[0]), int(passes.rows[0]), w, h, passes.projected, passes.lists,
+            self.background, passes.memory, passes.kept, color, depth, opacity,
+        )  # fmt: skip
+        depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
+        return Rendering(color, depth, opacity)
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras see a
+        surface: their pictures are rendered small and lifted by their depth."""
+        positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+        if len(self.gaussians.params):
+            share = max(count // max(len(self.cameras), 1), 1)
+            for view in self.cameras:
+                lens = view.intrinsics
+                small = lens.scaled(min(float(np.sqrt(share / (lens.width * lens.height))), 1.0))
+                out = self.render(view.camera_to_world, small)
+                solid = (out.opacity > SOLID) & (out.depth > 0)
+                pose = np.asarray(view.camera_to_world, dtype=np.float64)
+                rays = small.rays()[solid] @ pose[:3, :3].T
+                positions.append((pose[:3, 3] + rays * out.depth[solid, None]).astype(np.float32))
+                colors.append(out.color[solid])
+        return np.concatenate(positions)[:count], np.concatenate(colors)[:count]

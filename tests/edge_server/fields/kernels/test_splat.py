@@ -1,0 +1,288 @@
+"""The Gaussian kernels: projection, compositing and their gradients against torch and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from edge_server.fields import splat_torch
+from edge_server.fields.kernels.pool import CallerPool, Pool
+from edge_server.fields.kernels.rays import Views
+from edge_server.fields.kernels.splat_project import BASE, OPACITY, QUATERNION, SCALE, TILE, Gaussians
+from edge_server.fields.kernels.splat_raster import Loss, dissimilarity, render_tiles, train_tiles
+from edge_server.fields.kernels.splat_update import Moments, Rule, update
+from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.splat_passes import Passes, camera_rows
+from freshfield.geometry import Pinhole, look_at
+
+BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
+LENS = Pinhole(21, 18, 22.0, 24.0, 10.0, 9.5)
+BENT = replace(LENS, distortion=(-0.12, 0.03, 0.01, -0.015))
+BACK = np.array([0.2, 0.5, 0.9], np.float32)
+
+
+def _cloud(count: int = 12, harmonics: int = 1, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    params = rng.normal(size=(count, BASE + 3 * (harmonics - 1))).astype(np.float32)
+    params[:, :3] *= 0.5
+    params[:, SCALE:QUATERNION] = np.log(rng.uniform(0.08, 0.4, (count, 3)))
+    params[:, OPACITY] = rng.uniform(-1.0, 2.0, count)
+    params[:, BASE - 3 : BASE] = rng.random((count, 3))
+    params[:, BASE:] *= 0.2
+    return params
+
+
+def _camera(lens: Pinhole = LENS, eye: tuple[float, float, float] = (1.0, -2.5, 0.8)) -> np.ndarray:
+    return camera_rows([look_at(eye, (0.05, 0.0, 0.1))], [lens], BOX)
+
+
+def _render(params: np.ndarray, cam: np.ndarray, harmonics: int = 1, threads: int = 1) -> list[np.ndarray]:
+    passes = Passes(CallerPool() if threads == 1 else Pool(threads, 0))
+    passes.look(cam, Gaussians(params, harmonics), [None], differentiate=False)
+    w, h = LENS.width, LENS.height
+    out = [np.full((h, w, 3), 7, np.float32), np.full((h, w), 7, np.float32), np.full((h, w), 7, np.float32)]
+    passes.pool.run(
+        render_tiles, int(passes.columns[0]), int(passes.rows[0]), w, h, passes.projected, passes.lists, BACK,
+        passes.memory, passes.kept, *out,
+    )  # fmt: skip
+    return out
+
+
+def _oracle(params: torch.Tensor, cam: np.ndarray, harmonics: int = 1) -> tuple[torch.Tensor, ...]:
+    flat = splat_torch.flatten(torch.as_tensor(cam[0], dtype=torch.float64), params, harmonics)
+    back = torch.as_tensor(BACK, dtype=torch.float64)
+    return splat_torch.composite(flat, LENS.width, LENS.height, back)
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+@pytest.mark.parametrize("harmonics", [1, 4, 9])
+def test_pictures_equal_the_oracle(lens: Pinhole, harmonics: int) -> None:
+    params, cam = _cloud(harmonics=harmonics), _camera(lens)
+    expected = _oracle(torch.as_tensor(params, dtype=torch.float64), cam, harmonics)
+    for mine, theirs in zip(_render(params, cam, harmonics), expected):
+        reference = theirs.detach().numpy().clip(0.0, 1.0 if mine.ndim == 3 else None)
+        np.testing.assert_allclose(mine, reference, atol=2e-4)
+
+
+def test_a_ball_appears_where_the_lens_puts_it() -> None:
+    """Against the project's own lens model, without the oracle."""
+    params = _cloud(1)
+    params[0, :3], params[0, SCALE:QUATERNION], params[0, OPACITY] = (0.5, 0.2, -0.3), np.log(0.02), 9.0
+    pose = look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))
+    _, depth, opacity = _render(params, camera_rows([pose], [BENT], BOX))
+    local = (params[0, :3] - pose[:3, 3]) @ pose[:3, :3]
+    ys, xs = np.mgrid[0 : LENS.height, 0 : LENS.width] + 0.5
+    found = np.array([(xs * opacity).sum(), (ys * opacity).sum()]) / opacity.sum()
+    np.testing.assert_allclose(found, BENT.project(local), atol=0.1)
+    assert depth[opacity > 0.3] == pytest.approx(local[2], abs=1e-3)
+
+
+def _views(target: np.ndarray) -> Views:
+    h, w = target.shape[:2]
+    return Views(
+        first=np.array([0, h * w]), size=np.array([[w, h]]), lens=np.zeros((1, 8)),
+        rotation=np.zeros((1, 3, 3)), origin=np.zeros((1, 3)), pixels=target.reshape(h * w, -1),
+        changed=np.zeros(0, np.int64),
+    )  # fmt: skip
+
+
+def _gradient(
+    params: np.ndarray, cam: np.ndarray, target: np.ndarray, harmonics: int = 1, absolute: bool = False,
+    dssim: float = 0.0,
+) -> tuple[float, np.ndarray]:  # fmt: skip
+    """Loss and its gradient: Adam's first moment after one step with beta1 = 0."""
+    pool = CallerPool()
+    passes = Passes(pool)
+    gaussians = Gaussians(params.copy(), harmonics)
+    passes.look(cam, gaussians, [None])
+    total = int(passes.columns[0] * passes.rows[0])
+    tasks = np.array([(0, t) for t in range(total)], np.int32)
+    losses = np.zeros((total, 3))
+    loss = Loss(absolute, np.float32(dssim), BACK, False, np.uint64(1))
+    pool.run(
+        train_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
+        passes.lists, loss, passes.memory, passes.kept, passes.sums, losses,
+    )  # fmt: skip
+    n = len(params)
+    flat = [np.zeros(n, np.float32) for _ in range(3)]
+    moments = Moments(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
+    rule = Rule(
+        np.zeros(params.shape[1], np.float32), np.ones((4, 2), np.float32),
+        *(np.float32(v) for v in (0.0, 0.9, 1e-8, 0.0, 4.0, 5.0)),
+    )  # fmt: skip
+    dropped = np.zeros(n, np.int64)
+    pool.run(
+        update, cam, gaussians, n, passes.projected, passes.lists.own_first, passes.lists.own_count,
+        passes.sums, moments, rule, dropped,
+    )  # fmt: skip
+    assert losses[:, 2].sum() == 0 and dropped.sum() == 0
+    return float(losses[:, 0].sum()), moments.m
+
+
+def _target(channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(5).integers(0, 256, (LENS.height, LENS.width, channels), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+@pytest.mark.parametrize("harmonics", [1, 4, 9])
+@pytest.mark.parametrize("absolute", [False, True])
+def test_gradients_equal_the_oracle(lens: Pinhole, harmonics: int, absolute: bool) -> None:
+    params, cam, target = _cloud(harmonics=harmonics, seed=3), _camera(lens), _target(4)
+    value, gradient = _gradient(params, cam, target, harmonics, absolute)
+    theirs = torch.as_tensor(params, dtype=torch.float64).requires_grad_(True)
+    color, _, _ = _oracle(theirs, cam, harmonics)
+    alpha = torch.as_tensor(target[..., 3:] / 255.0)
+    wanted = torch.as_tensor(target[..., :3] / 255.0) * alpha + (1 - alpha) * torch.as_tensor(BACK)
+    error = color - wanted
+    loss = error.abs().sum() if absolute else error.square().sum()
+    loss.backward()
+    assert theirs.grad is not None
+    assert value == pytest.approx(loss.item(), rel=1e-4)
+    expected = theirs.grad.numpy()
+    scale = np.abs(expected).max(axis=0, keepdims=True)
+    np.testing.assert_allclose(gradient / scale, expected / scale, atol=3e-3)
+
+
+@pytest.mark.parametrize("dssim", [0.0, 3.0])
+def test_gradients_equal_finite_differences(dssim: float) -> None:
+    params, cam, target = _cloud(5, seed=8), _camera(BENT), _target()
+    _, gradient = _gradient(params, cam, target, dssim=dssim)
+    # The tolerance is for the rim: where a Gaussian adds less than 1/255 it ends, and a step that moves the
+    # rim makes a jump that no gradient knows.
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        # Uphill, so that contributions do not cancel out and rounding does not decide.
+        way = (np.sign(gradient) * rng.random(params.shape) * 2e-3).astype(np.float32)
+        up, _ = _gradient(params + way, cam, target, dssim=dssim)
+        down, _ = _gradient(params - way, cam, target, dssim=dssim)
+        assert (up - down) / 2.0 == pytest.approx(float((gradient * way).sum()), rel=0.2)
+
+
+def test_dissimilarity_equals_its_definition() -> None:
+    rng = np.random.default_rng(2)
+    memory, target = rng.random(11 * 64).astype(np.float32), rng.random(64).astype(np.float32)
+    target[56:] = -1.0  # outside the picture
+    x = torch.as_tensor(memory[192 : 192 + 56], dtype=torch.float64).requires_grad_(True)
+    y = torch.as_tensor(target[:56], dtype=torch.float64)
+    mx, my = x.mean(), y.mean()
+    xx, yy, xy = ((x - mx) ** 2).mean(), ((y - my) ** 2).mean(), ((x - mx) * (y - my)).mean()
+    c1, c2 = 0.01**2, 0.03**2
+    ssim = (2 * mx * my + c1) * (2 * xy + c2) / ((mx**2 + my**2 + c1) * (xx + yy + c2))
+    loss = 0.7 * 56 * (1 - ssim) / 2
+    loss.backward()
+    memory[448:512] = 0.0
+    value = dissimilarity(memory, 192, 448, target, 56, np.float32(0.7))
+    assert value == pytest.approx(loss.item(), rel=1e-4) and x.grad is not None
+    np.testing.assert_allclose(memory[448 : 448 + 56], x.grad.numpy(), atol=1e-4)
+    assert (memory[448 + 56 : 512] == 0).all()
+
+
+def test_what_is_clamped_has_no_gradient() -> None:
+    """An opaque Gaussian in one pixel's middle: its alpha is cut to .99 there, and nothing pulls at it."""
+    params, cam = _cloud(1), _camera()
+    params[0, :3], params[0, SCALE:QUATERNION], params[0, OPACITY] = (0.0, 0.0, 0.0), 3.9, 8.9
+    _, _, opacity = _render(params, cam)
+    assert opacity.max() == pytest.approx(0.99, abs=1e-6) and (opacity > 0.9899).mean() > 0.99
+    _, gradient = _gradient(params, cam, _target())
+    assert (gradient[0, :OPACITY] == 0).all() and np.abs(gradient[0, OPACITY + 1 :]).min() > 0
+
+
+def test_opacity_nought_and_one() -> None:
+    cam = _camera()
+    params = _cloud(3)
+    params[:, OPACITY] = -50.0
+    color, depth, opacity = _render(params, cam)
+    np.testing.assert_array_equal(color, np.broadcast_to(BACK, color.shape))
+    assert (depth == 0).all() and (opacity == 0).all()
+    _, gradient = _gradient(params, cam, _target())
+    assert (gradient == 0).all()
+    params[:, OPACITY] = 50.0
+    _, _, opacity = _render(params, cam)
+    assert 0.99 <= opacity.max() <= 1.0
+    _, gradient = _gradient(params, cam, _target())
+    assert np.isfinite(gradient).all() and (gradient[:, OPACITY] == 0).all()
+
+
+def test_a_quaternion_without_direction_is_no_rotation() -> None:
+    cam, params = _camera(), _cloud(2)
+    params[:, QUATERNION:OPACITY] = 0.0
+    plain = params.copy()
+    plain[:, QUATERNION] = 1.0
+    np.testing.assert_array_equal(_render(params, cam)[0], _render(plain, cam)[0])
+    _, gradient = _gradient(params, cam, _target())
+    assert np.isfinite(gradient).all() and (gradient[:, QUATERNION:OPACITY] == 0).all()
+
+
+@pytest.mark.parametrize("log_scales", [(-30.0, -30.0, -30.0), (3.0, -12.0, -12.0), (-12.0, 4.0, 4.0)])
+def test_covariances_near_singular_stay_finite(log_scales: tuple[float, float, float]) -> None:
+    cam, params = _camera(), _cloud(4)
+    params[:, SCALE:QUATERNION] = log_scales
+    for part in _render(params, cam):
+        assert np.isfinite(part).all()
+    _, gradient = _gradient(params, cam, _target())
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e-40])
+def test_no_parameter_poisons_the_picture(value: float) -> None:
+    cam = _camera()
+    for column in range(BASE):
+        params = _cloud(6)
+        params[2, column] = value
+        for part in _render(params, cam):
+            assert np.isfinite(part).all(), f"column {column}"
+
+
+def test_behind_the_camera_and_none_at_all() -> None:
+    params = _cloud(5)
+    params[:, :3] = (5.0, -12.0, 3.0)  # behind it
+    for cloud in (params, params[:0]):
+        color, _, opacity = _render(cloud, _camera())
+        np.testing.assert_array_equal(color, np.broadcast_to(BACK, color.shape))
+        assert (opacity == 0).all()
+
+
+def test_a_huge_one_far_to_the_side_does_not_fold_back() -> None:
+    """The lens's polynomial turns around beyond the field of view; what stands there must not appear."""
+    params = _cloud(1)
+    eye = np.array([1.0, -2.5, 0.8])
+    pose = look_at(eye, (0.05, 0.0, 0.1))
+    params[0, :3] = pose[:3, 3] + pose[:3, :3] @ np.array([6.0, 0.0, 0.4])
+    params[0, SCALE:QUATERNION], params[0, OPACITY] = np.log(0.05), 8.0
+    bent = replace(LENS, distortion=(-0.25, 0.0, 0.0, 0.0))
+    _, _, opacity = _render(params, camera_rows([pose], [bent], BOX))
+    assert (opacity == 0).all()
+
+
+def test_lists_are_front_to_back_whatever_the_thread_count() -> None:
+    params, cam = _cloud(200, seed=4), np.concatenate([_camera(), _camera(BENT, (-2.0, 1.5, 0.5))])
+    found = []
+    for pool in (CallerPool(), Pool(3, 0)):
+        passes = Passes(pool)
+        passes.look(cam, Gaussians(params, 1), [None, None])
+        found.append(passes)
+    for b in range(2):
+        lists = found[0].lists
+        for t in range(int(found[0].columns[b] * found[0].rows[b])):
+            mine = lists.pair[b, lists.first[b, t] : lists.first[b, t + 1]]
+            other = found[1].lists
+            np.testing.assert_array_equal(mine, other.pair[b, other.first[b, t] : other.first[b, t + 1]])
+            owners = lists.owner[b, mine]
+            depth = found[0].projected[b, owners, 9]
+            assert (np.diff(depth) > -1e-4).all() and len(set(owners)) == len(owners)
+    one, many = _render(params, cam[:1]), _render(params, cam[:1], threads=3)
+    for a, c in zip(one, many):
+        np.testing.assert_array_equal(a, c)
+
+
+def test_tiles_that_are_not_wanted_get_no_pairs() -> None:
+    passes, cam = Passes(CallerPool()), _camera()
+    total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
+    wanted = np.zeros(total, np.uint8)
+    wanted[4] = 1
+    passes.look(cam, Gaussians(_cloud(50), 1), [wanted])
+    lengths = np.diff(passes.lists.first[0, : total + 1])
+    assert lengths[4] > 0 and lengths.sum() == lengths[4] == passes.lists.needed[0]

@@ -1,0 +1,254 @@
+"""Hard cases for the Gaussian field: whatever comes, it stays finite, bounded and useful afterwards."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, View
+from edge_server.fields.kernels.splat_project import OPACITY, QUATERNION, SCALE
+from edge_server.fields.kernels.splat_update import OPACITY_LIMIT, POSITION_LIMIT
+from edge_server.fields.splat import SplatField
+from edge_server.fields.splat_settings import SplatSettings
+from freshfield.geometry import look_at
+from tests.edge_server.fields.scenes import picture, psnr, ring
+
+TINY = SplatSettings(gaussians=400, start=250, seed_cells=16, densify_every=10, threads=2)
+VIEWS = ring(9, size=24)
+
+
+def _healthy(field: SplatField, views: list[View] = VIEWS) -> None:
+    state = field.state()
+    for name in ("params", "m", "v", "slope", "looks", "reach", "behind"):
+        assert np.isfinite(state[name]).all(), f"{name} is not finite"
+    params = state["params"]
+    assert len(params) <= field.settings.gaussians
+    if len(params):
+        assert (
+            np.abs(params[:, :3]).max() <= POSITION_LIMIT
+            and np.abs(params[:, OPACITY]).max() <= OPACITY_LIMIT
+        )
+        sizes = params[:, SCALE:QUATERNION]
+        assert (np.ptp(sizes, axis=1) <= np.log(field.settings.aspect) + 1e-4).all(), "a needle"
+    for view in (views[0], views[-1]):
+        out = field.render(view.camera_to_world, view.intrinsics)
+        for part in (out.color, out.depth, out.opacity):
+            assert np.isfinite(part).all()
+        assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
+        assert out.opacity.min() >= 0.0 and out.opacity.max() <= 1.0
+
+
+def _score(field: SplatField, views: list[View]) -> float:
+    pictures = [(field.render(v.camera_to_world, v.intrinsics).color, v.image / 255.0) for v in views]
+    return float(np.mean([psnr(a, b) for a, b in pictures]))
+
+
+def test_nothing_at_all() -> None:
+    field = SplatField(TINY)
+    assert field.fit([], Budget(steps=3)).steps == 0
+    points, colors = field.points(10)
+    assert points.shape == (0, 3) and colors.shape == (0, 3)
+    _healthy(field)
+
+
+def test_one_view() -> None:
+    field = SplatField(TINY)
+    field.fit(VIEWS[:1], Budget(steps=60))
+    _healthy(field)
+    assert _score(field, VIEWS[:1]) > 15.0
+
+
+def test_one_pixel_and_one_gaussian() -> None:
+    camera = replace(VIEWS[0].intrinsics, width=1, height=1, cx=0.5, cy=0.5)
+    view = replace(VIEWS[0], image=np.full((1, 1, 3), 99, np.uint8), intrinsics=camera)
+    for settings in (TINY, replace(TINY, gaussians=1, start=1)):
+        field = SplatField(settings)
+        field.fit([view], Budget(steps=30))
+        _healthy(field, [view])
+
+
+@pytest.mark.parametrize("value", [0, 255, 77])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_constant_black_and_saturated_pictures(value: int, channels: int) -> None:
+    views = [replace(v, image=np.full((24, 24, channels), value, np.uint8)) for v in VIEWS]
+    field = SplatField(TINY)
+    field.fit(views, Budget(steps=60))
+    _healthy(field)
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
+    alpha = value / 255.0 if channels == 4 else 1.0
+    expected = value / 255.0 * alpha + (1.0 - alpha) * field.rig.background().mean()
+    assert abs(out.mean() - expected) < 0.1
+
+
+def test_all_poses_identical() -> None:
+    pose = VIEWS[0].camera_to_world
+    views = [replace(v, camera_to_world=pose, image=VIEWS[0].image) for v in VIEWS]
+    field = SplatField(TINY)
+    field.fit(views, Budget(steps=60))
+    _healthy(field)
+
+
+def test_cameras_that_miss_the_box_behind_it_and_inside() -> None:
+    field = SplatField(replace(TINY, centre_m=(50.0, 0.0, 0.0), radius_m=0.5, contracted=False))
+    assert field.fit(VIEWS, Budget(steps=20)).steps == 20
+    _healthy(field)
+    trained = SplatField(TINY)
+    trained.fit(VIEWS, Budget(steps=40))
+    for pose in (
+        look_at((0, 0, 3.0), (0, 0, 9.0), up=(0, 1, 0)),  # everything is behind it
+        look_at((0, 0, 0.5), (1.0, 0, 0.5)),  # inside the ball
+        look_at((1e5, 0, 0), (0, 0, 0)),
+    ):
+        out = trained.render(pose, VIEWS[0].intrinsics)
+        assert all(np.isfinite(p).all() for p in (out.color, out.depth, out.opacity))
+
+
+def test_views_that_contradict_each_other() -> None:
+    rng = np.random.default_rng(0)
+    views = [replace(v, image=rng.integers(0, 256, (24, 24, 3), dtype=np.uint8)) for v in VIEWS]
+    field = SplatField(TINY)
+    for _ in range(5):
+        field.fit(views, Budget(steps=20))
+    _healthy(field)
+    field.fit(VIEWS, Budget(steps=150))  # and it recovers
+    assert _score(field, VIEWS) > 16.0
+
+
+def test_a_poisoned_view_is_survived() -> None:
+    """One picture of noise among good ones; fifty updates later the field is back where it would be."""
+    field, clean = SplatField(TINY), SplatField(TINY)
+    for f in (field, clean):
+        f.fit(VIEWS, Budget(steps=150))
+    noise = np.random.default_rng(3).integers(0, 256, (24, 24, 3), dtype=np.uint8)
+    field.fit([replace(VIEWS[0], image=noise), *VIEWS[1:]], Budget(steps=10))
+    clean.fit(VIEWS, Budget(steps=10))
+    for _ in range(50):
+        for f in (field, clean):
+            f.fit(VIEWS, Budget(steps=4))
+    assert _score(field, VIEWS) > _score(clean, VIEWS) - 0.5
+
+
+def _parameter(column: int, value: float, every: int = 7) -> Callable[[SplatField], None]:
+    def damage(field: SplatField) -> None:
+        field.cloud.params[::every, column] = value
+
+    return damage
+
+
+def _moments(field: SplatField) -> None:
+    field.cloud.m[::5] = np.inf
+    field.cloud.v[::3] = np.nan
+
+
+@pytest.mark.parametrize("damage", [
+    _parameter(0, np.nan), _parameter(4, np.inf), _parameter(7, np.nan), _parameter(OPACITY, -np.inf),
+    _parameter(12, np.nan), _parameter(12, 1e38), _parameter(3, 1e30), _parameter(3, -1e30),
+    _parameter(1, 1e-41), _moments,
+])  # fmt: skip
+def test_damage_is_healed(damage: Callable[[SplatField], None]) -> None:
+    field = SplatField(TINY)
+    field.fit(VIEWS, Budget(steps=40))
+    damage(field)
+    field._snapshot = None
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
+    field.fit(VIEWS, Budget(steps=120))
+    _healthy(field)
+    assert _score(field, VIEWS) > 17.0
+    assert field.fit(VIEWS, Budget(steps=40)).dropped == 0, "still not finite 120 steps later"
+
+
+@pytest.mark.parametrize("raw", [-30.0, 30.0])
+def test_everything_faded_or_opaque(raw: float) -> None:
+    field = SplatField(TINY)
+    field.fit(VIEWS, Budget(steps=40))
+    field.cloud.params[:, OPACITY] = raw
+    field.fit(VIEWS, Budget(steps=200))
+    _healthy(field)
+    assert _score(field, VIEWS) > 16.0
+
+
+def test_quaternions_without_direction_and_flat_gaussians() -> None:
+    field = SplatField(TINY)
+    field.fit(VIEWS, Budget(steps=40))
+    field.cloud.params[::2, QUATERNION:OPACITY] = 0.0
+    field.cloud.params[::3, SCALE] = -60.0
+    field.fit(VIEWS, Budget(steps=60))
+    _healthy(field)
+    assert _score(field, VIEWS) > 17.0
+
+
+def test_giants_everywhere_cost_bounded_memory() -> None:
+    field = SplatField(TINY)
+    field.fit(VIEWS, Budget(steps=20))
+    field.cloud.params[:, SCALE:QUATERNION] = 50.0
+    field.fit(VIEWS, Budget(steps=60))
+    _healthy(field)
+    tiles = (24 // 8) ** 2
+    assert field._passes.lists.pair.shape[1] <= 4 * max(TINY.gaussians, tiles * TINY.gaussians)
+
+
+def test_a_thousand_updates_do_not_drift_or_grow() -> None:
+    """A moving ball, a new selection of views each time, warm starts only."""
+    rng = np.random.default_rng(1)
+    still = ring(9, size=24)
+    places = [np.array([0.3 * np.sin(a), 0.3 * np.cos(a), 0.5]) for a in np.linspace(0, 2 * np.pi, 12)]
+    frames = [[replace(v, image=picture(v.intrinsics, v.camera_to_world, p)) for v in still] for p in places]
+    field, scores = SplatField(TINY), []
+    for update in range(1000):
+        frame = frames[update % 12]
+        field.fit([frame[k] for k in rng.choice(9, 6, replace=False)], Budget(steps=2))
+        assert len(field.cloud) <= TINY.gaussians
+        if update % 100 >= 88:
+            scores.append(_score(field, frame[::4]))
+    _healthy(field)
+    first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
+    assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
+    assert last > 15.0
+    assert len(field.rig.memory) == 9
+
+
+def test_cameras_that_move_at_every_update() -> None:
+    field = SplatField(TINY)
+    for update in range(30):
+        views = []
+        for view in VIEWS[:4]:
+            eye = view.camera_to_world[:3, 3] + 0.05 * update * np.array([0.0, 0.0, 1.0])
+            pose = look_at(eye, (0.0, 0.0, 0.4))
+            views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
+        field.fit(views, Budget(steps=5))
+    _healthy(field, views)
+    assert _score(field, views) > 15.0
+
+
+def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """A whole fit and rendering with numba's bounds checks, in a process of its own."""
+    code = """
+from tests.stability.test_field_splat import TINY, VIEWS, SplatField, Budget, replace, np
+bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in VIEWS]
+for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True, "dssim": 0.1}, bent),
+                     ({"views_a_step": 3, "tile_share": 0.4, "loss": "l1"}, VIEWS)):
+    field = SplatField(replace(TINY, **extra))
+    field.fit(views, Budget(steps=25))
+    out = field.render(VIEWS[0].camera_to_world, replace(VIEWS[0].intrinsics, width=37, height=19))
+    field.points(50)
+    assert np.isfinite(out.color).all()
+moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
+field.fit(moved, Budget(steps=20))
+print("kept")
+"""
+    cache = request.config.cache
+    folder = str(cache.mkdir("numba-boundscheck")) if cache is not None else str(tmp_path)
+    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": folder}
+    out = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True,
+        cwd=Path(__file__).resolve().parents[2],
+    )  # fmt: skip
+    assert out.returncode == 0 and "kept" in out.stdout, out.stderr[-2000:]
