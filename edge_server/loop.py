@@ -202,7 +202,7 @@ class Loop:
             self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come
             return
         views, report = fitted
-        renderer = self._updates.field.snapshot()
+        renderer = self._updates.field.snapshot(present_ns=self._clock.now_ns())
         publication = self._updates.publication(selection, views, report, self._clock.now_ns())
         self._pacing.done(budget, publication.update_ms)
         self._on_published(publication, renderer, views)

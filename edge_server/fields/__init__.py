@@ -85,8 +85,10 @@ class Field(Renderer, Protocol):
         """Warm-start from the present parameters and train on ``views``. An empty set does nothing."""
         ...
 
-    def snapshot(self) -> Renderer:
-        """The field as it is now, for others to render from while it trains on."""
+    def snapshot(self, present_ns: int | None = None) -> Renderer:
+        """The field as it is now, for others to render from while it trains on. present_ns: the instant it is
+        to show, on the clock of the views' ``generated_ns``, where a representation knows how things move;
+        none: that of its newest view."""
         ...
 
     def warm_up(self) -> float:

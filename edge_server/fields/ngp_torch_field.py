@@ -201,7 +201,7 @@ class NgpTorchField:
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         return self.snapshot().points(count)
 
-    def snapshot(self) -> TorchSnapshot:
+    def snapshot(self, present_ns: int | None = None) -> TorchSnapshot:
         with self._lock:
             model = self._model()
             grid = replace(model.grid, table=model.grid.table.detach().clone())

@@ -28,7 +28,7 @@ from edge_server.fields.ngp_schedule import BETA1, BETA2, Pace, step_key
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import NOWHERE
 from edge_server.fields.splat_growth import Cloud, grow_and_prune
-from edge_server.fields.splat_motion import changed_tiles, forget_what_moved
+from edge_server.fields.splat_motion import LONGEST_S, Moved, carry, changed_tiles, drift, leave_behind, renew
 from edge_server.fields.splat_passes import Passes, camera_rows
 from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.splat_settings import SplatSettings, make_settings
@@ -36,7 +36,8 @@ from edge_server.fields.splat_snapshot import SplatSnapshot
 from edge_server.fields.turn import Turn
 from freshfield.geometry import Pinhole
 
-_AGES = 1024  # steps after which Adam's bias correction no longer matters
+_AGES = 4096  # steps after which Adam's bias correction no longer matters
+AHEAD_S = 0.5  # no farther ahead is a movement carried on: people turn
 CHANGED_SLOTS = 4  # pictures whose changed tiles one step looks at, at most
 
 
@@ -51,9 +52,11 @@ class SplatField:
         self.settings = settings or SplatSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         age = np.maximum(np.arange(_AGES), 1)
-        corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age)], axis=-1)
+        calm = np.maximum(np.minimum(self.settings.settle_after / age, 1.0), self.settings.rate_settled)
+        corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), calm], axis=-1)
         self._corrections = corrections.astype(np.float32)
         self._turn = Turn()
+        self._now_ns: int | None = None  # the instant that the Gaussians stand for
         self._snapshot: SplatSnapshot | None = None
         self.reset()
 
@@ -79,10 +82,12 @@ class SplatField:
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
         pace = Pace(budget)
-        with self._turn.mine():
-            self._take_in(views)
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
+        with self._turn.mine():
+            motion = self._take_in(views)
+        if motion is not None:
+            rays, samples = self._follow(motion, pace)
         while (progress := pace.begin()) is not None:
             with self._turn.mine():
                 loss, seen, pairs, lost = self._one_step(progress)
@@ -101,21 +106,28 @@ class SplatField:
         """Surface points in world metres and their colours; none before the first fit."""
         return self.snapshot().points(count)
 
-    def snapshot(self) -> SplatSnapshot:
-        """A copy that renders from any thread and never changes."""
+    def snapshot(self, present_ns: int | None = None) -> SplatSnapshot:
+        """A copy that renders from any thread and never changes. present_ns: what moves is shown where
+        it will be then, if it goes on as it went."""
         with self._turn.mine():
-            if self._snapshot is None or self._snapshot.step != self.step:
-                self._snapshot = SplatSnapshot(
+            now_ns = self._now_ns
+            ahead_s = 0.0 if present_ns is None or now_ns is None else (present_ns - now_ns) / 1e9
+            ahead_s = min(max(ahead_s, 0.0), AHEAD_S)
+            known = self._snapshot
+            if known is None or known.step != self.step or known.ahead_s != ahead_s:
+                gaussians = self.cloud.gaussians(self.settings.harmonics)
+                params = gaussians.params.copy()
+                params[:, :3] += gaussians.velocity * np.float32(ahead_s)
+                known = self._snapshot = SplatSnapshot(
                     box=self.rig.box or NOWHERE,
-                    gaussians=self.cloud.gaussians(self.settings.harmonics)._replace(
-                        params=self.cloud.params.copy()
-                    ),
+                    gaussians=gaussians._replace(params=params, velocity=np.zeros_like(gaussians.velocity)),
                     background=self.rig.background(),
                     cameras=self.rig.views,
                     pool=self.pool,
                     step=self.step,
+                    ahead_s=ahead_s,
                 )
-            return self._snapshot
+            return known
 
     def warm_up(self) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
@@ -143,7 +155,8 @@ class SplatField:
         with self._turn.mine():
             meta = {
                 "version": 1, "field": "splat", "settings": asdict(self.settings), "step": self.step,
-                "grown": self._grown, "dropped": self.dropped, **self.rig.meta(),
+                "grown": self._grown, "dropped": self.dropped,
+                "now_ns": self._now_ns, **self.rig.meta(),
             }  # fmt: skip
             cloud = {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
             both = {"meta": np.array(json.dumps(meta)), **cloud, **self.rig.arrays()}
@@ -157,6 +170,7 @@ class SplatField:
             self._forget_gaussians()
             self.cloud = cloud
             self.step, self._grown, self.dropped = (int(meta[k]) for k in ("step", "grown", "dropped"))
+            self._now_ns = None if meta["now_ns"] is None else int(meta["now_ns"])
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -164,7 +178,8 @@ class SplatField:
         self.step = 0
         self._grown = 0  # step of the last splitting and pruning
         self.cloud = Cloud.empty(self.settings)
-        self._passes = Passes(self.pool)
+        self._passes, self._follower = Passes(self.pool), Passes(self.pool)
+        self._now_ns = None
         self._snapshot = None
         self._views: tuple[View, ...] = ()
         self._epoch = -1
@@ -172,9 +187,9 @@ class SplatField:
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.settings.seed, self.step, purpose]))
 
-    def _take_in(self, views: Sequence[View]) -> None:
-        """Learn of new pictures; begin a cloud, or make it anew where they show that something moved."""
-        s = self.settings
+    def _take_in(self, views: Sequence[View]) -> Moved | None:
+        """Learn of new pictures; begin a cloud. Returns what they show to have moved, if anything."""
+        motion = None
         if len(views) != len(self._views) or any(a is not b for a, b in zip(views, self._views)):
             news = [v for v in views if v.camera not in self.rig.memory
                     or self.rig.memory[v.camera].view is not v]  # fmt: skip
@@ -183,18 +198,43 @@ class SplatField:
                 self._forget_gaussians()
             assert self.rig.box is not None
             self._data = intake.data
+            now_ns = max(v.generated_ns for v in views)
+            elapsed_s = 0.0 if self._now_ns is None else (now_ns - self._now_ns) / 1e9
+            self._now_ns = now_ns
             self._cams = camera_rows(
-                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.rig.box
-            )
+                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.rig.box,
+                [max((v.generated_ns - now_ns) / 1e9, -LONGEST_S) for v in views],
+            )  # fmt: skip
+            self._before = self.cloud.params[:, :3].copy()
+            drift(self.cloud, elapsed_s)
             moved = [self.rig.memory[v.camera].moved for v in views]
             self._changed = changed_tiles(moved)
             self._views, self._epoch = tuple(views), -1
             if len(self.cloud) and news and any(m is not None for m in moved):
-                forget_what_moved(s, self.pool, self.rig.box, self.cloud, views, moved, self._cams,
-                                  self._rng(2))  # fmt: skip
+                motion = Moved(self.rig.box, views, self._data, moved, self._changed, self._cams,
+                               self.rig.background(), elapsed_s)  # fmt: skip
         if len(self.cloud) == 0:
             self._begin()
         self._snapshot = None
+        return motion
+
+    def _follow(self, motion: Moved, pace: Pace) -> tuple[int, int]:
+        """Carry along what moved, and begin anew where that does not do; returns pixels and pairs."""
+        s, rays, samples = self.settings, 0, 0
+        with self._turn.mine():
+            going = carry(s, self._follower, self.cloud, motion, s.follow)
+        while pace.begin() is not None:
+            with self._turn.mine():
+                done = next(going, None)
+            if done is None:
+                break
+            rays, samples = rays + done[1], samples + done[2]
+            pace.end()
+        with self._turn.mine():
+            leave_behind(self.cloud, motion, self._before)
+            renew(s, self._follower, self.cloud, motion, self._rng(2))
+            self._snapshot = None
+        return rays, samples
 
     def _choose(self) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
         """The views of this step and which of their tiles."""

@@ -18,7 +18,10 @@ SHARP_PX = 1.0  # what is about a pixel wide is doubled without shrinking
 
 @dataclass
 class Cloud:
-    """The Gaussians and all that is known of each: arrays of equal length, at most ``settings.gaussians``."""
+    """The Gaussians and all that is known of each: arrays of equal length, at most ``settings.gaussians``.
+
+    velocity: (N, 3) scene units a second, 0 but for guests. guest: (N,), 0 for what belongs to the scene as
+    it stands; else 1 more than the updates since the Gaussian, begun where something moved, last moved."""
 
     params: NDArray[np.float32]
     m: NDArray[np.float32]
@@ -27,13 +30,17 @@ class Cloud:
     slope: NDArray[np.float32]
     looks: NDArray[np.float32]
     reach: NDArray[np.float32]
+    velocity: NDArray[np.float32]
+    guest: NDArray[np.int32]
 
     @classmethod
     def of(cls, params: NDArray[np.float32]) -> Cloud:
         """New Gaussians, without a history."""
         n = len(params)
-        flat = [np.zeros(n, np.float32) for _ in range(3)]
-        return cls(params, np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
+        slope, looks, reach = (np.zeros(n, np.float32) for _ in range(3))
+        age, guest, velocity = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros((n, 3), np.float32)
+        m, v = np.zeros_like(params), np.zeros_like(params)
+        return cls(params, m, v, age, slope, looks, reach, velocity, guest)
 
     @classmethod
     def empty(cls, settings: SplatSettings) -> Cloud:
@@ -45,7 +52,7 @@ class Cloud:
 
     def gaussians(self, harmonics: int) -> Gaussians:
         """As the kernels read them."""
-        return Gaussians(self.params, harmonics)
+        return Gaussians(self.params, harmonics, self.velocity)
 
     def moments(self) -> Moments:
         """As the kernels read them."""
@@ -56,9 +63,8 @@ class Cloud:
         for f in fields(self):
             setattr(self, f.name, np.ascontiguousarray(getattr(self, f.name)[which]))
 
-    def add(self, params: NDArray[np.float32]) -> None:
-        """Append new ones."""
-        new = Cloud.of(params)
+    def add(self, new: Cloud) -> None:
+        """Append others."""
         for f in fields(self):
             setattr(self, f.name, np.concatenate([getattr(self, f.name), getattr(new, f.name)]))
 
@@ -116,4 +122,6 @@ def _split(
     cloud.m[chosen] = 0.0
     cloud.v[chosen] = 0.0
     cloud.age[chosen] = 0
-    cloud.add(two)
+    halves = Cloud.of(two)
+    halves.velocity, halves.guest = cloud.velocity[chosen], cloud.guest[chosen]
+    cloud.add(halves)

@@ -30,10 +30,12 @@ from edge_server.fields.kernels.splat_project import (
     SCALE_HIGH,
     SCALE_LOW,
     SIZE,
+    TIME,
 )
 from edge_server.fields.kernels.splat_update import bound_all
 from edge_server.fields.ngp_torch import harmonics as harmonics_of
 from edge_server.fields.splat import SplatField
+from edge_server.fields.splat_motion import Moved
 from edge_server.fields.splat_settings import SplatSettings
 
 Rasterise = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
@@ -54,14 +56,14 @@ class SplatCudaField(SplatField):
         super().__init__(settings, pool)
         self._rasterise, self._device = rasterise, torch.device(device)
 
-    def _take_in(self, views: Sequence[View]) -> None:
+    def _take_in(self, views: Sequence[View]) -> Moved | None:
         for view in views:
             if view.intrinsics.distorted:
                 raise ValueError(
                     f"camera {view.camera}: device cuda takes pinhole cameras only; undistort its images, "
                     "or use device cpu, which renders through the lens"
                 )
-        super()._take_in(views)
+        return super()._take_in(views)
 
     def _one_step(self, progress: float) -> tuple[float, int, int, int]:
         s, cloud = self.settings, self.cloud
@@ -107,7 +109,7 @@ class SplatCudaField(SplatField):
         if self.settings.background == "random":
             back = torch.tensor(self._rng(6).random(3), dtype=torch.float32, device=self._device)
         color, _, info = self._rasterise(
-            means=params[:, :3],
+            means=params[:, :3] + float(cam[TIME]) * torch.tensor(self.cloud.velocity, device=self._device),
             quats=params[:, QUATERNION:OPACITY],
             scales=params[:, SCALE:QUATERNION].clamp(SCALE_LOW, SCALE_HIGH).exp(),
             opacities=params[:, OPACITY].clamp(-RAW_OPACITY, RAW_OPACITY).sigmoid(),
@@ -150,7 +152,9 @@ class SplatCudaField(SplatField):
         m = rule.beta1 * cloud.m[drawn] + (1.0 - rule.beta1) * g[drawn]
         v = rule.beta2 * cloud.v[drawn] + (1.0 - rule.beta2) * g[drawn] ** 2
         cloud.m[drawn], cloud.v[drawn] = m, v
-        step = rule.rates * m * correct[:, :1] / (np.sqrt(v * correct[:, 1:]) + rule.epsilon)
+        step = (
+            rule.rates * m * correct[:, :1] * correct[:, 2:] / (np.sqrt(v * correct[:, 1:2]) + rule.epsilon)
+        )
         step[:, :SCALE] *= np.maximum(np.abs(cloud.params[drawn, :3]).max(axis=1), 1.0)[:, None]
         cloud.params[drawn] -= step
         bound_all(cloud.params, rule.largest, rule.thinnest)

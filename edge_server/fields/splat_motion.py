@@ -1,23 +1,63 @@
-"""What is done where the scene moved: forget the Gaussians there, begin new ones, look there more often."""
+"""What is done where the scene moved: carry the Gaussians of a moving body along, forget those that no longer
+agree with the pictures, begin new ones where pictures are still wrong, look there more often.
+
+A *guest* is a Gaussian begun where something moved. Guests have a velocity, so that views of different ages
+each supervise the instant they were taken at, and what is shown may be carried on to the present.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.kernels.pool import Pool
-from edge_server.fields.kernels.splat_project import LENS, NEAR, OPACITY, ORIGIN, TILE
+from edge_server.fields.kernels.rays import Views
+from edge_server.fields.kernels.splat_project import LENS, NEAR, OPACITY, ORIGIN, TILE, TIME, Gaussians
+from edge_server.fields.kernels.splat_raster import Loss, compare_tiles, train_tiles
+from edge_server.fields.kernels.splat_update import pull
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.splat_growth import Cloud, opacity
+from edge_server.fields.splat_passes import Passes
 from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.splat_settings import SplatSettings
 
 AGREE = 0.1  # a Gaussian whose colour is this near to the pixel's, channel by channel, may stay
+AGREE_GUEST = 0.5  # the same for one that moves: carried along, it is a little off for a while
+STAYS = 0.02  # by which a colour must agree better with where a guest was for it to stay there
+OFF = 0.08  # a pixel this near to what it should be is shown well enough
 MOST = 0.5  # of a picture: more is no body that moved, but another light or a broken frame
-_SEEDS_A_PIXEL = 0.1
+SEEDS_A_PIXEL = 0.1
+
+LONGEST_S = 1.0  # after a longer pause, nothing is known of how things move
+FASTEST_M_PER_S = 8.0
+CARRY_VIEWS = 6  # a step
+LEFT = 4  # updates after which a guest that moves no more belongs to the scene
+# Carrying: bodies first, then their limbs. Cells in pixels at the scene's distance; the first step in metres
+# for each second since the last update.
+CELLS_PX, FALL = (32.0, 8.0), 0.85
+STEPS_M_PER_S = (0.25, 0.1)
+_TO_VELOCITY = 0.7  # of a correction that is taken for a wrong velocity rather than a wrong place
+
+
+@dataclass
+class Moved:
+    """One set of views and what changed in them.
+
+    moved: for each view bool (H, W) or None; tiles: the same by tiles, uint8 (T,), see ``changed_tiles``.
+    cams: float32 (V, CAMERA), with the time each picture was taken. elapsed_s: since the last set.
+    """
+
+    box: SceneBox
+    views: Sequence[View]
+    data: Views
+    moved: Sequence[NDArray[np.bool_] | None]
+    tiles: Sequence[NDArray[np.uint8] | None]
+    cams: NDArray[np.float32]
+    background: NDArray[np.float32]
+    elapsed_s: float
 
 
 def changed_tiles(moved: Sequence[NDArray[np.bool_] | None]) -> list[NDArray[np.uint8] | None]:
@@ -36,23 +76,152 @@ def changed_tiles(moved: Sequence[NDArray[np.bool_] | None]) -> list[NDArray[np.
     return masks
 
 
-def forget_what_moved(
-    settings: SplatSettings, pool: Pool, box: SceneBox, cloud: Cloud, views: Sequence[View],
-    moved: Sequence[NDArray[np.bool_] | None], cams: NDArray[np.float32], rng: np.random.Generator,
-) -> None:  # fmt: skip
-    """Remove the Gaussians in the hull of what changed that no longer agree, and begin new ones there.
+def tasks_of(tiles: Sequence[NDArray[np.uint8] | None], slots: Sequence[int]) -> NDArray[np.int32]:
+    """The changed tiles of views ``slots`` as (slot, tile) rows, int32 (M, 2)."""
+    parts = [np.zeros((0, 2), np.int32)]
+    for b, k in enumerate(slots):
+        mask = tiles[k]
+        assert mask is not None
+        where = np.flatnonzero(mask).astype(np.int32)
+        parts.append(np.stack([np.full_like(where, b), where], axis=-1))
+    return np.concatenate(parts)
+
+
+def drift(cloud: Cloud, elapsed_s: float) -> None:
+    """Let every guest go on as it went; after a long pause, none."""
+    if not 0.0 < elapsed_s <= LONGEST_S:
+        cloud.velocity[:] = 0.0
+        return
+    cloud.params[:, :3] += cloud.velocity * np.float32(elapsed_s)
+
+
+def carry(
+    settings: SplatSettings, passes: Passes, cloud: Cloud, seen: Moved, steps: int
+) -> Iterator[tuple[float, int, int]]:
+    """Move the guests together until the pictures agree: first as whole bodies, then in smaller parts. Their
+    velocities follow. Yields (squared error, pixels, pairs) of each of ``steps`` steps at most.
+
+    A descent with the gradient of all Gaussians of a cell: alone, each would rather change its colour.
+    """
+    guests = np.flatnonzero(cloud.guest).astype(np.int64)
+    slots = [k for k, t in enumerate(seen.tiles) if t is not None]
+    if guests.size == 0 or len(slots) < min(2, len(seen.views)) or not 0 < seen.elapsed_s <= LONGEST_S:
+        return
+    loss = Loss(False, np.float32(0.0), seen.background, False, np.uint64(0))
+    # Of the cloud, only what shows in the tiles that changed.
+    passes.look(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
+                [seen.tiles[k] for k in slots], differentiate=False)  # fmt: skip
+    shows = np.asarray((passes.lists.own_count[:, : len(cloud)] > 0).any(axis=0))
+    shows[guests] = True
+    some, theirs = np.flatnonzero(shows), guests
+    guests = np.searchsorted(some, theirs).astype(np.int64)
+    gaussians = Gaussians(cloud.params[some], settings.harmonics, cloud.velocity[some])
+    place, velocity = gaussians.params[:, :3], gaussians.velocity
+    slope = np.zeros((guests.size, 3), np.float32)
+    pixel = seen.box.pixel_m / seen.box.radius_m
+    fastest = FASTEST_M_PER_S / seen.box.radius_m
+    for level, (cell_px, step_m_per_s) in enumerate(zip(CELLS_PX, STEPS_M_PER_S)):
+        step = step_m_per_s * seen.elapsed_s / seen.box.radius_m
+        cell = _cells(place[guests], cell_px * pixel)
+        count = int(cell.max()) + 1
+        m, v = np.zeros((count, 3)), np.zeros(count)
+        for k in range((steps + 1 - level) // 2):
+            turn = (steps - k) * CARRY_VIEWS + level  # other views each time
+            some_slots = [slots[(turn + j) % len(slots)] for j in range(min(CARRY_VIEWS, len(slots)))]
+            picked, cams = np.array(some_slots, np.int64), np.ascontiguousarray(seen.cams[some_slots])
+            tasks = tasks_of(seen.tiles, some_slots)
+            losses = np.zeros((len(tasks), 3))
+            passes.look(cams, gaussians, [seen.tiles[k] for k in some_slots])
+            passes.pool.run(
+                train_tiles, seen.data, picked, tasks, passes.columns, passes.projected, passes.lists, loss,
+                passes.memory, passes.kept, passes.sums, losses,
+            )  # fmt: skip
+            passes.pool.run(
+                pull, cams, gaussians, guests, passes.projected, passes.lists.own_first,
+                passes.lists.own_count, passes.sums, slope,
+            )  # fmt: skip
+            total = np.stack([np.bincount(cell, slope[:, a], count) for a in range(3)], axis=-1)
+            m, v = 0.6 * m + 0.4 * total, 0.8 * v + 0.2 * (total**2).sum(axis=1)
+            length = np.sqrt(v / (1 - 0.8 ** (k + 1))) + 1e-12
+            shift = -step * FALL**k * m / (1 - 0.6 ** (k + 1)) / length[:, None]
+            mine = shift[cell].astype(np.float32)
+            place[guests] += mine
+            faster = velocity[guests] + mine * np.float32(_TO_VELOCITY / seen.elapsed_s)
+            velocity[guests] = np.clip(faster, -fastest, fastest)
+            cloud.params[theirs, :3], cloud.velocity[theirs] = place[guests], velocity[guests]
+            yield float(losses[:, 1].sum()), TILE * TILE * len(tasks), int(passes.lists.needed.sum())
+
+
+def leave_behind(cloud: Cloud, seen: Moved, before: NDArray[np.float32]) -> None:
+    """Guests that agree better with the pictures where they were (before: (N, 3)) stay there, as a part
+    of the scene: the body went on without them."""
+    guests = np.flatnonzero(cloud.guest)
+    if guests.size == 0:
+        return
+    colors = cloud.params[guests, OPACITY + 1 : OPACITY + 4]
+    there = _error(before[guests], colors, seen)
+    here = _error(cloud.params[guests, :3], colors, seen, cloud.velocity[guests])
+    stay = guests[there + STAYS < here]
+    cloud.params[stay, :3] = before[stay]
+    cloud.velocity[stay] = 0.0
+    cloud.guest[stay] = 0
+
+
+def _error(
+    points: NDArray[np.float32], colors: NDArray[np.float32], seen: Moved,
+    velocity: NDArray[np.float32] | None = None,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Mean difference (N,) of each point's colour from the pixels it falls on, none counting more than .5."""
+    total, count = np.zeros(len(points)), np.zeros(len(points))
+    for view, cam in zip(seen.views, seen.cams):
+        at = points if velocity is None else points + cam[TIME] * velocity
+        pixel = _pixels(at, cam, view)
+        inside = np.flatnonzero(pixel >= 0)
+        found = view.image.reshape(-1, view.image.shape[2])[pixel[inside], :3] / 255.0
+        total[inside] += np.minimum(np.abs(found - colors[inside]).max(axis=1), 0.5)
+        count[inside] += 1
+    return total / np.maximum(count, 1)
+
+
+def renew(
+    settings: SplatSettings, passes: Passes, cloud: Cloud, seen: Moved, rng: np.random.Generator
+) -> None:
+    """Remove the Gaussians in the hull of what changed that do not agree with it, and begin new ones where
+    pictures are still wrong.
 
     The hull: most cameras that see the place see it change, two at least. Of what lies in it, a Gaussian is
     removed where its colour disagrees with most of the pixels that changed: the background behind a moving
     body stays.
     """
+    views = seen.views
     needed = min(2, len(views))
-    if sum(mask is not None for mask in moved) < needed:
+    if sum(mask is not None for mask in seen.moved) < needed:
         return  # what one camera alone sees change may be that camera
+    hull, disagrees = _hull(cloud, seen)
+    _age(cloud, hull)
+    cloud.keep(~(hull & disagrees))
+    off = _still_wrong(settings, passes, cloud, seen)
+    pixels = sum(int(m.sum()) for m in off if m is not None)
+    count = min(int(settings.reseed * settings.gaussians), int(SEEDS_A_PIXEL * pixels))
+    new = Cloud.of(seeds(settings, passes.pool, seen.box, views, off, count, rng))
+    new.keep(_hull(new, seen)[0])
+    new.guest[:] = 1
+    _pass_on(cloud, new, CELLS_PX[0] * seen.box.pixel_m / seen.box.radius_m)
+    over = len(cloud) + len(new) - settings.gaussians
+    if over > 0:  # room is made by the ones that show least
+        keep = np.ones(len(cloud), bool)
+        keep[np.argsort(opacity(cloud.params), kind="stable")[:over]] = False
+        cloud.keep(keep)
+    cloud.add(new)
+
+
+def _hull(cloud: Cloud, seen: Moved) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which Gaussians lie in the hull of what changed, and which of them disagree with it: bool (N,) each."""
     sees = np.zeros(len(cloud), np.int32)
     marked, wrong = np.zeros_like(sees), np.zeros_like(sees)
-    for view, mask, cam in zip(views, moved, cams):
-        pixel = _pixels(cloud.params[:, :3], cam, view)
+    allowed = np.where(cloud.guest > 0, AGREE_GUEST, AGREE)
+    for view, mask, cam in zip(seen.views, seen.moved, seen.cams):
+        pixel = _pixels(cloud.params[:, :3] + cam[TIME] * cloud.velocity, cam, view)
         inside = np.flatnonzero(pixel >= 0)
         sees[inside] += 1
         if mask is None:
@@ -60,21 +229,66 @@ def forget_what_moved(
         hit = inside[mask.reshape(-1)[pixel[inside]]]
         marked[hit] += 1
         colors = view.image.reshape(-1, view.image.shape[2])[pixel[hit]] / 255.0
-        off = np.abs(colors[:, :3] - cloud.params[hit, OPACITY + 1 : OPACITY + 4]).max(axis=1) > AGREE
+        off = np.abs(colors[:, :3] - cloud.params[hit, OPACITY + 1 : OPACITY + 4]).max(axis=1) > allowed[hit]
         if view.image.shape[2] == 4:
             off |= colors[:, 3] < 0.5
         wrong[hit] += off
-    gone = (marked >= needed) & (2 * marked >= sees) & (2 * wrong >= marked)
-    cloud.keep(~gone)
-    pixels = sum(int(m.sum()) for m in moved if m is not None)
-    most = int(settings.reseed * settings.gaussians)
-    count = min(most, max(int(gone.sum()), int(_SEEDS_A_PIXEL * pixels)))
-    over = len(cloud) + count - settings.gaussians
-    if over > 0:  # room is made by the ones that show least
-        keep = np.ones(len(cloud), bool)
-        keep[np.argsort(opacity(cloud.params), kind="stable")[:over]] = False
-        cloud.keep(keep)
-    cloud.add(seeds(settings, pool, box, views, moved, count, rng))
+    return (marked >= min(2, len(seen.views))) & (2 * marked >= sees), 2 * wrong >= marked
+
+
+def _age(cloud: Cloud, hull: NDArray[np.bool_]) -> None:
+    guest = cloud.guest > 0
+    cloud.guest[guest & hull] = 1
+    rests = guest & ~hull
+    cloud.guest[rests] += 1
+    cloud.velocity[rests] = 0.0
+    cloud.guest[cloud.guest > LEFT] = 0
+
+
+def _pass_on(cloud: Cloud, new: Cloud, size: float) -> None:
+    """New guests move as the old ones around them do."""
+    guests = np.flatnonzero(cloud.guest)
+    if guests.size == 0 or len(new) == 0:
+        return
+    cell = _cells(np.concatenate([cloud.params[guests, :3], new.params[:, :3]]), size)
+    count = int(cell.max()) + 1
+    old = cell[: guests.size]
+    number = np.maximum(np.bincount(old, minlength=count), 1)
+    for a in range(3):
+        mean = np.bincount(old, cloud.velocity[guests, a], count) / number
+        new.velocity[:, a] = mean[cell[guests.size :]]
+
+
+def _cells(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
+    """The number (N,), from 0, of the cube of that size each point (N, 3) lies in."""
+    index = np.floor(points / size).clip(-1000, 1000).astype(np.int64) + 1000
+    cell: NDArray[np.int64] = np.unique((index[:, 0] * 2001 + index[:, 1]) * 2001 + index[:, 2],
+                                        return_inverse=True)[1]  # fmt: skip
+    return cell.reshape(-1)
+
+
+def _still_wrong(
+    settings: SplatSettings, passes: Passes, cloud: Cloud, seen: Moved
+) -> list[NDArray[np.bool_] | None]:
+    """Of the pixels that changed, those that the cloud does not show as they are now: where a body has left,
+    what is behind it is known already."""
+    slots = [k for k, t in enumerate(seen.tiles) if t is not None]
+    off = list(seen.moved)  # where nearly everything changed, all of it is wrong
+    if not slots:
+        return off
+    passes.look(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
+                [seen.tiles[k] for k in slots], differentiate=False)  # fmt: skip
+    data, tasks = seen.data, tasks_of(seen.tiles, slots)
+    error = np.zeros(int(data.first[-1]), np.float32)
+    passes.pool.run(
+        compare_tiles, data, np.array(slots, np.int64), tasks, passes.columns, passes.projected, passes.lists,
+        seen.background, passes.memory, passes.kept, error,
+    )  # fmt: skip
+    for k in slots:
+        mask = seen.moved[k]
+        assert mask is not None
+        off[k] = mask & (error[data.first[k] : data.first[k + 1]] > OFF).reshape(mask.shape)
+    return off
 
 
 def _pixels(points: NDArray[np.float32], cam: NDArray[np.float32], view: View) -> NDArray[np.int64]:

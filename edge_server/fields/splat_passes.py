@@ -18,6 +18,7 @@ from edge_server.fields.kernels.splat_project import (
     PROJECTED,
     SIZE,
     TILE,
+    TIME,
     Gaussians,
     project,
 )
@@ -54,9 +55,13 @@ def ray_lengths(camera: Pinhole) -> NDArray[np.float32]:
 
 
 def camera_rows(
-    poses: Sequence[NDArray[np.float64]], lenses: Sequence[Pinhole], box: SceneBox
+    poses: Sequence[NDArray[np.float64]],
+    lenses: Sequence[Pinhole],
+    box: SceneBox,
+    times_s: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
-    """Cameras in scene units as the kernels read them, float32 (B, CAMERA)."""
+    """Cameras in scene units as the kernels read them, float32 (B, CAMERA). times_s: when each picture was
+    taken, from the instant the Gaussians stand for (none: at that instant)."""
     rows = np.zeros((len(poses), CAMERA), np.float32)
     for row, pose, lens in zip(rows, poses, lenses):
         pose = np.asarray(pose, dtype=np.float64)
@@ -66,6 +71,8 @@ def camera_rows(
         row[LIMITS:NEAR] = _limits(lens)
         row[NEAR] = max(NEAR_LEAST, box.near_m / box.radius_m)
         row[SIZE], row[SIZE + 1] = lens.width, lens.height
+    if times_s is not None:
+        rows[:, TIME] = times_s
     return rows
 
 

@@ -37,6 +37,8 @@ class SplatSettings:
     rate_opacity: float = _option(0.15, "of opacities before the sigmoid")
     rate_color: float = _option(0.02, "of colours; a tenth of it for harmonics")
     rate_end: float = _option(0.1, "share of the learning rates that is left at the end of a fit")
+    settle_after: float = _option(300.0, "steps of a Gaussian at full rates; then they fall as 1 / steps")
+    rate_settled: float = _option(0.1, "share of the rates that a Gaussian keeps for good")
     epsilon: float = _option(1e-3, "Adam's epsilon, on gradients summed over pixels")
     fade: float = _option(0.0, "pull on opacities: empties what no picture needs")
     densify_every: int = _option(50, "steps between growth and pruning, at least one pass over all views")
@@ -47,6 +49,7 @@ class SplatSettings:
     widest: float = _option(0.2, "Gaussians wider than this share of a picture are split first")
     aspect: float = _option(20.0, "longest to shortest axis at most")
     changed_share: float = _option(0.25, "steps that look only at tiles that changed since the last view")
+    follow: int = _option(8, "steps at the start of an update that carry along what moves; 0: none")
     reseed: float = _option(0.25, "of ``gaussians``, how many are made anew where something moved, at most")
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
@@ -57,6 +60,7 @@ class SplatSettings:
         for name, low, high in (
             ("gaussians", 1, 1 << 20), ("start", 1, 1 << 20), ("views_a_step", 1, 64), ("seed_cells", 0, 256),
             ("min_views", 0, 1000), ("densify_every", 1, 1 << 30), ("opacity_reset", 0, 1 << 30),
+            ("follow", 0, 1000), ("settle_after", 1.0, 1e9), ("rate_settled", 0.0, 1.0),
             ("tile_share", 0.01, 1.0), ("dssim", 0.0, 1e3), ("seed_scale", 0.01, 100.0),
             ("seed_opacity", 0.001, 0.99), ("rate_end", 1e-4, 1.0), ("epsilon", 0.0, 1e3), ("fade", 0.0, 1e3),
             ("grow", 0.0, 1.0), ("prune", 0.0, 0.9), ("largest", 1e-3, 50.0), ("widest", 1e-3, 1e3),

@@ -20,7 +20,8 @@ SOLID = 0.5  # opacity from which on a pixel shows a surface
 
 @dataclass(frozen=True)
 class SplatSnapshot:
-    """Gaussians and cameras of one instant. Nothing in it is written after it is made."""
+    """Gaussians and cameras of one instant. Nothing in it is written after it is made. ahead_s: by how much
+    that instant is later than the newest view."""
 
     box: SceneBox
     gaussians: Gaussians
@@ -28,6 +29,7 @@ class SplatSnapshot:
     cameras: tuple[View, ...]
     pool: Pool
     step: int
+    ahead_s: float = 0.0
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture a camera at this pose would take."""

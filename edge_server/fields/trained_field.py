@@ -114,7 +114,7 @@ class TrainedField:
         """Surface points in world metres and their colours; none before the first fit."""
         return self.snapshot().points(count)
 
-    def snapshot(self) -> NgpSnapshot:
+    def snapshot(self, present_ns: int | None = None) -> NgpSnapshot:
         """A copy that renders from any thread and never changes."""
         with self._turn.mine():
             if self._snapshot is None or self._snapshot.step != self.step:

@@ -292,7 +292,7 @@ class VirtualDeployment:
             return publication
         if self._scored_ns is not None and present_ns - self._scored_ns < every_ms * 1e6:
             return publication
-        score = self.truth.score(self.updates.field, present_ns)
+        score = self.truth.score(self.updates.field.snapshot(present_ns), present_ns)
         if score is None:
             return publication
         self._scored_ns = present_ns

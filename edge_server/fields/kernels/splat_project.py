@@ -23,7 +23,7 @@ BASE = 14
 # Columns of a projected Gaussian.
 MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 12
 # Columns of a camera.
-ORIGIN, LENS, LIMITS, NEAR, SIZE, CAMERA = 9, 12, 20, 24, 25, 28
+ORIGIN, LENS, LIMITS, NEAR, SIZE, TIME, CAMERA = 9, 12, 20, 24, 25, 27, 28
 
 TILE = 8  # pixels a side
 BLOCK = 128  # Gaussians a task
@@ -40,10 +40,13 @@ _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.flo
 
 
 class Gaussians(NamedTuple):
-    """params: float32 (N, BASE + 3 (harmonics - 1)). harmonics: 1, 4 or 9."""
+    """params: float32 (N, BASE + 3 (harmonics - 1)). harmonics: 1, 4 or 9. velocity: float32 (N, 3), scene
+    units a second: a camera whose column TIME is t (seconds from the instant of ``params``) sees a Gaussian
+    where it was then."""
 
     params: NDArray[np.float32]
     harmonics: int
+    velocity: NDArray[np.float32]
 
 
 @njit(inline="always")
@@ -94,10 +97,11 @@ def _scale(params, i, k):
 
 
 @njit(inline="always")
-def _camera_point(cams, b, params, i):
-    x = params[i, 0] - cams[b, ORIGIN]
-    y = params[i, 1] - cams[b, ORIGIN + 1]
-    z = params[i, 2] - cams[b, ORIGIN + 2]
+def _camera_point(cams, b, params, velocity, i):
+    t = cams[b, TIME]
+    x = params[i, 0] + t * velocity[i, 0] - cams[b, ORIGIN]
+    y = params[i, 1] + t * velocity[i, 1] - cams[b, ORIGIN + 1]
+    z = params[i, 2] + t * velocity[i, 2] - cams[b, ORIGIN + 2]
     return (
         cams[b, 0] * x + cams[b, 1] * y + cams[b, 2] * z,
         cams[b, 3] * x + cams[b, 4] * y + cams[b, 5] * z,
@@ -131,11 +135,11 @@ def _times(cams, b, j0, j1, j2):
 
 
 @kernel
-def project_one(cams, b, params, harmonics, i, projected, tiles):
+def project_one(cams, b, params, velocity, harmonics, i, projected, tiles):
     """Fill projected[b, i] (PROJECTED,) and tiles[b, i] (x0, x1, y0, y1: tiles it may touch; x1 <= x0:
     none). conic: the inverse of the picture covariance, upper triangle."""
     tiles[b, i, 0] = tiles[b, i, 1] = tiles[b, i, 2] = tiles[b, i, 3] = 0
-    x, y, z = _camera_point(cams, b, params, i)
+    x, y, z = _camera_point(cams, b, params, velocity, i)
     raw = params[i, OPACITY]
     if not (z > cams[b, NEAR] and z < np.float32(FAR)) or not is_finite(raw):
         return
@@ -217,14 +221,14 @@ def _harmonic_slope(h, x, y, z):
 
 
 @kernel
-def project_back(cams, b, params, harmonics, i, sums, projected, out):
+def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
     """Add to out (BASE + ...,) the gradient of what ``project_one`` made of Gaussian i.
 
     sums: float32 (9,), over the pixels it covers: d loss / d power (h), h dx, h dy, h dx^2, h dx dy, h dy^2
     with (dx, dy) from the mean to the pixel, and d loss / d colour. Returns the length of the gradient of
     the mean in the picture (pixels)."""
     row = projected[b, i]
-    x, y, z = _camera_point(cams, b, params, i)
+    x, y, z = _camera_point(cams, b, params, velocity, i)
     fx, fy = cams[b, LENS], cams[b, LENS + 1]
     a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = _flattener(cams, b, x, y, z)
     gx, gy = fx * inverse, fy * inverse
@@ -332,4 +336,6 @@ def project(counter, worker, cams, gaussians, count, projected, tiles):
             return
         b, block = task // blocks, task % blocks
         for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            project_one(cams, b, gaussians.params, gaussians.harmonics, i, projected, tiles)
+            project_one(
+                cams, b, gaussians.params, gaussians.velocity, gaussians.harmonics, i, projected, tiles
+            )

@@ -256,3 +256,36 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
             healthy = is_finite(far) and is_finite(seen)
             depth[y, x] = far if healthy and seen > np.float32(1e-3) else _F0
             opacity[y, x] = min(max(seen, _F0), _F1) if healthy else _F0
+
+
+@kernel
+def compare_tiles(
+    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, kept, error
+):
+    """How far off each pixel is: error, float32 (P,), the largest difference of a channel, written for the
+    pixels of the tasks' tiles. picked: int64 (B,), the view of each camera slot. tasks: int32 (M, 2), slot
+    and tile."""
+    s, store = memory[worker], kept[worker]
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= tasks.shape[0]:
+            return
+        b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
+        x0, y0, v = TILE * (t % columns[b]), TILE * (t // columns[b]), picked[b]
+        width, height, first = views.size[v, 0], views.size[v, 1], views.first[v]
+        transparent = views.pixels.shape[1] == 4
+        _begin(s, x0, y0)
+        for j in range(lists.first[b, t], lists.first[b, t + 1]):
+            if blend(s, store, np.int64(0), projected[b, lists.owner[b, lists.pair[b, j]]]) == _F0:
+                break
+        for k in range(PIXELS):
+            x, y = x0 + k % TILE, y0 + k // TILE
+            if x >= width or y >= height:
+                continue
+            pixel, worst = first + y * width + x, _F0
+            opaque = np.float32(views.pixels[pixel, 3]) * _BYTE if transparent else _F1
+            for c in range(3):
+                wanted = np.float32(views.pixels[pixel, c]) * _BYTE * opaque + background[c] * (_F1 - opaque)
+                shown = s[_R + c * PIXELS + k] + s[_T + k] * background[c]
+                worst = max(worst, abs(shown - wanted))
+            error[pixel] = worst if is_finite(worst) else _F1

@@ -48,9 +48,9 @@ class Moments(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """One step's rule. rates: float32 (P,). corrections: float32 (A, 2), Adam's 1 / (1 - beta^t) by age, the
-    last for all higher ones. fade: pull on opacity, in loss per unit of opacity. largest: scale limit in
-    scene units; thinnest: logarithm of the largest aspect."""
+    """One step's rule. rates: float32 (P,). corrections: float32 (A, 3) by age, the last row for all higher
+    ones: Adam's two 1 / (1 - beta^t), and the share of the rates that is left. fade: pull on opacity, in loss
+    per unit of opacity. largest: scale limit in scene units; thinnest: logarithm of the largest aspect."""
 
     rates: NDArray[np.float32]
     corrections: NDArray[np.float32]
@@ -135,7 +135,9 @@ def update(counter, worker, cams, gaussians, count, projected, own_first, own_co
                 for p in range(first, first + pairs):
                     for k in range(SUMS):
                         sums[k] += pair_sums[b, p, k]
-                slope = project_back(cams, b, params, gaussians.harmonics, i, sums, projected, g)
+                slope = project_back(
+                    cams, b, params, gaussians.velocity, gaussians.harmonics, i, sums, projected, g
+                )
                 if is_finite(slope) and slope > _F0:
                     moments.slope[i] += slope * cams[b, SIZE]
                     moments.looks[i] += _F1
@@ -147,7 +149,11 @@ def update(counter, worker, cams, gaussians, count, projected, own_first, own_co
                 g[OPACITY] += rule.fade * alpha * (_F1 - alpha)
             moments.age[i] += 1
             age = min(np.int64(moments.age[i]), np.int64(rule.corrections.shape[0] - 1))
-            correct1, correct2 = rule.corrections[age, 0], rule.corrections[age, 1]
+            correct1, correct2, calm = (
+                rule.corrections[age, 0],
+                rule.corrections[age, 1],
+                rule.corrections[age, 2],
+            )
             far = max(_F1, max(abs(params[i, 0]), max(abs(params[i, 1]), abs(params[i, 2]))))
             limit = np.float32(GRADIENT_LIMIT)
             for k in range(width):
@@ -161,7 +167,36 @@ def update(counter, worker, cams, gaussians, count, projected, own_first, own_co
                 if not (is_finite(m) and is_finite(v)):
                     m, v = _F0, _F0
                 moments.m[i, k], moments.v[i, k] = m, v
-                rate = rule.rates[k] * (far if k < SCALE else _F1)
+                rate = rule.rates[k] * calm * (far if k < SCALE else _F1)
                 params[i, k] -= rate * m * correct1 / (np.sqrt(v * correct2) + rule.epsilon)
             bound(params, i, rule.largest, rule.thinnest)
         dropped[block] = lost
+
+
+@kernel
+def pull(counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums, slope):
+    """The gradient by position alone of Gaussians ``which`` (int64 (M,)), to slope: float32 (M, 3)."""
+    width = gaussians.params.shape[1]
+    g, sums = np.empty(width, np.float32), np.empty(SUMS, np.float32)
+    while True:
+        base = fetch_add(counter, 1) * BLOCK
+        if base >= which.size:
+            return
+        for n in range(base, min(base + BLOCK, which.size)):
+            i = which[n]
+            for k in range(width):
+                g[k] = _F0
+            for b in range(cams.shape[0]):
+                first, pairs = np.int64(own_first[b, i]), np.int64(own_count[b, i])
+                if pairs == 0:
+                    continue
+                for k in range(SUMS):
+                    sums[k] = _F0
+                for p in range(first, first + pairs):
+                    for k in range(SUMS):
+                        sums[k] += pair_sums[b, p, k]
+                project_back(
+                    cams, b, gaussians.params, gaussians.velocity, gaussians.harmonics, i, sums, projected, g
+                )
+            for k in range(3):
+                slope[n, k] = g[k] if is_finite(g[k]) else _F0

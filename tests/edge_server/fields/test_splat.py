@@ -10,6 +10,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.splat import SplatField
+from edge_server.fields.splat_growth import opacity
 from edge_server.fields.splat_settings import SplatSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
@@ -157,6 +158,53 @@ def test_what_is_gone_is_forgotten_and_what_came_grows() -> None:
     stale = _score(field, truth)
     field.fit(moved, Budget(steps=60))
     assert _score(field, truth) > stale + 4.0 and _score(field, truth) > 20.0
+
+
+MS = 1_000_000
+START, SPEED = np.array([-0.3, -0.3, 0.5]), np.array([0.8, 0.0, 0.0])  # metres, metres a second
+
+
+def _ball_at(t_ms: int, late: bool = False) -> list[View]:
+    """Views of the ball on its way; late: every other one is 100 ms old."""
+    views = []
+    for k, v in enumerate(SEEN):
+        taken_ms = t_ms - (100 if late and k % 2 else 0)
+        image = picture(v.intrinsics, v.camera_to_world, START + SPEED * taken_ms / 1e3)
+        views.append(replace(v, image=image, generated_ns=taken_ms * MS))
+    return views
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_what_moves_is_carried_along_and_on_to_the_present(late: bool) -> None:
+    field = SplatField(SMALL)
+    field.fit(_ball_at(0), Budget(steps=200))
+    for t_ms in range(100, 600, 100):
+        field.fit(_ball_at(t_ms, late), Budget(steps=30))
+    cloud = field.cloud
+    guests = (cloud.guest > 0) & (opacity(cloud.params) > 0.3)
+    assert field.rig.box is not None
+    found = np.median(cloud.velocity[guests] * field.rig.box.radius_m, axis=0)
+    np.testing.assert_allclose(found, SPEED, atol=0.3)
+    truth, then = (
+        picture(HELD.intrinsics, HELD.camera_to_world, START + SPEED * t) / 255.0 for t in (0.65, 0.5)
+    )
+    moving = np.abs(truth - then).max(axis=2) > 0.03
+
+    def off(present_ns: int | None) -> float:
+        shown = field.snapshot(present_ns).render(HELD.camera_to_world, HELD.intrinsics)
+        return float(np.square(shown.color - truth)[moving].mean())
+
+    assert off(650 * MS) < 0.8 * off(None)
+    assert off(100 * MS) == off(None)  # the past is not shown: what is known is newer
+
+
+def test_a_long_pause_leaves_nothing_known_of_motion() -> None:
+    field = SplatField(SMALL)
+    for t_ms in (0, 100, 200, 300):
+        field.fit(_ball_at(t_ms), Budget(steps=40))
+    assert np.abs(field.cloud.velocity).max() > 0
+    field.fit([replace(v, generated_ns=9000 * MS) for v in SEEN], Budget(steps=1))
+    assert np.abs(field.cloud.velocity).max() == 0
 
 
 def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:

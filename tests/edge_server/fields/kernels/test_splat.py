@@ -12,8 +12,14 @@ from edge_server.fields import splat_torch
 from edge_server.fields.kernels.pool import CallerPool, Pool
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.kernels.splat_project import BASE, OPACITY, QUATERNION, SCALE, TILE, Gaussians
-from edge_server.fields.kernels.splat_raster import Loss, dissimilarity, render_tiles, train_tiles
-from edge_server.fields.kernels.splat_update import Moments, Rule, update
+from edge_server.fields.kernels.splat_raster import (
+    Loss,
+    compare_tiles,
+    dissimilarity,
+    render_tiles,
+    train_tiles,
+)
+from edge_server.fields.kernels.splat_update import Moments, Rule, pull, update
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.splat_passes import Passes, camera_rows
 from freshfield.geometry import Pinhole, look_at
@@ -35,13 +41,17 @@ def _cloud(count: int = 12, harmonics: int = 1, seed: int = 0) -> np.ndarray:
     return params
 
 
+def _still(params: np.ndarray, harmonics: int) -> Gaussians:
+    return Gaussians(params, harmonics, np.zeros((len(params), 3), np.float32))
+
+
 def _camera(lens: Pinhole = LENS, eye: tuple[float, float, float] = (1.0, -2.5, 0.8)) -> np.ndarray:
     return camera_rows([look_at(eye, (0.05, 0.0, 0.1))], [lens], BOX)
 
 
 def _render(params: np.ndarray, cam: np.ndarray, harmonics: int = 1, threads: int = 1) -> list[np.ndarray]:
     passes = Passes(CallerPool() if threads == 1 else Pool(threads, 0))
-    passes.look(cam, Gaussians(params, harmonics), [None], differentiate=False)
+    passes.look(cam, _still(params, harmonics), [None], differentiate=False)
     w, h = LENS.width, LENS.height
     out = [np.full((h, w, 3), 7, np.float32), np.full((h, w), 7, np.float32), np.full((h, w), 7, np.float32)]
     passes.pool.run(
@@ -96,7 +106,7 @@ def _gradient(
     """Loss and its gradient: Adam's first moment after one step with beta1 = 0."""
     pool = CallerPool()
     passes = Passes(pool)
-    gaussians = Gaussians(params.copy(), harmonics)
+    gaussians = _still(params.copy(), harmonics)
     passes.look(cam, gaussians, [None])
     total = int(passes.columns[0] * passes.rows[0])
     tasks = np.array([(0, t) for t in range(total)], np.int32)
@@ -110,7 +120,7 @@ def _gradient(
     flat = [np.zeros(n, np.float32) for _ in range(3)]
     moments = Moments(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
     rule = Rule(
-        np.zeros(params.shape[1], np.float32), np.ones((4, 2), np.float32),
+        np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32),
         *(np.float32(v) for v in (0.0, 0.9, 1e-8, 0.0, 4.0, 5.0)),
     )  # fmt: skip
     dropped = np.zeros(n, np.int64)
@@ -262,7 +272,7 @@ def test_lists_are_front_to_back_whatever_the_thread_count() -> None:
     found = []
     for pool in (CallerPool(), Pool(3, 0)):
         passes = Passes(pool)
-        passes.look(cam, Gaussians(params, 1), [None, None])
+        passes.look(cam, _still(params, 1), [None, None])
         found.append(passes)
     for b in range(2):
         lists = found[0].lists
@@ -283,6 +293,58 @@ def test_tiles_that_are_not_wanted_get_no_pairs() -> None:
     total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
     wanted = np.zeros(total, np.uint8)
     wanted[4] = 1
-    passes.look(cam, Gaussians(_cloud(50), 1), [wanted])
+    passes.look(cam, _still(_cloud(50), 1), [wanted])
     lengths = np.diff(passes.lists.first[0, : total + 1])
     assert lengths[4] > 0 and lengths.sum() == lengths[4] == passes.lists.needed[0]
+
+
+def test_a_camera_sees_what_moves_where_it_was_when_its_picture_was_taken() -> None:
+    params, velocity = _cloud(5), np.random.default_rng(1).normal(size=(5, 3)).astype(np.float32)
+    late = camera_rows([look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))], [LENS], BOX, [-0.25])
+    there = params.copy()
+    there[:, :3] -= np.float32(0.25) * velocity
+    passes = [Passes(CallerPool()) for _ in range(2)]
+    passes[0].look(late, Gaussians(params, 1, velocity), [None])
+    passes[1].look(_camera(), _still(there, 1), [None])
+    np.testing.assert_allclose(passes[0].projected, passes[1].projected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_pull_on_a_place_is_the_gradient_by_position() -> None:
+    params, cam, target = _cloud(9, seed=2), _camera(), _target()
+    _, gradient = _gradient(params, cam, target)
+    passes, some = Passes(CallerPool()), np.array([7, 1, 4], np.int64)
+    gaussians = _still(params, 1)
+    passes.look(cam, gaussians, [None])
+    tasks = np.array([(0, t) for t in range(int(passes.columns[0] * passes.rows[0]))], np.int32)
+    passes.pool.run(
+        train_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
+        passes.lists, Loss(False, np.float32(0), BACK, False, np.uint64(1)), passes.memory, passes.kept,
+        passes.sums, np.zeros((len(tasks), 3)),
+    )  # fmt: skip
+    slope = np.full((3, 3), 7, np.float32)
+    passes.pool.run(
+        pull, cam, gaussians, some, passes.projected, passes.lists.own_first, passes.lists.own_count,
+        passes.sums, slope,
+    )  # fmt: skip
+    np.testing.assert_allclose(slope, gradient[some, :3], rtol=1e-5, atol=1e-6)
+
+
+def test_compared_pixels_are_as_far_off_as_the_rendering_is() -> None:
+    params, cam, target = _cloud(20, seed=4), _camera(), _target()
+    color = _render(params, cam)[0]
+    passes = Passes(CallerPool())
+    columns = -(-LENS.width // TILE)
+    passes.look(cam, _still(params, 1), [None], differentiate=False)
+    tasks = np.array([(0, 0), (0, columns + 1)], np.int32)
+    error = np.full(LENS.width * LENS.height, -1, np.float32)
+    passes.pool.run(
+        compare_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
+        passes.lists, BACK, passes.memory, passes.kept, error,
+    )  # fmt: skip
+    error = error.reshape(LENS.height, LENS.width)
+    wanted = np.abs(color - target / 255.0).max(axis=2)
+    for y, x in ((0, 0), (TILE, TILE)):
+        np.testing.assert_allclose(
+            error[y : y + TILE, x : x + TILE], wanted[y : y + TILE, x : x + TILE], atol=1e-5
+        )
+    assert (error[:TILE, TILE:] == -1).all()
