@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields import Field
-from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid, scatter
+from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.ngp_layout import make_grid, make_net
@@ -54,6 +54,9 @@ class NgpField(TrainedField):
         self.pool.run(
             scatter, self._grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
         )
+        if self.settings.smooth:
+            weight = np.float32(self.settings.smooth / scale)
+            self.pool.run(smooth_grid, self._grid, levels, weight, self._table_g, self._dirty)
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:

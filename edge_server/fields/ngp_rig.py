@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,23 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.scene_box import SceneBox, plain_background, scene_box
-from edge_server.fields.supervision import CameraMemory, check_view, pack_views, remember
+from edge_server.fields.supervision import CameraMemory, check_view, leave_out, pack_views, remember
 from edge_server.fields.trainer_settings import TrainerSettings
+from edge_server.fields.trust import refused, weights
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
 
 FINAL = 4  # cameras from which on a scene's box is kept
+SETTLED = 100  # steps after which a field may doubt what it is shown
+
+
+class PixelRenderer(Protocol):
+    """Shows single pixels: ``NgpSnapshot.render_pixels``."""
+
+    def render_pixels(
+        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 
 
 @dataclass(frozen=True)
@@ -63,9 +73,18 @@ class Rig:
             self._box_cameras = len(self.memory)
             self.behind = _behind(views)
         look = look or any(m.moved is not None for m in self.memory.values())
-        data = pack_views(views, self.box, self.memory)
+        data = pack_views(views, self.box, self.memory, weights(views, self.memory, self.settings))
         self._packed = (tuple(views), data)
         return Intake(data, new_box, look or new_box)
+
+    def trusted(self, views: Sequence[View], data: Views, step: int, field: PixelRenderer) -> Views:
+        """``data`` without the views that contradict ``field``, which has learnt for ``step`` steps."""
+
+        def pixels(view: View, points: NDArray[np.float64]) -> NDArray[np.float32]:
+            return field.render_pixels(view.camera_to_world, view.intrinsics, points)[0]
+
+        beyond, settled = self.settings.refuse_beyond, step >= SETTLED
+        return leave_out(data, refused(views, self.memory, beyond, settled, pixels))
 
     def background(self) -> NDArray[np.float32]:
         """The colour (3,) behind everything that is rendered."""
@@ -82,8 +101,13 @@ class Rig:
             "box": asdict(self.box) if self.box else None,
             "box_cameras": self._box_cameras,
             "cameras": [
-                {"camera": v.camera, "generated_ns": v.generated_ns, **asdict(v.intrinsics)}
-                for v in self.views
+                {
+                    "camera": m.view.camera,
+                    "generated_ns": m.view.generated_ns,
+                    "credit": m.credit,
+                    **asdict(m.view.intrinsics),
+                }
+                for m in self.memory.values()
             ],
         }
 
@@ -106,9 +130,10 @@ class Rig:
         for k, entry in enumerate(meta["cameras"]):
             known = dict(entry)
             camera, generated_ns = known.pop("camera"), known.pop("generated_ns")
+            credit = int(known.pop("credit", 0))
             known["distortion"] = tuple(known["distortion"])
             view = View(camera, arrays[f"image_{k}"], arrays[f"pose_{k}"], Pinhole(**known), generated_ns)
-            self.memory[camera] = CameraMemory(view, arrays.get(f"moved_{k}"))
+            self.memory[camera] = CameraMemory(view, arrays.get(f"moved_{k}"), credit)
 
 
 def _same(a: Sequence[View], b: Sequence[View]) -> bool:

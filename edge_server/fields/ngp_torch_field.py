@@ -186,9 +186,10 @@ class NgpTorchField:
                 self._forget_parameters()
             if intake.look:
                 self._occupancy.look(self.pool, self.rig)
+            data = self.rig.trusted(views, intake.data, self.step, self._model())
         while (progress := pace.begin()) is not None:
             with self._lock:
-                loss, used, bad = self._one_step(intake.data, progress)
+                loss, used, bad = self._one_step(data, progress)
             losses, samples, dropped = [*losses[-31:], loss], samples + used, dropped + bad
             pace.end()
         self.dropped += dropped
@@ -277,13 +278,14 @@ class NgpTorchField:
         if self.step % EVERY == 0:
             self._refresh(model, rng)
             model = self._model()
-        o, d, target, background = self._draw(data, rng)
+        o, d, target, background, weight = self._draw(data, rng)
         jitter = torch.as_tensor(rng.random(len(d), dtype=np.float32), device=self.device)
         table = self._grid.table.requires_grad_(True)
         net = self._net.requires_grad_(True)
         t, delta, u, inside = model.march(o, d, jitter)
         sigma, color = model.query(d, u, inside)
         error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion, s.sparsity)
+        error, loss = error * weight, loss * weight
         good = torch.isfinite(error)
         with _repeatable():
             torch.where(good, loss, torch.zeros_like(loss)).sum().backward()
@@ -315,10 +317,12 @@ class NgpTorchField:
         p.copy_(new.clamp(-PARAMETER_LIMIT, PARAMETER_LIMIT))
         return int((~finite).sum())
 
-    def _draw(self, data: Views, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Origins, directions, targets and backgrounds (R, 3) of one step's rays."""
+    def _draw(self, data: Views, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Origins, directions, targets and backgrounds (R, 3) of one step's rays, and their weights (R,)."""
         count = self.settings.rays
-        pixel = rng.integers(0, len(data.pixels), count)
+        pixel = rng.integers(0, len(data.drawn) or len(data.pixels), count)
+        if len(data.drawn):
+            pixel = data.drawn[pixel]
         if len(data.changed):
             moved = rng.choice(data.changed, count)
             pixel = np.where(rng.random(count) < self.settings.changed_share, moved, pixel)
@@ -337,9 +341,10 @@ class NgpTorchField:
             background = rng.random((count, 3), dtype=np.float32)
         alpha = rgb[:, 3:] if rgb.shape[1] == 4 else np.ones((count, 1), np.float32)
         target = rgb[:, :3] * alpha + background * (1 - alpha)
-        arrays = (data.origin[view].astype(np.float32), directions, target, background.copy())
-        o, d, wanted, behind = (torch.as_tensor(a, device=self.device) for a in arrays)
-        return o, d, wanted, behind
+        weight = data.weight[pixel] if len(data.weight) else np.ones(count, np.float32)
+        arrays = (data.origin[view].astype(np.float32), directions, target, background.copy(), weight)
+        o, d, wanted, behind, counts = (torch.as_tensor(a, device=self.device) for a in arrays)
+        return o, d, wanted, behind, counts
 
     @torch.no_grad()
     def _refresh(self, model: TorchModel, rng: np.random.Generator) -> None:

@@ -17,6 +17,7 @@ from edge_server.fields import View
 Array = NDArray[np.float64]
 
 NEAR_SHARE = 0.4  # of the cameras' distance to the scene: nothing nearer to a lens, where rooms are found
+ASTRAY = 0.3  # sine of the angle by which a camera may look past the scene without being doubted
 PLAIN = 8  # of 255, by which a plain background may vary
 
 
@@ -75,7 +76,7 @@ def scene_box(
     """
     poses = np.stack([v.camera_to_world for v in views])
     origins, axes = poses[:, :3, 3], poses[:, :3, 2]
-    point = converging_point(origins, axes)
+    point = _meeting_point(origins, axes)
     if centre_m is not None:
         centre = np.asarray(centre_m, dtype=np.float64)
     elif point is not None:
@@ -98,6 +99,34 @@ def scene_box(
         near_m = NEAR_SHARE * distance if contracted else max(0.05 * distance, distance - 1.8 * radius_m)
     x, y, z = map(float, centre)
     return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance, pixel)
+
+
+def _meeting_point(origins: Array, axes: Array) -> Array | None:
+    """``converging_point`` without cameras that look past it while all others meet there: a wrong pose in
+    the first views must not decide for good where the scene is. At most a quarter of them, and not of three.
+    """
+    point = converging_point(origins, axes)
+    kept = np.ones(len(origins), np.bool_)
+    for _ in range(len(origins) // 4):
+        if point is None:
+            break
+        worst = int(np.argmax(np.where(kept, _past(origins, axes, point), -1.0)))
+        kept[worst] = False
+        others = converging_point(origins[kept], axes[kept])
+        if others is None:
+            break
+        past = _past(origins, axes, others)
+        if past[worst] < max(ASTRAY, 4.0 * float(np.median(past[kept]))):
+            break
+        point = others
+    return point
+
+
+def _past(origins: Array, axes: Array, point: Array) -> Array:
+    """How far cameras (N,) look past a point: the sine of the angle, 1 and more where it is behind them."""
+    to_point = point - origins
+    ahead = (to_point * axes).sum(axis=1) / np.maximum(np.linalg.norm(to_point, axis=1), 1e-12)
+    return np.where(ahead < 0.0, 1.0 - ahead, np.sqrt(np.maximum(1.0 - ahead**2, 0.0)))
 
 
 def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:

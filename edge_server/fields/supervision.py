@@ -20,10 +20,12 @@ MARGIN_PX = 2
 
 @dataclass
 class CameraMemory:
-    """The newest view of one camera, and the pixels that moved in it: bool (H, W), or None."""
+    """The newest view of one camera, and the pixels that moved in it: bool (H, W), or None. credit: how many
+    views that contradict the field will still be refused (``trust.refused``)."""
 
     view: View
     moved: NDArray[np.bool_] | None = None
+    credit: int = 0
 
 
 def lens_row(camera: Pinhole) -> list[float]:
@@ -69,16 +71,20 @@ def remember(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
         known = memory.get(view.camera)
         if known is not None and known.view is view:
             continue
-        if known is None or (
-            known.view.intrinsics != view.intrinsics
-            or not np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3)
-        ):
-            news = True
+        stood = known is not None and (
+            known.view.intrinsics == view.intrinsics
+            and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3)
+        )
+        news = news or not stood
         moved = None
         if known is not None:
-            same = known.view.image is view.image or np.array_equal(known.view.image, view.image)
+            # The same frame decoded once more says nothing new; an equal but newer one says: nothing moved.
+            # What one wrong picture seemed to move would otherwise count as moving for as long as all stands.
+            again = known.view.generated_ns == view.generated_ns
+            same = again and np.array_equal(known.view.image, view.image)
             moved = known.moved if same else moved_pixels(known.view, view)
-        memory[view.camera] = CameraMemory(view, moved)
+        # What a camera sees from elsewhere may be what no other camera has seen: no reason to doubt it.
+        memory[view.camera] = CameraMemory(view, moved, known.credit if known is not None and stood else 0)
     return news
 
 
@@ -97,8 +103,16 @@ def pack_cameras(views: Sequence[View], box: SceneBox) -> Views:
     )
 
 
-def pack_views(views: Sequence[View], box: SceneBox, memory: dict[str, CameraMemory]) -> Views:
-    """Everything one fit reads. Opaque and transparent pictures may be mixed."""
+def pack_views(
+    views: Sequence[View],
+    box: SceneBox,
+    memory: dict[str, CameraMemory],
+    weights: Sequence[NDArray[np.float32]] | None = None,
+) -> Views:
+    """Everything one fit reads. Opaque and transparent pictures may be mixed.
+
+    weights: float32 (H, W) of each view, of which some are above 0 (``trust.weights``); None: all 1.
+    """
     packed = pack_cameras(views, box)
     channels = max(v.image.shape[2] for v in views)
     pixels = np.full((int(packed.first[-1]), channels), 255, np.uint8)
@@ -109,6 +123,27 @@ def pack_views(views: Sequence[View], box: SceneBox, memory: dict[str, CameraMem
         known = memory.get(view.camera)
         if known is not None and known.view is view and known.moved is not None:
             changed.append(a + np.flatnonzero(known.moved))
-    return packed._replace(
-        pixels=pixels, changed=np.concatenate(changed) if changed else np.zeros(0, np.int64)
+    moved = np.concatenate(changed) if changed else np.zeros(0, np.int64)
+    if weights is None:
+        return packed._replace(pixels=pixels, changed=moved)
+    weight = np.concatenate([w.reshape(-1) for w in weights])
+    return _weighted(packed._replace(pixels=pixels, changed=moved), weight)
+
+
+def leave_out(data: Views, refused: NDArray[np.bool_]) -> Views:
+    """``data`` without the pixels of the views (V,) that are refused."""
+    if not refused.any():
+        return data
+    weight = data.weight.copy() if data.weight.size else np.ones(len(data.pixels), np.float32)
+    for k in np.flatnonzero(refused):
+        weight[data.first[k] : data.first[k + 1]] = 0.0
+    return _weighted(data, weight)
+
+
+def _weighted(data: Views, weight: NDArray[np.float32]) -> Views:
+    drawn = np.flatnonzero(weight)
+    return data._replace(
+        changed=data.changed[weight[data.changed] > 0],
+        weight=weight,
+        drawn=drawn if drawn.size < weight.size else np.zeros(0, np.int64),
     )

@@ -88,7 +88,8 @@ class TrainedField:
                 self._occupancy.look(self.pool, self.rig)
             assert self.rig.box is not None
             box, cameras = self.rig.box, self._cameras
-            data = cameras.corrected(views, intake.data, box)
+            trusted = self.rig.trusted(views, intake.data, self.step, self._live())
+            data = cameras.corrected(views, trusted, box)
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
             self._batch = self._batch._replace(exposure=sums)
@@ -263,7 +264,7 @@ class TrainedField:
             d_acts=np.zeros((workers, units, CHUNK), np.float32),
             line=np.zeros((workers, 3, CHUNK), np.float32),
             ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
-            ray=np.zeros((workers, CHUNK_RAYS, 10), np.float32),
+            ray=np.zeros((workers, CHUNK_RAYS, 11), np.float32),
         )
         self._scratch_x = np.zeros((workers, 3, CHUNK), np.float32)
 

@@ -41,6 +41,16 @@ class TrainerSettings:
     sparsity: float = option(0.0, "weight of the loss on optical depth: empties what no picture needs")
     near_fade: float = option(0.0, "share of the cameras' distance over which gradients are held back")
     changed_share: float = option(0.25, "rays drawn from pixels that changed since the camera's last view")
+    age_tau_ms: float = option(0.0, "age at which a view counts by 1/e beside the newest; 0: all alike")
+    mask_stale_ms: float = option(
+        0.0, "views older than this beside the newest teach only what stood still; 0: off"
+    )
+    mask_grow_px_s: float = option(
+        0.0, "pixels by which ``mask_stale_ms`` widens what moved, per second of age"
+    )
+    refuse_beyond: float = option(
+        2.5, "a view is refused whose typical error is so many times the usual one; 0: none is"
+    )
     exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias a channel)")
     refine_m: float = option(0.0, "by how much a camera's given position may be corrected; 0: not at all")
     refine_deg: float = option(0.0, "by how much a camera's given rotation may be corrected; 0: not at all")
@@ -61,6 +71,10 @@ class TrainerSettings:
             ("samples_ramp", 0, 1 << 30),
             ("cells", 8, 256),
             ("min_views", 0, 1000),
+            ("age_tau_ms", 0.0, 1e9),
+            ("mask_stale_ms", 0.0, 1e9),
+            ("mask_grow_px_s", 0.0, 1e6),
+            ("refuse_beyond", 0.0, 1e6),
             ("refine_m", 0.0, 1.0),
             ("refine_deg", 0.0, 20.0),
         )

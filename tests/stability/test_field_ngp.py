@@ -207,7 +207,9 @@ def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.Fixture
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""
     code = """
 from tests.stability.test_field_ngp import TINY, VIEWS, NgpField, Budget, replace, np
-for extra in ({}, {"harmonics": 4, "contracted": False, "radius_m": 1.0}, {"batch_samples": 8192, "rays": 9}):
+trust = {"age_tau_ms": 1e-5, "mask_stale_ms": 2e-6, "mask_grow_px_s": 1e6}  # views are nanoseconds apart
+wide = {"smooth": 0.1, "harmonics": 4, "contracted": False, "radius_m": 1.0}
+for extra in ({}, wide, {"batch_samples": 8192, "rays": 9}, trust):
     field = NgpField(replace(TINY, **extra))
     field.fit(VIEWS, Budget(steps=20))
     out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)

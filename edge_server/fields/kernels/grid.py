@@ -172,6 +172,38 @@ def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirt
                 _scatter_level(False, res, mask, x[c], d0, d1, level_gradient, level_dirty)
 
 
+@kernel
+def smooth_grid(counter, worker, grid, levels, smooth, gradient, dirty):
+    """Add the gradient of half the squared differences between neighbouring vertices, times ``smooth``
+    (float32), to what is about to be updated; a task is a level.
+
+    Only levels that are stored densely: in a hashed one, neighbours in the table are not neighbours in space.
+    Only segments that are dirty already: what no ray reaches stays as it is.
+    """
+    while True:
+        level = fetch_add(counter, 1)
+        if level >= levels:
+            return
+        if not grid.dense[level]:
+            continue
+        side, first = np.int64(grid.resolution[level]) + 1, grid.first[level]
+        plane = side * side
+        for row in range(side * plane):
+            if not dirty[(first + row) // SEGMENT]:
+                continue
+            i, j, k = row % side, (row // side) % side, row // plane
+            at = first + row
+            x0, x1 = at - 1 if i > 0 else at, at + 1 if i < side - 1 else at
+            y0, y1 = at - side if j > 0 else at, at + side if j < side - 1 else at
+            z0, z1 = at - plane if k > 0 else at, at + plane if k < side - 1 else at
+            for c in range(FEATURES):
+                p = grid.table[at, c]
+                apart = (p - grid.table[x0, c]) + (p - grid.table[x1, c])
+                apart += (p - grid.table[y0, c]) + (p - grid.table[y1, c])
+                apart += (p - grid.table[z0, c]) + (p - grid.table[z1, c])
+                gradient[at, c] += smooth * apart
+
+
 @overload(query_density)
 def _query_density(encoding, levels, net, x, start, end, acts):
     if not is_a(encoding, Grid):

@@ -41,6 +41,8 @@ class Views(NamedTuple):
     (V, 8), fx fy cx cy k1 k2 p1 p2. rotation: float64 (V, 3, 3), camera to world. origin: float64 (V, 3),
     scene units. pixels: uint8 (N, 3 or 4). changed: int64 (M,), pixels that moved since the camera's
     previous view. exposure: float32 (V, 3, 2), gain and bias that pixels are corrected by; V = 0: none.
+    weight: float32 (N,), what each pixel's loss is multiplied by; size 0: all by 1. drawn: int64 (K,), the
+    pixels of weight above 0; size 0: all of them. ``changed`` holds none of weight 0.
     """
 
     first: NDArray[np.int64]
@@ -51,6 +53,8 @@ class Views(NamedTuple):
     pixels: NDArray[np.uint8]
     changed: NDArray[np.int64]
     exposure: NDArray[np.float32] = np.zeros((0, 3, 2), np.float32)
+    weight: NDArray[np.float32] = np.zeros(0, np.float32)
+    drawn: NDArray[np.int64] = np.zeros(0, np.int64)
 
 
 @njit(inline="always")

@@ -52,8 +52,8 @@ class Scratch(NamedTuple):
     """Memory of each worker, W of them, R = CHUNK_RAYS.
 
     acts, d_acts: float32 (W, units, CHUNK). line: float32 (W, 3, CHUNK): distance, length and weight of
-    each sample. ray_first: int64 (W, R + 1). ray: float32 (W, R, 10): direction, target,
-    background, view.
+    each sample. ray_first: int64 (W, R + 1). ray: float32 (W, R, 11): direction, target,
+    background, view, weight; the last two only where ``Views`` has exposures and weights.
     """
 
     acts: NDArray[np.float32]
@@ -92,13 +92,15 @@ def _view_of(first, pixel):
 
 @njit(inline="always")
 def _draw(views, recipe, n, ray):
-    """Choose the n-th ray of the step: fills ray (10,), returns its view's number."""
+    """Choose the n-th ray of the step: fills ray (11,), returns its view's number."""
     key, k = recipe.key, np.uint64(n) * np.uint64(8)
     total = views.pixels.shape[0]
     # 53 bits, because float32 cannot count the pixels of a hundred pictures.
     choice = np.float64(uniform(key, k)) + np.float64(uniform(key, k + np.uint64(1))) * 5.9604644775390625e-08
     if views.changed.size > 0 and uniform(key, k + np.uint64(2)) < recipe.changed_share:
         pixel = views.changed[min(np.int64(choice * views.changed.size), views.changed.size - 1)]
+    elif views.drawn.size > 0:
+        pixel = views.drawn[min(np.int64(choice * views.drawn.size), views.drawn.size - 1)]
     else:
         pixel = min(np.int64(choice * total), total - 1)
     view = _view_of(views.first, pixel)
@@ -121,6 +123,8 @@ def _draw(views, recipe, n, ray):
         ray[9] = np.float32(view)
         for c in range(3):
             ray[3 + c] = views.exposure[view, c, 0] * ray[3 + c] + views.exposure[view, c, 1]
+    if views.weight.size > 0:
+        ray[10] = views.weight[pixel]
     return view
 
 
@@ -261,6 +265,11 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
                 dropped += 1
                 acts[:, a:b] = _F0
             else:
+                if views.weight.size > 0:
+                    error *= ray[r, 10]
+                    for k in range(4):  # loops: slices compile for seconds
+                        for s in range(a, b):
+                            d_out[k, s] *= ray[r, 10]
                 loss += error
                 if batch.exposure.shape[1] > 0:
                     _compare(out, w, dts, a, b, ray[r], batch.exposure[chunk])

@@ -75,6 +75,22 @@ def test_results_are_equal_bit_for_bit_whatever_the_thread_count() -> None:
     np.testing.assert_array_equal(pictures[0].depth, pictures[1].depth)
 
 
+def test_a_smoothed_field_repeats_itself_and_is_smoother() -> None:
+    small = replace(SMALL, base_resolution=8)  # coarse enough not to be hashed
+    fields = [NgpField(replace(small, threads=n, smooth=s)) for n, s in ((1, 0.1), (3, 0.1), (2, 0.0))]
+    for field in fields:
+        field.fit(SEEN, Budget(steps=60))
+    _same_state(fields[0], fields[1])
+
+    def rough(field: NgpField) -> float:
+        side = int(field._grid.resolution[0]) + 1
+        cube = field._grid.table[: side**3].reshape(side, side, side, 2)
+        return float(np.mean([np.square(np.diff(cube, axis=axis)).mean() for axis in range(3)]))
+
+    assert rough(fields[0]) < 0.7 * rough(fields[2])
+    assert _score(fields[0]) > 16.0
+
+
 def test_another_seed_is_another_field() -> None:
     a, b = NgpField(SMALL), NgpField(replace(SMALL, seed=1))
     assert not np.array_equal(a.state()["table"], b.state()["table"])

@@ -64,3 +64,33 @@ def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
     assert np.linalg.norm(np.array(box.centre_m)[:2]) < 0.2 and np.isfinite(box.radius_m)
     same = [replace(VIEWS[0], camera=str(k)) for k in range(5)]
     assert np.isfinite(scene_box(same).radius_m) and scene_box(same).radius_m > 0
+
+
+@pytest.mark.parametrize("aside_m", [1.0, 2.0])
+def test_a_camera_that_looks_elsewhere_does_not_move_the_box(aside_m: float) -> None:
+    views = ring(9, distance_m=1.5)
+    expected = scene_box(views)
+    pose = views[2].camera_to_world.copy()
+    pose[:3, 3] += aside_m * pose[:3, 0]
+    box = scene_box([replace(v, camera_to_world=pose) if v is views[2] else v for v in views])
+    np.testing.assert_allclose(box.centre_m, expected.centre_m, atol=1e-9)
+    turned = pose[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    pose[:3, :3] = turned
+    box = scene_box([replace(v, camera_to_world=pose) if v is views[2] else v for v in views])
+    np.testing.assert_allclose(box.centre_m, expected.centre_m, atol=1e-9)
+
+
+def test_where_many_cameras_disagree_all_are_heard() -> None:
+    """Looking outwards, or only three cameras: nothing tells who is wrong."""
+    views = ring(8)
+    poses = []
+    for k, view in enumerate(views):
+        pose = view.camera_to_world.copy()
+        if k % 2:
+            pose[:3, 3] += 2.0 * pose[:3, 0]
+        poses.append(replace(view, camera_to_world=pose))
+    origins = np.stack([v.camera_to_world[:3, 3] for v in poses])
+    axes = np.stack([v.camera_to_world[:3, 2] for v in poses])
+    expected = converging_point(origins, axes)
+    assert expected is not None
+    np.testing.assert_allclose(np.array(scene_box(poses).centre_m), expected)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from edge_server.fields import ngp_torch
-from edge_server.fields.kernels.grid import SEGMENT, encode, scatter
+from edge_server.fields.kernels.grid import SEGMENT, Grid, encode, scatter, smooth_grid
 from edge_server.fields.ngp_layout import make_grid
 from edge_server.fields.ngp_settings import NgpSettings
 
@@ -84,3 +86,51 @@ def test_table_gradient_equals_finite_differences() -> None:
         step[row, 0] = 1e-4
         slope = (loss(table + step) - loss(table - step)).item() / 2e-4
         assert slope == pytest.approx(table.grad[row, 0].item(), rel=1e-5, abs=1e-8)
+
+
+def _variation(grid: Grid, levels: int, table: Tensor) -> Tensor:
+    """Half the squared differences between neighbouring vertices of the levels that are stored densely."""
+    total = table.sum() * 0.0
+    for l in range(levels):
+        side = int(grid.resolution[l]) + 1
+        if grid.dense[l]:
+            first = int(grid.first[l])
+            cube = table[first : first + side**3].view(side, side, side, 2)
+            for axis in range(3):
+                total = total + 0.5 * cube.diff(dim=axis).square().sum()
+    return total
+
+
+def _smoothed(grid: Grid, levels: int, dirty: NDArray[np.bool_]) -> NDArray[np.float32]:
+    gradient = np.zeros_like(grid.table)
+    smooth_grid(np.zeros(1, np.int64), 0, grid, levels, np.float32(0.3), gradient, dirty)
+    return gradient
+
+
+def test_gradient_of_the_variation_equals_the_oracle_and_finite_differences() -> None:
+    grid, _, _ = _case(2)
+    everywhere = np.ones(len(grid.table) // SEGMENT, np.bool_)
+    gradient = _smoothed(grid, 4, everywhere)
+    table = torch.as_tensor(grid.table, dtype=torch.float64).requires_grad_(True)
+    (0.3 * _variation(grid, 4, table)).backward()
+    assert table.grad is not None
+    np.testing.assert_allclose(gradient, table.grad.numpy(), atol=1e-5)
+    for row in (0, 7, int(grid.first[1]) + 3):
+        both = []
+        for sign in (1.0, -1.0):
+            moved = table.detach().clone()
+            moved[row, 1] += sign * 1e-5
+            both.append(0.3 * _variation(grid, 4, moved).item())
+        assert gradient[row, 1] == pytest.approx((both[0] - both[1]) / 2e-5, rel=1e-3, abs=1e-5)
+    assert not gradient[grid.first[np.flatnonzero(~grid.dense)[0]] :].any(), "a hashed level was smoothed"
+    assert not _smoothed(grid, 1, everywhere)[grid.first[1] :].any(), "a level that is off was smoothed"
+
+
+def test_variation_is_smoothed_only_where_something_is_learnt() -> None:
+    grid, _, _ = _case(2)
+    dirty = np.zeros(len(grid.table) // SEGMENT, np.bool_)
+    dirty[2] = True
+    gradient = _smoothed(grid, 4, dirty)
+    rows = np.flatnonzero(gradient.any(axis=1))
+    assert rows.min() == 2 * SEGMENT and rows.max() < 3 * SEGMENT
+    np.testing.assert_array_equal(gradient[rows], _smoothed(grid, 4, ~dirty | dirty)[rows])
