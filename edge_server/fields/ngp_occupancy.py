@@ -52,11 +52,12 @@ class Occupancy:
             np.float32(self.near),
         )
 
-    def look(self, pool: Pool, rig: Rig) -> None:
+    def look(self, pool: Pool, rig: Rig, empty: float = EMPTY) -> NDArray[np.bool_] | None:
         """Count anew which cells the known cameras see, and open those where something moved.
 
         A cell where something moved is seen to change by most cameras that see it at all: the hull of the
         changed pixels. Without it a moving body could not grow where space was known to be empty.
+        empty: the density below which a cell gets no samples. Returns the opened cells (cells^3,), if any.
         """
         assert rig.box is not None
         views = pack_cameras(rig.views, rig.box)
@@ -74,10 +75,12 @@ class Occupancy:
             self.seen, marked,
         )  # fmt: skip
         self.needed = min(self.min_views, len(rig.memory))
+        moving = None
         if length:
             moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
-            np.maximum(self.density, np.float32(1.5 * EMPTY), out=self.density, where=moving)
-        self.mark()
+            np.maximum(self.density, np.float32(1.5 * empty), out=self.density, where=moving)
+        self.mark(empty)
+        return moving
 
     def refresh(self, pool: Pool, key: np.uint64, turn: int, encoding: Any, levels: int, net: Net,
                 acts: NDArray[np.float32], x: NDArray[np.float32]) -> None:  # fmt: skip
@@ -88,9 +91,9 @@ class Occupancy:
         )  # fmt: skip
         self.mark()
 
-    def mark(self) -> None:
-        """Decide anew which cells get samples."""
-        threshold(self.density, self.seen, self.needed, EMPTY, self.cells, self.occupied, self.coarse)
+    def mark(self, empty: float = EMPTY) -> None:
+        """Decide anew which cells get samples: those with a density of ``empty`` or more."""
+        threshold(self.density, self.seen, self.needed, empty, self.cells, self.occupied, self.coarse)
 
 
 assert CELLS_A_TASK <= CHUNK, "a task's samples must fit the scratch of a training chunk"

@@ -34,11 +34,13 @@ class PixelRenderer(Protocol):
 @dataclass(frozen=True)
 class Intake:
     """data: what the kernels read. new_box: the scene was found anew, so what was learnt is void.
-    look: cameras or moving pixels changed, so visibility must be counted again."""
+    look: cameras or moving pixels changed, so visibility must be counted again. fresh: some picture was not
+    known before (a field that was loaded knows the pictures it was saved with)."""
 
     data: Views
     new_box: bool
     look: bool
+    fresh: bool
 
 
 class Rig:
@@ -49,6 +51,7 @@ class Rig:
         self.box: SceneBox | None = None
         self.memory: dict[str, CameraMemory] = {}
         self.behind = np.full(3, 0.5, np.float32)
+        self.plain = False  # whether ``behind`` is the colour of a plain background
         self._box_cameras = 0
         self._packed: tuple[tuple[View, ...], Views] | None = None
 
@@ -60,9 +63,10 @@ class Rig:
     def take_in(self, views: Sequence[View]) -> Intake:
         """Learn from ``views`` and pack them. Raises ValueError for one that cannot be a view."""
         if self._packed is not None and _same(views, self._packed[0]):
-            return Intake(self._packed[1], new_box=False, look=False)
+            return Intake(self._packed[1], new_box=False, look=False, fresh=False)
         for view in views:
             check_view(view)
+        fresh = any(self._unknown(view) for view in views)
         look, new_box = remember(self.memory, views), False
         if self.box is None or self._box_cameras < min(len(self.memory), FINAL):
             # Two or three cameras say little about where the scene is: look again when there are more.
@@ -71,11 +75,17 @@ class Rig:
             if self.box is None or not _alike(box, self.box):
                 self.box, new_box = box, True
             self._box_cameras = len(self.memory)
-            self.behind = _behind(views)
-        look = look or any(m.moved is not None for m in self.memory.values())
+            self.behind, self.plain = _behind(views)
+        look = look or (fresh and any(m.moved is not None for m in self.memory.values()))
         data = pack_views(views, self.box, self.memory, weights(views, self.memory, self.settings))
         self._packed = (tuple(views), data)
-        return Intake(data, new_box, look or new_box)
+        return Intake(data, new_box, look or new_box, fresh)
+
+    def _unknown(self, view: View) -> bool:
+        known = self.memory.get(view.camera)
+        return known is None or (
+            known.view.generated_ns != view.generated_ns or not np.array_equal(known.view.image, view.image)
+        )
 
     def trusted(self, views: Sequence[View], data: Views, step: int, field: PixelRenderer) -> Views:
         """``data`` without the views that contradict ``field``, which has learnt for ``step`` steps."""
@@ -100,6 +110,7 @@ class Rig:
         return {
             "box": asdict(self.box) if self.box else None,
             "box_cameras": self._box_cameras,
+            "plain": self.plain,
             "cameras": [
                 {
                     "camera": m.view.camera,
@@ -124,6 +135,7 @@ class Rig:
         """Undo ``meta`` and ``arrays``."""
         self._packed, self.memory = None, {}
         self._box_cameras = int(meta["box_cameras"])
+        self.plain = bool(meta.get("plain", False))
         box = meta["box"]
         self.box = SceneBox(**{**box, "centre_m": tuple(box["centre_m"])}) if box else None
         self.behind = np.array(arrays["behind"], dtype=np.float32)
@@ -140,15 +152,16 @@ def _same(a: Sequence[View], b: Sequence[View]) -> bool:
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
 
 
-def _behind(views: Sequence[View]) -> NDArray[np.float32]:
+def _behind(views: Sequence[View]) -> tuple[NDArray[np.float32], bool]:
     """What is taken to be behind everything: white for cut-out pictures, else the plain colour along the
-    pictures' edges, else the mean colour, which is the smallest mistake where rays find nothing."""
+    pictures' edges, else the mean colour, which is the smallest mistake where rays find nothing. Also returns
+    whether it is such a plain colour."""
     if any(v.image.shape[2] == 4 for v in views):
-        return np.ones(3, np.float32)
+        return np.ones(3, np.float32), False
     plain = plain_background(views)
     if plain is not None:
-        return plain
-    return np.mean([v.image.mean(axis=(0, 1)) / 255.0 for v in views], axis=0).astype(np.float32)
+        return plain, True
+    return np.mean([v.image.mean(axis=(0, 1)) / 255.0 for v in views], axis=0).astype(np.float32), False
 
 
 def _alike(a: SceneBox, b: SceneBox) -> bool:

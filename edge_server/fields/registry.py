@@ -13,6 +13,7 @@ _FIELDS: dict[str, str] = {
     "ngp": "edge_server.fields.ngp:make",
     "tensorf": "edge_server.fields.tensorf:make",
     "splat": "edge_server.fields.splat:make",
+    "voxel": "edge_server.fields.voxel:make",
 }
 
 

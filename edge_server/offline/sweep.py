@@ -23,6 +23,7 @@ _EFFORTS = {
     "ngp": "edge_server.fields.ngp_settings:EFFORTS",
     "tensorf": "edge_server.fields.tensorf_settings:EFFORTS",
     "splat": "edge_server.fields.splat_settings:EFFORTS",
+    "voxel": "edge_server.fields.voxel_settings:EFFORTS",
 }
 # What one knob alone buys, against the level "medium" (only in the full sweep).
 _KNOBS: dict[str, dict[str, dict[str, Any]]] = {

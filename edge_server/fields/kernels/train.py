@@ -103,6 +103,14 @@ def _draw(views, recipe, n, ray):
         pixel = views.drawn[min(np.int64(choice * views.drawn.size), views.drawn.size - 1)]
     else:
         pixel = min(np.int64(choice * total), total - 1)
+    return take_pixel(views, recipe, pixel, n, ray)
+
+
+@njit(inline="always")
+def take_pixel(views, recipe, pixel, n, ray):
+    """Fill ray (11,), the step's n-th, from a pixel: direction, target, background, view, weight (the last
+    two only where ``Views`` has exposures and weights). Returns the view's number."""
+    key, k = recipe.key, np.uint64(n) * np.uint64(8)
     view = _view_of(views.first, pixel)
     local = pixel - views.first[view]
     width = views.size[view, 0]
