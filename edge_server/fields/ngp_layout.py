@@ -43,10 +43,10 @@ def make_grid(settings: NgpSettings, box: SceneBox | None, rng: np.random.Genera
     return Grid(resolution, first, dense, table)
 
 
-def net_widths(inputs: int, settings: TrainerSettings) -> NDArray[np.int64]:
-    """Widths of the layers: ``inputs`` features in; density, colour and the colour's harmonics out; padded
-    to 4."""
-    outputs = _multiple_of_4(1 + 3 * settings.harmonics)
+def net_widths(inputs: int, settings: TrainerSettings, looks: int = 0) -> NDArray[np.int64]:
+    """Widths of the layers: ``inputs`` features in; density, colour, the colour's harmonics and three
+    numbers for each of ``looks`` out; padded to 4."""
+    outputs = _multiple_of_4(1 + 3 * settings.harmonics + 3 * looks)
     hidden = [settings.hidden] * settings.hidden_layers
     return np.array([_multiple_of_4(inputs), *hidden, outputs], dtype=np.int64)
 
@@ -56,9 +56,9 @@ def make_net(settings: NgpSettings, rng: np.random.Generator) -> Net:
     return first_net(FEATURES * settings.levels, settings, rng)
 
 
-def first_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator) -> Net:
+def first_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator, looks: int = 0) -> Net:
     """He initialisation, small output; a thin grey fog everywhere."""
-    widths = net_widths(inputs, settings)
+    widths = net_widths(inputs, settings, looks)
     params = np.zeros(param_count(widths), np.float32)
     first = 0
     for layer, (n_in, n_out) in enumerate(pairwise(widths)):

@@ -11,6 +11,7 @@ from edge_server.fields import Field
 # name -> "module:function"; the function takes (options, seed) and raises ValueError for a wrong option
 _FIELDS: dict[str, str] = {
     "ngp": "edge_server.fields.ngp:make",
+    "nerfacto": "edge_server.fields.nerfacto:make",
     "tensorf": "edge_server.fields.tensorf:make",
     "splat": "edge_server.fields.splat:make",
     "voxel": "edge_server.fields.voxel:make",

@@ -228,6 +228,12 @@ class TrainedField:
     def _grow(self) -> None:
         """Bring the encoding to the size it has at ``self.step``: called after every step."""
 
+    def _train(self, data: Views, recipe: Recipe, space: Space, weights: Weights) -> None:
+        """Fill ``self._batch`` and the gradients in it from one step's rays."""
+        self.pool.run(
+            train_chunks, data, recipe, space, self._encoding, self._net, weights, self._batch, self._scratch
+        )
+
     def _gather(self, levels: int, scale: float) -> None:
         """Add the encoding's gradient of the present batch to ``self._table_g``, set ``self._dirty``.
 
@@ -300,9 +306,7 @@ class TrainedField:
             sparsity=np.float32(s.sparsity),
             near=np.float32(s.near_fade * box.distance_m / box.radius_m),
         )
-        self.pool.run(
-            train_chunks, data, recipe, space, self._encoding, self._net, weights, batch, self._scratch
-        )
+        self._train(data, recipe, space, weights)
         rays = max(int(batch.rays.sum()), 1)
         self._gather(levels, NOMINAL_RAYS / rays)
         if batch.dropped.any():

@@ -21,6 +21,7 @@ from edge_server.offline.usage import Usage
 # Where a field keeps its named effort levels: option values by name. A field without any has one level.
 _EFFORTS = {
     "ngp": "edge_server.fields.ngp_settings:EFFORTS",
+    "nerfacto": "edge_server.fields.nerfacto_settings:EFFORTS",
     "tensorf": "edge_server.fields.tensorf_settings:EFFORTS",
     "splat": "edge_server.fields.splat_settings:EFFORTS",
     "voxel": "edge_server.fields.voxel_settings:EFFORTS",

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from camera_node.world import make_scene
 from edge_server.fields import Budget, View
+from edge_server.fields.nerfacto import NerfactoField
+from edge_server.fields.nerfacto_settings import NerfactoSettings
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import scene_box
@@ -31,10 +33,24 @@ SMALL: dict[str, Any] = {
     "threads": 2,
 }  # fmt: skip
 NGP = NgpSettings(levels=6, levels_every=10, log2_table=12, finest_resolution=64, **SMALL)
+NERFACTO = NerfactoSettings(
+    levels=6,
+    levels_every=10,
+    log2_table=12,
+    finest_resolution=64,
+    bins=48,
+    proposal_cells=32,
+    **SMALL | {"samples": 16, "samples_start": 16},
+)
 TENSORF = TensorfSettings(color_rank=8, resolution_start=16, resolution=48, upsample=(40, 100), **SMALL)
 VOXEL = VoxelSettings(sizes=(16, 32, 48), refine_at=(20, 60), rays=1024, cells=32, threads=2)
-FIELDS: list[tuple[Any, Any]] = [(NgpField, NGP), (TensorfField, TENSORF), (VoxelField, VOXEL)]
-each = pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "voxel"])
+FIELDS: list[tuple[Any, Any]] = [
+    (NgpField, NGP),
+    (TensorfField, TENSORF),
+    (VoxelField, VOXEL),
+    (NerfactoField, NERFACTO),
+]
+each = pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "voxel", "nerfacto"])
 
 STEPS, WARM, AFTER = 4, 40, 50  # of an update; updates before and after the poison
 WITHIN_DB = 0.5

@@ -80,7 +80,7 @@ def pixel_direction(lens, rotation, u, v):
 
 
 @njit(inline="always")
-def _slab(o, d, half, enter, leave):
+def slab(o, d, half, enter, leave):
     if abs(d) < np.float32(1e-9):
         return (enter, leave) if abs(o) <= half else (enter, np.float32(-1.0))
     a, b = (-half - o) / d, (half - o) / d
@@ -96,9 +96,9 @@ def interval(space, ox, oy, oz, dx, dy, dz):
         return np.float32(0.0), np.float32(-1.0)
     half = np.float32(HORIZON) if space.contracted else np.float32(1.0)
     enter, leave = space.near, np.float32(1e9)
-    enter, leave = _slab(ox, dx, half, enter, leave)
-    enter, leave = _slab(oy, dy, half, enter, leave)
-    return _slab(oz, dz, half, enter, leave)
+    enter, leave = slab(ox, dx, half, enter, leave)
+    enter, leave = slab(oy, dy, half, enter, leave)
+    return slab(oz, dz, half, enter, leave)
 
 
 @njit(inline="always")

@@ -35,7 +35,7 @@ class Batch(NamedTuple):
 
     x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, rows, CHUNK). d_params: float32 (C, P).
     samples, rays, dropped: int64 (C,). loss: float64 (C,), squared error summed over rays and channels.
-    exposure: float64 (C, V, 3, 5), see ``_compare``; V = 0 where exposures are not asked for.
+    exposure: float64 (C, V, 3, 5), see ``compare``; V = 0 where exposures are not asked for.
     """
 
     x: NDArray[np.float32]
@@ -91,7 +91,7 @@ def _view_of(first, pixel):
 
 
 @njit(inline="always")
-def _draw(views, recipe, n, ray):
+def draw(views, recipe, n, ray):
     """Choose the n-th ray of the step: fills ray (11,), returns its view's number."""
     key, k = recipe.key, np.uint64(n) * np.uint64(8)
     total = views.pixels.shape[0]
@@ -137,7 +137,7 @@ def take_pixel(views, recipe, pixel, n, ray):
 
 
 @njit(inline="always")
-def _keep(rows, a, b, to):
+def keep(rows, a, b, to):
     """Move columns a to b of every row to ``to`` <= a."""
     for k in range(rows.shape[0]):
         row = rows[k]
@@ -171,7 +171,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
             index, most = chunk * CHUNK_RAYS + fresh, np.float32(GUESS)
             if taken < waiting:
                 index, most = again[taken], NEVER
-            view = _draw(views, recipe, index, ray[drawn])
+            view = draw(views, recipe, index, ray[drawn])
             o = views.origin[view]
             ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
             dx, dy, dz = ray[drawn, 0], ray[drawn, 1], ray[drawn, 2]
@@ -205,9 +205,9 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
                 waiting += 1
             else:
                 if n < begin:
-                    _keep(acts, begin, begin + kept, n)
-                    _keep(x, begin, begin + kept, n)
-                    _keep(line[:2], begin, begin + kept, n)
+                    keep(acts, begin, begin + kept, n)
+                    keep(x, begin, begin + kept, n)
+                    keep(line[:2], begin, begin + kept, n)
                 for k in range(ray.shape[1]):
                     ray[kept_rays, k] = ray[r, k]
                 n += kept
@@ -219,7 +219,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
 
 
 @kernel
-def _compare(out, w, dts, first, end, ray, sums):
+def compare(out, w, dts, first, end, ray, sums):
     """Add one ray to what ``refinement.Exposures`` learns from: its number, target t, t^2, error e and e t
     per channel; sums: float64 (views, 3, 5). After ``ray_loss``."""
     depth, last = _F0, end
@@ -280,7 +280,7 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
                             d_out[k, s] *= ray[r, 10]
                 loss += error
                 if batch.exposure.shape[1] > 0:
-                    _compare(out, w, dts, a, b, ray[r], batch.exposure[chunk])
+                    compare(out, w, dts, a, b, ray[r], batch.exposure[chunk])
         if recipe.harmonics > 1:
             for r in range(rays):
                 a, b = ray_first[r], ray_first[r + 1]

@@ -10,6 +10,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.kernels.rays import Views
+from edge_server.fields.nerfacto import NerfactoField
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_rig import Rig
 from edge_server.fields.ngp_settings import NgpSettings, make_settings
@@ -18,6 +19,7 @@ from edge_server.fields.tensorf import TensorfField
 from edge_server.fields.trust import PATIENCE, refused, weights
 from edge_server.fields.voxel import VoxelField
 from tests.edge_server.fields.scenes import picture, psnr, ring
+from tests.edge_server.fields.test_nerfacto import SMALL as NERFACTO
 from tests.edge_server.fields.test_ngp import SMALL as NGP
 from tests.edge_server.fields.test_tensorf import SMALL as TENSORF
 from tests.edge_server.fields.test_voxel import SMALL as VOXEL
@@ -145,10 +147,15 @@ def test_the_rig_packs_weights_only_where_asked() -> None:
     assert 0 < masked.changed.size < off.changed.size and (masked.weight[masked.changed] == 1.0).all()
 
 
-FIELDS: list[tuple[Any, Any]] = [(NgpField, NGP), (TensorfField, TENSORF), (VoxelField, VOXEL)]
+FIELDS: list[tuple[Any, Any]] = [
+    (NgpField, NGP),
+    (TensorfField, TENSORF),
+    (VoxelField, VOXEL),
+    (NerfactoField, NERFACTO),
+]
 
 
-@pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "voxel"])
+@pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "voxel", "nerfacto"])
 def test_masked_pixels_teach_nothing(kind: Any, settings: Any) -> None:
     """Views whose moving pixels are noise: with the mask the field does not see the noise."""
     options = replace(settings, mask_stale_ms=60.0, changed_share=0.5)
@@ -177,7 +184,7 @@ def test_masked_pixels_teach_nothing(kind: Any, settings: Any) -> None:
         np.testing.assert_array_equal(states[0][name], states[1][name])
 
 
-@pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "voxel"])
+@pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "voxel", "nerfacto"])
 def test_weighted_fits_repeat_and_resume_bit_for_bit(kind: Any, settings: Any) -> None:
     options = replace(settings, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=20.0)
     ages = tuple(25.0 * k for k in range(13))

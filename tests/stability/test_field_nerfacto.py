@@ -1,0 +1,236 @@
+"""Hard cases for the proposal-sampled field: whatever comes, it stays finite, bounded and useful."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, View
+from edge_server.fields.kernels.adam import PARAMETER_LIMIT
+from edge_server.fields.nerfacto import NerfactoField
+from edge_server.fields.nerfacto_settings import NerfactoSettings
+from freshfield.geometry import look_at
+from tests.edge_server.fields.scenes import picture, psnr, ring
+
+TINY = NerfactoSettings(
+    levels=5, log2_table=11, base_resolution=8, finest_resolution=48, hidden=16, rays=512, batch_samples=4096,
+    samples=12, samples_start=16, bins=48, cells=16, proposal_cells=16, anneal=40, threads=2,
+)  # fmt: skip
+VIEWS = ring(9, size=24)
+
+
+def _healthy(field: NerfactoField, views: list[View] = VIEWS) -> None:
+    state = field.state()
+    for name in ("table", "net", "density", "behind"):
+        assert np.isfinite(state[name]).all(), f"{name} is not finite"
+    assert abs(state["table"]).max() <= PARAMETER_LIMIT
+    for view in (views[0], views[-1]):
+        out = field.render(view.camera_to_world, view.intrinsics)
+        for part in (out.color, out.depth, out.opacity):
+            assert np.isfinite(part).all()
+        assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
+        assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
+
+
+def _score(field: NerfactoField, views: list[View]) -> float:
+    pictures = [(field.render(v.camera_to_world, v.intrinsics).color, v.image / 255.0) for v in views]
+    return float(np.mean([psnr(a, b) for a, b in pictures]))
+
+
+def test_nothing_at_all() -> None:
+    field = NerfactoField(TINY)
+    assert field.fit([], Budget(steps=3)).steps == 0
+    points, colors = field.points(10)
+    assert points.shape == (0, 3) and colors.shape == (0, 3)
+    _healthy(field)
+
+
+def test_one_view() -> None:
+    field = NerfactoField(TINY)
+    field.fit(VIEWS[:1], Budget(steps=60))
+    _healthy(field)
+    assert _score(field, VIEWS[:1]) > 15.0
+
+
+def test_one_pixel() -> None:
+    camera = replace(VIEWS[0].intrinsics, width=1, height=1, cx=0.5, cy=0.5)
+    view = replace(VIEWS[0], image=np.full((1, 1, 3), 99, np.uint8), intrinsics=camera)
+    field = NerfactoField(TINY)
+    field.fit([view], Budget(steps=10))
+    _healthy(field, [view])
+
+
+@pytest.mark.parametrize("value", [0, 255, 77])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_constant_black_and_saturated_pictures(value: int, channels: int) -> None:
+    views = [replace(v, image=np.full((24, 24, channels), value, np.uint8)) for v in VIEWS]
+    field = NerfactoField(TINY)
+    field.fit(views, Budget(steps=60))
+    _healthy(field)
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
+    alpha = value / 255.0 if channels == 4 else 1.0
+    expected = value / 255.0 * alpha + (1.0 - alpha) * field.rig.background().mean()
+    assert abs(out.mean() - expected) < 0.1
+
+
+def test_all_poses_identical() -> None:
+    pose = VIEWS[0].camera_to_world
+    views = [replace(v, camera_to_world=pose, image=VIEWS[0].image) for v in VIEWS]
+    field = NerfactoField(TINY)
+    field.fit(views, Budget(steps=60))
+    _healthy(field)
+
+
+def test_rays_that_miss_the_box() -> None:
+    field = NerfactoField(replace(TINY, centre_m=(50.0, 0.0, 0.0), radius_m=0.5, contracted=False))
+    report = field.fit(VIEWS, Budget(steps=20))
+    assert report.steps == 20 and report.rays > 0 and report.samples == 0
+    _healthy(field)
+    away = look_at((0, 0, 3.0), (0, 0, 9.0), up=(0, 1, 0))
+    trained = NerfactoField(TINY)
+    trained.fit(VIEWS, Budget(steps=20))
+    out = trained.render(away, VIEWS[0].intrinsics)
+    assert np.isfinite(out.color).all()
+
+
+def test_views_that_contradict_each_other() -> None:
+    rng = np.random.default_rng(0)
+    views = [replace(v, image=rng.integers(0, 256, (24, 24, 3), dtype=np.uint8)) for v in VIEWS]
+    field = NerfactoField(TINY)
+    for _ in range(5):
+        field.fit(views, Budget(steps=20))
+    _healthy(field)
+    field.fit(VIEWS, Budget(steps=150))  # and it recovers
+    assert _score(field, VIEWS) > 16.0
+
+
+def _poison_table(field: NerfactoField) -> None:
+    field._encoding.table[::7] = np.nan
+
+
+def _poison_proposal(field: NerfactoField) -> None:
+    field._encoding.table[field._encoding.first[-1] :] = np.nan
+
+
+def _poison_net(field: NerfactoField) -> None:
+    field._net.params[3] = np.nan
+
+
+def _poison_moments(field: NerfactoField) -> None:
+    field._table_m[::5] = np.inf
+    field._net_v[::3] = np.nan
+
+
+def _poison_gradient(field: NerfactoField) -> None:
+    field._table_g[::3] = np.nan
+    field._dirty[:] = True
+
+
+def _overflow(field: NerfactoField) -> None:
+    field._encoding.table[:] = 1e30
+
+
+def _saturate(field: NerfactoField) -> None:
+    field._encoding.table[:] = PARAMETER_LIMIT
+    field._net.params[:] = PARAMETER_LIMIT
+
+
+@pytest.mark.parametrize(
+    "damage", [_poison_table, _poison_proposal, _poison_net, _poison_moments, _poison_gradient]
+)
+def test_damage_is_counted_and_healed(damage: Callable[[NerfactoField], None]) -> None:
+    field = NerfactoField(TINY)
+    field.fit(VIEWS, Budget(steps=30))
+    damage(field)
+    field._snapshot = None
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
+    report = field.fit(VIEWS, Budget(steps=40))
+    assert field.dropped == report.dropped and (report.dropped > 0) == (damage is not _poison_moments)
+    assert field.fit(VIEWS, Budget(steps=200)).dropped == 0, "still not finite 40 steps later"
+    _healthy(field)
+    assert _score(field, VIEWS) > 15.0
+
+
+@pytest.mark.parametrize("damage", [_overflow, _saturate])
+def test_density_that_overflows_stays_finite(damage: Callable[[NerfactoField], None]) -> None:
+    """Opaque everywhere: no gradient leads out of that, but a reset does, and nothing becomes NaN."""
+    field = NerfactoField(TINY)
+    field.fit(VIEWS, Budget(steps=30))
+    damage(field)
+    field.fit(VIEWS, Budget(steps=20))
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all() and out.color.max() <= 1.0
+    assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
+    field.reset()
+    field.fit(VIEWS, Budget(steps=200))
+    _healthy(field)
+    assert _score(field, VIEWS) > 15.0
+
+
+def test_a_thousand_updates_do_not_drift_or_grow() -> None:
+    """A moving ball, a new selection of views each time, warm starts only."""
+    rng = np.random.default_rng(1)
+    still = ring(9, size=24)
+    places = [np.array([0.3 * np.sin(a), 0.3 * np.cos(a), 0.5]) for a in np.linspace(0, 2 * np.pi, 12)]
+    frames = [[replace(v, image=picture(v.intrinsics, v.camera_to_world, p)) for v in still] for p in places]
+    field, scores, sizes = NerfactoField(TINY), [], []
+    for update in range(1000):
+        frame = frames[update % 12]
+        field.fit([frame[k] for k in rng.choice(9, 6, replace=False)], Budget(steps=2))
+        if update % 100 >= 88:
+            scores.append(_score(field, frame[::4]))
+            sizes.append(np.abs(field._encoding.table).mean())
+    _healthy(field)
+    first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
+    assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
+    assert last > 15.0
+    assert np.mean(sizes[-12:]) < 3.0 * np.mean(sizes[12:24]), "parameters grow"
+    assert len(field.rig.memory) == 9
+
+
+def test_cameras_that_move_at_every_update() -> None:
+    field = NerfactoField(TINY)
+    for update in range(30):
+        views = []
+        for view in VIEWS[:4]:
+            eye = view.camera_to_world[:3, 3] + 0.05 * update * np.array([0.0, 0.0, 1.0])
+            pose = look_at(eye, (0.0, 0.0, 0.4))
+            views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
+        field.fit(views, Budget(steps=5))
+    _healthy(field, views)
+    assert _score(field, views) > 15.0
+
+
+def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """A whole fit and rendering with numba's bounds checks, in a process of its own."""
+    code = """
+from tests.stability.test_field_nerfacto import TINY, VIEWS, NerfactoField, Budget, replace, np
+plain = {"contracted": False, "radius_m": 1.0}
+poses = {"refine_m": 0.05, "refine_deg": 2.0}
+few = {"batch_samples": 8192, "rays": 9}
+for extra in ({"exposure": True, **poses}, {"harmonics": 4, **plain}, {"appearance": 3, **poses}, few):
+    field = NerfactoField(replace(TINY, **extra))
+    field.fit(VIEWS, Budget(steps=50))
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    field.points(50)
+    assert np.isfinite(out.color).all()
+moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
+field.fit(moved, Budget(steps=20))
+print("kept")
+"""
+    cache = request.config.cache
+    folder = str(cache.mkdir("numba-boundscheck")) if cache is not None else str(tmp_path)
+    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": folder}
+    out = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True,
+        cwd=Path(__file__).resolve().parents[2],
+    )  # fmt: skip
+    assert out.returncode == 0 and "kept" in out.stdout, out.stderr[-2000:]
