@@ -19,6 +19,9 @@ PORT ?= 8080
 # Folder of recorded data, for scenarios that stream it (fox, lego, people, kitchen).
 DATA ?=
 
+# Options of `make bench`, for edge-server bench: --quick, or --resume to go on where Ctrl-C stopped it.
+BENCH ?=
+
 # Options of `make test`: which marks, and more for pytest.
 SELECT ?= not slow
 PYTEST ?=
@@ -57,9 +60,10 @@ types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
 	MYPYPATH=proto:deploy $(PY) -m mypy deploy/up.py deploy/healthy.py deploy/check_report.py deploy/launch
 
-bench: .venv/.ok-test  ## measure this machine: field, ingest, fidelity, emulator, world (runs/bench*.json)
+bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, runs/bench-*; DATA=FOLDER BENCH=--quick
 	@mkdir -p runs
-	$(PY) -m edge_server.cli bench all --json runs/bench.json
+	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench all $(if $(DATA),peer) \
+	  --json docs/results/field.json $(BENCH)
 	$(PY) -m channel_emu.cli bench --json | tee runs/bench-emulator.json
 	$(PY) -m camera_node.world.bench --json runs/bench-world.json
 

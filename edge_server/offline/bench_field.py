@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
 from edge_server.offline.fitting import evaluate
-from edge_server.offline.still import Still, open_still, synthetic
+from edge_server.offline.kept import Kept
+from edge_server.offline.still import Still, open_still, smallest_angle_deg, synthetic
 from edge_server.offline.usage import Usage, peak_rss_mb
 from freshfield.geometry import Pinhole
 
@@ -55,31 +57,45 @@ _RECORDED = {
 
 
 def measure(
-    quick: bool, folder: Path, lpips: Path | None = None, fields: Sequence[str] = ()
+    quick: bool,
+    folder: Path,
+    lpips: Path | None = None,
+    fields: Sequence[str] = (),
+    kept: Kept | None = None,
 ) -> dict[str, Any]:
     """All figures of ``fields`` (default: all there are); ``folder`` takes a fresh kernel cache.
 
-    {start: {field: jit, memory}, SCENE: {scene, baseline, FIELD: {series, seconds_to_db, rates}}}; recorded
-    scenes where FRESHFIELD_DATA names their folder.
+    {start: {field: jit, memory}, SCENE: {scene, angle_deg, baseline, FIELD: {series, seconds_to_db, rates}}};
+    recorded scenes where FRESHFIELD_DATA names their folder.
     """
-    effort, names = QUICK if quick else FULL, tuple(fields) or field_names()
+    effort, names, kept = QUICK if quick else FULL, tuple(fields) or field_names(), kept or Kept()
     scorer_lpips, missing = open_lpips(lpips)
-    figures: dict[str, Any] = {"lpips_missing": missing}
-    figures["start"] = {name: _start_up(name, quick, folder / name) for name in names}
+    kept.put("lpips_missing", missing)
+    for name in names:
+        kept.get("start", name, measure=partial(_start_up, name, quick, folder / name))
     for scene in ("tile", "room"):
         still = synthetic(scene, cameras=VIEWS + 1, size=SIZE)
-        rows = {
-            name: {
-                **_curve(name, still, effort.planned_s, effort.seeds, scorer_lpips),
-                **_rates(name, still, effort.rate_repeats),
-            }
-            for name in names
-        }
-        figures[scene] = {"scene": still.describe(), "baseline": _baseline(still), **rows}
+        _describe(kept, scene, still)
+        for name in names:
+            kept.get(scene, name, measure=partial(_of_ours, name, still, effort, scorer_lpips))
     for scene, still in _recorded_scenes():
-        rows = {name: _curve(name, still, effort.recorded_s, 1, scorer_lpips) for name in names}
-        figures[scene] = {"scene": still.describe(), "baseline": _baseline(still), **rows}
-    return figures
+        _describe(kept, scene, still)
+        for name in names:
+            curve = partial(_curve, name, still, effort.recorded_s, 1, scorer_lpips)
+            kept.get(scene, name, measure=curve)
+    return kept.figures
+
+
+def _describe(kept: Kept, scene: str, still: Still) -> None:
+    kept.get(scene, "baseline", measure=partial(_baseline, still))
+    kept.figures[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
+
+
+def _of_ours(name: str, still: Still, effort: Effort, lpips: Any) -> dict[str, Any]:
+    return {
+        **_curve(name, still, effort.planned_s, effort.seeds, lpips),
+        **_rates(name, still, effort.rate_repeats),
+    }
 
 
 def _recorded_scenes() -> Iterable[tuple[str, Still]]:
@@ -105,7 +121,7 @@ def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
     else:
         _child(field, None)  # fills the cache if nobody has
         cached = _child(field, None)
-    figures["jit_cached_s"] = cached["jit_s"]
+    figures["jit_cached_s"], figures["jit_cached_cpu_s"] = cached["jit_s"], cached["jit_cpu_s"]
     figures["peak_rss_mb"] = cached["peak_rss_mb"]
     figures["machine_cores_busy"] = usage.row(0.0).get("machine", {}).get("cpu")
     return figures
@@ -212,17 +228,57 @@ def draw(figures: dict[str, Any], path: Path) -> None:
 
 
 def table(figures: dict[str, Any]) -> str:
-    """The scenes' curves as one Markdown table."""
-    lines = ["| scene | representation | seconds: PSNR dB | baselines dB |", "|---|---|---|---|"]
-    for scene, part in figures.items():
-        if not isinstance(part, dict) or "baseline" not in part:
-            continue
-        bases = ", ".join("-" if v is None else f"{v:.1f}" for v in part["baseline"].values())
-        for name, rows in part.items():
-            if isinstance(rows, dict) and "series" in rows:
-                points = ", ".join(f"{r['seconds']:g}: {r['psnr_db']:.1f}" for r in rows["series"].values())
-                lines.append(f"| {scene} | {name} | {points} | {bases} |")
-    return "\n".join(lines)
+    """Markdown tables: the scenes, the curves, rates on our own scenes, and what a start costs."""
+    scenes = {name: part for name, part in figures.items() if isinstance(part, dict) and "baseline" in part}
+    found = [
+        (scene, name, rows)
+        for scene, part in scenes.items()
+        for name, rows in part.items()
+        if isinstance(rows, dict) and "series" in rows
+    ]
+    least = [
+        (
+            part["scene"], f"{part['angle_deg']:.1f}",
+            *(_n(part["baseline"][key], 1) for key in ("mean_colour_db", "nearest_view_db")),
+        )
+        for part in scenes.values()
+    ]  # fmt: skip
+    curves = [
+        (
+            scene, name, str(rows["seeds"]),
+            ", ".join(f"{r['seconds']:g}: {r['psnr_db']:.1f}" for r in rows["series"].values()),
+            ", ".join(_n(rows["seconds_to_db"][f"{db}_db"]) for db in TARGETS_DB), _n(rows["outside_cores"]),
+        )
+        for scene, name, rows in found
+    ]  # fmt: skip
+    of_rates = ("steps_per_s", "rays_per_s", "samples_per_s", "render_128_ms", "render_256_ms")
+    rates = [
+        (scene, name, *(_n(rows[key]) for key in of_rates), _n(rows["rates_outside_cores"]))
+        for scene, name, rows in found
+        if "steps_per_s" in rows
+    ]
+    compiled = ("jit_cold_s", "jit_cold_cpu_s", "jit_cached_s", "jit_cached_cpu_s")
+    keys = (*compiled, "peak_rss_mb", "machine_cores_busy")
+    starts = [(name, *(_n(row.get(key)) for key in keys)) for name, row in figures.get("start", {}).items()]
+    targets = ", ".join(str(db) for db in TARGETS_DB)
+    tables = {
+        "scene|held-out camera from any other, degrees|mean colour dB|nearest view dB": least,
+        f"scene|representation|seeds|seconds: PSNR dB|seconds to {targets} dB|outside cores": curves,
+        "scene|representation|steps/s|rays/s|samples/s|128 x 128 in ms|256 x 256 in ms|outside cores": rates,
+        "representation|JIT cold s|of CPU s|JIT cached s|of CPU s|peak memory MB|cores busy": starts,
+    }
+    return "\n\n".join(_markdown(head.split("|"), rows) for head, rows in tables.items() if rows)
+
+
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _n(value: float | None, digits: int = 2) -> str:
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.{digits}f}"
 
 
 def _main(field: str) -> None:

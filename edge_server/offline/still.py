@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from camera_node.world import make_scene
 from camera_node.world.scene import HELD_OUT, SCENES
 from edge_server.fidelity.images import BLACK, Colour
@@ -43,3 +45,12 @@ def open_still(scene: str, size: int = 128, holdout: str = "8", scale: float = 1
         return synthetic(scene, size=size)
     data = load_recorded(Path(scene), holdout, scale, frame)
     return Still(data.file.resolve().parent.name, data.training, data.held_out or data.training[:8], WHITE)
+
+
+def smallest_angle_deg(still: Still) -> float:
+    """The angle between the directions in which a held-out and a training camera look, the least of all
+    pairs: how far the fields are asked to go beyond what they were shown."""
+    forward = [
+        np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)
+    ]
+    return float(np.rad2deg(np.arccos(np.clip(forward[0] @ forward[1].T, -1.0, 1.0)).min()))

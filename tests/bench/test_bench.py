@@ -38,8 +38,68 @@ def test_field(tmp_path, monkeypatch):
         assert row["render_128_ms"] < row["render_256_ms"]
         assert row["best_db"] > found[scene]["baseline"]["mean_colour_db"]
     assert found["tile"]["ngp"]["best_db"] > 18.0
-    assert (tmp_path / "bench.png").stat().st_size > 1000
-    assert "| tile | ngp | 0.3: " in (tmp_path / "bench.md").read_text()
+    assert (tmp_path / "field.png").stat().st_size > 1000
+    assert "| tile | ngp | 1 | 0.3: " in (tmp_path / "bench.md").read_text()
+
+
+def _curve(name, still, planned_s, seeds, lpips):
+    """What ``bench field`` measures, without measuring: of two seeds, a dB more every point."""
+    series = {f"{s:g}_s": {"seconds": s, "psnr_db": 24.0 + k} for k, s in enumerate(planned_s)}
+    to_db = {f"{db}_db": 0.5 if db < 25 else None for db in bench_field.TARGETS_DB}
+    return {"seeds": seeds, "series": series, "seconds_to_db": to_db, "best_db": 25.0, "outside_cores": 0.25}
+
+
+def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    rates = {"steps_per_s": 71.5, "rays_per_s": 98765.0, "samples_per_s": 2.5e6, "render_128_ms": 8.25,
+             "render_256_ms": 31.0, "rates_outside_cores": 0.5}  # fmt: skip
+    starts = {"jit_cold_s": 11.5, "jit_cold_cpu_s": 10.25, "jit_cached_s": 0.375,
+              "jit_cached_cpu_s": 0.25, "peak_rss_mb": 456.0}  # fmt: skip
+    asked = []
+    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: asked.append(name) or _curve(name, *rest))
+    monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: dict(rates))
+    monkeypatch.setattr(bench_field, "_start_up", lambda name, quick, folder: dict(starts))
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(2, (0.5, 1.0), (), 1))
+    path = tmp_path / "results" / "field.json"
+    found = bench("field", path, "--field", "ngp")
+    text = path.with_suffix(".md").read_text()
+    for scene in ("tile", "room"):
+        part = found[scene]
+        # The owner's condition for our own scenes.
+        assert part["angle_deg"] >= 15.0
+        bases = part["baseline"]
+        assert f"| {part['scene']} | {part['angle_deg']:.1f} | {bases['mean_colour_db']:.1f} |" in text
+        assert f"| {scene} | ngp | 2 | 0.5: 24.0, 1: 25.0 | 0.50, -, -, - | 0.25 |" in text
+        assert f"| {scene} | ngp | 71.50 | 98,765 | 2,500,000 | 8.25 | 31.00 | 0.50 |" in text
+    assert "| ngp | 11.50 | 10.25 | 0.38 | 0.25 | 456.00 | - |" in text
+    assert "![field](field.png)" in text and (path.parent / "field.png").stat().st_size > 1000
+    assert text.count("\n## ") == 1
+
+    # A second part beside it, and another representation: what is known stays, nothing is measured twice.
+    words = ["fidelity", "--quick", "--json", str(path), "--resume", "--field", "ngp", "--field", "tensorf"]
+    assert edge_server(["bench", "field", *words]) == 0
+    more = json.loads(path.read_text())
+    assert asked == ["ngp", "ngp", "tensorf", "tensorf"]
+    assert more["field"]["tile"]["ngp"] == found["tile"]["ngp"] and "tensorf" in more["field"]["room"]
+    text = path.with_suffix(".md").read_text()
+    assert more["runs"] == 2 and "Measured in 2 runs" in text
+    assert "## field" in text and "## fidelity" in text
+    assert f"| 128.psnr_ms | {more['fidelity']['128']['psnr_ms']:.3g} |" in text
+    # A part that is one figure is skipped as a whole.
+    before = more["fidelity"]
+    assert edge_server(["bench", *words]) == 0
+    assert json.loads(path.read_text())["fidelity"] == before
+
+
+def test_a_part_that_cannot_be_measured_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    path = tmp_path / "bench.json"
+    assert edge_server(["bench", "peer", "fidelity", "--quick", "--json", str(path)]) == 1
+    assert "edge-server bench peer: set FRESHFIELD_DATA" in capsys.readouterr().err
+    assert "## fidelity" in path.with_suffix(".md").read_text()
+    with pytest.raises(SystemExit):
+        edge_server(["bench", "speed"])
+    assert "no part is called speed; there are: field, track" in capsys.readouterr().err
 
 
 def test_a_field_that_does_not_exist_is_refused(capsys):
