@@ -25,7 +25,7 @@ from edge_server.fields.kernels.rays import Space, Views
 from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Recipe
 from edge_server.fields.nerfacto_settings import NerfactoSettings, make_settings
 from edge_server.fields.ngp_layout import first_net, make_grid
-from edge_server.fields.ngp_schedule import active_levels
+from edge_server.fields.ngp_schedule import active_levels, smoothing
 from edge_server.fields.ngp_snapshot import NgpSnapshot
 from edge_server.fields.supervision import lens_row
 from edge_server.fields.trained_field import TINY, TrainedField
@@ -155,9 +155,8 @@ class NerfactoField(TrainedField):
         self.pool.run(
             scatter, grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
         )
-        if self.settings.smooth:
-            weight = np.float32(self.settings.smooth / scale)
-            self.pool.run(smooth_grid, grid, levels, weight, self._table_g, self._dirty)
+        if weight := smoothing(self.settings, self.step):
+            self.pool.run(smooth_grid, grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
         self.pool.run(scatter_proposal, e, bins.cell, bins.grad, bins.counts, self._table_g, self._dirty)
 
     def _live(self) -> NerfactoSnapshot:

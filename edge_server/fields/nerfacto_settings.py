@@ -24,6 +24,7 @@ class NerfactoSettings(NgpSettings):
     proposal_decay: float = option(3e-2, "pull of the proposal's raw densities back to thin fog")
     even: float = option(0.4, "share of a ray's samples that is dealt evenly, whatever the proposal says")
     anneal: int = option(40, "steps over which that share falls from 1: first there is nothing to follow")
+    smooth: float = option(3e-3, "weight of the total variation of the levels that are not hashed")
     appearance: int = option(0, "numbers learnt of each camera's look (exposure, tint); 0: none")
 
     def __post_init__(self) -> None:

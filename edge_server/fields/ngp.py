@@ -15,7 +15,7 @@ from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid, scatter, sm
 from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.ngp_layout import make_grid, make_net
-from edge_server.fields.ngp_schedule import active_levels
+from edge_server.fields.ngp_schedule import active_levels, smoothing
 from edge_server.fields.ngp_settings import NgpSettings, make_settings
 from edge_server.fields.trained_field import DIRTY, TINY, TrainedField
 
@@ -54,9 +54,10 @@ class NgpField(TrainedField):
         self.pool.run(
             scatter, self._grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
         )
-        if self.settings.smooth:
-            weight = np.float32(self.settings.smooth / scale)
-            self.pool.run(smooth_grid, self._grid, levels, weight, self._table_g, self._dirty)
+        if weight := smoothing(self.settings, self.step):
+            self.pool.run(
+                smooth_grid, self._grid, levels, np.float32(weight / scale), self._table_g, self._dirty
+            )
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:

@@ -11,6 +11,8 @@ from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.trainer_settings import TrainerSettings
 
 BETA1, BETA2 = 0.9, 0.99
+# The smoothness prior goes through whole levels: now and then, and stronger for it, does as well.
+SMOOTH_EVERY = 4
 NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
 
 
@@ -24,6 +26,11 @@ def active_levels(settings: NgpSettings, step: int) -> int:
     if settings.levels_every == 0:
         return settings.levels
     return min(settings.levels, settings.levels_start + step // settings.levels_every)
+
+
+def smoothing(settings: NgpSettings, step: int) -> float:
+    """The weight of the smoothness prior at a step, 0 for most of them."""
+    return SMOOTH_EVERY * settings.smooth if step % SMOOTH_EVERY == 0 else 0.0
 
 
 def step_length(settings: TrainerSettings, step: int) -> float:

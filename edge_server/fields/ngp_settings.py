@@ -20,7 +20,7 @@ class NgpSettings(TrainerSettings):
     finest_resolution: int | None = option(None, "cells a side of the finest level; None: about a pixel")
     rate: float = option(8e-2, "learning rate of the hash tables at the start of a fit")
     decay: float = option(0.0, "pull of the tables' entries towards zero, per step and rate")
-    smooth: float = option(0.0, "weight of the total variation of the levels that are not hashed")
+    smooth: float = option(1.5e-3, "weight of the total variation of the levels that are not hashed")
     levels_start: int = option(4, "levels in use at first; the finer ones follow (coarse to fine)")
     levels_every: int = option(30, "steps after which one more level is switched on")
 

@@ -55,6 +55,18 @@ CHOICES: tuple[Choice, ...] = (
         "changed pixels first", {"changed_share": 0.0}, {"changed_share": 0.25},
         ("room, moving", "kitchen, moving"),
     ),
+    Choice("smoothness", {"smooth": 0.0}, {"smooth": 3e-3}, ("tile", "room")),
+    Choice("appearance", {"appearance": 0}, {"appearance": 8}, ("room, gains", "room")),
+    Choice("outlines", {"outline": 0.0}, {"outline": 0.25}, ("tile", "room")),
+    Choice("weighed by age", {"age_tau_ms": 0.0}, {"age_tau_ms": 100.0}, ("room, late", "room, moving")),
+    Choice(
+        "stale pixels masked", {"mask_stale_ms": 0.0}, {"mask_stale_ms": 50.0}, ("room, late", "room, moving")
+    ),
+    Choice("movement followed", {"follow": 0}, {"follow": 8}, ("room, late", "room, moving")),
+    Choice(
+        "wrong views refused", {"refuse_beyond": 0.0}, {"refuse_beyond": 2.5},
+        ("room, moving", "kitchen, moving"),
+    ),
 )  # fmt: skip
 
 
