@@ -203,7 +203,7 @@ def renew(
     off = _still_wrong(settings, passes, cloud, seen)
     pixels = sum(int(m.sum()) for m in off if m is not None)
     count = min(int(settings.reseed * settings.gaussians), int(SEEDS_A_PIXEL * pixels))
-    new = Cloud.of(seeds(settings, passes.pool, seen.box, views, off, count, rng))
+    new = Cloud.of(seeds(settings, passes.pool, seen.box, views, off, count, rng, seen.moved))
     new.keep(_hull(new, seen)[0])
     new.guest[:] = 1
     _pass_on(cloud, new, CELLS_PX[0] * seen.box.pixel_m / seen.box.radius_m)

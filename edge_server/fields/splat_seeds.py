@@ -27,9 +27,11 @@ _PLAIN = 0.06
 def seeds(
     settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
     masks: Sequence[NDArray[np.bool_] | None] | None, count: int, rng: np.random.Generator,
+    moved: Sequence[NDArray[np.bool_] | None] | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Parameters of up to ``count`` new Gaussians, float32 (N, P). masks: for each view bool (H, W), where
-    they may begin (None in the list: nowhere); no list at all: anywhere."""
+    they may begin (None in the list: nowhere); no list at all: anywhere. moved: the same for where something
+    moved: only places that most cameras see move are looked at."""
     width = BASE + 3 * (settings.harmonics - 1)
     data = pack_cameras(views, box)
     where = _pixels(settings, views, data, masks)
@@ -44,7 +46,7 @@ def seeds(
     scores = np.zeros(cells**3, np.float32)
     near = np.float32(max(0.01, box.near_m / box.radius_m))
     if settings.seed_cells:
-        _score(settings, pool, box, views, scores, cells)
+        _score(settings, pool, box, views, moved, scores, cells)
         pool.run(sweep_rays, data, view_of, local, near, middle, box.contracted, cells, scores, distance)
     else:
         distance[:] = np.maximum(near, middle * rng.uniform(0.4, 1.6, drawn.size))
@@ -99,22 +101,29 @@ def _empty_color(settings: SplatSettings, views: Sequence[View]) -> NDArray[np.f
 
 
 def _score(settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
-           scores: NDArray[np.float32], cells: int) -> None:  # fmt: skip
-    some = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, MOST_VIEWS).astype(int))]
+           moved: Sequence[NDArray[np.bool_] | None] | None, scores: NDArray[np.float32],
+           cells: int) -> None:  # fmt: skip
+    chosen = np.unique(np.linspace(0, len(views) - 1, MOST_VIEWS).astype(int))
+    some = [views[k] for k in chosen]
     cams = camera_rows([v.camera_to_world for v in some], [v.intrinsics for v in some], box)
     data = pack_cameras(some, box)
     channels = max(v.image.shape[2] for v in some)
     blurred = np.full((int(data.first[-1]), channels), 255, np.uint8)
+    marks = np.zeros(0 if moved is None else len(blurred), np.uint8)
     for k, view in enumerate(some):
         footprint = (4.0 if box.contracted else 2.0) * box.radius_m / cells / box.distance_m
         size = 2 * (max(int(0.5 * footprint * view.intrinsics.fx), 1) // 2) + 1
         a, b = data.first[k], data.first[k + 1]
         image = cv2.blur(view.image, (size, size)) if size > 1 else view.image
         blurred[a:b, : image.shape[2]] = image.reshape(int(b - a), -1)
+        mask = moved[chosen[k]] if moved is not None else None
+        if mask is not None:  # a cell is as wide as so many pixels
+            wide = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+            marks[a:b] = wide.reshape(-1)
     plain = _empty_color(settings, some)
     needed = min(settings.min_views, len(some))
     pool.run(
-        score_cells, cams, data, blurred, plain is not None,
+        score_cells, cams, data, blurred, marks, plain is not None,
         plain if plain is not None else np.zeros(3, np.float32), np.float32(TOLERANCE), box.contracted, cells,
         needed, scores,
     )  # fmt: skip

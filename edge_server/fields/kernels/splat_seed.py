@@ -25,13 +25,14 @@ def _spread(u):
 
 
 @kernel
-def score_cells(counter, worker, cams, views, blurred, plain, plain_color, tolerance, contracted, cells,
-                min_views, scores):  # fmt: skip
+def score_cells(counter, worker, cams, views, blurred, marks, plain, plain_color, tolerance, contracted,
+                cells, min_views, scores):  # fmt: skip
     """scores: float32 (cells^3,), x fastest: how well the cameras agree on a colour there, up to 1; NOT_SEEN
     where fewer than min_views look or background shows. Tasks are layers along z.
 
     views: ``rays.Views`` of at most MOST_VIEWS cameras, rows of ``cams``; blurred: uint8 (pixels, 3 or 4),
-    their pictures at the cells' sharpness. plain: whether plain_color (3,) is an empty background;
+    their pictures at the cells' sharpness. marks: uint8 (pixels,), or (0,): only cells that most cameras see
+    marked are looked at, the others are NOT_SEEN. plain: whether plain_color (3,) is an empty background;
     tolerance: of a colour, summed over channels, in [0, 3].
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
@@ -49,8 +50,10 @@ def score_cells(counter, worker, cams, views, blurred, plain, plain_color, toler
                 if contracted:
                     s = _spread(max(abs(x), max(abs(y), abs(z))))
                     x, y, z = x * s, y * s, z * s
-                n, empty = 0, 0
+                n, empty, unmarked = 0, 0, 0
                 for v in range(total):
+                    if 2 * unmarked > total:
+                        break
                     dx, dy, dz = x - cams[v, ORIGIN], y - cams[v, ORIGIN + 1], z - cams[v, ORIGIN + 2]
                     depth = cams[v, 6] * dx + cams[v, 7] * dy + cams[v, 8] * dz
                     if depth <= cams[v, NEAR]:
@@ -66,6 +69,8 @@ def score_cells(counter, worker, cams, views, blurred, plain, plain_color, toler
                     if not (px >= _F0 and py >= _F0 and px < width and py < height):
                         continue
                     pixel = views.first[v] + np.int64(py) * width + np.int64(px)
+                    if marks.size > 0:
+                        unmarked += 1 if marks[pixel] == 0 else 0
                     away = _F0
                     for c in range(3):
                         colors[n, c] = np.float32(blurred[pixel, c]) * np.float32(1.0 / 255.0)
@@ -76,7 +81,8 @@ def score_cells(counter, worker, cams, views, blurred, plain, plain_color, toler
                         empty += 1
                     n += 1
                 best = 0
-                for j in range(n):
+                hidden = 2 * unmarked > n
+                for j in range(0 if hidden else n):
                     agree = 0
                     for k in range(n):
                         apart = (
@@ -87,7 +93,7 @@ def score_cells(counter, worker, cams, views, blurred, plain, plain_color, toler
                         agree += 1 if apart < tolerance else 0
                     best = max(best, agree)
                 score = np.float32(best - 1) / np.float32(n + 1)
-                if n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
+                if hidden or n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
                     score = np.float32(NOT_SEEN)
                 scores[ix + cells * (iy + cells * layer)] = score
 
