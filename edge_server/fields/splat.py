@@ -38,6 +38,7 @@ from freshfield.geometry import Pinhole
 
 _AGES = 4096  # steps after which Adam's bias correction no longer matters
 AHEAD_S = 0.5  # no farther ahead is a movement carried on: people turn
+CARRY_SHARE = 0.35  # of an update, at most, that carries along what moved: the rest learns
 CHANGED_SLOTS = 4  # pictures whose changed tiles one step looks at, at most
 
 
@@ -56,6 +57,7 @@ class SplatField:
         corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), calm], axis=-1)
         self._corrections = corrections.astype(np.float32)
         self._turn = Turn()
+        self._carry_s = 0.0  # a carrying step of the last update, for budgets in seconds
         self._now_ns: int | None = None  # the instant that the Gaussians stand for
         self._snapshot: SplatSnapshot | None = None
         self.reset()
@@ -87,7 +89,7 @@ class SplatField:
         with self._turn.mine():
             motion = self._take_in(views)
         if motion is not None:
-            rays, samples = self._follow(motion, pace)
+            rays, samples = self._follow(motion, pace, self._carries(budget))
         while (progress := pace.begin()) is not None:
             with self._turn.mine():
                 loss, seen, pairs, lost = self._one_step(progress)
@@ -218,11 +220,20 @@ class SplatField:
         self._snapshot = None
         return motion
 
-    def _follow(self, motion: Moved, pace: Pace) -> tuple[int, int]:
+    def _carries(self, budget: Budget) -> int:
+        """Steps that carry along what moved: all that are set, or a share of a short budget."""
+        most = self.settings.follow
+        if budget.steps is not None:
+            return min(most, int(CARRY_SHARE * budget.steps))
+        assert budget.seconds is not None
+        return min(most, int(CARRY_SHARE * budget.seconds / self._carry_s)) if self._carry_s else most
+
+    def _follow(self, motion: Moved, pace: Pace, carries: int) -> tuple[int, int]:
         """Carry along what moved, and begin anew where that does not do; returns pixels and pairs."""
         s, rays, samples = self.settings, 0, 0
         with self._turn.mine():
-            going = carry(s, self._follower, self.cloud, motion, s.follow)
+            going = carry(s, self._follower, self.cloud, motion, carries)
+        began = pace.seconds()
         while pace.begin() is not None:
             with self._turn.mine():
                 done = next(going, None)
@@ -230,6 +241,7 @@ class SplatField:
                 break
             rays, samples = rays + done[1], samples + done[2]
             pace.end()
+            self._carry_s = (pace.seconds() - began) / pace.steps
         with self._turn.mine():
             leave_behind(self.cloud, motion, self._before)
             renew(s, self._follower, self.cloud, motion, self._rng(2))
