@@ -13,8 +13,7 @@ from edge_server.fields import View
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.scene_box import SceneBox, plain_background, scene_box
 from edge_server.fields.supervision import CameraMemory, check_view, leave_out, pack_views, remember
-from edge_server.fields.trainer_settings import TrainerSettings
-from edge_server.fields.trust import refused, weights
+from edge_server.fields.trust import TrustSettings, refused, weights
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
@@ -23,8 +22,25 @@ FINAL = 4  # cameras from which on a scene's box is kept
 SETTLED = 100  # steps after which a field may doubt what it is shown
 
 
+class RigSettings(TrustSettings, Protocol):
+    """The options that are read here; ``TrainerSettings`` says what they mean."""
+
+    @property
+    def centre_m(self) -> tuple[float, float, float] | None: ...
+    @property
+    def radius_m(self) -> float | None: ...
+    @property
+    def near_m(self) -> float | None: ...
+    @property
+    def contracted(self) -> bool | None: ...
+    @property
+    def background(self) -> str: ...
+    @property
+    def refuse_beyond(self) -> float: ...
+
+
 class PixelRenderer(Protocol):
-    """Shows single pixels: ``NgpSnapshot.render_pixels``."""
+    """Shows single pixels: ``NgpSnapshot.render_pixels``, ``SplatSnapshot.render_pixels``."""
 
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
@@ -46,7 +62,7 @@ class Intake:
 class Rig:
     """The cameras of one field."""
 
-    def __init__(self, settings: TrainerSettings) -> None:
+    def __init__(self, settings: RigSettings) -> None:
         self.settings = settings
         self.box: SceneBox | None = None
         self.memory: dict[str, CameraMemory] = {}
@@ -62,7 +78,7 @@ class Rig:
 
     def take_in(self, views: Sequence[View]) -> Intake:
         """Learn from ``views`` and pack them. Raises ValueError for one that cannot be a view."""
-        if self._packed is not None and _same(views, self._packed[0]):
+        if self._packed is not None and same_views(views, self._packed[0]):
             return Intake(self._packed[1], new_box=False, look=False, fresh=False)
         for view in views:
             check_view(view)
@@ -89,12 +105,16 @@ class Rig:
 
     def trusted(self, views: Sequence[View], data: Views, step: int, field: PixelRenderer) -> Views:
         """``data`` without the views that contradict ``field``, which has learnt for ``step`` steps."""
+        return leave_out(data, self.refused(views, step, field))
+
+    def refused(self, views: Sequence[View], step: int, field: PixelRenderer) -> NDArray[np.bool_]:
+        """Which of the views (V,) contradict ``field``, which has learnt for ``step`` steps."""
 
         def pixels(view: View, points: NDArray[np.float64]) -> NDArray[np.float32]:
             return field.render_pixels(view.camera_to_world, view.intrinsics, points)[0]
 
         beyond, settled = self.settings.refuse_beyond, step >= SETTLED
-        return leave_out(data, refused(views, self.memory, beyond, settled, pixels))
+        return refused(views, self.memory, beyond, settled, pixels)
 
     def background(self) -> NDArray[np.float32]:
         """The colour (3,) behind everything that is rendered."""
@@ -148,7 +168,8 @@ class Rig:
             self.memory[camera] = CameraMemory(view, arrays.get(f"moved_{k}"), credit)
 
 
-def _same(a: Sequence[View], b: Sequence[View]) -> bool:
+def same_views(a: Sequence[View], b: Sequence[View]) -> bool:
+    """Whether they are the very same objects."""
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
 
 

@@ -23,16 +23,26 @@ from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
 from edge_server.fields.kernels.splat_project import BASE, BLOCK, COLOR, OPACITY, QUATERNION, SCALE, TILE
 from edge_server.fields.kernels.splat_raster import Loss, train_tiles
 from edge_server.fields.kernels.splat_update import Rule, bound_all, update
-from edge_server.fields.ngp_rig import Arrays, Rig
+from edge_server.fields.ngp_rig import Arrays, Rig, same_views
 from edge_server.fields.ngp_schedule import BETA1, BETA2, Pace, step_key
-from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import NOWHERE
 from edge_server.fields.splat_growth import Cloud, grow_and_prune
-from edge_server.fields.splat_motion import LONGEST_S, Moved, carry, changed_tiles, drift, leave_behind, renew
+from edge_server.fields.splat_motion import (
+    LONGEST_S,
+    Moved,
+    carry,
+    changed_tiles,
+    drift,
+    leave_behind,
+    renew,
+    silent_tiles,
+    trusted_moves,
+)
 from edge_server.fields.splat_passes import Passes, camera_rows
 from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.splat_settings import SplatSettings, make_settings
 from edge_server.fields.splat_snapshot import SplatSnapshot
+from edge_server.fields.supervision import asked_views, leave_out
 from edge_server.fields.turn import Turn
 from freshfield.geometry import Pinhole
 
@@ -60,19 +70,18 @@ class SplatField:
         self._carry_s = 0.0  # a carrying step of the last update, for budgets in seconds
         self._now_ns: int | None = None  # the instant that the Gaussians stand for
         self._snapshot: SplatSnapshot | None = None
+        self._given: tuple[View, ...] = ()  # the last fit's views, known again after ``load_state``
+        self._refused: set[str] = set()  # cameras whose newest view is left out
+        self._unsure: set[str] = set()  # cameras whose newest view followed one that was
         self.reset()
 
     # --- the protocol -------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        s = self.settings
         with self._turn.mine():
             self.dropped = 0
-            self.rig = Rig(NgpSettings(
-                centre_m=s.centre_m, radius_m=s.radius_m, near_m=s.near_m, contracted=s.contracted,
-                background=s.background,
-            ))  # fmt: skip
+            self.rig = Rig(self.settings)
             self._forget_gaussians()
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
@@ -117,19 +126,25 @@ class SplatField:
             ahead_s = min(max(ahead_s, 0.0), AHEAD_S)
             known = self._snapshot
             if known is None or known.step != self.step or known.ahead_s != ahead_s:
-                gaussians = self.cloud.gaussians(self.settings.harmonics)
-                params = gaussians.params.copy()
-                params[:, :3] += gaussians.velocity * np.float32(ahead_s)
-                known = self._snapshot = SplatSnapshot(
-                    box=self.rig.box or NOWHERE,
-                    gaussians=gaussians._replace(params=params, velocity=np.zeros_like(gaussians.velocity)),
-                    background=self.rig.background(),
-                    cameras=self.rig.views,
-                    pool=self.pool,
-                    step=self.step,
-                    ahead_s=ahead_s,
-                )
+                live = self._live()
+                params, velocity = live.gaussians.params.copy(), live.gaussians.velocity
+                params[:, :3] += velocity * np.float32(ahead_s)
+                gaussians = live.gaussians._replace(params=params, velocity=np.zeros_like(velocity))
+                known = replace(live, gaussians=gaussians, ahead_s=ahead_s, passes=None)
+                self._snapshot = known
             return known
+
+    def _live(self) -> SplatSnapshot:
+        """A renderer of the living arrays, for whoever has the turn."""
+        return SplatSnapshot(
+            box=self.rig.box or NOWHERE,
+            gaussians=self.cloud.gaussians(self.settings.harmonics),
+            background=self.rig.background(),
+            cameras=self.rig.views,
+            pool=self.pool,
+            step=self.step,
+            passes=self._looker,
+        )
 
     def warm_up(self) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
@@ -148,6 +163,7 @@ class SplatField:
             image[2:6, 2:6] = 255
             field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
             field.render(pose, camera)
+            field._live().render_pixels(pose, camera, np.full((1, 2), 0.5))  # as ``trust`` asks
         return time.perf_counter() - start
 
     # --- state --------------------------------------------------------------------------------
@@ -158,7 +174,8 @@ class SplatField:
             meta = {
                 "version": 1, "field": "splat", "settings": asdict(self.settings), "step": self.step,
                 "grown": self._grown, "dropped": self.dropped,
-                "now_ns": self._now_ns, **self.rig.meta(),
+                "now_ns": self._now_ns, "given": [v.camera for v in self._given],
+                "refused": sorted(self._refused), "unsure": sorted(self._unsure), **self.rig.meta(),
             }  # fmt: skip
             cloud = {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
             both = {"meta": np.array(json.dumps(meta)), **cloud, **self.rig.arrays()}
@@ -173,6 +190,8 @@ class SplatField:
             self.cloud = cloud
             self.step, self._grown, self.dropped = (int(meta[k]) for k in ("step", "grown", "dropped"))
             self._now_ns = None if meta["now_ns"] is None else int(meta["now_ns"])
+            self._given = tuple(self.rig.memory[camera].view for camera in meta.get("given", ()))
+            self._refused, self._unsure = (set(meta.get(key, ())) for key in ("refused", "unsure"))
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -180,10 +199,12 @@ class SplatField:
         self.step = 0
         self._grown = 0  # step of the last splitting and pruning
         self.cloud = Cloud.empty(self.settings)
-        self._passes, self._follower = Passes(self.pool), Passes(self.pool)
+        self._passes, self._follower, self._looker = (Passes(self.pool) for _ in range(3))
         self._now_ns = None
         self._snapshot = None
         self._views: tuple[View, ...] = ()
+        self._given = ()
+        self._refused, self._unsure = set(), set()
         self._epoch = -1
 
     def _rng(self, purpose: int) -> np.random.Generator:
@@ -192,14 +213,14 @@ class SplatField:
     def _take_in(self, views: Sequence[View]) -> Moved | None:
         """Learn of new pictures; begin a cloud. Returns what they show to have moved, if anything."""
         motion = None
-        if len(views) != len(self._views) or any(a is not b for a, b in zip(views, self._views)):
-            news = [v for v in views if v.camera not in self.rig.memory
-                    or self.rig.memory[v.camera].view is not v]  # fmt: skip
+        if not same_views(views, self._views):
+            memory = self.rig.memory
+            news = {v.camera for v in views if v.camera not in memory or memory[v.camera].view is not v}
+            known = _equal(views, self._given)  # decoded once more, or the first after ``load_state``
             intake = self.rig.take_in(views)
             if intake.new_box:
                 self._forget_gaussians()
             assert self.rig.box is not None
-            self._data = intake.data
             now_ns = max(v.generated_ns for v in views)
             elapsed_s = 0.0 if self._now_ns is None else (now_ns - self._now_ns) / 1e9
             self._now_ns = now_ns
@@ -207,14 +228,21 @@ class SplatField:
                 [v.camera_to_world for v in views], [v.intrinsics for v in views], self.rig.box,
                 [max((v.generated_ns - now_ns) / 1e9, -LONGEST_S) for v in views],
             )  # fmt: skip
-            self._before = self.cloud.params[:, :3].copy()
-            drift(self.cloud, elapsed_s)
-            moved = [self.rig.memory[v.camera].moved for v in views]
+            if not known:
+                self._before = self.cloud.params[:, :3].copy()
+                drift(self.cloud, elapsed_s)
+                self._doubt(views, news)
+            data = self._data = leave_out(intake.data, np.array([v.camera in self._refused for v in views]))
+            self._asked = asked_views(data) or list(range(len(views)))  # of none, all teach nothing
+            moved = trusted_moves(
+                [None if v.camera in self._unsure else memory[v.camera].moved for v in views], data
+            )
             self._changed = changed_tiles(moved)
-            self._views, self._epoch = tuple(views), -1
-            if len(self.cloud) and news and any(m is not None for m in moved):
-                motion = Moved(self.rig.box, views, self._data, moved, self._changed, self._cams,
-                               self.rig.background(), elapsed_s)  # fmt: skip
+            self._views, self._given, self._epoch = tuple(views), tuple(views), -1
+            fresh = any(v.camera in news for k, v in enumerate(views) if k in self._asked)
+            if len(self.cloud) and fresh and not known and any(m is not None for m in moved):
+                motion = Moved(self.rig.box, views, data, moved, self._changed, self._cams,
+                               self.rig.background(), elapsed_s, len(self._asked))  # fmt: skip
         if len(self.cloud) == 0:
             self._begin()
         self._snapshot = None
@@ -227,6 +255,14 @@ class SplatField:
             return min(most, int(CARRY_SHARE * budget.steps))
         assert budget.seconds is not None
         return min(most, int(CARRY_SHARE * budget.seconds / self._carry_s)) if self._carry_s else most
+
+    def _doubt(self, views: Sequence[View], news: set[str]) -> None:
+        """Refuse the views that contradict what is known. What a camera's next one seems to show to have
+        moved is beside a picture that was wrong, so that is not known."""
+        self._unsure = (self._unsure - news) | (self._refused & news)
+        flags = self.rig.refused(views, self.step, self._live())
+        given = {v.camera for v in views}
+        self._refused = (self._refused - given) | {v.camera for v, flag in zip(views, flags) if flag}
 
     def _follow(self, motion: Moved, pace: Pace, carries: int) -> tuple[int, int]:
         """Carry along what moved, and begin anew where that does not do; returns pixels and pairs."""
@@ -250,7 +286,7 @@ class SplatField:
 
     def _choose(self) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
         """The views of this step and which of their tiles."""
-        s, n = self.settings, len(self._views)
+        s, n = self.settings, len(self._asked)
         rng = self._rng(3)
         slots = min(s.views_a_step, n)
         first = self.step * s.views_a_step
@@ -258,7 +294,7 @@ class SplatField:
             self._epoch = first // n
             pick = np.random.SeedSequence([s.seed, self._epoch, 4])
             self._order = np.random.default_rng(pick).permutation(n)
-        picked = self._order[(first + np.arange(slots)) % n]
+        picked = np.array(self._asked, np.int64)[self._order[(first + np.arange(slots)) % n]]
         moving = [k for k, tiles in enumerate(self._changed) if tiles is not None]
         if moving and rng.random() < s.changed_share:
             some = np.array(moving)[(first + np.arange(min(CHANGED_SLOTS, len(moving)))) % len(moving)]
@@ -318,7 +354,7 @@ class SplatField:
         """A step is made: grow and prune when it is time, after a look at every view at least."""
         s = self.settings
         self.step += 1
-        if self.step - self._grown >= max(s.densify_every, -(-len(self._views) // s.views_a_step)):
+        if self.step - self._grown >= max(s.densify_every, -(-len(self._asked) // s.views_a_step)):
             self._grow()
 
     def _rule(self, progress: float) -> Rule:
@@ -342,6 +378,8 @@ class SplatField:
 
     def _grow(self) -> None:
         s = self.settings
+        if self._data.weight.size:
+            self._keep_what_is_not_asked()
         grow_and_prune(self.cloud, s, float(self._data.size[:, 0].mean()), self._rng(5))
         if s.opacity_reset and self.step // s.opacity_reset != self._grown // s.opacity_reset:
             # To a tenth: what pictures need grows back, what they do not is pruned (Kerbl et al. 5.2).
@@ -350,12 +388,27 @@ class SplatField:
         if len(self.cloud) == 0:  # everything faded away: begin again rather than never
             self._begin()
 
+    def _keep_what_is_not_asked(self) -> None:
+        """What shows in tiles with pixels of weight 0 counts as seen: that no picture needed it means nothing
+        while those that may are not asked."""
+        data, cloud = self._data, self.cloud
+        tiles = silent_tiles(data)
+        slots = [k for k, mask in enumerate(tiles) if mask is not None]
+        if slots:
+            cams = np.ascontiguousarray(self._cams[slots])
+            gaussians = cloud.gaussians(self.settings.harmonics)
+            self._looker.look(cams, gaussians, [tiles[k] for k in slots], differentiate=False)
+            shows = (self._looker.lists.own_count[:, : len(cloud)] > 0).any(axis=0)
+            cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
+
     def _begin(self) -> None:
         """First Gaussians, from the views at hand."""
         assert self.rig.box is not None
         s = self.settings
-        first = min(s.start, s.gaussians)
-        self.cloud = Cloud.of(seeds(s, self.pool, self.rig.box, self._views, None, first, self._rng(1)))
+        first, weight = min(s.start, s.gaussians), self._data.weight
+        self.cloud = Cloud.of(
+            seeds(s, self.pool, self.rig.box, self._views, None, weight, first, self._rng(1))
+        )
 
     def _repair(self) -> None:
         """Bring back what is not finite; such Gaussians become invisible and are pruned."""
@@ -388,6 +441,15 @@ def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], Clo
     if count > settings.gaussians:
         raise ValueError(f"the state has {count} Gaussians, this field holds {settings.gaussians} at most")
     return meta, Cloud(**arrays)
+
+
+def _equal(a: Sequence[View], b: Sequence[View]) -> bool:
+    return len(a) == len(b) and all(
+        x is y
+        or (x.camera == y.camera and x.generated_ns == y.generated_ns and x.intrinsics == y.intrinsics
+            and np.array_equal(x.camera_to_world, y.camera_to_world) and np.array_equal(x.image, y.image))
+        for x, y in zip(a, b)
+    )  # fmt: skip
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:

@@ -73,7 +73,8 @@ class SplatCudaField(SplatField):
         drawn = torch.zeros(len(cloud), device=self._device)
         for k in picked.tolist():
             error, info = self._errors(params, k)
-            loss = error.abs().sum() if s.loss == "l1" else error.square().sum()
+            weight = self._weight(k)
+            loss = (weight * (error.abs() if s.loss == "l1" else error.square())).sum()
             if not bool(torch.isfinite(loss)):
                 lost += 1
                 continue
@@ -83,7 +84,7 @@ class SplatCudaField(SplatField):
                 loss.backward()
             drawn += self._note(info, float(self._cams[k, SIZE]))
             pixels += error.shape[0] * error.shape[1]
-            square += float(error.detach().square().sum())
+            square += float((weight * error.detach().square()).sum())
         gradient = np.zeros_like(cloud.params) if params.grad is None else params.grad.cpu().numpy()
         lost += int((~np.isfinite(gradient)).sum())
         self._adam(np.nan_to_num(gradient, posinf=0.0, neginf=0.0), drawn.cpu().numpy() > 0, progress)
@@ -127,6 +128,15 @@ class SplatCudaField(SplatField):
         if image.shape[2] == 4:
             target = target * image[..., 3:] + back * (1.0 - image[..., 3:])
         return color[0] - target, info
+
+    def _weight(self, k: int) -> Tensor:
+        """The weights of view k's pixels, (H, W, 1), or one 1 for all."""
+        weight, first = self._data.weight, self._data.first
+        if weight.size == 0:
+            return torch.ones(1, device=self._device)
+        width, height = self._data.size[k]
+        share = weight[first[k] : first[k + 1]].reshape(height, width, 1)
+        return torch.tensor(share, device=self._device)
 
     def _note(self, info: dict[str, Any], width: float) -> Tensor:
         """Keep what growth goes by; returns which Gaussians were drawn, (N,)."""

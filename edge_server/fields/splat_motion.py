@@ -46,8 +46,9 @@ _TO_VELOCITY = 0.7  # of a correction that is taken for a wrong velocity rather 
 class Moved:
     """One set of views and what changed in them.
 
-    moved: for each view bool (H, W) or None; tiles: the same by tiles, uint8 (T,), see ``changed_tiles``.
-    cams: float32 (V, CAMERA), with the time each picture was taken. elapsed_s: since the last set.
+    moved: for each view bool (H, W) or None, pixels of weight 0 left out; tiles: the same by tiles, uint8
+    (T,), see ``changed_tiles``. cams: float32 (V, CAMERA), with the time each picture was taken. elapsed_s:
+    since the last set. asked: how many of the views have pixels of more weight than 0.
     """
 
     box: SceneBox
@@ -58,6 +59,28 @@ class Moved:
     cams: NDArray[np.float32]
     background: NDArray[np.float32]
     elapsed_s: float
+    asked: int
+
+    def pixels(self, k: int, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """The pixel of view k that each point (N, 3) in scene units falls on, -1 outside the picture and
+        where the pixel's weight is 0: it has no say."""
+        pixel = _pixels(points, self.cams[k], self.views[k])
+        if self.data.weight.size:
+            weight = self.data.weight[self.data.first[k] : self.data.first[k + 1]]
+            pixel = np.where((pixel >= 0) & (weight[pixel] > 0), pixel, -1)
+        return pixel
+
+
+def trusted_moves(moved: Sequence[NDArray[np.bool_] | None], data: Views) -> list[NDArray[np.bool_] | None]:
+    """``moved`` without pixels of weight 0; None for views of which nothing is left."""
+    if data.weight.size == 0:
+        return list(moved)
+    left: list[NDArray[np.bool_] | None] = []
+    for k, mask in enumerate(moved):
+        if mask is not None:
+            mask = mask & (data.weight[data.first[k] : data.first[k + 1]] > 0).reshape(mask.shape)
+        left.append(mask if mask is not None and mask.any() else None)
+    return left
 
 
 def changed_tiles(moved: Sequence[NDArray[np.bool_] | None]) -> list[NDArray[np.uint8] | None]:
@@ -68,12 +91,26 @@ def changed_tiles(moved: Sequence[NDArray[np.bool_] | None]) -> list[NDArray[np.
         if mask is None or not 0.0 < mask.mean() < MOST:
             masks.append(None)
             continue
-        h, w = mask.shape
-        rows, columns = -(-h // TILE), -(-w // TILE)
-        whole = np.zeros((rows * TILE, columns * TILE), np.uint8)
-        whole[:h, :w] = mask
-        masks.append(whole.reshape(rows, TILE, columns, TILE).max(axis=(1, 3)).reshape(-1))
+        masks.append(_by_tiles(mask))
     return masks
+
+
+def silent_tiles(data: Views) -> list[NDArray[np.uint8] | None]:
+    """For each view the tiles with pixels of weight 0, uint8 (tiles,), or None where there are none."""
+    masks: list[NDArray[np.uint8] | None] = []
+    for (w, h), first in zip(data.size, data.first):
+        silent = data.weight[first : first + w * h].reshape(h, w) == 0
+        masks.append(_by_tiles(silent) if silent.any() else None)
+    return masks
+
+
+def _by_tiles(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    h, w = mask.shape
+    rows, columns = -(-h // TILE), -(-w // TILE)
+    whole = np.zeros((rows * TILE, columns * TILE), np.uint8)
+    whole[:h, :w] = mask
+    tiles: NDArray[np.uint8] = whole.reshape(rows, TILE, columns, TILE).max(axis=(1, 3)).reshape(-1)
+    return tiles
 
 
 def tasks_of(tiles: Sequence[NDArray[np.uint8] | None], slots: Sequence[int]) -> NDArray[np.int32]:
@@ -105,7 +142,7 @@ def carry(
     """
     guests = np.flatnonzero(cloud.guest).astype(np.int64)
     slots = [k for k, t in enumerate(seen.tiles) if t is not None]
-    if guests.size == 0 or len(slots) < min(2, len(seen.views)) or not 0 < seen.elapsed_s <= LONGEST_S:
+    if guests.size == 0 or len(slots) < min(2, seen.asked) or not 0 < seen.elapsed_s <= LONGEST_S:
         return
     loss = Loss(False, np.float32(0.0), seen.background, False, np.uint64(0))
     # Of the cloud, only what shows in the tiles that changed.
@@ -173,9 +210,8 @@ def _error(
 ) -> NDArray[np.float64]:  # fmt: skip
     """Mean difference (N,) of each point's colour from the pixels it falls on, none counting more than .5."""
     total, count = np.zeros(len(points)), np.zeros(len(points))
-    for view, cam in zip(seen.views, seen.cams):
-        at = points if velocity is None else points + cam[TIME] * velocity
-        pixel = _pixels(at, cam, view)
+    for k, (view, cam) in enumerate(zip(seen.views, seen.cams)):
+        pixel = seen.pixels(k, points if velocity is None else points + cam[TIME] * velocity)
         inside = np.flatnonzero(pixel >= 0)
         found = view.image.reshape(-1, view.image.shape[2])[pixel[inside], :3] / 255.0
         total[inside] += np.minimum(np.abs(found - colors[inside]).max(axis=1), 0.5)
@@ -194,7 +230,7 @@ def renew(
     body stays.
     """
     views = seen.views
-    needed = min(2, len(views))
+    needed = min(2, seen.asked)
     if sum(mask is not None for mask in seen.moved) < needed:
         return  # what one camera alone sees change may be that camera
     hull, disagrees = _hull(cloud, seen)
@@ -203,7 +239,9 @@ def renew(
     off = _still_wrong(settings, passes, cloud, seen)
     pixels = sum(int(m.sum()) for m in off if m is not None)
     count = min(int(settings.reseed * settings.gaussians), int(SEEDS_A_PIXEL * pixels))
-    new = Cloud.of(seeds(settings, passes.pool, seen.box, views, off, count, rng, seen.moved))
+    new = Cloud.of(
+        seeds(settings, passes.pool, seen.box, views, off, seen.data.weight, count, rng, seen.moved)
+    )
     new.keep(_hull(new, seen)[0])
     new.guest[:] = 1
     _pass_on(cloud, new, CELLS_PX[0] * seen.box.pixel_m / seen.box.radius_m)
@@ -220,8 +258,8 @@ def _hull(cloud: Cloud, seen: Moved) -> tuple[NDArray[np.bool_], NDArray[np.bool
     sees = np.zeros(len(cloud), np.int32)
     marked, wrong = np.zeros_like(sees), np.zeros_like(sees)
     allowed = np.where(cloud.guest > 0, AGREE_GUEST, AGREE)
-    for view, mask, cam in zip(seen.views, seen.moved, seen.cams):
-        pixel = _pixels(cloud.params[:, :3] + cam[TIME] * cloud.velocity, cam, view)
+    for k, (view, mask, cam) in enumerate(zip(seen.views, seen.moved, seen.cams)):
+        pixel = seen.pixels(k, cloud.params[:, :3] + cam[TIME] * cloud.velocity)
         inside = np.flatnonzero(pixel >= 0)
         sees[inside] += 1
         if mask is None:
@@ -233,7 +271,7 @@ def _hull(cloud: Cloud, seen: Moved) -> tuple[NDArray[np.bool_], NDArray[np.bool
         if view.image.shape[2] == 4:
             off |= colors[:, 3] < 0.5
         wrong[hit] += off
-    return (marked >= min(2, len(seen.views))) & (2 * marked >= sees), 2 * wrong >= marked
+    return (marked >= min(2, seen.asked)) & (2 * marked >= sees), 2 * wrong >= marked
 
 
 def _age(cloud: Cloud, hull: NDArray[np.bool_]) -> None:

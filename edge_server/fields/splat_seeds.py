@@ -17,7 +17,7 @@ from edge_server.fields.kernels.splat_update import bound_all
 from edge_server.fields.scene_box import SceneBox, plain_background
 from edge_server.fields.splat_passes import camera_rows
 from edge_server.fields.splat_settings import SplatSettings
-from edge_server.fields.supervision import pack_cameras
+from edge_server.fields.supervision import asked_views, pack_cameras
 
 TOLERANCE = 0.08  # summed over the channels: more and walls are taken to be where they are not
 _CANDIDATES = 4  # rays a Gaussian: those without a surface are left out
@@ -26,14 +26,14 @@ _PLAIN = 0.06
 
 def seeds(
     settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
-    masks: Sequence[NDArray[np.bool_] | None] | None, count: int, rng: np.random.Generator,
-    moved: Sequence[NDArray[np.bool_] | None] | None = None,
+    masks: Sequence[NDArray[np.bool_] | None] | None, weight: NDArray[np.float32], count: int,
+    rng: np.random.Generator, moved: Sequence[NDArray[np.bool_] | None] | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Parameters of up to ``count`` new Gaussians, float32 (N, P). masks: for each view bool (H, W), where
-    they may begin (None in the list: nowhere); no list at all: anywhere. moved: the same for where something
-    moved: only places that most cameras see move are looked at."""
+    they may begin (None in the list: nowhere); no list at all: anywhere. weight: ``Views.weight``, pixels of
+    none have no say. moved: bool (H, W) each: only places that most cameras see move are looked at."""
     width = BASE + 3 * (settings.harmonics - 1)
-    data = pack_cameras(views, box)
+    data = pack_cameras(views, box)._replace(weight=weight)
     where = _pixels(settings, views, data, masks)
     if count <= 0 or where.size == 0:
         return np.zeros((0, width), np.float32)
@@ -46,7 +46,7 @@ def seeds(
     scores = np.zeros(cells**3, np.float32)
     near = np.float32(max(0.01, box.near_m / box.radius_m))
     if settings.seed_cells:
-        _score(settings, pool, box, views, moved, scores, cells)
+        _score(settings, pool, box, views, moved, data, scores, cells)
         pool.run(sweep_rays, data, view_of, local, near, middle, box.contracted, cells, scores, distance)
     else:
         distance[:] = np.maximum(near, middle * rng.uniform(0.4, 1.6, drawn.size))
@@ -77,7 +77,7 @@ def _pixels(
     masks: Sequence[NDArray[np.bool_] | None] | None,
 ) -> NDArray[np.int64]:  # fmt: skip
     """Numbers of the pixels that show something, over all views."""
-    plain = _empty_color(settings, views)
+    plain = _empty_color(settings, [views[k] for k in asked_views(data)])
     parts = [np.zeros(0, np.int64)]
     for k, view in enumerate(views):
         image = view.image
@@ -90,6 +90,8 @@ def _pixels(
         if masks is not None:
             mask = masks[k]
             shows = shows & mask if mask is not None else np.zeros_like(shows)
+        if data.weight.size:
+            shows = shows & (data.weight[data.first[k] : data.first[k + 1]] > 0).reshape(shows.shape)
         parts.append(data.first[k] + np.flatnonzero(shows))
     return np.concatenate(parts).astype(np.int64)
 
@@ -97,16 +99,19 @@ def _pixels(
 def _empty_color(settings: SplatSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
     """The plain colour (3,) that is rendered where nothing is, if pictures have one: with a background of
     the user's choice, a plain sky has to be made of Gaussians like everything else."""
-    return plain_background(views) if settings.background == "auto" else None
+    return plain_background(views) if settings.background == "auto" and views else None
 
 
 def _score(settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
-           moved: Sequence[NDArray[np.bool_] | None] | None, scores: NDArray[np.float32],
-           cells: int) -> None:  # fmt: skip
-    chosen = np.unique(np.linspace(0, len(views) - 1, MOST_VIEWS).astype(int))
+           moved: Sequence[NDArray[np.bool_] | None] | None, all_data: Views,
+           scores: NDArray[np.float32], cells: int) -> None:  # fmt: skip
+    asked = asked_views(all_data)
+    chosen = [asked[k] for k in np.unique(np.linspace(0, len(asked) - 1, MOST_VIEWS).astype(int))]
     some = [views[k] for k in chosen]
     cams = camera_rows([v.camera_to_world for v in some], [v.intrinsics for v in some], box)
-    data = pack_cameras(some, box)
+    data = pack_cameras(some, box)._replace(weight=np.concatenate(
+        [all_data.weight[all_data.first[k] : all_data.first[k + 1]] for k in chosen]
+    ))  # fmt: skip
     channels = max(v.image.shape[2] for v in some)
     blurred = np.full((int(data.first[-1]), channels), 255, np.uint8)
     marks = np.zeros(0 if moved is None else len(blurred), np.uint8)

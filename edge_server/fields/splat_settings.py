@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
-
-def _option(default: Any, text: str) -> Any:
-    return field(default=default, metadata={"help": text})
+from edge_server.fields.trainer_settings import TRUST_BOUNDS, shared_option
+from edge_server.fields.trainer_settings import option as _option
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,10 @@ class SplatSettings:
     changed_share: float = _option(0.25, "steps that look only at tiles that changed since the last view")
     follow: int = _option(8, "steps at the start of an update that carry along what moves; 0: none")
     reseed: float = _option(0.25, "of ``gaussians``, how many are made anew where something moved, at most")
+    age_tau_ms: float = shared_option("age_tau_ms")
+    mask_stale_ms: float = shared_option("mask_stale_ms")
+    mask_grow_px_s: float = shared_option("mask_grow_px_s")
+    refuse_beyond: float = shared_option("refuse_beyond")
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
     nice: int = _option(5, "how far workers lower their own priority (Linux)")
@@ -66,7 +69,7 @@ class SplatSettings:
             ("grow", 0.0, 1.0), ("prune", 0.0, 0.9), ("largest", 1e-3, 50.0), ("widest", 1e-3, 1e3),
             ("aspect", 1.0, 1e4), ("changed_share", 0.0, 1.0), ("reseed", 0.0, 1.0),
             ("rate_position", 0.0, 100.0), ("rate_scale", 0.0, 10.0), ("rate_rotation", 0.0, 10.0),
-            ("rate_opacity", 0.0, 10.0), ("rate_color", 0.0, 10.0),
+            ("rate_opacity", 0.0, 10.0), ("rate_color", 0.0, 10.0), *TRUST_BOUNDS,
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"splat: {name} must be in {low}..{high}, not {getattr(self, name)}")

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.kernels.pool import Pool
-from edge_server.fields.kernels.splat_project import Gaussians
-from edge_server.fields.kernels.splat_raster import render_tiles
+from edge_server.fields.kernels.splat_project import TILE, Gaussians
+from edge_server.fields.kernels.splat_raster import render_points, render_tiles
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.splat_passes import Passes, camera_rows, ray_lengths
 from freshfield.geometry import Pinhole
@@ -21,7 +21,8 @@ SOLID = 0.5  # opacity from which on a pixel shows a surface
 @dataclass(frozen=True)
 class SplatSnapshot:
     """Gaussians and cameras of one instant. Nothing in it is written after it is made. ahead_s: by how much
-    that instant is later than the newest view."""
+    that instant is later than the newest view. passes: buffers to render pixels with, if one thread alone
+    uses this."""
 
     box: SceneBox
     gaussians: Gaussians
@@ -30,6 +31,7 @@ class SplatSnapshot:
     pool: Pool
     step: int
     ahead_s: float = 0.0
+    passes: Passes | None = None
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture a camera at this pose would take."""
@@ -45,6 +47,25 @@ class SplatSnapshot:
         )  # fmt: skip
         depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
         return Rendering(color, depth, opacity)
+
+    def render_pixels(
+        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Colour (N, 3), distance in metres and opacity (N,) at image points (N, 2) within the picture."""
+        passes = self.passes or Passes(self.pool)
+        cams = camera_rows([camera_to_world], [intrinsics], self.box)
+        columns, rows = -(-intrinsics.width // TILE), -(-intrinsics.height // TILE)
+        wanted = np.zeros((rows, columns), np.uint8)
+        wanted[tuple((pixels[:, ::-1] // TILE).astype(np.int64).T)] = 1
+        passes.look(cams, self.gaussians, [wanted.reshape(-1)], differentiate=False)
+        color = np.empty((len(pixels), 3), np.float32)
+        depth, opacity = np.empty(len(pixels), np.float32), np.empty(len(pixels), np.float32)
+        self.pool.run(
+            render_points, columns, pixels.astype(np.float32), passes.projected, passes.lists,
+            self.background, color, depth, opacity,
+        )  # fmt: skip
+        depth *= (self.box.radius_m / np.maximum(intrinsics.rays(pixels)[:, 2], 1e-6)).astype(np.float32)
+        return color, depth, opacity
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras see a

@@ -144,6 +144,12 @@ def leave_out(data: Views, refused: NDArray[np.bool_]) -> Views:
     return _weighted(data, weight)
 
 
+def asked_views(data: Views) -> list[int]:
+    """The views that have pixels of more weight than 0."""
+    spans = zip(data.first[:-1], data.first[1:])
+    return [k for k, (a, b) in enumerate(spans) if not data.weight.size or data.weight[a:b].any()]
+
+
 def _weighted(data: Views, weight: NDArray[np.float32]) -> Views:
     drawn = np.flatnonzero(weight)
     return data._replace(

@@ -13,6 +13,15 @@ def option(default: Any, text: str) -> Any:
     return field(default=default, metadata={"help": text})
 
 
+# The bounds of the options of ``trust``, which ``splat`` has too: (option, low, high) each.
+TRUST_BOUNDS = (
+    ("age_tau_ms", 0.0, 1e9),
+    ("mask_stale_ms", 0.0, 1e9),
+    ("mask_grow_px_s", 0.0, 1e6),
+    ("refuse_beyond", 0.0, 1e6),
+)
+
+
 @dataclass(frozen=True)
 class TrainerSettings:
     """Lengths in metres; None means: found from the cameras."""
@@ -71,10 +80,7 @@ class TrainerSettings:
             ("samples_ramp", 0, 1 << 30),
             ("cells", 8, 256),
             ("min_views", 0, 1000),
-            ("age_tau_ms", 0.0, 1e9),
-            ("mask_stale_ms", 0.0, 1e9),
-            ("mask_grow_px_s", 0.0, 1e6),
-            ("refuse_beyond", 0.0, 1e6),
+            *TRUST_BOUNDS,
             ("refine_m", 0.0, 1.0),
             ("refine_deg", 0.0, 20.0),
         )
@@ -104,6 +110,12 @@ class TrainerSettings:
 
 
 Settings = TypeVar("Settings", bound=TrainerSettings)
+
+
+def shared_option(name: str) -> Any:
+    """The option ``name`` as all of these representations have it, for settings of another family."""
+    known = TrainerSettings.__dataclass_fields__[name]
+    return option(known.default, known.metadata["help"])
 
 
 def option_names(kind: type[TrainerSettings]) -> list[str]:

@@ -98,8 +98,9 @@ def refused(
     if beyond <= 0.0 or not settled or len(views) < JUDGES:
         return none
     off = np.array([_typical_error(view, pixels) for view in views])
-    usual = float(np.median(off))
-    contradicts = off > max(beyond * usual, LEAST_ERROR)
+    # No less than this: where half of every picture is plain sky, shown exactly, no view else would agree.
+    usual = max(float(np.median(off)), LEAST_ERROR / beyond)
+    contradicts = off > beyond * usual
     few = 4 * contradicts.sum() <= len(views)
     for k, view in enumerate(views):
         known = memory[view.camera]

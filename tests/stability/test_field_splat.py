@@ -242,6 +242,18 @@ for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True, "dssim":
     assert np.isfinite(out.color).all()
 moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
 field.fit(moved, Budget(steps=20))
+field = SplatField(replace(TINY, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0, dssim=0.1))
+field.fit(VIEWS, Budget(steps=100))
+for later in (1, 2, 3):
+    moved = []
+    for k, view in enumerate(VIEWS):
+        image = view.image.copy()
+        image[8:12, 4 * later : 4 * later + 5] = (255, 0, 255)
+        image = 255 - image if later == 2 and k == 2 else image
+        moved.append(replace(view, image=image, generated_ns=later * 10**8 + k * 10**7))
+    field.fit(moved, Budget(steps=20))
+    assert field._data.drawn.size, "nothing is masked"
+    assert field._refused == ({"cam02"} if later == 2 else set())
 print("kept")
 """
     cache = request.config.cache

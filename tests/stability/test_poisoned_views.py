@@ -15,18 +15,24 @@ import pytest
 from numpy.typing import NDArray
 
 from camera_node.world import make_scene
-from edge_server.fields import Budget, View
+from edge_server.fields import Budget, View, splat
+from edge_server.fields.kernels.splat_project import OPACITY, QUATERNION, SCALE
 from edge_server.fields.nerfacto import NerfactoField
 from edge_server.fields.nerfacto_settings import NerfactoSettings
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.scene_box import scene_box
+from edge_server.fields.splat import SplatField
+from edge_server.fields.splat_growth import Cloud
+from edge_server.fields.splat_motion import Moved
+from edge_server.fields.splat_settings import SplatSettings
 from edge_server.fields.tensorf import TensorfField
 from edge_server.fields.tensorf_settings import TensorfSettings
 from edge_server.fields.trust import PATIENCE
 from edge_server.fields.voxel import VoxelField
 from edge_server.fields.voxel_settings import VoxelSettings
-from tests.edge_server.fields.scenes import psnr, ring
+from freshfield.geometry import look_at
+from tests.edge_server.fields.scenes import picture, psnr, ring
 
 SMALL: dict[str, Any] = {
     "hidden": 16, "rays": 512, "batch_samples": 4096, "samples": 64, "samples_ramp": 100, "cells": 32,
@@ -44,18 +50,24 @@ NERFACTO = NerfactoSettings(
 )
 TENSORF = TensorfSettings(color_rank=8, resolution_start=16, resolution=48, upsample=(40, 100), **SMALL)
 VOXEL = VoxelSettings(sizes=(16, 32, 48), refine_at=(20, 60), rays=1024, cells=32, threads=2)
+SPLAT = SplatSettings(gaussians=1000, start=500, seed_cells=24, densify_every=20, views_a_step=3, threads=2)
 FIELDS: list[tuple[Any, Any]] = [
     (NgpField, NGP),
     (TensorfField, TENSORF),
+    (SplatField, SPLAT),
     (VoxelField, VOXEL),
     (NerfactoField, NERFACTO),
 ]
-each = pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "voxel", "nerfacto"])
+every = pytest.mark.parametrize(
+    ("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "splat", "voxel", "nerfacto"]
+)
 
 STEPS, WARM, AFTER = 4, 40, 50  # of an update; updates before and after the poison
 WITHIN_DB = 0.5
 VIEWS = ring(13, size=64)
 HELD, SEEN, BAD = VIEWS[6], VIEWS[:6] + VIEWS[7:], 3
+# Splat's score on one view differs by 0.2 dB between seeds, on these by 0.06.
+BETWEEN = ring(26, size=64)[1::4]
 
 Poison = Callable[[View, int], View]
 
@@ -115,7 +127,9 @@ class Deployment:
             self.loss = self.field.fit(now, Budget(steps=STEPS)).loss
 
     def score(self) -> float:
-        return psnr(self.field.render(HELD.camera_to_world, HELD.intrinsics).color, HELD.image / 255.0)
+        held = BETWEEN if isinstance(self.field, SplatField) else [HELD]
+        shown = [self.field.render(view.camera_to_world, view.intrinsics).color for view in held]
+        return float(np.mean([psnr(color, view.image / 255.0) for color, view in zip(shown, held)]))
 
 
 @cache
@@ -147,7 +161,7 @@ def _finite(field: Any) -> None:
 
 @pytest.mark.parametrize("updates", [1, 10])
 @pytest.mark.parametrize("poison", PICTURES + POSES)
-@each
+@every
 def test_a_poisoned_view_is_survived(kind: Any, settings: Any, poison: Poison, updates: int) -> None:
     deployment = _deployment(kind, settings)
     deployment.update(updates, poison)
@@ -158,7 +172,7 @@ def test_a_poisoned_view_is_survived(kind: Any, settings: Any, poison: Poison, u
 
 
 @pytest.mark.parametrize("poison", PICTURES + POSES)
-@each
+@every
 def test_poison_in_the_very_first_update_is_survived(kind: Any, settings: Any, poison: Poison) -> None:
     """Before anything is known, and where the scene's box is found."""
     deployment = Deployment(kind(settings))
@@ -168,7 +182,7 @@ def test_poison_in_the_very_first_update_is_survived(kind: Any, settings: Any, p
 
 
 @pytest.mark.parametrize("poison", [_noise, _black, _inverted])
-@each
+@every
 def test_wrong_pictures_are_refused_while_they_last(kind: Any, settings: Any, poison: Poison) -> None:
     """What is shown meanwhile is not spoilt either; and without refusals it would be."""
     without = replace(settings, refuse_beyond=0.0)
@@ -184,18 +198,20 @@ def test_wrong_pictures_are_refused_while_they_last(kind: Any, settings: Any, po
     assert scores[1] < scores[0] - 0.5 * WITHIN_DB, "it does no harm anyway: nothing was tested"
 
 
-@each
+@every
 def test_a_picture_that_stays_different_is_learnt_in_the_end(kind: Any, settings: Any) -> None:
     """The camera was right after all, say because somebody hung a cloth before it: patience ends."""
     deployment = _deployment(kind, settings)
     deployment.update(PATIENCE, _black)
     assert deployment.field.rig.memory[SEEN[BAD].camera].credit == 0
-    refused = deployment.loss
-    deployment.update(1, _black)
-    assert deployment.loss > 3.0 * refused, "it still is not learnt from"
+    refused, losses = deployment.loss, []
+    for _ in range(-(-len(SEEN) // STEPS)):  # splat looks at one view a step
+        deployment.update(1, _black)
+        losses.append(deployment.loss)
+    assert max(losses) > 3.0 * refused, "it still is not learnt from"
 
 
-@each
+@every
 def test_a_picture_repeated_is_not_a_scene_in_motion(kind: Any, settings: Any) -> None:
     """One wrong picture makes all of the next one seem to have moved; equal ones after it must end that."""
     deployment = _deployment(kind, settings)
@@ -208,11 +224,12 @@ def test_a_picture_repeated_is_not_a_scene_in_motion(kind: Any, settings: Any) -
     assert memory[SEEN[BAD].camera].moved is None
 
 
-def test_two_poisoned_views_and_refusals_resume_bit_for_bit() -> None:
+@every
+def test_two_poisoned_views_and_refusals_resume_bit_for_bit(kind: Any, settings: Any) -> None:
     """Refusals depend on what a state keeps."""
-    one = _deployment(NgpField, NGP)
+    one = _deployment(kind, settings)
     one.update(3, _black)
-    field = NgpField(NGP)
+    field = kind(settings)
     field.load_state(one.field.state())
     two = Deployment(field)
     two.updates = one.updates
@@ -222,6 +239,90 @@ def test_two_poisoned_views_and_refusals_resume_bit_for_bit() -> None:
     assert one.field.rig.memory[SEEN[BAD].camera].credit == PATIENCE - 6
     for name in a.keys() - {"meta"}:
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+Shown = tuple[float, int]
+
+
+@cache
+def _in_motion(poison: Poison | None, updates: int = 3) -> tuple[Shown, Shown]:
+    """Score and guests (Gaussians begun where something moved) of splat while its ball moves on: at the end
+    of so many updates with the poison, and 8 updates later."""
+
+    def frames(views: list[View], update: int) -> list[View]:
+        ball_m = np.array([0.35 * np.sin(0.15 * update), 0.0, 0.5])
+        return [
+            replace(v, image=picture(v.intrinsics, v.camera_to_world, ball_m), generated_ns=update * 10**8)
+            for v in views
+        ]
+
+    field, result = SplatField(SPLAT), []
+    field.load_state(_warm(SplatField, SPLAT))
+    for update in range(WARM + 1, WARM + 15):
+        now, poisoned = frames(SEEN, update), WARM + 4 <= update < WARM + 4 + updates
+        if poison is not None and poisoned:
+            now[BAD] = poison(now[BAD], update)
+        field.fit(now, Budget(steps=STEPS))
+        if update in (WARM + 3 + updates, WARM + 14):
+            pictures = [
+                (field.render(v.camera_to_world, v.intrinsics).color, v) for v in frames(BETWEEN, update)
+            ]
+            score = np.mean([psnr(color, v.image / 255.0) for color, v in pictures])
+            result.append((float(score), int((field.cloud.guest > 0).sum())))
+    _finite(field)
+    return result[0], result[1]
+
+
+@pytest.mark.parametrize("poison", [*PICTURES, _a_metre_off])
+def test_what_moves_is_not_made_of_poison(poison: Poison) -> None:
+    """A wrong picture differs everywhere from the one before it and the one after: nothing moved there."""
+    (now, guests), (later, guests_later) = _in_motion(poison)
+    (expected, usual), (expected_later, usual_later) = _in_motion(None)
+    assert expected > 20.0 and min(usual, usual_later) > 50, "nothing moves: nothing was tested"
+    if poison in PICTURES:
+        assert now > expected - WITHIN_DB and guests < 1.3 * usual
+    assert later > expected_later - WITHIN_DB and guests_later < 1.3 * usual_later
+
+
+def test_what_moved_beside_a_wrong_picture_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a refused view nor the one after it has a say in what moves; the others always have."""
+    said: list[list[bool]] = []
+
+    def renew(settings: Any, passes: Any, cloud: Any, seen: Moved, rng: Any) -> None:
+        said.append([mask is not None for mask in seen.moved])
+
+    monkeypatch.setattr(splat, "renew", renew)
+    _in_motion.__wrapped__(_noise)
+    assert [s[BAD] for s in said[:10]] == [True] * 3 + [False] * 4 + [True] * 3
+    assert all(s[k] for s in said[:10] for k in range(len(SEEN)) if k != BAD)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_what_only_a_refused_view_shows_is_kept(asked: bool) -> None:
+    """Gaussians that no picture needs are pruned; while the one camera that sees them is refused, that says
+    nothing."""
+    pose = look_at((2.5, 0.0, 1.0), (3.5, 0.0, 9.0))  # up, over the heads of the others
+    sky = np.broadcast_to(SEEN[0].image[0, 0], SEEN[0].image.shape)
+    away = replace(SEEN[0], camera="away", image=sky, camera_to_world=pose)
+    field = SplatField(SPLAT)
+    field.load_state(_warm(SplatField, SPLAT))
+
+    def update(number: int, *more: View) -> None:
+        now = [replace(v, generated_ns=(WARM + number) * 10**8) for v in (*SEEN, *more)]
+        field.fit(now, Budget(steps=STEPS))
+
+    update(1, away)
+    assert field.rig.memory["away"].credit == PATIENCE and field.rig.box is not None
+    place = field.rig.box.normalise(pose[:3, 3] + 2.0 * pose[:3, 2])
+    params = field.cloud.params[:4].copy()
+    params[:, :3], params[:, SCALE:QUATERNION], params[:, OPACITY] = place, -5.0, 2.0
+    field.cloud.keep(np.arange(len(field.cloud)) >= 4)
+    field.cloud.add(Cloud.of(params))
+    for number in range(2, 10):
+        update(number, *([_noise(away, number)] if asked else []))
+    assert field.rig.memory["away"].credit == (PATIENCE - 8 if asked else PATIENCE)
+    left = np.linalg.norm(field.cloud.params[:, :3] - place, axis=1) < 0.02
+    assert left.sum() == (4 if asked else 0)
 
 
 @pytest.mark.parametrize("poison", POSES)

@@ -175,14 +175,49 @@ def _target(views, view, x0, y0, loss, task, target, back):
     return count
 
 
+@njit(inline="always")
+def _trust(views, view, x0, y0, target, share):
+    """Fill share (PIXELS,) with the pixels' weights; those of none count as outside the picture, -1 in
+    target. Returns how many are left, and their mean weight."""
+    width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
+    count, total = 0, _F0
+    for k in range(PIXELS):
+        x, y = x0 + k % TILE, y0 + k // TILE
+        inside = x < width and y < height
+        share[k] = views.weight[first + y * width + x] if inside else _F0
+        if share[k] > _F0:
+            count += 1
+            total += share[k]
+        else:
+            target[0, k] = target[1, k] = target[2, k] = -_F1
+    return count, total / np.float32(max(count, 1))
+
+
+@njit(inline="always")
+def _weigh(s, target, share, absolute):
+    """Multiply the error rows of ``s`` by the pixels' shares; returns loss and squared error, so weighed."""
+    total, square = _F0, _F0
+    for c in range(3):
+        for k in range(PIXELS):
+            e = s[_R + c * PIXELS + k] - target[c, k] if share[k] > _F0 else _F0
+            square += share[k] * (e * e)
+            total += share[k] * (abs(e) if absolute else e * e)
+            s[_ER + c * PIXELS + k] *= share[k]
+    return total, square
+
+
 @kernel
 def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, kept,
                 sums, losses):  # fmt: skip
     """Render, compare, differentiate. views: ``rays.Views``; picked: int64 (B,), the view of each camera
     slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), kept: float32
     (W, longest * KEPT), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written. losses:
-    float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not finite."""
+    float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not finite.
+
+    With ``views.weight``, a pixel's loss is multiplied by its own, that of a tile's SSIM by their mean over
+    the pixels that have any; the others are not part of the window."""
     s, store = memory[worker], kept[worker]
+    weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
     target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
     while True:
         task = fetch_add(counter, 1)
@@ -190,11 +225,14 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
             return
         b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
         x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
-        count = _target(views, picked[b], x0, y0, loss, task, target, back)
+        count, dssim = _target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
+        if weighed:
+            count, mean = _trust(views, picked[b], x0, y0, target, share)
+            dssim *= mean
         _begin(s, x0, y0)
         begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
-        last = end
-        for j in range(begin, end):
+        last = end if count > 0 else begin
+        for j in range(begin, last):
             i = lists.owner[b, lists.pair[b, j]]
             if blend(s, store, (j - begin) * KEPT, projected[b, i]) == _F0:
                 last = j + 1
@@ -209,9 +247,11 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
                 total += abs(e) if loss.absolute else e * e
                 sign = _F1 if e > _F0 else (-_F1 if e < _F0 else _F0)
                 s[_ER + c * PIXELS + k] = sign if loss.absolute else _F2 * e
-        if loss.dssim > _F0:
+        if weighed:
+            total, square = _weigh(s, target, share, loss.absolute)
+        if dssim > _F0:
             for c in range(3):
-                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], count, loss.dssim)
+                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], count, dssim)
         finite = is_finite(total)
         losses[task, 0], losses[task, 1] = total if finite else 0.0, square if finite else 0.0
         losses[task, 2] = 0.0 if finite else 1.0
@@ -256,6 +296,44 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
             healthy = is_finite(far) and is_finite(seen)
             depth[y, x] = far if healthy and seen > np.float32(1e-3) else _F0
             opacity[y, x] = min(max(seen, _F0), _F1) if healthy else _F0
+
+
+@kernel
+def render_points(counter, worker, columns, points, projected, lists, background, color, depth, opacity):
+    """The same at image points, float32 (N, 2), of which the tiles are wanted: some of them cost much less
+    than their tiles. color: float32 (N, 3), depth and opacity (N,), all written. Tasks are runs of 16."""
+    most, least, stop = np.float32(ALPHA_MOST), np.float32(ALPHA_LEAST), np.float32(STOP)
+    while True:
+        base = fetch_add(counter, 1) * 16
+        if base >= points.shape[0]:
+            return
+        for n in range(base, min(base + 16, points.shape[0])):
+            x, y = points[n, 0], points[n, 1]
+            t = (np.int64(y) // TILE) * columns + np.int64(x) // TILE
+            r = g = b = z = _F0
+            left = _F1
+            for j in range(lists.first[0, t], lists.first[0, t + 1]):
+                row = projected[0, lists.owner[0, lists.pair[0, j]]]
+                dx, dy = x - row[MX], y - row[MY]
+                power = -_HALF * (row[QA] * dx * dx + row[QC] * dy * dy) - row[QB] * dx * dy
+                a = min(row[ALPHA] * exp32(power), most)
+                if a >= least:
+                    w = a * left
+                    r += w * row[RED]
+                    g += w * row[RED + 1]
+                    b += w * row[RED + 2]
+                    z += w * row[DEPTH]
+                    left -= w
+                    if not left >= stop:
+                        break
+            seen = _F1 - left
+            for c, value in enumerate((r, g, b)):
+                value += left * background[c]
+                color[n, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
+            far = z / max(seen, np.float32(1e-3))
+            healthy = is_finite(far) and is_finite(seen)
+            depth[n] = far if healthy and seen > np.float32(1e-3) else _F0
+            opacity[n] = min(max(seen, _F0), _F1) if healthy else _F0
 
 
 @kernel

@@ -31,9 +31,9 @@ def score_cells(counter, worker, cams, views, blurred, marks, plain, plain_color
     where fewer than min_views look or background shows. Tasks are layers along z.
 
     views: ``rays.Views`` of at most MOST_VIEWS cameras, rows of ``cams``; blurred: uint8 (pixels, 3 or 4),
-    their pictures at the cells' sharpness. marks: uint8 (pixels,), or (0,): only cells that most cameras see
-    marked are looked at, the others are NOT_SEEN. plain: whether plain_color (3,) is an empty background;
-    tolerance: of a colour, summed over channels, in [0, 3].
+    their pictures at the cells' sharpness; pixels of weight 0 have no say. marks: uint8 (pixels,), or (0,):
+    only cells that most cameras see marked are looked at, the others are NOT_SEEN. plain: whether plain_color
+    (3,) is an empty background; tolerance: of a colour, summed over channels, in [0, 3].
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
     colors = np.empty((MOST_VIEWS, 3), np.float32)
@@ -69,6 +69,8 @@ def score_cells(counter, worker, cams, views, blurred, marks, plain, plain_color
                     if not (px >= _F0 and py >= _F0 and px < width and py < height):
                         continue
                     pixel = views.first[v] + np.int64(py) * width + np.int64(px)
+                    if views.weight.size > 0 and views.weight[pixel] <= _F0:
+                        continue
                     if marks.size > 0:
                         unmarked += 1 if marks[pixel] == 0 else 0
                     away = _F0

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
+from edge_server.fields.kernels.pool import CallerPool
+from edge_server.fields.scene_box import scene_box
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_growth import opacity
+from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.splat_settings import SplatSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
@@ -72,6 +75,36 @@ def test_results_are_equal_bit_for_bit_whatever_the_thread_count() -> None:
     pictures = [f.render(HELD.camera_to_world, HELD.intrinsics) for f in fields]
     np.testing.assert_array_equal(pictures[0].color, pictures[1].color)
     np.testing.assert_array_equal(pictures[0].depth, pictures[1].depth)
+
+
+def test_a_state_knows_the_views_it_was_fitted_to() -> None:
+    """The same frames after ``load_state`` are no new ones: nothing is judged or carried along twice."""
+    ball_m = np.array([0.3, 0, 0.5])
+    moved = [
+        replace(v, image=picture(v.intrinsics, v.camera_to_world, ball_m), generated_ns=10**8) for v in SEEN
+    ]
+    a, b = SplatField(SMALL), SplatField(replace(SMALL, threads=1))
+    a.fit(SEEN, Budget(steps=100))
+    a.fit(moved, Budget(steps=10))
+    b.load_state(a.state())
+    assert all((b.state()[k] == v).all() for k, v in a.state().items() if k != "meta")
+    for field in (a, b):
+        field.fit([replace(v, image=v.image.copy()) for v in moved], Budget(steps=10))
+    assert (a.cloud.guest > 0).any() and a.cloud.velocity.shape == (len(a.cloud), 3)
+    _same_state(a, b)
+
+
+def test_nothing_begins_at_pixels_without_weight() -> None:
+    box, pool, rng = scene_box(SEEN), CallerPool(), np.random.default_rng
+    weight = [np.full(v.image.shape[:2], k % 2, np.float32) for k, v in enumerate(SEEN)]
+    found = []
+    for other in (False, True):  # pictures that have no say may show anything
+        views = [replace(v, image=255 - v.image) if other and k % 2 == 0 else v for k, v in enumerate(SEEN)]
+        share = np.concatenate([w.ravel() for w in weight])
+        found.append(seeds(SMALL, pool, box, views, None, share, 300, rng(1)))
+    assert len(found[0]) > 100
+    np.testing.assert_array_equal(found[0], found[1])
+    assert len(seeds(SMALL, pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
 
 
 def test_another_seed_is_another_field() -> None:

@@ -22,6 +22,7 @@ from edge_server.fields.kernels.splat_raster import (
 from edge_server.fields.kernels.splat_update import Moments, Rule, pull, update
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.splat_passes import Passes, camera_rows
+from edge_server.fields.splat_snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole, look_at
 
 BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
@@ -90,18 +91,19 @@ def test_a_ball_appears_where_the_lens_puts_it() -> None:
     assert depth[opacity > 0.3] == pytest.approx(local[2], abs=1e-3)
 
 
-def _views(target: np.ndarray) -> Views:
+def _views(target: np.ndarray, weight: np.ndarray | None = None) -> Views:
     h, w = target.shape[:2]
     return Views(
         first=np.array([0, h * w]), size=np.array([[w, h]]), lens=np.zeros((1, 8)),
         rotation=np.zeros((1, 3, 3)), origin=np.zeros((1, 3)), pixels=target.reshape(h * w, -1),
         changed=np.zeros(0, np.int64),
+        weight=np.zeros(0, np.float32) if weight is None else weight.reshape(-1),
     )  # fmt: skip
 
 
 def _gradient(
     params: np.ndarray, cam: np.ndarray, target: np.ndarray, harmonics: int = 1, absolute: bool = False,
-    dssim: float = 0.0,
+    dssim: float = 0.0, weight: np.ndarray | None = None,
 ) -> tuple[float, np.ndarray]:  # fmt: skip
     """Loss and its gradient: Adam's first moment after one step with beta1 = 0."""
     pool = CallerPool()
@@ -113,7 +115,7 @@ def _gradient(
     losses = np.zeros((total, 3))
     loss = Loss(absolute, np.float32(dssim), BACK, False, np.uint64(1))
     pool.run(
-        train_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
+        train_tiles, _views(target, weight), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
         passes.lists, loss, passes.memory, passes.kept, passes.sums, losses,
     )  # fmt: skip
     n = len(params)
@@ -154,6 +156,69 @@ def test_gradients_equal_the_oracle(lens: Pinhole, harmonics: int, absolute: boo
     expected = theirs.grad.numpy()
     scale = np.abs(expected).max(axis=0, keepdims=True)
     np.testing.assert_allclose(gradient / scale, expected / scale, atol=3e-3)
+
+
+def _weights() -> np.ndarray:
+    """Some of none, a whole tile of none, the others unequal."""
+    rng = np.random.default_rng(6)
+    weight = rng.random((LENS.height, LENS.width)).astype(np.float32)
+    weight[rng.random(weight.shape) < 0.3] = 0.0
+    weight[:TILE, TILE : 2 * TILE] = 0.0
+    return weight
+
+
+def _tile_dissimilarity(color: torch.Tensor, wanted: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """(1 - SSIM) / 2 of each tile and channel, times the sum of its weights; pixels of none left out."""
+    total = torch.zeros(()).to(color)
+    for y in range(0, LENS.height, TILE):
+        for x in range(0, LENS.width, TILE):
+            counts = weight[y : y + TILE, x : x + TILE] > 0
+            for a, b in zip(*(p[y : y + TILE, x : x + TILE][counts].T for p in (color, wanted))):
+                if counts.any():
+                    ma, mb, va, vb = a.mean(), b.mean(), a.var(correction=0), b.var(correction=0)
+                    both = ((a - ma) * (b - mb)).mean()
+                    c1, c2 = 0.01**2, 0.03**2
+                    ssim = (2 * ma * mb + c1) * (2 * both + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2))
+                    total = total + weight[y : y + TILE, x : x + TILE].sum() * (1 - ssim) / 2
+    return total
+
+
+@pytest.mark.parametrize(("absolute", "dssim"), [(False, 0.0), (True, 0.0), (False, 3.0), (True, 3.0)])
+def test_weighed_gradients_equal_the_oracle(absolute: bool, dssim: float) -> None:
+    params, cam, target, weight = _cloud(seed=3), _camera(BENT), _target(), _weights()
+    value, gradient = _gradient(params, cam, target, absolute=absolute, dssim=dssim, weight=weight)
+    theirs = torch.as_tensor(params, dtype=torch.float64).requires_grad_(True)
+    color, wanted = _oracle(theirs, cam)[0], torch.as_tensor(target / 255.0)
+    share, error = torch.as_tensor(weight, dtype=torch.float64), color - wanted
+    loss = (share[..., None] * (error.abs() if absolute else error.square())).sum()
+    loss = loss + dssim * _tile_dissimilarity(color, wanted, share)
+    loss.backward()
+    assert theirs.grad is not None and value == pytest.approx(loss.item(), rel=1e-4)
+    expected = theirs.grad.numpy()
+    scale = np.abs(expected).max(axis=0, keepdims=True)
+    np.testing.assert_allclose(gradient / scale, expected / scale, atol=3e-3)
+
+
+@pytest.mark.parametrize("dssim", [0.0, 3.0])
+def test_pixels_without_weight_do_not_matter(dssim: float) -> None:
+    params, cam, target, weight = _cloud(seed=3), _camera(), _target(), _weights()
+    other = target.copy()
+    other[weight == 0] = 255 - other[weight == 0]
+    one, two = (_gradient(params, cam, t, dssim=dssim, weight=weight) for t in (target, other))
+    assert one[0] == two[0] > 0
+    np.testing.assert_array_equal(one[1], two[1])
+    nothing, gradient = _gradient(params, cam, target, dssim=dssim, weight=np.zeros_like(weight))
+    assert nothing == 0.0 and (gradient == 0).all()
+
+
+@pytest.mark.parametrize("dssim", [0.0, 3.0])
+def test_equal_weights_scale_the_gradient(dssim: float) -> None:
+    params, cam, target = _cloud(seed=3), _camera(), _target()
+    value, gradient = _gradient(params, cam, target, dssim=dssim)
+    half = np.full(target.shape[:2], 0.5, np.float32)
+    halved, weighed = _gradient(params, cam, target, dssim=dssim, weight=half)
+    assert halved == pytest.approx(0.5 * value, rel=1e-5)
+    np.testing.assert_allclose(weighed, 0.5 * gradient, rtol=1e-4, atol=1e-4 * np.abs(gradient).max())
 
 
 @pytest.mark.parametrize("dssim", [0.0, 3.0])
@@ -327,6 +392,29 @@ def test_the_pull_on_a_place_is_the_gradient_by_position() -> None:
         passes.sums, slope,
     )  # fmt: skip
     np.testing.assert_allclose(slope, gradient[some, :3], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+def test_single_pixels_are_rendered_as_their_picture_is(lens: Pinhole) -> None:
+    params, pose = _cloud(40, harmonics=4, seed=4), look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))
+    snapshot = SplatSnapshot(BOX, _still(params, 4), BACK, (), CallerPool(), 0)
+    whole = snapshot.render(pose, lens)
+    x, y = np.random.default_rng(1).integers(0, (lens.width, lens.height), (40, 2)).T
+    color, depth, opacity = snapshot.render_pixels(pose, lens, np.stack([x, y], axis=-1) + 0.5)
+    np.testing.assert_allclose(color, whole.color[y, x], atol=1e-5)
+    np.testing.assert_allclose(depth, whole.depth[y, x], rtol=1e-4)
+    np.testing.assert_allclose(opacity, whole.opacity[y, x], atol=1e-5)
+    assert opacity.min() < 0.5 < opacity.max()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e-40])
+def test_no_parameter_poisons_single_pixels(value: float) -> None:
+    pixels, pose = np.array([[0.5, 0.5], [10.5, 9.5], [20.5, 17.5]]), look_at((1.0, -2.5, 0.8), (0, 0, 0.1))
+    for column in range(BASE):
+        params = _cloud(6)
+        params[2, column] = value
+        snapshot = SplatSnapshot(BOX, _still(params, 1), BACK, (), CallerPool(), 0)
+        assert all(np.isfinite(part).all() for part in snapshot.render_pixels(pose, LENS, pixels))
 
 
 def test_compared_pixels_are_as_far_off_as_the_rendering_is() -> None:
