@@ -60,6 +60,19 @@ def test_its_steps_are_those_of_the_kernels(harmonics: int) -> None:
     assert close.mean() > 0.95
 
 
+def test_it_weighs_pixels_as_the_kernels_do() -> None:
+    views = [replace(v, generated_ns=-k * 10**8) for k, v in enumerate(VIEWS)]
+    moments = []
+    for tau_ms in (0.0, 100.0):
+        settings = replace(TINY, start=8, age_tau_ms=tau_ms, epsilon=1.0)
+        cpu, cuda = SplatField(settings), SplatCudaField(settings, rasterise, "cpu")
+        losses = [field.fit(views, Budget(steps=2)).loss for field in (cpu, cuda)]
+        assert losses[0] == pytest.approx(losses[1], rel=0.02)
+        moments.append(np.abs(cpu.cloud.m).sum())
+        assert np.abs(cuda.cloud.m).sum() == pytest.approx(moments[-1], rel=0.05)
+    assert moments[1] < 0.7 * moments[0]
+
+
 def test_it_grows_saves_and_resumes_on_the_cpu() -> None:
     cuda = SplatCudaField(TINY, rasterise, "cpu")
     cuda.fit(VIEWS, Budget(steps=14))
