@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from edge_server.fields.kernels.intrinsics import exp32, is_finite
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import part
 
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
 # step opaque many times over, the smallest makes a whole ray transparent.
@@ -56,14 +56,14 @@ def harmonic(k, x, y, z):
     return np.float32(0.5462742) * (x * x - y * y)
 
 
-@kernel
+@part
 def activate(out, a, b):
     """Both of the following."""
     activate_density(out, a, b)
     activate_color(out, a, b)
 
 
-@kernel
+@part
 def activate_density(out, a, b):
     """Raw density -> density, in place, samples a to b of row 0."""
     sigma = out[0, a:b]
@@ -71,7 +71,7 @@ def activate_density(out, a, b):
         sigma[s] = exp32(min(max(sigma[s], np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
 
 
-@kernel
+@part
 def activate_color(out, a, b):
     """Raw colours -> colours in [0, 1], in place, samples a to b of rows 1 to 3."""
     for c in range(1, 4):
@@ -80,7 +80,7 @@ def activate_color(out, a, b):
             row[s] = _F1 / (_F1 + exp32(-row[s]))
 
 
-@kernel
+@part
 def seen_samples(out, dts, first, end):
     """How many samples of a ray there are until it is opaque, and whether it is: density in row 0 of out."""
     depth = _F0
@@ -91,7 +91,7 @@ def seen_samples(out, dts, first, end):
     return end - first, False
 
 
-@kernel
+@part
 def add_harmonics(out, harmonics, first, end, dx, dy, dz):
     """Add the direction's share to the raw colours of samples first to end: rows 1 to 3 of out."""
     for k in range(1, harmonics):
@@ -102,7 +102,7 @@ def add_harmonics(out, harmonics, first, end, dx, dy, dz):
                 base[s] += y * share[s]
 
 
-@kernel
+@part
 def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
     """The gradient of ``add_harmonics``: rows 4 on from rows 1 to 3 of d_out."""
     for k in range(1, harmonics):
@@ -113,7 +113,7 @@ def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
                 share[s] = y * base[s]
 
 
-@kernel
+@part
 def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
     """Squared colour error of one ray (3.22) and its gradient.
 

@@ -14,7 +14,7 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import add_pair, fetch_add, weighted_pairs
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.mlp import backward, forward
 from edge_server.fields.kernels.model import is_a, query_back, query_color, query_density
 
@@ -91,7 +91,7 @@ def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
         out0[s], out1[s] = weighted_pairs(table, rows, _weights(fx, fy, fz))
 
 
-@kernel
+@part
 def encode(grid, levels, x, a, b, features):
     """Features of points a to b: x float32 (3, N) in the unit cube -> features float32 (>= 2 L, N).
 

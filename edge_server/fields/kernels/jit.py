@@ -24,14 +24,26 @@ def _digest() -> str:
 SOURCES = _digest()
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def part(function: Callable[..., Any]) -> Any:
+    """A ``kernel`` that other kernels call: it becomes a part of each of them.
+
+    Left to itself, the compiler leaves a copy in every caller's object code, and the one that a process
+    happens to load first serves all: copies differ in the last bits, so results would depend on what was
+    called, or compiled, before.
+    """
+    return kernel(function, forceinline=True)
+
+
+def kernel(function: Callable[..., Any], **options: Any) -> Any:
     """``njit`` with a cache that knows what a kernel is made of.
 
     numba's own cache looks at the file a function stands in; kernels here inline functions of other files,
     and would go on running yesterday's. The digest of all of them is made part of the cache's stamp.
     """
     # numpy's error model: no exception, and no branch, for a division by zero.
-    dispatcher = njit(nogil=True, fastmath=FAST, error_model="numpy", no_cfunc_wrapper=True)(function)
+    dispatcher = njit(nogil=True, fastmath=FAST, error_model="numpy", no_cfunc_wrapper=True, **options)(
+        function
+    )
     dispatcher.enable_caching()
     file = dispatcher._cache._cache_file
     file._source_stamp = (*file._source_stamp, SOURCES)

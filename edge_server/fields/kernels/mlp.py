@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import part
 
 BLOCK = 256
 
@@ -77,7 +77,7 @@ def _weight_gradient(d_w, first, n_out, n_in, d_y, y_row, x, x_row, a, b):
             d_w[base + 3 * n_in + i + 1] += d1
 
 
-@kernel
+@part
 def forward(net, acts, start, end):
     """Run samples start to end through the net.
 
@@ -104,7 +104,7 @@ def forward(net, acts, start, end):
             row = y_row
 
 
-@kernel
+@part
 def backward(net, acts, d_acts, n, d_params):
     """Gradients of n samples after ``forward``.
 

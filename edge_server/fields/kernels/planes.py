@@ -20,7 +20,7 @@ from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import fetch_add
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.mlp import backward, forward
 from edge_server.fields.kernels.model import is_a, query_back, query_color, query_density
 
@@ -166,7 +166,7 @@ def _axes(x, group):
     return u, v, w
 
 
-@kernel
+@part
 def products(table, size, x, group, a, count, tile):
     """The components of one group at samples a to a + count (at most TILE): tile, float32 (TILE, 8).
     table: the group's own rows."""
@@ -176,7 +176,7 @@ def products(table, size, x, group, a, count, tile):
         store_products(table, rows, weights, tile, np.uint32(s))
 
 
-@kernel
+@part
 def density(planes, x, start, end, out):
     """Raw density (eq. 6) of samples start to end into ``out``, float32 (N,)."""
     tile = np.empty((TILE, CHANNELS), np.float32)
@@ -195,7 +195,7 @@ def density(planes, x, start, end, out):
                 raw[s] += total
 
 
-@kernel
+@part
 def components(planes, x, start, end, acts):
     """The colour groups' components of samples start to end into the first rows of acts."""
     tile = np.empty((TILE, CHANNELS), np.float32)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edge_server.fields.kernels.composite import RAW_HIGH, RAW_LOW
 from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.model import is_a, query_back, query_color, query_density
 from edge_server.fields.kernels.rays import slab
 
@@ -86,7 +86,7 @@ def _cell(cells, ux, uy, uz):
     return np.int32(np.int32(ux * f) + n * np.int32(np.int32(uy * f) + n * np.int32(uz * f)))
 
 
-@kernel
+@part
 def warp(contracted, ox, oy, oz, dx, dy, dz, enter, leave):
     """The spacing of bins: linear in distance as far as the box of interest goes, then in disparity.
 
@@ -110,7 +110,7 @@ def unwarp(u, knee, slope):
     return u if u <= knee else knee + (_F1 / (_F1 - (u - knee) * slope) - _F1) / slope
 
 
-@kernel
+@part
 def propose(
     space, encoding, bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell, depth, edges, at
 ):
@@ -157,7 +157,7 @@ def propose(
     return count, finite
 
 
-@kernel
+@part
 def weigh(depth, first, count, weight):
     """Weights of bins in volume rendering (3.21): depth, weight: float32, from ``first`` on."""
     total, before = _F0, _F1
@@ -168,7 +168,7 @@ def weigh(depth, first, count, weight):
         before = after
 
 
-@kernel
+@part
 def deal(weight, first, count, samples, even, shift, group, share):
     """Inverse-CDF sampling: how a ray's bins share its samples.
 
@@ -213,7 +213,7 @@ def _dilated(weight, k, first, end):
     return _HALF * (max(left, w) + max(w, right))
 
 
-@kernel
+@part
 def place(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, shift, n, limit, x, line):
     """Append a ray's samples, of equal length in each group; shift: in [0, 1), where in its part each lies.
 
@@ -245,7 +245,7 @@ def place(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share,
     return n
 
 
-@kernel
+@part
 def interlevel(
     encoding, cell, depth, weight, group, first, count, w, group_of, start, stop, plan, slope, grad
 ):

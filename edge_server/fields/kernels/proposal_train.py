@@ -16,7 +16,7 @@ from edge_server.fields.kernels.composite import (
     spread_harmonics,
 )
 from edge_server.fields.kernels.intrinsics import fetch_add, uniform
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.model import query_back, query_color, query_density
 from edge_server.fields.kernels.proposal import deal, interlevel, place, propose, weigh
 from edge_server.fields.kernels.rays import interval
@@ -50,7 +50,7 @@ class BinScratch(NamedTuple):
     first: NDArray[np.int64]
 
 
-@kernel
+@part
 def add_looks(out, row, look, a, b):
     """Add an appearance's share to the raw colours of samples a to b: rows 1 to 3 of out.
 
@@ -64,7 +64,7 @@ def add_looks(out, row, look, a, b):
                 base[s] += look[k] * share[s]
 
 
-@kernel
+@part
 def spread_looks(out, d_out, row, look, a, b, d_look):
     """The gradient of ``add_looks``: rows ``row`` on of d_out, and d_look, added to."""
     for k in range(look.size):
@@ -77,7 +77,7 @@ def spread_looks(out, d_out, row, look, a, b, d_look):
         d_look[k] += total
 
 
-@kernel
+@part
 def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell,
                   depth, weight, group, bin_first):  # fmt: skip
     """Fill a chunk with rays, their bins, their samples and what ``query_density`` says of them. Samples that

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import part
 
 COARSE = 4  # cells of the occupancy grid a side of one cell of its coarse copy
 NEVER = np.float32(1e30)
@@ -112,7 +112,7 @@ def _exit(u, d, blocks):
     return np.float32(1e9)
 
 
-@kernel
+@part
 def march(space, ox, oy, oz, dx, dy, dz, t, leave, x, ts, dts, n, limit, most):
     """Append the ray's samples in occupied cells from distance t on.
 

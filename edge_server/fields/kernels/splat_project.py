@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.kernels.composite import harmonic
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 
 # Columns of a Gaussian's parameters; from COLOR + 3 on, three for each further spherical harmonic.
 POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
@@ -134,7 +134,7 @@ def _times(cams, b, j0, j1, j2):
     )
 
 
-@kernel
+@part
 def project_one(cams, b, params, velocity, harmonics, i, projected, tiles):
     """Fill projected[b, i] (PROJECTED,) and tiles[b, i] (x0, x1, y0, y1: tiles it may touch; x1 <= x0:
     none). conic: the inverse of the picture covariance, upper triangle."""
@@ -220,7 +220,7 @@ def _harmonic_slope(h, x, y, z):
     return d * x, -d * y, _F0
 
 
-@kernel
+@part
 def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
     """Add to out (BASE + ...,) the gradient of what ``project_one`` made of Gaussian i.
 

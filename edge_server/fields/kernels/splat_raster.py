@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.splat_project import (
     ALPHA,
     ALPHA_LEAST,
@@ -65,7 +65,7 @@ def _begin(s, x0, y0):
         s[_R + k] = s[_G + k] = s[_B + k] = s[_Z + k] = _F0
 
 
-@kernel
+@part
 def blend(s, kept, at, row):
     """Lay one Gaussian (projected row) behind what tile memory ``s`` holds; its alphas and the light that
     reached it go to kept[at : at + KEPT]. Returns in how many pixels light is left."""
@@ -92,7 +92,7 @@ def blend(s, kept, at, row):
     return alive
 
 
-@kernel
+@part
 def unblend(s, kept, at, row, sums):
     """The gradient of ``blend``, back to front: rows ER, EG, EB of ``s`` hold d loss / d colour, row BEHIND
     what the pixel's colour behind this Gaussian has to do with it. sums: float32 (9,), written; see
@@ -123,7 +123,7 @@ def unblend(s, kept, at, row, sums):
     sums[6], sums[7], sums[8] = s6, s7, s8
 
 
-@kernel
+@part
 def dissimilarity(s, row, error_row, target, count, weight):
     """Add the gradient of weight * count * (1 - SSIM) / 2 between a colour row of ``s`` and target (PIXELS,)
     over their first ``count`` pixels that lie in the picture; returns that loss."""

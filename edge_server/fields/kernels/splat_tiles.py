@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import fetch_add
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.splat_project import DEPTH
 
 RADIX = 2048
@@ -36,7 +36,7 @@ class Lists(NamedTuple):
     keys: NDArray[np.uint32]
 
 
-@kernel
+@part
 def _sort(keys, order, n):
     """Stable radix sort of order[0, :n] by keys[0, :n], 33 bits in three passes; ends in row 1."""
     counts = np.empty(RADIX + 1, np.int64)

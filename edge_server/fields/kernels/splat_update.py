@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import fetch_add, is_finite
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.splat_project import (
     BASE,
     BLOCK,
@@ -62,7 +62,7 @@ class Rule(NamedTuple):
     thinnest: np.float32
 
 
-@kernel
+@part
 def bound(params, i, largest, thinnest):
     """Hold Gaussian i to what it may be: finite, not a needle, not a giant."""
     row = params[i]

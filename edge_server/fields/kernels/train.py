@@ -18,7 +18,7 @@ from edge_server.fields.kernels.composite import (
     spread_harmonics,
 )
 from edge_server.fields.kernels.intrinsics import fetch_add, uniform
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.model import query_back, query_color, query_density
 from edge_server.fields.kernels.rays import NEVER, interval, march, pixel_direction
 
@@ -145,7 +145,7 @@ def keep(rows, a, b, to):
             row[to + s] = row[a + s]
 
 
-@kernel
+@part
 def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_first, ray):
     """Fill a chunk with rays, their samples and what ``query_density`` says of them.
     Returns (rays, samples).
@@ -218,7 +218,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
     return rays, n
 
 
-@kernel
+@part
 def compare(out, w, dts, first, end, ray, sums):
     """Add one ray to what ``refinement.Exposures`` learns from: its number, target t, t^2, error e and e t
     per channel; sums: float64 (views, 3, 5). After ``ray_loss``."""

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.rays import interval, pixel_direction
 from edge_server.fields.kernels.train import take_pixel
 from edge_server.fields.kernels.voxel_quads import add_to_cell, cell_value
@@ -60,7 +60,7 @@ class Trace(NamedTuple):
     ray: NDArray[np.float32]
 
 
-@kernel
+@part
 def trace(space, voxels, ox, oy, oz, dx, dy, dz, t, leave, row, line):
     """Sample a ray from distance t until it leaves or is opaque; fills row (ROOM,) and line (ROOM, 9).
     Returns (samples, transmittance, red, green, blue, distance), the last four times their weights."""
@@ -113,7 +113,7 @@ def trace(space, voxels, ox, oy, oz, dx, dy, dz, t, leave, row, line):
     return n, through, red, green, blue, far
 
 
-@kernel
+@part
 def spread(row, line, n, size, d_r, d_g, d_b, total, d_solid, gradient, dirty):
     """Add a ray's gradient to the vertices of its n samples, and flag their segments.
 
