@@ -63,7 +63,7 @@ types: .venv/.ok-test  ## mypy
 bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, runs/bench-*; DATA=FOLDER BENCH=--quick
 	@mkdir -p runs
 	$(if $(DATA),FRESHFIELD_DATA=$(DATA)) $(PY) -m edge_server.cli bench all $(if $(DATA),peer) \
-	  --json docs/results/field.json $(BENCH)
+	  --json $(if $(findstring --quick,$(BENCH)),runs/quick,docs/results)/field.json $(BENCH)
 	$(PY) -m channel_emu.cli bench --json | tee runs/bench-emulator.json
 	$(PY) -m camera_node.world.bench --json runs/bench-world.json
 

@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 _OFFLINE = {
     "fit": "fit a recorded data set without a network and report fidelity over time",
     "frontier": "what accuracy costs in time: sweep effort, plot fidelity against seconds",
-    "bench": "measure this machine: field, track, options, ingest, fidelity",
+    "bench": "measure this machine: field, track, options, limits, ingest, fidelity, peer",
 }
 
 

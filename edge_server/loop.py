@@ -88,6 +88,7 @@ class Updates:
             update_ms=(published_ns - selection.now_ns) / 1e6,
             steps=fit.steps,
             loss=fit.loss if np.isfinite(fit.loss) else None,
+            refused=fit.refused,
         )
         self.number += 1
         return publication

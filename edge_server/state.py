@@ -39,6 +39,8 @@ class Publication:
     update_ms: float
     steps: int = 0
     loss: float | None = None
+    refused: tuple[str, ...] = ()
+    """Of the selected cameras, those whose picture the field left out, because it contradicts all others."""
     psnr_db: float | None = None
     psnr_moving_db: float | None = None
     ssim: float | None = None

@@ -46,7 +46,8 @@ class Budget:
 class FitReport:
     """What one fit did: optimiser steps, wall seconds, mean loss of the last steps, rays and samples.
 
-    dropped: rays and gradients that were not finite and were left out. note: why nothing was done, if so.
+    dropped: rays and gradients that were not finite and were left out. refused: cameras whose view was left
+    out because it contradicts all that is known (``trust.refused``). note: why nothing was done, if so.
     """
 
     steps: int
@@ -55,6 +56,7 @@ class FitReport:
     rays: int
     samples: int
     dropped: int = 0
+    refused: tuple[str, ...] = ()
     note: str = ""
 
 

@@ -83,6 +83,11 @@ class CameraLooks(CameraErrors):
         self.now = np.zeros((0, 0), np.float32)
         self.gradient, self.rays = np.zeros((0, 0, 0), np.float32), 0
 
+    @property
+    def asked(self) -> bool:
+        """Whether any error or look is to be learnt."""
+        return super().asked or self.appearances is not None
+
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
         """``data`` as it is to be read with what is known by now; takes note of the embeddings."""
         if self.appearances is not None:

@@ -25,11 +25,14 @@ class NerfactoSettings(NgpSettings):
     even: float = option(0.4, "share of a ray's samples that is dealt evenly, whatever the proposal says")
     anneal: int = option(40, "steps over which that share falls from 1: first there is nothing to follow")
     smooth: float = option(3e-3, "weight of the total variation of the levels that are not hashed")
+    device: str = option("auto", "cpu or auto: it runs on CPUs only")
     appearance: int = option(0, "numbers learnt of each camera's look (exposure, tint); 0: none")
 
     def __post_init__(self) -> None:
         self._within(
             ("bins", 8, 1024),
+            ("samples", 8, 512),
+            ("samples_start", 8, 512),
             ("proposal_cells", 8, 256),
             ("interlevel", 0.0, 1e3),
             ("proposal_decay", 0.0, 1e3),

@@ -13,7 +13,7 @@ from edge_server.fields import View
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.scene_box import SceneBox, plain_background, scene_box
 from edge_server.fields.supervision import CameraMemory, check_view, leave_out, pack_views, remember
-from edge_server.fields.trust import TrustSettings, refused, weights
+from edge_server.fields.trust import Pixels, TrustSettings, refused, weights
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]
@@ -40,7 +40,7 @@ class RigSettings(TrustSettings, Protocol):
 
 
 class PixelRenderer(Protocol):
-    """Shows single pixels: ``NgpSnapshot.render_pixels``, ``SplatSnapshot.render_pixels``."""
+    """Shows single pixels: ``NgpSnapshot.render_pixels``."""
 
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
@@ -68,6 +68,7 @@ class Rig:
         self.memory: dict[str, CameraMemory] = {}
         self.behind = np.full(3, 0.5, np.float32)
         self.plain = False  # whether ``behind`` is the colour of a plain background
+        self.left_out: set[str] = set()  # cameras whose newest view is refused
         self._box_cameras = 0
         self._packed: tuple[tuple[View, ...], Views] | None = None
 
@@ -103,16 +104,30 @@ class Rig:
             known.view.generated_ns != view.generated_ns or not np.array_equal(known.view.image, view.image)
         )
 
-    def trusted(self, views: Sequence[View], data: Views, step: int, field: PixelRenderer) -> Views:
-        """``data`` without the views that contradict ``field``, which has learnt for ``step`` steps."""
-        return leave_out(data, self.refused(views, step, field))
+    def trusted(self, views: Sequence[View], intake: Intake, step: int, field: PixelRenderer) -> Views:
+        """The data without the views that contradict ``field``, which has learnt for ``step`` steps. Pictures
+        that were known already are not judged again: nothing new contradicts."""
 
-    def refused(self, views: Sequence[View], step: int, field: PixelRenderer) -> NDArray[np.bool_]:
-        """Which of the views (V,) contradict ``field``, which has learnt for ``step`` steps."""
+        def pixels(views: Sequence[View], points: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float32]]:
+            return [
+                field.render_pixels(view.camera_to_world, view.intrinsics, where)[0]
+                for view, where in zip(views, points)
+            ]
 
-        def pixels(view: View, points: NDArray[np.float64]) -> NDArray[np.float32]:
-            return field.render_pixels(view.camera_to_world, view.intrinsics, points)[0]
+        if intake.fresh:
+            flags = self.refused(views, step, pixels)
+            given = {view.camera for view in views}
+            refused = {view.camera for view, flag in zip(views, flags) if flag}
+            self.left_out = (self.left_out - given) | refused
+        return leave_out(intake.data, np.array([view.camera in self.left_out for view in views]))
 
+    def left_out_of(self, views: Sequence[View]) -> tuple[str, ...]:
+        """The cameras of ``views`` that are refused."""
+        return tuple(view.camera for view in views if view.camera in self.left_out)
+
+    def refused(self, views: Sequence[View], step: int, pixels: Pixels) -> NDArray[np.bool_]:
+        """Which of the views (V,) contradict a field that has learnt for ``step`` steps. pixels: what it
+        shows."""
         beyond, settled = self.settings.refuse_beyond, step >= SETTLED
         return refused(views, self.memory, beyond, settled, pixels)
 
@@ -131,6 +146,7 @@ class Rig:
             "box": asdict(self.box) if self.box else None,
             "box_cameras": self._box_cameras,
             "plain": self.plain,
+            "left_out": sorted(self.left_out),
             "cameras": [
                 {
                     "camera": m.view.camera,
@@ -156,6 +172,7 @@ class Rig:
         self._packed, self.memory = None, {}
         self._box_cameras = int(meta["box_cameras"])
         self.plain = bool(meta.get("plain", False))
+        self.left_out = set(meta.get("left_out", ()))
         box = meta["box"]
         self.box = SceneBox(**{**box, "centre_m": tuple(box["centre_m"])}) if box else None
         self.behind = np.array(arrays["behind"], dtype=np.float32)

@@ -186,7 +186,7 @@ class NgpTorchField:
                 self._forget_parameters()
             if intake.look:
                 self._occupancy.look(self.pool, self.rig)
-            data = self.rig.trusted(views, intake.data, self.step, self._model())
+            data = self.rig.trusted(views, intake, self.step, self._model())
         while (progress := pace.begin()) is not None:
             with self._lock:
                 loss, used, bad = self._one_step(data, progress)
@@ -194,7 +194,8 @@ class NgpTorchField:
             pace.end()
         self.dropped += dropped
         rays = pace.steps * self.settings.rays
-        return FitReport(pace.steps, pace.seconds(), float(np.mean(losses)), rays, samples, dropped=dropped)
+        refused = self.rig.left_out_of(views)
+        return FitReport(pace.steps, pace.seconds(), float(np.mean(losses)), rays, samples, dropped, refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         return self.snapshot().render(camera_to_world, intrinsics)

@@ -168,6 +168,11 @@ class CameraErrors:
         self.exposures = Exposures() if exposure else None
         self.poses = Poses(most_m, most_deg) if most_m > 0 or most_deg > 0 else None
 
+    @property
+    def asked(self) -> bool:
+        """Whether any error is to be learnt. Then a view that looks wrong may only not be understood yet."""
+        return self.exposures is not None or self.poses is not None
+
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
         """``data`` as it is to be read with what is known by now."""
         if self.exposures is not None:

@@ -23,6 +23,14 @@ def field_names() -> tuple[str, ...]:
     return tuple(_FIELDS)
 
 
+def option_help(name: str) -> dict[str, str]:
+    """What each option of a representation means. ValueError: there is no such representation."""
+    if name not in _FIELDS:
+        raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
+    found: dict[str, str] = import_module(f"edge_server.fields.{name}_settings").help_text()
+    return found
+
+
 def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
     """A fresh field. ValueError: no such representation, or an option it does not have (both are listed)."""
     if name not in _FIELDS:

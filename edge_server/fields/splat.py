@@ -106,8 +106,9 @@ class SplatField:
             rays, samples, dropped = rays + seen, samples + pairs, dropped + lost
             pace.end()
         self.dropped += dropped
+        refused = tuple(v.camera for v in views if v.camera in self._refused)
         loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped)
+        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped, refused=refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture of a camera, from the present Gaussians."""
@@ -153,17 +154,18 @@ class SplatField:
         would make compiling on a busy machine take minutes. This field's state is not touched.
         """
         start = time.perf_counter()
-        tiny = replace(self.settings, gaussians=16, start=8, min_views=1, seed_cells=8, contracted=False)
-        camera = Pinhole.from_fov(8, 8, 60.0)
+        tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
+        camera = Pinhole.from_fov(32, 32, 60.0)
         pose = np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
             field = SplatField(tiny, CallerPool())
-            image = np.full((8, 8, channels), 128, np.uint8)
-            image[2:6, 2:6] = 255
-            field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
+            for k in range(3):  # something moves: it is found, then carried along
+                image = np.full((32, 32, channels), 128, np.uint8)
+                image[8:16, 8 + 2 * k : 16 + 2 * k, :3] = 255
+                field.fit([View("warm-up", image, pose, camera, k * 10**8)], Budget(steps=8))
             field.render(pose, camera)
-            field._live().render_pixels(pose, camera, np.full((1, 2), 0.5))  # as ``trust`` asks
+            field._live().colors_at(field.rig.views, [np.full((1, 2), 0.5)])  # as ``trust`` asks
         return time.perf_counter() - start
 
     # --- state --------------------------------------------------------------------------------
@@ -230,7 +232,7 @@ class SplatField:
             )  # fmt: skip
             if not known:
                 self._before = self.cloud.params[:, :3].copy()
-                drift(self.cloud, elapsed_s)
+                drift(self.cloud, elapsed_s, any(memory[v.camera].moved is not None for v in views))
                 self._doubt(views, news)
             data = self._data = leave_out(intake.data, np.array([v.camera in self._refused for v in views]))
             self._asked = asked_views(data) or list(range(len(views)))  # of none, all teach nothing
@@ -260,7 +262,7 @@ class SplatField:
         """Refuse the views that contradict what is known. What a camera's next one seems to show to have
         moved is beside a picture that was wrong, so that is not known."""
         self._unsure = (self._unsure - news) | (self._refused & news)
-        flags = self.rig.refused(views, self.step, self._live())
+        flags = self.rig.refused(views, self.step, self._live().colors_at)
         given = {v.camera for v in views}
         self._refused = (self._refused - given) | {v.camera for v, flag in zip(views, flags) if flag}
 
@@ -279,7 +281,7 @@ class SplatField:
             pace.end()
             self._carry_s = (pace.seconds() - began) / pace.steps
         with self._turn.mine():
-            leave_behind(self.cloud, motion, self._before)
+            leave_behind(s, self.pool, self.cloud, motion, self._before)
             renew(s, self._follower, self.cloud, motion, self._rng(2))
             self._snapshot = None
         return rays, samples
@@ -378,8 +380,7 @@ class SplatField:
 
     def _grow(self) -> None:
         s = self.settings
-        if self._data.weight.size:
-            self._keep_what_is_not_asked()
+        self._keep_what_is_not_asked()
         grow_and_prune(self.cloud, s, float(self._data.size[:, 0].mean()), self._rng(5))
         if s.opacity_reset and self.step // s.opacity_reset != self._grown // s.opacity_reset:
             # To a tenth: what pictures need grows back, what they do not is pruned (Kerbl et al. 5.2).
@@ -389,17 +390,25 @@ class SplatField:
             self._begin()
 
     def _keep_what_is_not_asked(self) -> None:
-        """What shows in tiles with pixels of weight 0 counts as seen: that no picture needed it means nothing
-        while those that may are not asked."""
-        data, cloud = self._data, self.cloud
-        tiles = silent_tiles(data)
+        """What shows in tiles with pixels of weight 0, or in the last picture of a camera that is not among
+        the views now, counts as seen: that no picture needed it means nothing while those that may are not
+        asked."""
+        cloud, box = self.cloud, self.rig.box
+        assert box is not None
+        tiles = silent_tiles(self._data)
         slots = [k for k, mask in enumerate(tiles) if mask is not None]
-        if slots:
-            cams = np.ascontiguousarray(self._cams[slots])
-            gaussians = cloud.gaussians(self.settings.harmonics)
-            self._looker.look(cams, gaussians, [tiles[k] for k in slots], differentiate=False)
-            shows = (self._looker.lists.own_count[:, : len(cloud)] > 0).any(axis=0)
-            cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
+        given = {view.camera for view in self._views}
+        others = [view for view in self.rig.views if view.camera not in given]
+        if not slots and not others:
+            return
+        cams = np.concatenate([
+            self._cams[slots],
+            camera_rows([v.camera_to_world for v in others], [v.intrinsics for v in others], box),
+        ])  # fmt: skip
+        wanted = [tiles[k] for k in slots] + [None] * len(others)
+        self._looker.look(cams, cloud.gaussians(self.settings.harmonics), wanted, differentiate=False)
+        shows = (self._looker.lists.own_count[: len(cams), : len(cloud)] > 0).any(axis=0)
+        cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
 
     def _begin(self) -> None:
         """First Gaussians, from the views at hand."""

@@ -60,13 +60,17 @@ class Cloud:
 
     def keep(self, which: NDArray[np.bool_]) -> None:
         """Remove the others."""
-        for f in fields(self):
-            setattr(self, f.name, np.ascontiguousarray(getattr(self, f.name)[which]))
+        self._become({f.name: np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)})
 
     def add(self, new: Cloud) -> None:
         """Append others."""
-        for f in fields(self):
-            setattr(self, f.name, np.concatenate([getattr(self, f.name), getattr(new, f.name)]))
+        self._become({
+            f.name: np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(self)
+        })  # fmt: skip
+
+    def _become(self, arrays: dict[str, NDArray]) -> None:
+        # All at once: Ctrl-C in between would leave arrays of different lengths.
+        self.__dict__.update(arrays)
 
 
 def opacity(params: NDArray[np.float32]) -> NDArray[np.float32]:

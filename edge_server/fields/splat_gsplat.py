@@ -32,7 +32,7 @@ from edge_server.fields.kernels.splat_project import (
     SIZE,
     TIME,
 )
-from edge_server.fields.kernels.splat_update import bound_all
+from edge_server.fields.kernels.splat_update import GRADIENT_LIMIT, bound_all
 from edge_server.fields.ngp_torch import harmonics as harmonics_of
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_motion import Moved
@@ -154,6 +154,7 @@ class SplatCudaField(SplatField):
     def _adam(self, g: NDArray[np.float32], drawn: NDArray[np.bool_], progress: float) -> None:
         """``kernels.splat_update``'s rule, in numpy."""
         rule, cloud = self._rule(progress), self.cloud
+        g = np.clip(np.nan_to_num(g, nan=0.0), -GRADIENT_LIMIT, GRADIENT_LIMIT)
         if rule.fade > 0:
             alpha = 1.0 / (1.0 + np.exp(-cloud.params[:, OPACITY]))
             g[:, OPACITY] += rule.fade * alpha * (1.0 - alpha)

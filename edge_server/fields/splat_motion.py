@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import Views
-from edge_server.fields.kernels.splat_project import LENS, NEAR, OPACITY, ORIGIN, TILE, TIME, Gaussians
+from edge_server.fields.kernels.splat_judge import Verdicts, judge
+from edge_server.fields.kernels.splat_project import TILE, Gaussians
 from edge_server.fields.kernels.splat_raster import Loss, compare_tiles, train_tiles
 from edge_server.fields.kernels.splat_update import pull
 from edge_server.fields.scene_box import SceneBox
@@ -61,14 +63,20 @@ class Moved:
     elapsed_s: float
     asked: int
 
-    def pixels(self, k: int, points: NDArray[np.float32]) -> NDArray[np.int64]:
-        """The pixel of view k that each point (N, 3) in scene units falls on, -1 outside the picture and
-        where the pixel's weight is 0: it has no say."""
-        pixel = _pixels(points, self.cams[k], self.views[k])
-        if self.data.weight.size:
-            weight = self.data.weight[self.data.first[k] : self.data.first[k + 1]]
-            pixel = np.where((pixel >= 0) & (weight[pixel] > 0), pixel, -1)
-        return pixel
+    def verdicts(
+        self, pool: Pool, gaussians: Gaussians, allowed: NDArray[np.float32] | None = None
+    ) -> Verdicts:
+        """What the pictures say of each Gaussian. allowed: see ``judge``; none: nothing is ever wrong."""
+        count, data = len(gaussians.params), self.data
+        found = Verdicts.room(count)
+        marks = np.zeros(int(data.first[-1]), np.uint8)
+        for mask, first in zip(self.moved, data.first):
+            if mask is not None:
+                marks[first : first + mask.size] = mask.reshape(-1)
+        if allowed is None:
+            allowed = np.full(count, np.inf, np.float32)
+        pool.run(judge, self.cams, data, marks, gaussians, allowed, found)
+        return found
 
 
 def trusted_moves(moved: Sequence[NDArray[np.bool_] | None], data: Views) -> list[NDArray[np.bool_] | None]:
@@ -97,10 +105,11 @@ def changed_tiles(moved: Sequence[NDArray[np.bool_] | None]) -> list[NDArray[np.
 
 def silent_tiles(data: Views) -> list[NDArray[np.uint8] | None]:
     """For each view the tiles with pixels of weight 0, uint8 (tiles,), or None where there are none."""
-    masks: list[NDArray[np.uint8] | None] = []
-    for (w, h), first in zip(data.size, data.first):
-        silent = data.weight[first : first + w * h].reshape(h, w) == 0
-        masks.append(_by_tiles(silent) if silent.any() else None)
+    masks: list[NDArray[np.uint8] | None] = [None] * len(data.size)
+    if data.weight.size:
+        for k, ((w, h), first) in enumerate(zip(data.size, data.first)):
+            silent = data.weight[first : first + w * h].reshape(h, w) == 0
+            masks[k] = _by_tiles(silent) if silent.any() else None
     return masks
 
 
@@ -124,11 +133,11 @@ def tasks_of(tiles: Sequence[NDArray[np.uint8] | None], slots: Sequence[int]) ->
     return np.concatenate(parts)
 
 
-def drift(cloud: Cloud, elapsed_s: float) -> None:
-    """Let every guest go on as it went; after a long pause, none."""
-    if not 0.0 < elapsed_s <= LONGEST_S:
+def drift(cloud: Cloud, elapsed_s: float, moves: bool) -> None:
+    """Let every guest go on as it went, or back if the newest view is an older one; after a long pause, or
+    where no camera sees anything move, none."""
+    if not moves or not abs(elapsed_s) <= LONGEST_S:
         cloud.velocity[:] = 0.0
-        return
     cloud.params[:, :3] += cloud.velocity * np.float32(elapsed_s)
 
 
@@ -148,7 +157,7 @@ def carry(
     # Of the cloud, only what shows in the tiles that changed.
     passes.look(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
                 [seen.tiles[k] for k in slots], differentiate=False)  # fmt: skip
-    shows = np.asarray((passes.lists.own_count[:, : len(cloud)] > 0).any(axis=0))
+    shows = np.asarray((passes.lists.own_count[: len(slots), : len(cloud)] > 0).any(axis=0))
     shows[guests] = True
     some, theirs = np.flatnonzero(shows), guests
     guests = np.searchsorted(some, theirs).astype(np.int64)
@@ -186,37 +195,29 @@ def carry(
             faster = velocity[guests] + mine * np.float32(_TO_VELOCITY / seen.elapsed_s)
             velocity[guests] = np.clip(faster, -fastest, fastest)
             cloud.params[theirs, :3], cloud.velocity[theirs] = place[guests], velocity[guests]
-            yield float(losses[:, 1].sum()), TILE * TILE * len(tasks), int(passes.lists.needed.sum())
+            yield (
+                float(losses[:, 1].sum()),
+                TILE * TILE * len(tasks),
+                int(passes.lists.needed[: len(cams)].sum()),
+            )
 
 
-def leave_behind(cloud: Cloud, seen: Moved, before: NDArray[np.float32]) -> None:
+def leave_behind(
+    settings: SplatSettings, pool: Pool, cloud: Cloud, seen: Moved, before: NDArray[np.float32]
+) -> None:
     """Guests that agree better with the pictures where they were (before: (N, 3)) stay there, as a part
     of the scene: the body went on without them."""
     guests = np.flatnonzero(cloud.guest)
     if guests.size == 0:
         return
-    colors = cloud.params[guests, OPACITY + 1 : OPACITY + 4]
-    there = _error(before[guests], colors, seen)
-    here = _error(cloud.params[guests, :3], colors, seen, cloud.velocity[guests])
-    stay = guests[there + STAYS < here]
+    moving = Gaussians(cloud.params[guests], settings.harmonics, cloud.velocity[guests])
+    still = Gaussians(moving.params.copy(), settings.harmonics, np.zeros_like(moving.velocity))
+    still.params[:, :3] = before[guests]
+    here, there = (seen.verdicts(pool, gaussians).off for gaussians in (moving, still))
+    stay = guests[there + np.float32(STAYS) < here]
     cloud.params[stay, :3] = before[stay]
     cloud.velocity[stay] = 0.0
     cloud.guest[stay] = 0
-
-
-def _error(
-    points: NDArray[np.float32], colors: NDArray[np.float32], seen: Moved,
-    velocity: NDArray[np.float32] | None = None,
-) -> NDArray[np.float64]:  # fmt: skip
-    """Mean difference (N,) of each point's colour from the pixels it falls on, none counting more than .5."""
-    total, count = np.zeros(len(points)), np.zeros(len(points))
-    for k, (view, cam) in enumerate(zip(seen.views, seen.cams)):
-        pixel = seen.pixels(k, points if velocity is None else points + cam[TIME] * velocity)
-        inside = np.flatnonzero(pixel >= 0)
-        found = view.image.reshape(-1, view.image.shape[2])[pixel[inside], :3] / 255.0
-        total[inside] += np.minimum(np.abs(found - colors[inside]).max(axis=1), 0.5)
-        count[inside] += 1
-    return total / np.maximum(count, 1)
 
 
 def renew(
@@ -232,8 +233,9 @@ def renew(
     views = seen.views
     needed = min(2, seen.asked)
     if sum(mask is not None for mask in seen.moved) < needed:
+        _age(cloud, np.zeros(len(cloud), bool))
         return  # what one camera alone sees change may be that camera
-    hull, disagrees = _hull(cloud, seen)
+    hull, disagrees = _hull(settings, passes.pool, cloud, seen)
     _age(cloud, hull)
     cloud.keep(~(hull & disagrees))
     off = _still_wrong(settings, passes, cloud, seen)
@@ -242,7 +244,7 @@ def renew(
     new = Cloud.of(
         seeds(settings, passes.pool, seen.box, views, off, seen.data.weight, count, rng, seen.moved)
     )
-    new.keep(_hull(new, seen)[0])
+    new.keep(_hull(settings, passes.pool, new, seen)[0])
     new.guest[:] = 1
     _pass_on(cloud, new, CELLS_PX[0] * seen.box.pixel_m / seen.box.radius_m)
     over = len(cloud) + len(new) - settings.gaussians
@@ -253,25 +255,14 @@ def renew(
     cloud.add(new)
 
 
-def _hull(cloud: Cloud, seen: Moved) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _hull(
+    settings: SplatSettings, pool: Pool, cloud: Cloud, seen: Moved
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which Gaussians lie in the hull of what changed, and which of them disagree with it: bool (N,) each."""
-    sees = np.zeros(len(cloud), np.int32)
-    marked, wrong = np.zeros_like(sees), np.zeros_like(sees)
-    allowed = np.where(cloud.guest > 0, AGREE_GUEST, AGREE)
-    for k, (view, mask, cam) in enumerate(zip(seen.views, seen.moved, seen.cams)):
-        pixel = seen.pixels(k, cloud.params[:, :3] + cam[TIME] * cloud.velocity)
-        inside = np.flatnonzero(pixel >= 0)
-        sees[inside] += 1
-        if mask is None:
-            continue
-        hit = inside[mask.reshape(-1)[pixel[inside]]]
-        marked[hit] += 1
-        colors = view.image.reshape(-1, view.image.shape[2])[pixel[hit]] / 255.0
-        off = np.abs(colors[:, :3] - cloud.params[hit, OPACITY + 1 : OPACITY + 4]).max(axis=1) > allowed[hit]
-        if view.image.shape[2] == 4:
-            off |= colors[:, 3] < 0.5
-        wrong[hit] += off
-    return (marked >= min(2, seen.asked)) & (2 * marked >= sees), 2 * wrong >= marked
+    allowed = np.where(cloud.guest > 0, AGREE_GUEST, AGREE).astype(np.float32)
+    found = seen.verdicts(pool, cloud.gaussians(settings.harmonics), allowed)
+    hull = (found.marked >= min(2, seen.asked)) & (2 * found.marked >= found.sees)
+    return hull, 2 * found.wrong >= found.marked
 
 
 def _age(cloud: Cloud, hull: NDArray[np.bool_]) -> None:
@@ -327,14 +318,3 @@ def _still_wrong(
         assert mask is not None
         off[k] = mask & (error[data.first[k] : data.first[k + 1]] > OFF).reshape(mask.shape)
     return off
-
-
-def _pixels(points: NDArray[np.float32], cam: NDArray[np.float32], view: View) -> NDArray[np.int64]:
-    """The pixel each point (N, 3) in scene units falls on, -1 outside the picture."""
-    local = (points - cam[ORIGIN:LENS]) @ cam[:ORIGIN].reshape(3, 3).T
-    lens = view.intrinsics
-    front = local[:, 2] > cam[NEAR]
-    safe = np.where(front[:, None], local, [0.0, 0.0, 1.0])
-    u, v = np.floor(lens.project(safe)).clip(-1e6, 1e6).astype(np.int64).T
-    inside = front & (u >= 0) & (v >= 0) & (u < lens.width) & (v < lens.height)
-    return np.where(inside, v * lens.width + u, -1)

@@ -110,7 +110,7 @@ class Passes:
             self.lists.wanted[b, :total] = 1 if mask is None else mask
         self.pool.run(project, cams, gaussians, count, self.projected, self.tiles)
         self._deal(count)
-        pairs = min(int(self.lists.needed.max(initial=0)), PAIRS_MOST)
+        pairs = min(int(self.lists.needed[:slots].max(initial=0)), PAIRS_MOST)
         if pairs > self.lists.pair.shape[1]:
             room = min(pairs + pairs // 4, PAIRS_MOST)
             self._lists = self.lists._replace(
@@ -118,7 +118,7 @@ class Passes:
                 owner=np.zeros((self.lists.pair.shape[0], room), np.int32),
             )
             self._deal(count)
-        length = max(int(self.lists.longest.max(initial=0)), 1) * KEPT if differentiate else KEPT
+        length = max(int(self.lists.longest[:slots].max(initial=0)), 1) * KEPT if differentiate else KEPT
         if self.kept.shape[1] < length:
             self.kept = np.zeros((self.pool.threads, length + length // 4), np.float32)
         if differentiate and self.sums.shape[:2] != self.lists.pair.shape:
@@ -130,12 +130,12 @@ class Passes:
     def _make_room(self, slots: int, count: int, tiles: int) -> None:
         if (
             self._lists is not None
-            and self.projected.shape[0] == slots
+            and self.projected.shape[0] >= slots
             and self.projected.shape[1] >= count
             and self._lists.wanted.shape[1] >= tiles
         ):
             return
-        room = max(count, self.projected.shape[1])
+        slots, room = max(slots, self.projected.shape[0]), max(count, self.projected.shape[1])
         tiles = max(tiles, 0 if self._lists is None else self._lists.wanted.shape[1])
         pairs = max(4 * room, 1024, 0 if self._lists is None else self._lists.pair.shape[1])
         self.projected = np.zeros((slots, room, PROJECTED), np.float32)

@@ -57,7 +57,7 @@ class SplatSettings:
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
     nice: int = _option(5, "how far workers lower their own priority (Linux)")
-    device: str = _option("auto", "cpu (numba), cuda (gsplat) or auto")
+    device: str = _option("auto", "cpu (numba) or cuda (gsplat, only where asked for); auto: cpu")
 
     def __post_init__(self) -> None:
         for name, low, high in (

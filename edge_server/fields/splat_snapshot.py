@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,24 +49,28 @@ class SplatSnapshot:
         depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
         return Rendering(color, depth, opacity)
 
-    def render_pixels(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Colour (N, 3), distance in metres and opacity (N,) at image points (N, 2) within the picture."""
+    def colors_at(
+        self, views: Sequence[View], points: Sequence[NDArray[np.float64]]
+    ) -> list[NDArray[np.float32]]:
+        """What is seen of each view at image points (N, 2) within its picture: colours (N, 3). All at once:
+        most of the work is to project the Gaussians, and views share it out among the cores."""
         passes = self.passes or Passes(self.pool)
-        cams = camera_rows([camera_to_world], [intrinsics], self.box)
-        columns, rows = -(-intrinsics.width // TILE), -(-intrinsics.height // TILE)
-        wanted = np.zeros((rows, columns), np.uint8)
-        wanted[tuple((pixels[:, ::-1] // TILE).astype(np.int64).T)] = 1
-        passes.look(cams, self.gaussians, [wanted.reshape(-1)], differentiate=False)
-        color = np.empty((len(pixels), 3), np.float32)
-        depth, opacity = np.empty(len(pixels), np.float32), np.empty(len(pixels), np.float32)
+        cams = camera_rows([v.camera_to_world for v in views], [v.intrinsics for v in views], self.box)
+        wanted = []
+        for view, where in zip(views, points):
+            lens = view.intrinsics
+            tiles = np.zeros((-(-lens.height // TILE), -(-lens.width // TILE)), np.uint8)
+            tiles[tuple((where[:, ::-1] // TILE).astype(np.int64).T)] = 1
+            wanted.append(tiles.reshape(-1))
+        passes.look(cams, self.gaussians, wanted, differentiate=False)
+        counts = [len(where) for where in points]
+        slots = np.repeat(np.arange(len(views)), counts)
+        color = np.empty((len(slots), 3), np.float32)
         self.pool.run(
-            render_points, columns, pixels.astype(np.float32), passes.projected, passes.lists,
-            self.background, color, depth, opacity,
+            render_points, passes.columns, slots, np.concatenate(points).astype(np.float32), passes.projected,
+            passes.lists, self.background, color,
         )  # fmt: skip
-        depth *= (self.box.radius_m / np.maximum(intrinsics.rays(pixels)[:, 2], 1e-6)).astype(np.float32)
-        return color, depth, opacity
+        return np.split(color, np.cumsum(counts)[:-1])
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras see a

@@ -88,8 +88,10 @@ class TrainedField:
                 self._occupancy.look(self.pool, self.rig)
             assert self.rig.box is not None
             box, cameras = self.rig.box, self._cameras
-            trusted = self.rig.trusted(views, intake.data, self.step, self._live())
-            data = cameras.corrected(views, trusted, box)
+            data = intake.data
+            if not cameras.asked:
+                data = self.rig.trusted(views, intake, self.step, self._live())
+            data = cameras.corrected(views, data, box)
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
             self._batch = self._batch._replace(exposure=sums)
@@ -105,7 +107,8 @@ class TrainedField:
             pace.end()
         self.dropped += dropped
         loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped)
+        refused = self.rig.left_out_of(views)
+        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped, refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture of a camera, from the present parameters."""
@@ -247,6 +250,7 @@ class TrainedField:
         s = self.settings
         rng = np.random.default_rng(np.random.SeedSequence(s.seed))
         self.step = 0
+        self._snapshot = None  # it is known by its step alone
         self._updates = 0  # optimiser steps that Adam's bias correction counts
         self._encoding, self._net = self._make(rng)
         self._take_table(self._encoding.table)

@@ -58,7 +58,9 @@ class TrainerSettings:
         0.0, "pixels by which ``mask_stale_ms`` widens what moved, per second of age"
     )
     refuse_beyond: float = option(
-        2.5, "a view is refused whose typical error is so many times the usual one; 0: none is"
+        2.5,
+        "a view is refused whose typical error is so many times the usual one; 0, or while cameras' "
+        "errors are learnt: none is",
     )
     exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias a channel)")
     refine_m: float = option(0.0, "by how much a camera's given position may be corrected; 0: not at all")

@@ -23,6 +23,10 @@ AGREES = 1.5  # times the usual error with which a view agrees
 PATIENCE = 20  # refusals in a row
 
 
+# What a field shows of each view at image points (N, 2): colours (N, 3).
+Pixels = Callable[[Sequence[View], Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float32]]]
+
+
 class TrustSettings(Protocol):
     """The options that are read here; ``TrainerSettings`` says what they mean."""
 
@@ -83,7 +87,7 @@ def refused(
     memory: Mapping[str, Credited],
     beyond: float,
     settled: bool,
-    pixels: Callable[[View, NDArray[np.float64]], NDArray[np.float32]],
+    pixels: Pixels,
 ) -> NDArray[np.bool_]:
     """Which views (V,) contradict the field so much that they are to be left out of this fit.
 
@@ -92,12 +96,13 @@ def refused(
     picture does not reach that. It is refused only where an earlier view from the same place agreed, so a
     camera that sees what no other does is learnt; only ``PATIENCE`` times, for then the scene must have
     changed; and never more than a quarter of the views. settled: whether the field knows enough to agree
-    with. pixels: what it shows (N, 3) of a view at image points (N, 2). Updates the credits in ``memory``.
+    with. pixels: what it shows. Updates the credits in ``memory``.
     """
     none = np.zeros(len(views), np.bool_)
     if beyond <= 0.0 or not settled or len(views) < JUDGES:
         return none
-    off = np.array([_typical_error(view, pixels) for view in views])
+    shown = pixels(views, [_raster(view) for view in views])
+    off = np.array([_typical_error(view, colors) for view, colors in zip(views, shown)])
     # No less than this: where half of every picture is plain sky, shown exactly, no view else would agree.
     usual = max(float(np.median(off)), LEAST_ERROR / beyond)
     contradicts = off > beyond * usual
@@ -112,13 +117,18 @@ def refused(
     return none
 
 
-def _typical_error(view: View, pixels: Callable[[View, NDArray[np.float64]], NDArray[np.float32]]) -> float:
-    """The median over a raster of pixels of how far the field is off in the worst channel, in [0, 1]."""
+def _raster(view: View) -> NDArray[np.float64]:
+    """The centres (N, 2) of the pixels that a view is judged by."""
     height, width = view.image.shape[:2]
     middle = (np.arange(RASTER) + 0.5) / RASTER
-    column, row = np.meshgrid((middle * width).astype(np.int64), (middle * height).astype(np.int64))
-    taken = view.image[row, column].reshape(-1, view.image.shape[2]).astype(np.float32) / 255.0
-    shown = pixels(view, np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=-1))
+    column, row = np.meshgrid(np.floor(middle * width), np.floor(middle * height))
+    return np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=-1)
+
+
+def _typical_error(view: View, shown: NDArray[np.float32]) -> float:
+    """The median over the raster of how far the field (N, 3) is off in the worst channel, in [0, 1]."""
+    column, row = _raster(view).astype(np.int64).T
+    taken = view.image[row, column].astype(np.float32) / 255.0
     off = np.abs(shown - taken[:, :3]).max(axis=1)
     if taken.shape[1] == 4:
         off *= taken[:, 3]  # what is cut away is not the field's business

@@ -90,7 +90,7 @@ class VoxelField:
                 if intake.fresh:
                     self._soften(moving)
                 self._clear()
-            data = self._outlined(self.rig.trusted(views, intake.data, self.step, self._live()))
+            data = self._outlined(self.rig.trusted(views, intake, self.step, self._live()))
             # Once the grid is fine, most of what a fit meets is known: full rates would undo it.
             share = s.warm if self.step >= WARM * max(s.refine_at, default=s.prune_from) else 1.0
         rays = samples = dropped = 0
@@ -104,7 +104,8 @@ class VoxelField:
             pace.end()
         self.dropped += dropped
         loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped)
+        refused = self.rig.left_out_of(views)
+        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped, refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture of a camera, from the present grid."""
@@ -195,6 +196,7 @@ class VoxelField:
 
     def _forget(self) -> None:
         self.step = 0
+        self._snapshot = None  # it is known by its step alone
         self._outlines: tuple[Views, Views] | None = None  # of the views last seen, before and after
         self._updates = 0  # optimiser steps that Adam's bias correction counts
         s = self.settings

@@ -38,7 +38,8 @@ class VoxelSettings(TrainerSettings):
     prune: float = option(0.2, "optical depth of one step below which a cell is taken to be empty")
     prune_from: int = option(15, "step from which on empty cells are left out")
     cells: int = option(48, "cells a side of the occupancy grid, a multiple of 4")
-    parts: int = option(2, "gradient buffers, a task each; results depend on it, not on the threads")
+    device: str = option("auto", "cpu or auto: it runs on CPUs only")
+    parts: int = option(2, "gradient buffers: so many cores train at once; results depend on it")
 
     def __post_init__(self) -> None:
         self._within(
@@ -54,6 +55,8 @@ class VoxelSettings(TrainerSettings):
             ("soften", 0.0, 4.0),
         )
         at = list(self.refine_at)
+        if len(at) > 8:
+            raise ValueError(f"voxel: refine_at has at most 8 step numbers, not {len(at)}")
         if at != sorted(set(at)) or any(step < 1 for step in at):
             raise ValueError(f"voxel: refine_at must be rising step numbers, not {at}")
         if self.sizes is not None:
@@ -92,10 +95,13 @@ def make_settings(options: dict[str, Any], seed: int = 0) -> VoxelSettings:
     valid = voxel_options()
     if unknown := sorted(set(options) - {"effort", *valid}):
         raise ValueError(f"voxel has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}")
-    given = {
-        name: tuple(int(v) for v in value) if name in ("sizes", "refine_at") and value is not None else value
-        for name, value in options.items()
-    }
+    given = dict(options)
+    for name in ("sizes", "refine_at"):
+        if given.get(name) is not None:
+            try:
+                given[name] = tuple(int(v) for v in given[name])
+            except (TypeError, ValueError):
+                raise ValueError(f"voxel: {name} must be a list like [32, 64], not {given[name]!r}") from None
     return settings_from(VoxelSettings, EFFORTS, given, seed)
 
 

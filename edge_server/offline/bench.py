@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from edge_server.fields.registry import field_names
+from edge_server.fields.registry import field_names, make_field
 from edge_server.offline.fit import FitError, parse_options
 from edge_server.offline.kept import Kept
 from edge_server.offline.usage import BenchError
@@ -47,6 +47,12 @@ PARTS = ("field", "track", "options", "limits", "ingest", "fidelity")
 MORE = ("peer",)
 # Parts that write each figure as it comes, and can skip what is known.
 _KEEPING = ("field", "track", "options")
+# Flags that mean something to some parts only.
+_ONLY_OF = {
+    "field": _KEEPING, "resume": (*PARTS, *MORE), "only": ("options",), "scene": ("track",),
+    "updates": ("track",), "update_s": ("track",), "steps": ("track",), "samples": ("track",),
+    "option": ("track",),
+}  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,14 +62,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parts = list(dict.fromkeys(p for part in args.part or ["all"] for p in _expanded(part)))
     if unknown := set(parts) - {*PARTS, *MORE}:
         parser.error(f"no part is called {', '.join(unknown)}; there are: {', '.join((*PARTS, *MORE))}, all")
+    args.field = [name for words in args.field for name in words.split(",")]
     if unknown := set(args.field) - set(field_names()):
         parser.error(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
     if args.resume and args.json is None:
         parser.error("--resume needs --json FILE, the file to go on with")
+    for flag, of in _ONLY_OF.items():
+        if getattr(args, flag) and not set(parts) & set(of):
+            parser.error(f"--{flag.replace('_', '-')} is for {', '.join(of)}; asked for: {', '.join(parts)}")
     try:
         args.option = parse_options(args.option)
+        for name in args.field or field_names():
+            make_field(name, args.option)
         figures = _known(args.json, args.quick) if args.resume else {}
-    except (BenchError, FitError) as error:
+    except (BenchError, FitError, ValueError) as error:
         parser.error(str(error))
     figures |= {"machine": machine(), "versions": versions(), "quick": args.quick}
     figures["runs"] = figures.get("runs", 0) + 1

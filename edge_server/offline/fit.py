@@ -22,6 +22,7 @@ from edge_server.fidelity.images import Colour, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
+from edge_server.fields.registry import field_names, option_help
 from edge_server.offline.fitting import Scored, evaluate, fit_in_slices, marks_s
 from edge_server.offline.recorded import Recorded, load_recorded
 from edge_server.offline.usage import Usage
@@ -32,7 +33,8 @@ DESCRIPTION = """\
 Fit a recorded data set as fast as this machine can, and measure fidelity on views it never saw.
 
   edge-server fit ~/data/lego --seconds 60 --holdout 8 --scale 2 --out runs/lego
-  edge-server fit ~/data/kitchen --holdout cam00 --frame 12
+  edge-server fit ~/data/kitchen --field splat --holdout cam00 --frame 12
+  edge-server fit --field splat --list-options
   edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --option samples=256
 
 DATA is a transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), the calibration JSON of a rig's videos,
@@ -70,8 +72,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="edge-server fit", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("data", type=Path, metavar="DATA", help="data set: folder or JSON file")
-    parser.add_argument("--field", default="ngp", help="representation [%(default)s]")
+    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or JSON file")
+    parser.add_argument(
+        "--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]"
+    )
+    parser.add_argument("--list-options", action="store_true", help="say what the field's options mean")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
     parser.add_argument(
         "--holdout", default="8", metavar="K|NAME,...",
@@ -90,12 +95,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
     parser.add_argument(
         "--option", action="append", default=[], metavar="KEY=VALUE",
-        help="setting of the field, e.g. levels=12; again for more (a wrong one lists them all)",
+        help="setting of the field, e.g. levels=12; again for more",
     )  # fmt: skip
     parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     parser.add_argument("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
     parser.add_argument("--resume", action="store_true", help="go on from OUT until --seconds in all")
     args = parser.parse_args(argv)
+    if args.list_options:
+        try:
+            known = option_help(args.field)
+        except ValueError as error:
+            parser.error(str(error))
+        print("\n".join(f"{name:18} {text}" for name, text in known.items()))
+        return 0
+    if args.data is None:
+        parser.error("name a data set: a folder, or a JSON file")
     job = Job(args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background,
               args.seed)  # fmt: skip
     name = (args.data if args.data.is_dir() else args.data.parent).resolve().name

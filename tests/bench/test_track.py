@@ -172,6 +172,15 @@ def test_recordings_are_followed_too_or_said_to_be_missing(tmp_path, flat, monke
     assert "kitchen: set FRESHFIELD_DATA" in capsys.readouterr().err
 
 
+def test_flags_that_mean_nothing_to_the_parts_asked_for_are_refused(capsys):
+    with pytest.raises(SystemExit):
+        edge_server(["bench", "field", "--scene", "room"])
+    assert "--scene is for track; asked for: field" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        edge_server(["bench", "track", "--field", "voxel,ngp", "--option", "sizes=64"])
+    assert "voxel: sizes must be a list like [32, 64], not 64" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [["--updates", "0"], ["--update-s", "1,x"], ["--scene", "attic"]])
 def test_wrong_words_are_refused(words, flat, capsys):
     with pytest.raises(SystemExit):

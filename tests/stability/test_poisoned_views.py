@@ -299,8 +299,8 @@ def test_what_moved_beside_a_wrong_picture_is_not_known(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("asked", [True, False])
 def test_what_only_a_refused_view_shows_is_kept(asked: bool) -> None:
-    """Gaussians that no picture needs are pruned; while the one camera that sees them is refused, that says
-    nothing."""
+    """Gaussians that no picture needs are pruned; while the one camera that sees them is refused, or absent,
+    that says nothing. Where no camera has ever looked there is nothing to keep."""
     pose = look_at((2.5, 0.0, 1.0), (3.5, 0.0, 9.0))  # up, over the heads of the others
     sky = np.broadcast_to(SEEN[0].image[0, 0], SEEN[0].image.shape)
     away = replace(SEEN[0], camera="away", image=sky, camera_to_world=pose)
@@ -316,13 +316,17 @@ def test_what_only_a_refused_view_shows_is_kept(asked: bool) -> None:
     place = field.rig.box.normalise(pose[:3, 3] + 2.0 * pose[:3, 2])
     params = field.cloud.params[:4].copy()
     params[:, :3], params[:, SCALE:QUATERNION], params[:, OPACITY] = place, -5.0, 2.0
-    field.cloud.keep(np.arange(len(field.cloud)) >= 4)
+    nowhere = params.copy()
+    nowhere[:, :3] = field.rig.box.normalise(np.array([0.0, 0.0, -40.0]))  # under the feet of all
+    field.cloud.keep(np.arange(len(field.cloud)) >= 8)
     field.cloud.add(Cloud.of(params))
+    field.cloud.add(Cloud.of(nowhere))
     for number in range(2, 10):
         update(number, *([_noise(away, number)] if asked else []))
     assert field.rig.memory["away"].credit == (PATIENCE - 8 if asked else PATIENCE)
-    left = np.linalg.norm(field.cloud.params[:, :3] - place, axis=1) < 0.02
-    assert left.sum() == (4 if asked else 0)
+    for where, count in ((place, 4), (nowhere[0, :3], 0)):
+        left = np.linalg.norm(field.cloud.params[:, :3] - where, axis=1) < 0.02
+        assert left.sum() == count
 
 
 @pytest.mark.parametrize("poison", POSES)

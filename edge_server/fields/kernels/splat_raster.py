@@ -299,7 +299,7 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
 
 
 @kernel
-def render_points(counter, worker, columns, points, projected, lists, background, color, depth, opacity):
+def render_points(counter, worker, columns, slots, points, projected, lists, background, color):
     """The same at image points, float32 (N, 2), of which the tiles are wanted: some of them cost much less
     than their tiles. color: float32 (N, 3), depth and opacity (N,), all written. Tasks are runs of 16."""
     most, least, stop = np.float32(ALPHA_MOST), np.float32(ALPHA_LEAST), np.float32(STOP)
@@ -309,11 +309,12 @@ def render_points(counter, worker, columns, points, projected, lists, background
             return
         for n in range(base, min(base + 16, points.shape[0])):
             x, y = points[n, 0], points[n, 1]
-            t = (np.int64(y) // TILE) * columns + np.int64(x) // TILE
-            r = g = b = z = _F0
+            v = slots[n]
+            t = (np.int64(y) // TILE) * columns[v] + np.int64(x) // TILE
+            r = g = b = _F0
             left = _F1
-            for j in range(lists.first[0, t], lists.first[0, t + 1]):
-                row = projected[0, lists.owner[0, lists.pair[0, j]]]
+            for j in range(lists.first[v, t], lists.first[v, t + 1]):
+                row = projected[v, lists.owner[v, lists.pair[v, j]]]
                 dx, dy = x - row[MX], y - row[MY]
                 power = -_HALF * (row[QA] * dx * dx + row[QC] * dy * dy) - row[QB] * dx * dy
                 a = min(row[ALPHA] * exp32(power), most)
@@ -322,18 +323,12 @@ def render_points(counter, worker, columns, points, projected, lists, background
                     r += w * row[RED]
                     g += w * row[RED + 1]
                     b += w * row[RED + 2]
-                    z += w * row[DEPTH]
                     left -= w
                     if not left >= stop:
                         break
-            seen = _F1 - left
             for c, value in enumerate((r, g, b)):
                 value += left * background[c]
                 color[n, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
-            far = z / max(seen, np.float32(1e-3))
-            healthy = is_finite(far) and is_finite(seen)
-            depth[n] = far if healthy and seen > np.float32(1e-3) else _F0
-            opacity[n] = min(max(seen, _F0), _F1) if healthy else _F0
 
 
 @kernel

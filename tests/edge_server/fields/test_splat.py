@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -13,6 +15,7 @@ from edge_server.fields.kernels.pool import CallerPool
 from edge_server.fields.scene_box import scene_box
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_growth import opacity
+from edge_server.fields.splat_motion import drift
 from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.splat_settings import SplatSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
@@ -155,6 +158,19 @@ def test_a_budget_in_seconds_is_kept(trained: SplatField, seconds: float) -> Non
     assert 0.85 * seconds <= report.seconds <= 1.1 * seconds + 0.15 and report.steps > 3
 
 
+def test_a_budget_in_seconds_is_kept_while_things_move() -> None:
+    """New pictures at every update: they are taken in, judged, followed and seeded within the budget."""
+    field = SplatField(SMALL)
+    field.warm_up()
+    field.fit(_ball_at(0), Budget(steps=200))
+    spent = []
+    for t_ms in range(100, 1000, 100):
+        report = field.fit(_ball_at(t_ms), Budget(seconds=0.3))
+        assert report.seconds >= 0.85 * 0.3 and report.steps > 3
+        spent.append(report.seconds)
+    assert np.median(spent) <= 1.1 * 0.3
+
+
 def test_a_snapshot_does_not_change_while_the_field_trains(trained: SplatField) -> None:
     snapshot = trained.snapshot()
     before = snapshot.render(HELD.camera_to_world, HELD.intrinsics).color
@@ -238,6 +254,63 @@ def test_a_long_pause_leaves_nothing_known_of_motion() -> None:
     assert np.abs(field.cloud.velocity).max() > 0
     field.fit([replace(v, generated_ns=9000 * MS) for v in SEEN], Budget(steps=1))
     assert np.abs(field.cloud.velocity).max() == 0
+
+
+@pytest.mark.parametrize("seen", [0, 1])
+def test_what_has_stopped_stays_where_it_is(seen: int) -> None:
+    """Guests must not go on when no camera, or only one, sees anything move: here and then it is equal
+    pictures that come in, of which ``seen`` have a little noise."""
+    field = SplatField(SMALL)
+    for t_ms in (0, 100, 200, 300):
+        field.fit(_ball_at(t_ms), Budget(steps=40))
+    assert np.abs(field.cloud.velocity).max() > 0
+    stopped = [replace(v, generated_ns=400 * MS) for v in _ball_at(300)]
+    rng = np.random.default_rng(0)
+    for update in range(10):
+        now = [replace(v, generated_ns=(400 + 100 * update) * MS) for v in stopped]
+        for k in range(seen):
+            image = now[k].image.copy()
+            image[5:9, 5:9] = rng.integers(0, 255, (4, 4, 3), dtype=np.uint8)
+            now[k] = replace(now[k], image=image)
+        field.fit(now, Budget(steps=1))
+    assert np.abs(field.cloud.velocity).max() == 0
+    truth = picture(HELD.intrinsics, HELD.camera_to_world, START + SPEED * 0.3)
+    assert _score(field, replace(HELD, image=truth)) > 18.0
+
+
+def test_time_that_stands_still_or_goes_back_does_not_fling_anything() -> None:
+    field = SplatField(SMALL)
+    for t_ms in (0, 100, 200, 300):
+        field.fit(_ball_at(t_ms), Budget(steps=40))
+    before = field.cloud.params[:, :3].copy()
+    velocity = field.cloud.velocity.copy()
+    assert np.abs(velocity).max() > 0
+    drift(field.cloud, 0.0, moves=True)
+    np.testing.assert_array_equal(field.cloud.params[:, :3], before)
+    drift(field.cloud, -0.1, moves=True)
+    np.testing.assert_allclose(field.cloud.params[:, :3], before - 0.1 * velocity, atol=1e-6)
+    np.testing.assert_array_equal(field.cloud.velocity, velocity)
+    field.fit(_ball_at(200), Budget(steps=5))
+    assert np.isfinite(field.cloud.params).all()
+
+
+def test_warming_up_compiles_every_kernel() -> None:
+    """In a process of its own: the first motion must not wait for a compiler."""
+    code = """
+from edge_server.fields.kernels import splat_judge, splat_project, splat_raster, splat_seed, splat_tiles
+from edge_server.fields.kernels import splat_update
+from edge_server.fields.splat import SplatField
+SplatField().warm_up()
+for module in (splat_judge, splat_project, splat_raster, splat_seed, splat_tiles, splat_update):
+    for name, thing in vars(module).items():
+        if hasattr(thing, "signatures") and thing.py_func.__code__.co_varnames[0] == "counter":
+            print(name, len(thing.signatures))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-1000:]
+    counts = dict(line.split() for line in done.stdout.splitlines())
+    assert {"judge", "pull", "compare_tiles", "render_points", "train_tiles"} <= counts.keys()
+    assert set(counts.values()) == {"1"}, counts
 
 
 def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:

@@ -236,7 +236,7 @@ def _shown(off: dict[str, float]) -> Any:
         taken = view.image[row, column, :3].astype(np.float32) / 255.0
         return taken + np.float32(off.get(view.camera, 0.02))
 
-    return pixels
+    return lambda views, points: list(map(pixels, views, points))
 
 
 def _refused(memory: dict[str, CameraMemory], off: dict[str, float], **more: Any) -> list[str]:
@@ -293,7 +293,52 @@ def test_what_moves_through_a_picture_is_no_reason_to_refuse_it() -> None:
         return image[row, column]
 
     views = [m.view for m in memory.values()]
-    assert not refused(views, memory, 2.5, True, pixels).any()
+    assert not refused(views, memory, 2.5, True, lambda *of: list(map(pixels, *of))).any()
+
+
+@every
+def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_again(
+    kind: Any, settings: Any
+) -> None:
+    field = kind(settings)
+    views = ring(13, size=32)
+    for update in range(4):
+        field.fit([replace(v, generated_ns=update * 100 * MS) for v in views], Budget(steps=40))
+    wrong = [replace(v, generated_ns=500 * MS) for v in views]
+    noise = np.random.default_rng(1).integers(0, 256, views[3].image.shape, dtype=np.uint8)
+    wrong[3] = replace(wrong[3], image=noise)
+    assert field.fit(wrong, Budget(steps=2)).refused == ("cam03",)
+    credit = field.rig.memory["cam03"].credit
+    assert credit < PATIENCE
+    again = field.fit(wrong, Budget(steps=2))
+    other = kind(settings)
+    other.load_state(field.state())
+    resumed = other.fit(wrong, Budget(steps=2))
+    assert again.refused == resumed.refused == ("cam03",)
+    assert field.rig.memory["cam03"].credit == other.rig.memory["cam03"].credit == credit
+    assert field.fit([replace(v, generated_ns=600 * MS) for v in views], Budget(steps=2)).refused == ()
+
+
+def test_cameras_whose_errors_are_learnt_are_not_refused() -> None:
+    field = NgpField(replace(NGP, exposure=True))
+    views = ring(13, size=32)
+    field.fit(views, Budget(steps=150))
+    dark = [replace(v, generated_ns=100 * MS) for v in views]
+    dark[3] = replace(dark[3], image=(views[3].image * 0.2).astype(np.uint8))
+    assert field.fit(dark, Budget(steps=2)).refused == ()
+
+
+@every
+def test_a_snapshot_is_of_the_box_the_field_has(kind: Any, settings: Any) -> None:
+    """Two cameras find one box, all of them another: what was learnt is void, what is shown too."""
+    field = kind(settings)
+    views, shift = ring(13, size=32), np.eye(4)
+    shift[:3, 3] = 3.0
+    field.fit([replace(v, camera_to_world=shift @ v.camera_to_world) for v in views[:2]], Budget(steps=5))
+    old = field.snapshot()
+    field.fit(views, Budget(steps=5))
+    assert field.rig.box != old.box, "the same box: nothing was tested"
+    assert field.snapshot().box == field.rig.box
 
 
 def test_three_views_cannot_outvote_one() -> None:

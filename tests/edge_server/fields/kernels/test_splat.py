@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from edge_server.fields import splat_torch
+from edge_server.fields import View, splat_torch
 from edge_server.fields.kernels.pool import CallerPool, Pool
 from edge_server.fields.kernels.rays import Views
+from edge_server.fields.kernels.splat_judge import Verdicts, judge
 from edge_server.fields.kernels.splat_project import BASE, OPACITY, QUATERNION, SCALE, TILE, Gaussians
 from edge_server.fields.kernels.splat_raster import (
     Loss,
@@ -398,13 +399,21 @@ def test_the_pull_on_a_place_is_the_gradient_by_position() -> None:
 def test_single_pixels_are_rendered_as_their_picture_is(lens: Pinhole) -> None:
     params, pose = _cloud(40, harmonics=4, seed=4), look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))
     snapshot = SplatSnapshot(BOX, _still(params, 4), BACK, (), CallerPool(), 0)
-    whole = snapshot.render(pose, lens)
-    x, y = np.random.default_rng(1).integers(0, (lens.width, lens.height), (40, 2)).T
-    color, depth, opacity = snapshot.render_pixels(pose, lens, np.stack([x, y], axis=-1) + 0.5)
-    np.testing.assert_allclose(color, whole.color[y, x], atol=1e-5)
-    np.testing.assert_allclose(depth, whole.depth[y, x], rtol=1e-4)
-    np.testing.assert_allclose(opacity, whole.opacity[y, x], atol=1e-5)
-    assert opacity.min() < 0.5 < opacity.max()
+    views = [
+        View("a", np.zeros((lens.height, lens.width, 3), np.uint8), pose, lens),
+        View(
+            "b", np.zeros((LENS.height, LENS.width, 3), np.uint8), look_at((2.0, 1.5, 1.0), (0, 0, 0)), LENS
+        ),
+    ]
+    rng, points = np.random.default_rng(1), []
+    for view, count in zip(views, (40, 7)):
+        size = (view.intrinsics.width, view.intrinsics.height)
+        points.append(rng.integers(0, size, (count, 2)) + 0.5)
+    for view, where, color in zip(views, points, snapshot.colors_at(views, points)):
+        whole = snapshot.render(view.camera_to_world, view.intrinsics)
+        x, y = where.astype(int).T
+        np.testing.assert_allclose(color, whole.color[y, x], atol=1e-5)
+        assert np.ptp(color) > 0.2
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e-40])
@@ -414,7 +423,8 @@ def test_no_parameter_poisons_single_pixels(value: float) -> None:
         params = _cloud(6)
         params[2, column] = value
         snapshot = SplatSnapshot(BOX, _still(params, 1), BACK, (), CallerPool(), 0)
-        assert all(np.isfinite(part).all() for part in snapshot.render_pixels(pose, LENS, pixels))
+        view = View("a", np.zeros((LENS.height, LENS.width, 3), np.uint8), pose, LENS)
+        assert np.isfinite(snapshot.colors_at([view], [pixels])[0]).all()
 
 
 def test_compared_pixels_are_as_far_off_as_the_rendering_is() -> None:
@@ -436,3 +446,45 @@ def test_compared_pixels_are_as_far_off_as_the_rendering_is() -> None:
             error[y : y + TILE, x : x + TILE], wanted[y : y + TILE, x : x + TILE], atol=1e-5
         )
     assert (error[:TILE, TILE:] == -1).all()
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_verdicts_are_what_pixel_after_pixel_says(lens: Pinhole, channels: int) -> None:
+    rng = np.random.default_rng(channels)
+    eyes = [(1.0, -2.5, 0.8), (2.0, 1.5, 1.0), (0.3, 0.2, 0.1)]  # the last among the Gaussians
+    poses = [look_at(eye, (0.05, 0.0, 0.1)) for eye in eyes]
+    lenses = [lens, LENS, lens]
+    cams = camera_rows(poses, lenses, BOX, [0.0, -0.2, -0.5])
+    sizes = np.array([[q.width, q.height] for q in lenses])
+    first = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
+    pixels = rng.integers(0, 256, (first[-1], channels), dtype=np.uint8)
+    marks = (rng.random(first[-1]) < 0.5).astype(np.uint8)
+    weight = (rng.random(first[-1]) < 0.8).astype(np.float32)
+    data = _views(pixels.reshape(1, -1, channels), weight)._replace(first=first, size=sizes)
+    params, velocity = _cloud(200, seed=3), rng.normal(size=(200, 3)).astype(np.float32)
+    params[7, 0], params[8, BASE - 1] = np.nan, np.inf
+    allowed = rng.uniform(0.1, 0.9, 200).astype(np.float32)
+    found = Verdicts.room(200)
+    CallerPool().run(judge, cams, data, marks, Gaussians(params, 1, velocity), allowed, found)
+    for i in range(200):
+        sees = marked = wrong = 0
+        off = []
+        for k, (pose, q, t) in enumerate(zip(poses, lenses, (0.0, -0.2, -0.5))):
+            local = (params[i, :3] + t * velocity[i] - pose[:3, 3]) @ pose[:3, :3]
+            if not local[2] > 0.05:
+                continue
+            u, v = q.project(local)
+            if not (0 <= u < q.width and 0 <= v < q.height):
+                continue
+            pixel = first[k] + int(v) * q.width + int(u)
+            if weight[pixel] > 0:
+                apart = np.abs(pixels[pixel, :3] / 255.0 - params[i, BASE - 3 : BASE]).max()
+                sees, off = sees + 1, [*off, min(apart, 0.5)]
+                marked += marks[pixel]
+                cut = channels == 4 and pixels[pixel, 3] < 128
+                wrong += marks[pixel] * (apart > allowed[i] or cut)
+        said = (found.sees[i], found.marked[i], found.wrong[i])
+        assert said == (sees, marked, wrong), f"Gaussian {i}"
+        assert found.off[i] == pytest.approx(np.mean(off) if off else 0.0, abs=1e-5)
+    assert found.sees.max() == 3 and 0 < found.wrong.sum() < found.marked.sum() < found.sees.sum()
