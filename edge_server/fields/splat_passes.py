@@ -48,7 +48,7 @@ def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
     return float(x0), float(x1), float(y0), float(y1)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def ray_lengths(camera: Pinhole) -> NDArray[np.float32]:
     """float32 (H, W): length of each pixel's ray per unit of depth along the optical axis."""
     return (1.0 / np.maximum(camera.rays()[..., 2], 1e-6)).astype(np.float32)

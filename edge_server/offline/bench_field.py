@@ -216,7 +216,7 @@ def draw(figures: dict[str, Any], path: Path) -> None:
     """PSNR against seconds from scratch, a panel a scene, a line a representation, to ``path`` (PNG)."""
     from edge_server.report.style import CYCLE, GREY, figure, label_lines
 
-    scenes = [name for name, part in figures.items() if isinstance(part, dict) and "baseline" in part]
+    scenes = [name for name, part in figures.items() if isinstance(part, dict) and "scene" in part]
     if not scenes:
         return
     with figure(path, len(scenes), height_inch=2.4) as (_, axes):
@@ -236,7 +236,7 @@ def draw(figures: dict[str, Any], path: Path) -> None:
 
 def table(figures: dict[str, Any]) -> str:
     """Markdown tables: the scenes, the curves, rates on our own scenes, and what a start costs."""
-    scenes = {name: part for name, part in figures.items() if isinstance(part, dict) and "baseline" in part}
+    scenes = {name: part for name, part in figures.items() if isinstance(part, dict) and "scene" in part}
     found = [
         (scene, name, rows)
         for scene, part in scenes.items()

@@ -215,7 +215,7 @@ def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.Fixture
 from tests.stability.test_field_nerfacto import TINY, VIEWS, NerfactoField, Budget, replace, np
 plain = {"contracted": False, "radius_m": 1.0}
 poses = {"refine_m": 0.05, "refine_deg": 2.0}
-few = {"batch_samples": 8192, "rays": 9}
+few = {"batch_samples": 8192, "rays": 9, "contracted": True, "radius_m": 0.5}
 for extra in ({"exposure": True, **poses}, {"harmonics": 4, **plain}, {"appearance": 3, **poses}, few):
     field = NerfactoField(replace(TINY, **extra))
     field.fit(VIEWS, Budget(steps=50))
@@ -224,6 +224,11 @@ for extra in ({"exposure": True, **poses}, {"harmonics": 4, **plain}, {"appearan
     assert np.isfinite(out.color).all()
 moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
 field.fit(moved, Budget(steps=20))
+field = NerfactoField(replace(TINY, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0))
+for later in range(3):
+    field.fit([replace(v, image=np.roll(v.image, 3 * later, axis=0), generated_ns=later * 10**8 + k * 10**7)
+               for k, v in enumerate(VIEWS)], Budget(steps=10))
+assert (field.rig._packed[1].weight > 0).any() and field.rig._packed[1].drawn.size, "nothing is masked"
 print("kept")
 """
     cache = request.config.cache

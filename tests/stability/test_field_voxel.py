@@ -199,7 +199,7 @@ def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.Fixture
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""
     code = """
 from tests.stability.test_field_voxel import TINY, VIEWS, VoxelField, Budget, replace, np
-for extra in ({}, {"contracted": False, "radius_m": 1.0}, {"parts": 7, "rays": 9, "background": "random"}):
+for extra in ({}, {"contracted": True, "radius_m": 0.5}, {"parts": 7, "rays": 9, "background": "random"}):
     field = VoxelField(replace(TINY, **extra))
     field.fit(VIEWS, Budget(steps=20))
     out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
@@ -207,6 +207,11 @@ for extra in ({}, {"contracted": False, "radius_m": 1.0}, {"parts": 7, "rays": 9
     assert np.isfinite(out.color).all()
 moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
 field.fit(moved, Budget(steps=20))
+field = VoxelField(replace(TINY, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0))
+for later in range(3):
+    field.fit([replace(v, image=np.roll(v.image, 3 * later, axis=0), generated_ns=later * 10**8 + k * 10**7)
+               for k, v in enumerate(VIEWS)], Budget(steps=10))
+assert (field.rig._packed[1].weight > 0).any() and field.rig._packed[1].drawn.size, "nothing is masked"
 print("kept")
 """
     cache = request.config.cache

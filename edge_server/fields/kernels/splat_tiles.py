@@ -71,7 +71,7 @@ def deal(counter, worker, columns, rows, count, projected, tiles, lists):
         for i in range(count):
             own_count[i] = 0
             if tiles[b, i, 1] > tiles[b, i, 0]:
-                # Depths are positive: their bits sort as they do. 2^-6 of the mantissa's steps suffice.
+                # Whole numbers sort faster: what is as near to another as this may come before or after it.
                 keys[0, n] = np.uint32(projected[b, i, DEPTH] * np.float32(16384.0))
                 order[0, n] = i
                 n += 1
