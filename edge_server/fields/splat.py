@@ -47,7 +47,7 @@ from edge_server.fields.turn import Turn
 from freshfield.geometry import Pinhole
 
 _AGES = 4096  # steps after which Adam's bias correction no longer matters
-AHEAD_S = 0.5  # no farther ahead is a movement carried on: people turn
+AHEAD_S = 0.3  # no farther ahead is a movement carried on: people turn
 CARRY_SHARE = 0.35  # of an update, at most, that carries along what moved: the rest learns
 CHANGED_SLOTS = 4  # pictures whose changed tiles one step looks at, at most
 

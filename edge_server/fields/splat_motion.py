@@ -33,7 +33,7 @@ OFF = 0.08  # a pixel this near to what it should be is shown well enough
 MOST = 0.5  # of a picture: more is no body that moved, but another light or a broken frame
 SEEDS_A_PIXEL = 0.1
 
-LONGEST_S = 1.0  # after a longer pause, nothing is known of how things move
+LONGEST_S = 0.45  # after a longer pause, nothing is known of how things move: people turn
 FASTEST_M_PER_S = 8.0
 CARRY_VIEWS = 6  # a step
 LEFT = 4  # updates after which a guest that moves no more belongs to the scene
