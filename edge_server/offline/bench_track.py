@@ -3,7 +3,8 @@
 A field that has settled on the first frame is given all training views of the next one and a short update,
 then those of the frame after that, and so on; each update is scored on the held-out camera at that frame.
 At some of the frames a new field of the same representation is fitted for fifteen seconds (or times the
-steps of an update) to the same views: that is what the follower could know. Between those frames its score is interpolated.
+steps of an update) to the same views: that is what the follower could know. Between those frames its score is
+interpolated.
 
 Updates are of some seconds, or of a number of steps (``--steps``), which repeats bit for bit.
 """
