@@ -44,7 +44,7 @@ def test_field(tmp_path, monkeypatch):
 
 def _curve(name, still, planned_s, seeds, lpips):
     """What ``bench field`` measures, without measuring: of two seeds, a dB more every point."""
-    series = {f"{s:g}_s": {"seconds": s, "psnr_db": 24.0 + k} for k, s in enumerate(planned_s)}
+    series = {f"{s:g}_s": {"seconds": s, "fitted_s": s, "psnr_db": 24.0 + k} for k, s in enumerate(planned_s)}
     to_db = {f"{db}_db": 0.5 if db < 25 else None for db in bench_field.TARGETS_DB}
     return {"seeds": seeds, "series": series, "seconds_to_db": to_db, "best_db": 25.0, "outside_cores": 0.25}
 
@@ -76,8 +76,8 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
     assert text.count("\n## ") == 1
 
     # A second part beside it, and another representation: what is known stays, nothing is measured twice.
-    words = ["fidelity", "--quick", "--json", str(path), "--resume", "--field", "ngp", "--field", "tensorf"]
-    assert edge_server(["bench", "field", *words]) == 0
+    words = ["fidelity", "--quick", "--json", str(path), "--resume"]
+    assert edge_server(["bench", "field", *words, "--field", "ngp,tensorf"]) == 0
     more = json.loads(path.read_text())
     assert asked == ["ngp", "ngp", "tensorf", "tensorf"]
     assert more["field"]["tile"]["ngp"] == found["tile"]["ngp"] and "tensorf" in more["field"]["room"]
