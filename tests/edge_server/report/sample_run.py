@@ -61,6 +61,7 @@ def publication(number: int) -> Publication:
         lpips=0.6 - psnr / 60 if scored else None,
         truth_gap_ms=3.0 if scored else None,
         scored_on="cam00" if scored else None,
+        refused=("cam02",) if number % 20 == 5 else (),
     )
 
 

@@ -34,7 +34,7 @@ def test_report_json_holds_what_is_returned_and_every_key_that_was_promised(run)
         "duplicated", "delivered", "rejected", "in_flight",
     }  # fmt: skip
     assert set(report["age_ms"]) == {"mean", "p50", "p95", "by_camera"}
-    assert set(report["updates"]) == {"count", "ms_p50", "ms_p95", "first_ms", "undecodable"}
+    assert set(report["updates"]) == {"count", "ms_p50", "ms_p95", "first_ms", "undecodable", "refused"}
     assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
     assert set(report["fidelity"]["baseline"]) == {"mean_colour_db", "nearest_view_db"}
     assert report["fidelity"]["lpips_missing"] is None
@@ -78,6 +78,7 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
     assert updates["count"] == 50  # the last one's line was not written any more
     assert updates["first_ms"] == 3100.0 and updates["undecodable"] == 1
     assert updates["ms_p50"] == np.percentile([publication(i).update_ms for i in range(49)], 50)
+    assert updates["refused"] == {"cam02": 3}  # 5, 25 and 45
 
 
 def test_every_figure_is_drawn_and_inside_the_page(run):
