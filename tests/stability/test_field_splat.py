@@ -231,6 +231,7 @@ def test_cameras_that_move_at_every_update() -> None:
     assert _score(field, views) > 15.0
 
 
+@pytest.mark.slow
 def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""
     code = """
