@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +14,8 @@ from edge_server.fields.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_settings import NgpSettings
 from freshfield.geometry import look_at
-from tests.edge_server.fields.scenes import picture, psnr, ring
+from tests.edge_server.fields.bounds import run_with_bounds_checks
+from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 
 TINY = NgpSettings(
     levels=4, levels_every=10, log2_table=11, finest_resolution=32, hidden=16, rays=512, batch_samples=4096,
@@ -37,78 +35,6 @@ def _healthy(field: NgpField, views: list[View] = VIEWS) -> None:
             assert np.isfinite(part).all()
         assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
         assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
-
-
-def _score(field: NgpField, views: list[View]) -> float:
-    pictures = [(field.render(v.camera_to_world, v.intrinsics).color, v.image / 255.0) for v in views]
-    return float(np.mean([psnr(a, b) for a, b in pictures]))
-
-
-def test_nothing_at_all() -> None:
-    field = NgpField(TINY)
-    assert field.fit([], Budget(steps=3)).steps == 0
-    points, colors = field.points(10)
-    assert points.shape == (0, 3) and colors.shape == (0, 3)
-    _healthy(field)
-
-
-def test_one_view() -> None:
-    field = NgpField(TINY)
-    field.fit(VIEWS[:1], Budget(steps=60))
-    _healthy(field)
-    assert _score(field, VIEWS[:1]) > 15.0
-
-
-def test_one_pixel() -> None:
-    camera = replace(VIEWS[0].intrinsics, width=1, height=1, cx=0.5, cy=0.5)
-    view = replace(VIEWS[0], image=np.full((1, 1, 3), 99, np.uint8), intrinsics=camera)
-    field = NgpField(TINY)
-    field.fit([view], Budget(steps=10))
-    _healthy(field, [view])
-
-
-@pytest.mark.parametrize("value", [0, 255, 77])
-@pytest.mark.parametrize("channels", [3, 4])
-def test_constant_black_and_saturated_pictures(value: int, channels: int) -> None:
-    views = [replace(v, image=np.full((24, 24, channels), value, np.uint8)) for v in VIEWS]
-    field = NgpField(TINY)
-    field.fit(views, Budget(steps=60))
-    _healthy(field)
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
-    alpha = value / 255.0 if channels == 4 else 1.0
-    expected = value / 255.0 * alpha + (1.0 - alpha) * field.rig.background().mean()
-    assert abs(out.mean() - expected) < 0.1
-
-
-def test_all_poses_identical() -> None:
-    pose = VIEWS[0].camera_to_world
-    views = [replace(v, camera_to_world=pose, image=VIEWS[0].image) for v in VIEWS]
-    field = NgpField(TINY)
-    field.fit(views, Budget(steps=60))
-    _healthy(field)
-
-
-def test_rays_that_miss_the_box() -> None:
-    field = NgpField(replace(TINY, centre_m=(50.0, 0.0, 0.0), radius_m=0.5, contracted=False))
-    report = field.fit(VIEWS, Budget(steps=20))
-    assert report.steps == 20 and report.rays > 0 and report.samples == 0
-    _healthy(field)
-    away = look_at((0, 0, 3.0), (0, 0, 9.0), up=(0, 1, 0))
-    trained = NgpField(TINY)
-    trained.fit(VIEWS, Budget(steps=20))
-    out = trained.render(away, VIEWS[0].intrinsics)
-    assert np.isfinite(out.color).all()
-
-
-def test_views_that_contradict_each_other() -> None:
-    rng = np.random.default_rng(0)
-    views = [replace(v, image=rng.integers(0, 256, (24, 24, 3), dtype=np.uint8)) for v in VIEWS]
-    field = NgpField(TINY)
-    for _ in range(5):
-        field.fit(views, Budget(steps=20))
-    _healthy(field)
-    field.fit(VIEWS, Budget(steps=150))  # and it recovers
-    assert _score(field, VIEWS) > 16.0
 
 
 def _poison_table(field: NgpField) -> None:
@@ -150,7 +76,7 @@ def test_damage_is_counted_and_healed(damage: Callable[[NgpField], None]) -> Non
     assert field.dropped == report.dropped and (report.dropped > 0) == (damage is not _poison_moments)
     assert field.fit(VIEWS, Budget(steps=200)).dropped == 0, "still not finite 40 steps later"
     _healthy(field)
-    assert _score(field, VIEWS) > 15.0
+    assert mean_psnr(field, VIEWS) > 15.0
 
 
 @pytest.mark.parametrize("damage", [_overflow, _saturate])
@@ -166,7 +92,7 @@ def test_density_that_overflows_stays_finite(damage: Callable[[NgpField], None])
     field.reset()
     field.fit(VIEWS, Budget(steps=200))
     _healthy(field)
-    assert _score(field, VIEWS) > 15.0
+    assert mean_psnr(field, VIEWS) > 15.0
 
 
 def test_a_thousand_updates_do_not_drift_or_grow() -> None:
@@ -180,7 +106,7 @@ def test_a_thousand_updates_do_not_drift_or_grow() -> None:
         frame = frames[update % 12]
         field.fit([frame[k] for k in rng.choice(9, 6, replace=False)], Budget(steps=2))
         if update % 100 >= 88:
-            scores.append(_score(field, frame[::4]))
+            scores.append(mean_psnr(field, frame[::4]))
             sizes.append(np.abs(field._grid.table).mean())
     _healthy(field)
     first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
@@ -200,7 +126,7 @@ def test_cameras_that_move_at_every_update() -> None:
             views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
         field.fit(views, Budget(steps=5))
     _healthy(field, views)
-    assert _score(field, views) > 15.0
+    assert mean_psnr(field, views) > 15.0
 
 
 @pytest.mark.slow
@@ -220,11 +146,4 @@ moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
 field.fit(moved, Budget(steps=20))
 print("kept")
 """
-    cache = request.config.cache
-    folder = str(cache.mkdir("numba-boundscheck")) if cache is not None else str(tmp_path)
-    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": folder}
-    out = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True,
-        cwd=Path(__file__).resolve().parents[2],
-    )  # fmt: skip
-    assert out.returncode == 0 and "kept" in out.stdout, out.stderr[-2000:]
+    run_with_bounds_checks(code, tmp_path, request)

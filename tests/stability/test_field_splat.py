@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +15,8 @@ from edge_server.fields.kernels.splat_update import OPACITY_LIMIT, POSITION_LIMI
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_settings import SplatSettings
 from freshfield.geometry import look_at
-from tests.edge_server.fields.scenes import picture, psnr, ring
+from tests.edge_server.fields.bounds import run_with_bounds_checks
+from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 
 TINY = SplatSettings(gaussians=400, start=250, seed_cells=16, densify_every=10, threads=2)
 VIEWS = ring(9, size=24)
@@ -45,11 +43,6 @@ def _healthy(field: SplatField, views: list[View] = VIEWS) -> None:
         assert out.opacity.min() >= 0.0 and out.opacity.max() <= 1.0
 
 
-def _score(field: SplatField, views: list[View]) -> float:
-    pictures = [(field.render(v.camera_to_world, v.intrinsics).color, v.image / 255.0) for v in views]
-    return float(np.mean([psnr(a, b) for a, b in pictures]))
-
-
 def test_nothing_at_all() -> None:
     field = SplatField(TINY)
     assert field.fit([], Budget(steps=3)).steps == 0
@@ -62,7 +55,7 @@ def test_one_view() -> None:
     field = SplatField(TINY)
     field.fit(VIEWS[:1], Budget(steps=60))
     _healthy(field)
-    assert _score(field, VIEWS[:1]) > 15.0
+    assert mean_psnr(field, VIEWS[:1]) > 15.0
 
 
 def test_one_pixel_and_one_gaussian() -> None:
@@ -118,7 +111,7 @@ def test_views_that_contradict_each_other() -> None:
         field.fit(views, Budget(steps=20))
     _healthy(field)
     field.fit(VIEWS, Budget(steps=150))  # and it recovers
-    assert _score(field, VIEWS) > 16.0
+    assert mean_psnr(field, VIEWS) > 16.0
 
 
 def test_a_poisoned_view_is_survived() -> None:
@@ -132,7 +125,7 @@ def test_a_poisoned_view_is_survived() -> None:
     for _ in range(50):
         for f in (field, clean):
             f.fit(VIEWS, Budget(steps=4))
-    assert _score(field, VIEWS) > _score(clean, VIEWS) - 0.5
+    assert mean_psnr(field, VIEWS) > mean_psnr(clean, VIEWS) - 0.5
 
 
 def _parameter(column: int, value: float, every: int = 7) -> Callable[[SplatField], None]:
@@ -161,7 +154,7 @@ def test_damage_is_healed(damage: Callable[[SplatField], None]) -> None:
     assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
     field.fit(VIEWS, Budget(steps=120))
     _healthy(field)
-    assert _score(field, VIEWS) > 17.0
+    assert mean_psnr(field, VIEWS) > 17.0
     assert field.fit(VIEWS, Budget(steps=40)).dropped == 0, "still not finite 120 steps later"
 
 
@@ -172,7 +165,7 @@ def test_everything_faded_or_opaque(raw: float) -> None:
     field.cloud.params[:, OPACITY] = raw
     field.fit(VIEWS, Budget(steps=200))
     _healthy(field)
-    assert _score(field, VIEWS) > 16.0
+    assert mean_psnr(field, VIEWS) > 16.0
 
 
 def test_quaternions_without_direction_and_flat_gaussians() -> None:
@@ -182,7 +175,7 @@ def test_quaternions_without_direction_and_flat_gaussians() -> None:
     field.cloud.params[::3, SCALE] = -60.0
     field.fit(VIEWS, Budget(steps=60))
     _healthy(field)
-    assert _score(field, VIEWS) > 17.0
+    assert mean_psnr(field, VIEWS) > 17.0
 
 
 def test_giants_everywhere_cost_bounded_memory() -> None:
@@ -209,7 +202,7 @@ def test_a_thousand_updates_do_not_drift_or_grow() -> None:
         followed += int((np.abs(field.cloud.velocity) > 0).any())
         assert len(field.cloud) <= TINY.gaussians
         if update % 100 >= 88:
-            scores.append(_score(field, frame[::4]))
+            scores.append(mean_psnr(field, frame[::4]))
     _healthy(field)
     first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
     assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
@@ -228,7 +221,7 @@ def test_cameras_that_move_at_every_update() -> None:
             views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
         field.fit(views, Budget(steps=5))
     _healthy(field, views)
-    assert _score(field, views) > 15.0
+    assert mean_psnr(field, views) > 15.0
 
 
 @pytest.mark.slow
@@ -260,11 +253,4 @@ for later in (1, 2, 3):
     assert field._refused == ({"cam02"} if later == 2 else set())
 print("kept")
 """
-    cache = request.config.cache
-    folder = str(cache.mkdir("numba-boundscheck")) if cache is not None else str(tmp_path)
-    environment = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": folder}
-    out = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True,
-        cwd=Path(__file__).resolve().parents[2],
-    )  # fmt: skip
-    assert out.returncode == 0 and "kept" in out.stdout, out.stderr[-2000:]
+    run_with_bounds_checks(code, tmp_path, request)

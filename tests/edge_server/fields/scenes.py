@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,3 +52,9 @@ def ring(
 def psnr(a: NDArray, b: NDArray) -> float:
     """PSNR in dB of float pictures in [0, 1]."""
     return float(-10.0 * np.log10(np.mean((np.asarray(a, float) - b) ** 2) + 1e-12))
+
+
+def mean_psnr(field: Any, views: list[View]) -> float:
+    """Of what a field shows of ``views``, dB."""
+    pictures = [(field.render(v.camera_to_world, v.intrinsics).color, v.image / 255.0) for v in views]
+    return float(np.mean([psnr(a, b) for a, b in pictures]))
