@@ -123,3 +123,8 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@echo "test tools"
 	@$(INSTALL) -e '.[edge,up,test,dev]'
 	@touch $@
+
+# What slow tests need besides: Ray, some 240 MB.
+.venv/.ok-slow: .venv/.ok-test
+	@$(INSTALL) -e '.[cluster]'
+	@touch $@

@@ -29,9 +29,13 @@ class Sawtooth:
 
 def sawtooth(delivered_ns: Instants, generated_ns: Instants, end_ns: int) -> Sawtooth:
     """From all deliveries in any order: late ones that bring nothing newer do not change the age (5.4)."""
-    order = np.argsort(delivered_ns, kind="stable")
-    due, born = delivered_ns[order], generated_ns[order]
-    newest = np.maximum.accumulate(born) if len(born) else born
+    due, born = delivered_ns, generated_ns
+    if (due[1:] < due[:-1]).any():  # only where frames overtake each other
+        order = np.argsort(due, kind="stable")
+        due, born = due[order], born[order]
+    if (born[1:] > born[:-1]).all():
+        return Sawtooth(due, born, end_ns)
+    newest = np.maximum.accumulate(born)
     fresh = np.ones(len(born), bool)
     fresh[1:] = born[1:] > newest[:-1]
     return Sawtooth(due[fresh], born[fresh], end_ns)
@@ -64,13 +68,56 @@ def peak_age_ms(saw: Sawtooth) -> float | None:
     return float((saw.delivered_ns[1:] - saw.generated_ns[:-1]).mean() / 1e6)
 
 
+def newest_at(saw: Sawtooth, at_ns: Instants) -> Instants:
+    """When the newest frame delivered by each instant (T,) was generated, int64 ns; -1 before the first."""
+    if not len(saw.delivered_ns):
+        return np.full(np.shape(at_ns), -1, np.int64)
+    k = np.searchsorted(saw.delivered_ns, at_ns, side="right") - 1
+    return np.where(k >= 0, saw.generated_ns[np.maximum(k, 0)], -1)
+
+
 def ages_at(saw: Sawtooth, at_ns: Instants) -> NDArray[np.float64]:
     """Age in ms at any instants (T,) (5.5); NaN before the first delivery."""
-    at = np.asarray(at_ns, np.int64)
-    if not len(saw.delivered_ns):
-        return np.full(at.shape, np.nan)
-    k = np.searchsorted(saw.delivered_ns, at, side="right") - 1
-    return np.where(k >= 0, (at - saw.generated_ns[np.maximum(k, 0)]) / 1e6, np.nan)
+    born_ns = newest_at(saw, at_ns)
+    return np.where(born_ns >= 0, (np.asarray(at_ns, np.int64) - born_ns) / 1e6, np.nan)
+
+
+class RunningAge:
+    """``mean_age_ms`` and ``peak_age_ms`` of deliveries as they come, in fixed memory. Deliveries come in
+    order of time."""
+
+    def __init__(self) -> None:
+        self._first_ns = self._delivered_ns = self._generated_ns = 0
+        self._area = 0  # ns², whole: a float would lose the last tooth of a long run
+        self._peaks_ns = 0
+        self._teeth = 0
+
+    def add(self, delivered_ns: int, generated_ns: int) -> None:
+        """A delivery; one that brings nothing newer changes nothing."""
+        if self._teeth and generated_ns <= self._generated_ns:
+            return
+        if self._teeth:
+            self._area += self._tooth(delivered_ns)
+            self._peaks_ns += delivered_ns - self._generated_ns
+        else:
+            self._first_ns = delivered_ns
+        self._teeth += 1
+        self._delivered_ns, self._generated_ns = delivered_ns, generated_ns
+
+    def mean_age_ms(self, end_ns: int) -> float | None:
+        """From the first delivery to ``end_ns``; None where nothing arrived."""
+        if not self._teeth or end_ns <= self._first_ns:
+            return None
+        return (self._area + self._tooth(end_ns)) / 2 / (end_ns - self._first_ns) / 1e6
+
+    def peak_age_ms(self) -> float | None:
+        """Mean of the ages just before each delivery; None with fewer than two."""
+        return self._peaks_ns / (self._teeth - 1) / 1e6 if self._teeth > 1 else None
+
+    def _tooth(self, until_ns: int) -> int:
+        """Twice the area under the present tooth."""
+        length = until_ns - self._delivered_ns
+        return length * (2 * (self._delivered_ns - self._generated_ns) + length)
 
 
 def _teeth(saw: Sawtooth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

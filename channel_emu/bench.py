@@ -102,6 +102,7 @@ def bench(
         "not_sent": sent["behind"],
         "arrived": arrived,
         "lost": sent["sent"] - arrived,
+        "broken": status["counts"]["broken"],
         "messages_per_s": round(sent["sent"] / sent["seconds"], 1),
         "megabytes_per_s": round(sent["sent"] * frame_bytes / sent["seconds"] / 1e6, 2),
         "delay_error_ms": status["delay_error_ms"],
@@ -121,7 +122,8 @@ def show(result: dict[str, Any]) -> str:
         f"{result['cameras']} cameras x {result['rate_hz']:g} Hz x {result['frame_bytes']:,} bytes for "
         f"{result['seconds']:g} s, {result['load']} computing beside, priority {result['priority']}",
         f"throughput       {result['messages_per_s']:,.0f} messages/s, {result['megabytes_per_s']:g} MB/s; "
-        f"sent {result['sent']:,}, lost {result['lost']:,}, cameras behind {result['not_sent']:,} times",
+        f"sent {result['sent']:,}, lost {result['lost']:,}, cameras behind {result['not_sent']:,} times"
+        + (f"; {result['broken']:,} found the sink too far behind" if result["broken"] else ""),
         _row("delay error", error),
         _row("arrival error", result["arrival_error_ms"]),
         _row("answer to camera", result["answer_ms"]),

@@ -1,7 +1,8 @@
 """The network's state: a continuous-time Markov chain of M states, sampled exactly (thesis 6.2.5).
 
-Every jump of the chain is drawn at its own instant; nothing is decided on a slot grid, so a chain that
-switches many times within a frame's transit is right too.
+Every jump of the chain is drawn at its own instant, so a chain that switches many times within a frame's
+transit is right too. Where ``slot_ms`` is given the state is drawn anew at slot boundaries only and kept in
+between, as the thesis does (6.27): the same at the boundaries, but blind to what happens between them.
 """
 
 from __future__ import annotations
@@ -20,8 +21,6 @@ MAX_JUMPS_PER_MS = 1_000.0
 # From this relaxation rate on, states one nanosecond apart are independent to 2^-53: nothing is lost by
 # drawing each instant's state directly.
 WHITE_RATE_PER_MS = 4e7
-
-
 _CHECK_EVERY = 100_000
 
 
@@ -64,7 +63,9 @@ def transition_matrix(generator_per_ms: NDArray[np.float64], span_ms: float) -> 
         if a + b == 0.0:
             return np.eye(2)
         moved = -math.expm1(-(a + b) * span_ms) / (a + b)
-        return np.array([[1 - a * moved, a * moved], [b * moved, 1 - b * moved]])
+        kept = math.exp(-(a + b) * span_ms)
+        # Sums, not one minus the others: a state that is hardly ever kept has digits too.
+        return np.array([[(b + a * kept) / (a + b), a * moved], [b * moved, (a + b * kept) / (a + b)]])
     fastest = float(-q.diagonal().min())
     if fastest * span_ms == 0.0:
         return np.eye(len(q))
@@ -115,23 +116,49 @@ def _recurrent(q: NDArray[np.float64]) -> list[int]:
     return [int(state) for state in closed.pop()]
 
 
-class Chain:
-    """A path of the chain, extended on demand. Instants may be asked for in any order until forgotten."""
+def leaving(transitions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Probability of leaving each state in one step, (M,): the sum of the row's other entries, which keeps
+    digits that one minus the diagonal has lost."""
+    return np.minimum((transitions - np.diag(np.diag(transitions))).sum(1), 1.0)
 
-    def __init__(self, generator_per_ms: NDArray[np.float64], uniforms: Uniforms, initial: int | None = None):
+
+class Chain:
+    """A path of the chain, extended on demand. Instants may be asked for in any order until forgotten.
+
+    generator_per_ms: (M, M). initial: the first state; drawn from the stationary distribution if None.
+    slot_ms: None follows every jump; a number samples the state every so many ms. A state then lasts a
+    geometric number of slots, which is one draw and the same in law as a draw a slot.
+    """
+
+    def __init__(
+        self,
+        generator_per_ms: NDArray[np.float64],
+        uniforms: Uniforms,
+        initial: int | None = None,
+        slot_ms: float | None = None,
+    ) -> None:
         q = check_generator(generator_per_ms)
         self.generator_per_ms = q
         self.states = len(q)
         self.shares = np.zeros(len(q))  # long-run shares, where there are such and they matter
         self._uniforms = uniforms
-        self.rates_per_ms = -q.diagonal()
+        self.slot_ns = 0 if slot_ms is None else round(slot_ms * 1e6)
+        if slot_ms is not None:
+            if self.slot_ns < 1:
+                raise ChainError(f"a slot lasts at least a nanosecond, got {slot_ms:g} ms")
+            q = transition_matrix(q, self.slot_ns / 1e6)
+        off = q - np.diag(np.diag(q))
+        leave = leaving(q) if self.slot_ns else off.sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            jumps = np.cumsum((q - np.diag(np.diag(q))) / self.rates_per_ms[:, None], 1)
+            jumps = np.cumsum(off / off.sum(1)[:, None], 1)
+            # Per state what the length of a sojourn follows from: its rate in 1/ms; in slots, the logarithm
+            # of the probability to stay for one more.
+            self.pace = np.log1p(-leave) if self.slot_ns else leave
         # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
-        self.jumps = np.where(np.arange(self.states) >= self._last_targets(q)[:, None], 1.0, jumps)
+        self.jumps = np.where(np.arange(self.states) >= self._last_targets(off)[:, None], 1.0, jumps)
         self._jump_lists = self.jumps.tolist()
-        self._rates = [float(r) for r in self.rates_per_ms]
-        self.white = self._is_white()
+        self._pace = [float(p) for p in self.pace]
+        self.white = not self.slot_ns and self._is_white()
         self.initial = self._draw_initial() if initial is None else initial
         self._starts = [0]
         self._visited = [self.initial]
@@ -196,7 +223,10 @@ class Chain:
             if self._number - mark == _CHECK_EVERY:
                 # A rate that the stationary distribution did not foretell, as before an absorbing state.
                 if (start - mark_ns) * MAX_JUMPS_PER_MS * 10 < _CHECK_EVERY * 10**6:
-                    raise ChainError("the chain switches more than 10000 times a ms: slow it down")
+                    raise ChainError(
+                        "the chain switches more than 10000 times a ms: slow it down, or sample it at slot "
+                        "boundaries (sampled: slots)"
+                    )
                 mark, mark_ns = self._number, start
             target = bisect_right(self._jump_lists[self._visited[-1]], self._uniforms.pair(self._number)[1])
             self._number += 1
@@ -205,10 +235,16 @@ class Chain:
             self._until = self._sojourn_end(start, target)
 
     def _sojourn_end(self, start_ns: int, state: int) -> int:
-        rate = self._rates[state]
-        if rate == 0.0:
+        pace = self._pace[state]
+        if pace == 0.0:
             return NEVER_NS
-        return later(start_ns, saturate(-math.log(self._uniforms.pair(self._number)[0]) / rate * 1e6))
+        logarithm = math.log(self._uniforms.pair(self._number)[0])
+        if not self.slot_ns:
+            return later(start_ns, saturate(-logarithm / pace * 1e6))
+        slots = logarithm / pace
+        if slots * self.slot_ns >= NEVER_NS:
+            return NEVER_NS
+        return later(start_ns, (int(slots) + 1) * self.slot_ns)
 
     def _draw_initial(self) -> int:
         shares = np.cumsum(stationary(self.generator_per_ms))
@@ -216,26 +252,27 @@ class Chain:
 
     def _is_white(self) -> bool:
         """True for a two-state chain so fast that it is noise. Refuses what is too fast to follow."""
-        if not self.rates_per_ms.all():
+        rates_per_ms = -self.generator_per_ms.diagonal()
+        if not rates_per_ms.all():
             return False  # it comes to rest somewhere
         try:
             self.shares = stationary(self.generator_per_ms)
         except ChainError:
             return False
-        jumps_per_ms = float(self.shares @ self.rates_per_ms)
+        jumps_per_ms = float(self.shares @ rates_per_ms)
         if jumps_per_ms <= MAX_JUMPS_PER_MS:
             return False
-        if self.states == 2 and self.rates_per_ms.sum() >= WHITE_RATE_PER_MS:
+        if self.states == 2 and rates_per_ms.sum() >= WHITE_RATE_PER_MS:
             return True
         raise ChainError(
             f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {MAX_JUMPS_PER_MS:g} are "
-            f"followed (two-state chains faster than {WHITE_RATE_PER_MS:g} a ms are treated as noise)"
+            f"followed (two-state chains faster than {WHITE_RATE_PER_MS:g} a ms are treated as noise); or "
+            "sample it at slot boundaries (sampled: slots)"
         )
 
     def _state_of_instant(self, at_ns: int) -> int:
         return 0 if self._uniforms.uniform(at_ns) < self.shares[0] else 1
 
     @staticmethod
-    def _last_targets(q: NDArray[np.float64]) -> NDArray[np.intp]:
-        off = q - np.diag(np.diag(q))
+    def _last_targets(off: NDArray[np.float64]) -> NDArray[np.intp]:
         return np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])

@@ -6,6 +6,7 @@ from channel_emu import faults
 from channel_emu.chain import Chain
 from channel_emu.config import ChannelConfig, per_state
 from channel_emu.link import Link
+from channel_emu.server import Server
 from channel_emu.service import (
     NoService,
     Service,
@@ -27,6 +28,7 @@ class Channel:
         self.config = config
         self.seed = seed
         self.chain = self._chain("") if config.chain is not None and config.chain.scope == "shared" else None
+        self._server = Server(config.server.order, config.queue_limit) if config.server.shared else None
 
     def chain_of(self, camera: str) -> Chain | None:
         """A fresh chain of the camera's own where each has one, else the shared one (None: one state)."""
@@ -35,7 +37,8 @@ class Channel:
 
     def link(self, camera: str, *, sampled: bool = True) -> Link:
         """A fresh link. ``sampled=False``: frames are offered at the arrivals of the arrival process itself,
-        so the link takes each as it comes."""
+        so the link takes each as it comes. Links of a shared server serve the cameras they were made for:
+        make one for each camera."""
         chain = self.chain_of(camera)
         arrivals = self.arrivals(camera, chain) if sampled else None
         return Link(
@@ -44,7 +47,7 @@ class Channel:
             self.service(camera, chain),
             arrivals,
             faults.make(self.config.faults, self.seed, camera) if self.config.faults else (),
-            self.config.queue_limit,
+            self._server or Server(queue_limit=self.config.queue_limit),
         )
 
     def forget(self, before_ns: int) -> None:
@@ -85,4 +88,5 @@ class Channel:
         config = self.config.chain
         assert config is not None
         initial = None if config.initial is None else config.names().index(config.initial)
-        return Chain(config.generator(), Uniforms(self.seed, camera, "channel.chain"), initial)
+        uniforms = Uniforms(self.seed, camera, "channel.chain")
+        return Chain(config.generator(), uniforms, initial, config.slot_ms)

@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from channel_emu import spell
-from channel_emu.config import ChannelConfig, channel_from_mapping
+from channel_emu.config import SCOPES, ChannelConfig, channel_from_mapping
 from channel_emu.link import DISCIPLINES
+from channel_emu.observed import ROW_DISCIPLINES
 from channel_emu.presets import PRESETS
+from channel_emu.server import ORDERS
 from freshfield import scenario, transport
 
 DESCRIPTION = """\
@@ -26,7 +28,11 @@ Emulates a bad network between cameras and the edge, seeded and per frame.
   channel-emu simulate --preset ch6 --cameras 18 --seconds 600
   channel-emu simulate --arrivals poisson:1/60ms --service exp:30ms --discipline lcfs-preempt
   channel-emu replay runs/room/trace.jsonl
+  channel-emu proxy --preset ch5 --to localhost:50051 --listen 127.0.0.1:50052 --seed 1
+  channel-emu fit runs/room/trace.jsonl --plot fit.png --out fitted.yaml
   channel-emu bench --seconds 20 --load 2
+  channel-emu bench --simulate
+  channel-emu accuracy --out runs/accuracy
 """
 _HARD_LIMIT_STATUS = 3
 
@@ -41,7 +47,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     _add_run(commands)
     _add_simulate(commands)
     _add_replay(commands)
+    _add_proxy(commands)
+    _add_fit(commands)
     _add_bench(commands)
+    _add_accuracy(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     try:
@@ -114,18 +123,8 @@ def _add_simulate(commands: Any) -> None:
         description="Simulates every camera's link and prints mean age (continuous time average), mean age "
         "at slot boundaries, peak age, what was delivered and dropped, the chain's shares and the delays.",
     )  # fmt: skip
-    source = sub.add_mutually_exclusive_group()
-    source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
-    source.add_argument("--scenario", help="take the channel section of a scenario")
-    sub.add_argument("--arrivals", metavar="SPEC", help="as-offered, periodic:30ms, poisson:1/30ms, or a "
-                     "rate for each state: mmpp:1/120ms,1/30ms")  # fmt: skip
-    sub.add_argument("--service", metavar="SPEC", help="none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
-                     "lognormal:60ms:SIGMA, trace:FILE")  # fmt: skip
-    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="exp:30ms,exp:60ms")
-    sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, "
-                     "and scope=per-camera, initial=s1")  # fmt: skip
-    sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
-    sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
+    _add_channel_options(sub)
+    sub.add_argument("--spread", action="store_true", help="periodic cameras take turns over the period")
     sub.add_argument("--cameras", type=int, default=1, metavar="N", help="default: %(default)s")
     sub.add_argument("--seconds", type=float, default=600.0, metavar="S", help="default: %(default)s")
     sub.add_argument("--seed", type=int, default=0, metavar="K", help="default: %(default)s")
@@ -136,6 +135,24 @@ def _add_simulate(commands: Any) -> None:
     sub.add_argument("--engine", choices=["auto", "python", "kernel"], default="auto")
     sub.add_argument("--json", action="store_true", help="everything, as one JSON object")
     sub.set_defaults(go=_simulate)
+
+
+def _add_channel_options(sub: argparse.ArgumentParser) -> None:
+    """A channel as ``_config_of`` reads it."""
+    source = sub.add_mutually_exclusive_group()
+    source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
+    source.add_argument("--scenario", help="take the channel section of a scenario")
+    sub.add_argument("--arrivals", metavar="SPEC", help="as-offered, periodic:30ms, poisson:1/30ms, or a "
+                     "rate for each state: mmpp:1/120ms,1/30ms")  # fmt: skip
+    sub.add_argument("--service", metavar="SPEC", help="none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
+                     "lognormal:60ms:SIGMA, trace:FILE")  # fmt: skip
+    sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="exp:30ms,exp:60ms")
+    sub.add_argument("--chain", metavar="SPEC", help="mu1=1/30,mu2=1/30 per ms, and "
+                     "scope=per-camera, initial=s1, slots=1ms, or {generator_per_ms: [[..]]}")  # fmt: skip
+    sub.add_argument("--service-state", choices=["at-start", "modulated"], help="when the state counts")
+    sub.add_argument("--discipline", choices=DISCIPLINES, help="what a busy link does with a frame")
+    sub.add_argument("--shared-server", metavar="ORDER", choices=ORDERS, help="one line for all cameras; "
+                     f"whose waiting frame is next: {', '.join(ORDERS)}")  # fmt: skip
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -180,9 +197,15 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
         "service_state": args.service_state,
         "discipline": args.discipline,
     }
+    if args.shared_server:
+        given["server"] = {"shared": True, "order": args.shared_server}
+    if vars(args).get("spread"):  # of simulate alone
+        base = section.get("arrivals") or {}
+        base = {"process": base} if isinstance(base, str) else base
+        given["arrivals"] = {**(given["arrivals"] or base), "spread": True}
     if args.service_by_state:
         given["service"] = spell.service_by_state(args.service_by_state)
-    return channel_from_mapping({**section, **{k: v for k, v in given.items() if v is not None}}, "simulate")
+    return channel_from_mapping({**section, **{k: v for k, v in given.items() if v is not None}}, "channel")
 
 
 def _add_replay(commands: Any) -> None:
@@ -209,16 +232,113 @@ def _replay(args: argparse.Namespace) -> int:
     return 0 if result["equal"] == result["frames"] else 1
 
 
+def _add_proxy(commands: Any) -> None:
+    sub = commands.add_parser(
+        "proxy", help="put any gRPC service behind a seeded link: unary calls and streams, nothing is parsed",
+        description="Clients connect to LISTEN instead of the service at TO. A dropped unary call answers "
+        "UNAVAILABLE, a dropped stream message is left out. Prints what happened on Ctrl-C. In tests, use "
+        "the pytest fixture of channel_emu.testing.",
+    )  # fmt: skip
+    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
+    sub.add_argument("--to", required=True, metavar="HOST:PORT", help="the service")
+    _add_channel_options(sub)
+    sub.add_argument("--seed", type=int, default=0, metavar="K", help="default: %(default)s")
+    sub.add_argument("--direction", choices=["up", "down", "both"], default="up", help="messages that pass "
+                     "the link: to the service, its answers, or both (%(default)s)")  # fmt: skip
+    sub.add_argument("--shared", action="store_true", help="one link for all methods, not one for each")
+    sub.add_argument("--trace", type=Path, metavar="FILE", help="record what happens to every message")
+    sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
+    sub.add_argument("--hard-limit-ms", type=float, metavar="MS", help="stop if a message leaves this late")
+    sub.add_argument("--no-priority", action="store_true", help="do not ask to run before other processes")
+    sub.add_argument("--json", action="store_true")
+    transport.add_arguments(sub)
+    sub.set_defaults(go=_proxy)
+
+
+def _proxy(args: argparse.Namespace) -> int:
+    from channel_emu import trace
+    from channel_emu.generic import GenericOptions, GenericProxy, Report, show
+    from channel_emu.lane import HardLimit
+    from channel_emu.priority import raise_priority
+
+    config = _config_of(args)
+    if args.hard_limit_ms is not None:
+        config = dataclasses.replace(config, hard_limit_ms=args.hard_limit_ms)
+    options = GenericOptions(
+        args.listen, args.to, transport.from_arguments(args), args.direction, args.shared, args.trace,
+        trace.read(args.replay) if args.replay else None,
+    )  # fmt: skip
+    if not args.no_priority:
+        raise_priority()
+    sys.setswitchinterval(0.0005)
+
+    async def live() -> Report:
+        stop = asyncio.Event()
+        for name in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(name, stop.set)
+        proxy = GenericProxy(config, args.seed, options)
+        return await proxy.run(stop)
+
+    try:
+        report = asyncio.run(live())
+    except HardLimit as error:
+        print(f"channel-emu: {error}", file=sys.stderr)
+        return _HARD_LIMIT_STATUS
+    print(json.dumps(report.plain()) if args.json else show(report))
+    return 0
+
+
+def _add_fit(commands: Any) -> None:
+    sub = commands.add_parser(
+        "fit", help="estimate a channel from a recording: chain, rates, delays, bursts, with 95 %% intervals",
+        description="Fits one or two hidden states to a trace of this emulator (its recorded states are not "
+        "looked at) or to rows of any link: offered_ms, delivered_ms (blank: it never came), camera. Prints "
+        "the channel section for a scenario.",
+    )  # fmt: skip
+    sub.add_argument("trace", type=Path)
+    sub.add_argument("--states", choices=["1", "2", "auto"], default="auto", help="auto: by BIC")
+    sub.add_argument("--use-states", action="store_true", help="take the states that the trace recorded")
+    sub.add_argument("--scope", choices=SCOPES, default="shared", help="one chain for all cameras "
+                     "(%(default)s), or one for each")  # fmt: skip
+    sub.add_argument("--discipline", choices=ROW_DISCIPLINES, help="what the link of the rows does with a "
+                     "frame while it is busy (default: drop-new)")  # fmt: skip
+    sub.add_argument("--out", type=Path, metavar="FILE.yaml", help="write a scenario with the fitted channel")
+    sub.add_argument("--plot", type=Path, metavar="FILE", help="picture: delays over time and the state")
+    sub.add_argument("--json", action="store_true")
+    sub.set_defaults(go=_fit)
+
+
+def _fit(args: argparse.Namespace) -> int:
+    from channel_emu import fitshow
+    from channel_emu.fit import fit
+
+    result = fit(args.trace, args.states, discipline=args.discipline, scope=args.scope,
+                 use_states=args.use_states)  # fmt: skip
+    if args.out:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(fitshow.scenario(result))
+    if args.plot:
+        fitshow.plot(result, args.plot)
+    print(json.dumps(result.summary()) if args.json else fitshow.show(result))
+    return 0
+
+
 def _add_bench(commands: Any) -> None:
     sub = commands.add_parser(
         "bench", help="measure the live emulator on this machine: throughput and its own delay error",
         description="Cameras, emulator and a sink as separate processes on loopback; exponential delays, "
-        "every frame delivered. Prints messages a second, frames lost, and the histogram of delay error.",
+        "every frame delivered. Prints messages a second, frames lost, and the histogram of delay error. "
+        "With --simulate or --cost: the links in virtual time instead.",
     )  # fmt: skip
+    what = sub.add_mutually_exclusive_group()
+    what.add_argument("--simulate", action="store_true", help="link-slots a second in virtual time, beside a "
+                      "plain Python loop over slots in the same run")  # fmt: skip
+    what.add_argument("--cost", action="store_true", help="ns a frame of an ideal link, and what each fault, "
+                      "law and chain adds")  # fmt: skip
     sub.add_argument("--cameras", type=int, default=18, metavar="N", help="default: %(default)s")
     sub.add_argument("--rate", type=float, default=33.0, metavar="HZ", help="of each camera (%(default)s)")
     sub.add_argument("--bytes", type=int, default=20_000, metavar="N", help="of each frame (%(default)s)")
-    sub.add_argument("--seconds", type=float, default=15.0, metavar="S", help="default: %(default)s")
+    sub.add_argument("--seconds", type=float, metavar="S", help="15, or 2000 virtual ones with --simulate")
     sub.add_argument("--load", type=int, default=0, metavar="N", help="processes that compute beside it")
     sub.add_argument("--no-priority", action="store_true")
     sub.add_argument("--json", action="store_true")
@@ -226,11 +346,47 @@ def _add_bench(commands: Any) -> None:
 
 
 def _bench(args: argparse.Namespace) -> int:
+    if args.cost:
+        from channel_emu.bench_virtual import bench_cost, show_cost
+
+        rows = bench_cost()
+        print(json.dumps(rows) if args.json else show_cost(rows))
+        return 0
+    if args.simulate:
+        from channel_emu.bench_virtual import LOOPS, bench_simulate, show_simulate
+
+        found = [bench_simulate(args.cameras, args.seconds or 2000.0, preset=preset) for preset in LOOPS]
+        print(json.dumps(found) if args.json else "\n".join(show_simulate(each) for each in found))
+        return 0
     from channel_emu.bench import bench, show
 
-    result = bench(args.cameras, args.rate, args.bytes, args.seconds, args.load, not args.no_priority)
+    seconds = 15.0 if args.seconds is None else args.seconds
+    result = bench(args.cameras, args.rate, args.bytes, seconds, args.load, not args.no_priority)
     print(json.dumps(result) if args.json else show(result))
     return 0 if result["lost"] == 0 else 1
+
+
+def _add_accuracy(commands: Any) -> None:
+    sub = commands.add_parser(
+        "accuracy", help="what accuracy costs in time: the simulation's error against seconds, slots, seeds",
+        description="Measures the mean age against its exact value: by seconds simulated and computed, by "
+        "slot length (bias and speed), by number of seeds (width of the interval).",
+    )  # fmt: skip
+    sub.add_argument("--quick", action="store_true", help="fewer seeds, shorter runs")
+    sub.add_argument("--seed", type=int, default=0, metavar="K", help="the first one (default: %(default)s)")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="write the tables as CSV and a figure there")
+    sub.add_argument("--json", action="store_true")
+    sub.set_defaults(go=_accuracy)
+
+
+def _accuracy(args: argparse.Namespace) -> int:
+    from channel_emu.accuracy import measure, show, write
+
+    tables = measure(args.quick, args.seed)
+    print(json.dumps(tables) if args.json else show(tables))
+    for path in write(tables, args.out) if args.out else ():
+        print(f"wrote {path}", file=sys.stderr)
+    return 0
 
 
 if __name__ == "__main__":

@@ -15,15 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from channel_emu import faults as fault_modules
-from channel_emu.chain import MAX_JUMPS_PER_MS, ChainError, check_generator, stationary, two_state_generator
+from channel_emu.chain import (
+    MAX_JUMPS_PER_MS,
+    ChainError,
+    check_generator,
+    leaving,
+    stationary,
+    transition_matrix,
+    two_state_generator,
+)
 from channel_emu.link import DISCIPLINES
 from channel_emu.presets import PRESETS
+from channel_emu.server import ORDERS
 from freshfield.scenario import ScenarioError, read_section
 
 PROCESSES = ("as-offered", "periodic", "poisson")
 LAWS = ("none", "exponential", "deterministic", "gamma", "lognormal", "trace")
 SERVICE_STATES = ("at-start", "modulated")
 SCOPES = ("shared", "per-camera")
+SAMPLINGS = ("continuous", "slots")
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,8 @@ class ArrivalsConfig:
     process: str = "as-offered"
     period_ms: float | None = None
     rate_per_ms: float | list[float] | None = None
+    spread: bool = False
+    """Simulations: periodic cameras take turns, evenly over the period, instead of all at one instant."""
 
     def __post_init__(self) -> None:
         _one_of("process", self.process, PROCESSES)
@@ -45,6 +57,8 @@ class ArrivalsConfig:
         _belongs("rate_per_ms", self.rate_per_ms, self.process == "poisson", "process poisson")
         if self.period_ms is not None and not self.period_ms >= 1e-3:
             raise ValueError(f"period_ms: expected at least 0.001, got {self.period_ms:g}")
+        if self.spread and self.process == "poisson":
+            raise ValueError("spread: belongs to process periodic or as-offered only")
         if self.rate_per_ms is not None:
             _not_negative("rate_per_ms", per_state(self.rate_per_ms))
             if max(per_state(self.rate_per_ms)) <= 0:
@@ -64,9 +78,17 @@ class ChainConfig:
     initial: str | None = None
     """The state it starts in; drawn from the stationary distribution if not given."""
     scope: str = "shared"
+    sampled: str = "continuous"
+    """continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
+    the slot, as the thesis does; ``channel-emu accuracy`` shows what that costs."""
+    slot_ms: float | None = None
 
     def __post_init__(self) -> None:
         _one_of("scope", self.scope, SCOPES)
+        _one_of("sampled", self.sampled, SAMPLINGS)
+        _belongs("slot_ms", self.slot_ms, self.sampled == "slots", "sampled slots")
+        if self.slot_ms is not None and not 1e-3 <= self.slot_ms <= 1e9:
+            raise ValueError(f"slot_ms: expected 0.001 to 1e9, got {self.slot_ms:g}")
         pair = (self.mu1_per_ms is not None) + (self.mu2_per_ms is not None)
         if pair != (0 if self.generator_per_ms is not None else 2):
             raise ValueError("expected mu1_per_ms and mu2_per_ms, or generator_per_ms")
@@ -94,6 +116,14 @@ class ChainConfig:
         if len({len(row) for row in self.generator_per_ms} | {len(self.generator_per_ms)}) != 1:
             raise ValueError("expected a square matrix, row by row")
         return check_generator(np.array(self.generator_per_ms, float))
+
+    def switches_per_ms(self) -> float:
+        """How often the sampled state changes in the long run. Raises ChainError where there is none."""
+        generator = self.generator()
+        shares = stationary(generator)
+        if self.slot_ms is None:
+            return float(-shares @ generator.diagonal())
+        return float(shares @ leaving(transition_matrix(generator, self.slot_ms))) / self.slot_ms
 
     def names(self) -> list[str]:
         count = 2 if self.generator_per_ms is None else len(self.generator_per_ms)
@@ -130,6 +160,22 @@ class ServiceConfig:
 
 
 @dataclass(frozen=True)
+class ServerConfig:
+    """Who transmits. By default every camera has a line of its own. ``shared``: all cameras' frames compete
+    for one line; ``server`` says what each discipline and order then means. Cameras that capture at one
+    instant ask for the line in the order of their names: under drop-new the first of them keeps it."""
+
+    shared: bool = False
+    order: str = "fcfs"
+    """Whose waiting frame is next when the line falls free (newest-waits and fcfs)."""
+
+    def __post_init__(self) -> None:
+        _one_of("order", self.order, ORDERS)
+        if self.order != "fcfs" and not self.shared:
+            raise ValueError("order: belongs to a shared server only")
+
+
+@dataclass(frozen=True)
 class ChannelConfig:
     """One channel; see ``presets`` for the thesis's."""
 
@@ -141,8 +187,10 @@ class ChannelConfig:
     """at-start: the delay is drawn for the state in which transmission starts. modulated: the rate follows
     the state while the frame is on its way."""
     discipline: str = "drop-new"
+    server: ServerConfig = field(default_factory=ServerConfig)
     queue_limit: int = 1024
-    """Most frames waiting (fcfs) or on their way at once (parallel), so that memory is bounded."""
+    """Most frames waiting (fcfs) or on their way at once (parallel), so that memory is bounded; of a shared
+    server, all cameras' together."""
     hard_limit_ms: float | None = None
     """Live only: end the emulator as soon as a frame leaves this much later than it was due."""
     faults: dict[str, Any] = field(default_factory=dict)
@@ -153,6 +201,8 @@ class ChannelConfig:
         _one_of("discipline", self.discipline, DISCIPLINES)
         if not 1 <= self.queue_limit <= 10**6:
             raise ValueError(f"queue_limit: expected 1 to 1000000, got {self.queue_limit}")
+        if self.server.order != "fcfs" and self.discipline not in ("newest-waits", "fcfs"):
+            raise ValueError(f"server.order: nothing waits its turn under discipline {self.discipline}")
         if self.hard_limit_ms is not None and self.hard_limit_ms <= 0:
             raise ValueError(f"hard_limit_ms: expected more than 0, got {self.hard_limit_ms:g}")
         states = 1 if self.chain is None else len(self.chain.names())
@@ -176,7 +226,7 @@ class ChannelConfig:
             shares = stationary(generator)
         except ChainError:
             return  # it comes to rest, so no frame is followed for long
-        jumps = float(-shares @ generator.diagonal())
+        jumps = self.chain.switches_per_ms()
         rate = max(r for r, share in zip(rates_per_ms, shares) if share > 1e-12)
         if jumps > 1e5 * rate and jumps <= MAX_JUMPS_PER_MS:
             raise ValueError(

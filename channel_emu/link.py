@@ -15,6 +15,7 @@ from enum import StrEnum
 from typing import Any, Protocol
 
 from channel_emu.instants import NEVER_NS
+from channel_emu.server import Server
 from channel_emu.service import NoService, Service
 from channel_emu.traffic import PoissonArrivals
 
@@ -48,6 +49,8 @@ class Transit:
     """The chain's state when transmission started."""
     outcome: Kind | None = None
     ended_ns: int | None = None
+    turn: int = 0
+    """Of its arrivals the server counts each; a frame that replaces a waiting one may inherit its turn."""
     flips: tuple[tuple[float, int], ...] = ()
     """Damage: (place as a fraction of the payload, byte to exclusive-or with)."""
 
@@ -79,7 +82,9 @@ class Link:
 
     arrivals: with a Poisson process, a frame waits where it is offered until the process's next arrival
     samples it; a newer one takes its place there (``skipped``). None: every offer is an arrival.
-    queue_limit: frames waiting (fcfs) or in service (parallel) at most; more are dropped_busy.
+    server: the line, which other links may have joined; None makes one for this link alone. Links that share
+    one must be told of time together: what one caller's ``offer`` or ``advance`` makes happen to another
+    camera's frames waits in that camera's link, whose ``next_event_ns`` is then no later than now.
     """
 
     def __init__(
@@ -89,40 +94,60 @@ class Link:
         service: Service | NoService,
         arrivals: PoissonArrivals | None = None,
         faults: Sequence[Fault] = (),
-        queue_limit: int = 1024,
+        server: Server | None = None,
     ) -> None:
         if discipline not in DISCIPLINES:
             raise ValueError(f"discipline {discipline!r} is not one of {', '.join(DISCIPLINES)}")
         self.camera = camera
         self.discipline = discipline
-        self.queue_limit = queue_limit
         self.counts: Counter[str] = Counter()
         self.offered = 0
         self.clock_backwards = 0
         """Times at which the caller's clock ran backwards and was held."""
         self.resets = 0
         """Times at which a fault reset the camera's stream."""
-        self.now_ns = 0
         self.chain = service.chain
+        self.waiting: deque[Transit] = deque()
+        self.newest_delivered_ns = -1
+        """Instant at which the newest frame that was delivered had been offered."""
+        self.server = server or Server()
         self._service = service
         self._arrivals = arrivals
         self._faults = tuple(faults)
         self._serving: list[tuple[int, int, Transit]] = []  # heap of (due, number)
-        self._waiting: deque[Transit] = deque()
         self._unsampled: Transit | None = None
         self._sample_ns = NEVER_NS
         self._reset_ns = min((f.next_reset_ns(-1) for f in self._faults), default=NEVER_NS)
         self._events: list[Event] = []
+        self._news_ns = NEVER_NS  # since when something has happened that the caller was not told
+        self.own_event_ns = self._reset_ns
+        """As ``next_event_ns``, without what has happened already."""
+        self.server.join(self)
+
+    @property
+    def queue_limit(self) -> int:
+        """Frames waiting (fcfs) or in service (parallel) at most; more are dropped_busy."""
+        return self.server.queue_limit
 
     @property
     def in_flight(self) -> int:
-        return len(self._serving) + len(self._waiting) + (self._unsampled is not None)
+        return len(self._serving) + len(self.waiting) + (self._unsampled is not None)
 
     @property
     def next_event_ns(self) -> int:
-        """Instant of the next thing that happens without an offer; NEVER_NS if nothing will."""
-        due = self._serving[0][0] if self._serving else NEVER_NS
-        return min(due, self._sample_ns, self._reset_ns)
+        """Instant of the next thing that happens without an offer of this camera, as far as is known now;
+        NEVER_NS if nothing will."""
+        return min(self.own_event_ns, self._news_ns)
+
+    @property
+    def urgency(self) -> tuple[int, int]:
+        """Which of several links' events at one instant comes first: the least."""
+        at_ns = self.own_event_ns
+        if self._serving and self._serving[0][0] == at_ns:
+            return 0, 0
+        if self._reset_ns == at_ns or self._unsampled is None:
+            return 1, 0
+        return 2, self._unsampled.offered_ns
 
     def offer(self, at_ns: int, item: Any = None, size_bytes: int = 0) -> tuple[Transit, list[Event]]:
         """The camera offers a frame. Returns it and everything that happened up to and at this instant.
@@ -131,7 +156,7 @@ class Link:
         the frame of that boundary. ``transit.outcome`` says at once whether it was dropped.
         """
         at_ns = self._hold(at_ns)
-        self._run_to(at_ns)
+        self.server.run_to(at_ns)
         transit = Transit(self.offered, item, size_bytes, at_ns)
         self.offered += 1
         if self._arrivals is None:
@@ -141,66 +166,106 @@ class Link:
                 self._end(self._unsampled, Kind.SKIPPED, at_ns)
             self._unsampled = transit
             self._sample_ns = self._arrivals.next_ns(at_ns, transit.number)
-        self._run_to(at_ns)
+            self._reckon()
+        self.server.run_to(at_ns)
         return transit, self._take_events()
 
     def advance(self, to_ns: int) -> list[Event]:
         """Everything that happens up to and at ``to_ns``, in order."""
-        self._run_to(self._hold(to_ns))
+        self.server.run_to(self._hold(to_ns))
+        return self._take_events()
+
+    def flush(self, at_ns: int) -> list[Event]:
+        """Break off everything inside at ``at_ns``, after what is due up to it; the events, in order."""
+        at_ns = self._hold(at_ns)
+        self.server.run_to(at_ns)
+        self._empty(at_ns)
+        self.server.feed(at_ns)
         return self._take_events()
 
     def pending(self) -> list[Transit]:
         """The frames now inside, oldest first."""
-        inside = [t for _, _, t in self._serving] + list(self._waiting)
+        inside = [t for _, _, t in self._serving] + list(self.waiting)
         if self._unsampled is not None:
             inside.append(self._unsampled)
         return sorted(inside, key=lambda t: t.number)
 
+    def step(self) -> None:
+        """Let the next of this link's own events happen; the server calls it in turn."""
+        at_ns = self.own_event_ns
+        if self._serving and self._serving[0][0] == at_ns:
+            self._complete(at_ns)
+        elif self._reset_ns == at_ns:
+            self._break(at_ns)
+        else:
+            transit, self._unsampled, self._sample_ns = self._unsampled, None, NEVER_NS
+            assert transit is not None
+            self._reckon()
+            self._arrive(transit, at_ns)
+
+    def start_waiting(self, at_ns: int) -> None:
+        """The server is free and this link's turn has come."""
+        self.server.waiting -= 1
+        self._start(self.waiting.popleft(), at_ns)
+
     def _hold(self, at_ns: int) -> int:
-        if at_ns < self.now_ns:
+        if at_ns < self.server.now_ns:
             self.clock_backwards += 1
-            return self.now_ns
-        self.now_ns = at_ns
+            return self.server.now_ns
+        self.server.now_ns = at_ns
         return at_ns
 
+    def _reckon(self) -> None:
+        """Which event is next; a shared server asks every link at each step, so it is kept, not found."""
+        due = self._serving[0][0] if self._serving else NEVER_NS
+        self.own_event_ns = min(due, self._sample_ns, self._reset_ns)
+
     def _take_events(self) -> list[Event]:
-        events, self._events = self._events, []
+        events, self._events, self._news_ns = self._events, [], NEVER_NS
         return events
 
-    def _run_to(self, to_ns: int) -> None:
-        while (at_ns := self.next_event_ns) <= to_ns and at_ns < NEVER_NS:
-            if self._serving and self._serving[0][0] == at_ns:
-                self._complete(at_ns)
-            elif self._reset_ns == at_ns:
-                self._break(at_ns)
-                self.resets += 1
-                self._reset_ns = min(f.next_reset_ns(at_ns) for f in self._faults)
-            else:
-                transit, self._unsampled, self._sample_ns = self._unsampled, None, NEVER_NS
-                assert transit is not None
-                self._arrive(transit, at_ns)
+    def _tell(self, kind: Kind, at_ns: int, transit: Transit) -> None:
+        self._events.append(Event(kind, at_ns, transit))
+        self._news_ns = min(self._news_ns, at_ns)
 
     def _arrive(self, transit: Transit, at_ns: int) -> None:
-        if not self._serving:
+        server = self.server
+        transit.turn = server.next_turn()
+        if not server.busy:
             self._start(transit, at_ns)
         elif self.discipline == "drop-new":
             self._end(transit, Kind.DROPPED_BUSY, at_ns)
         elif self.discipline == "newest-waits":
-            if self._waiting:
-                self._end(self._waiting.popleft(), Kind.SUPERSEDED, at_ns)
-            self._waiting.append(transit)
+            if self.waiting:
+                server.waiting -= 1
+                older = self.waiting.popleft()
+                if server.order == "fcfs":
+                    transit.turn = older.turn
+                self._end(older, Kind.SUPERSEDED, at_ns)
+            self._wait(transit)
         elif self.discipline == "fcfs":
-            if len(self._waiting) >= self.queue_limit:
+            if server.waiting >= server.queue_limit:
                 self._end(transit, Kind.DROPPED_BUSY, at_ns)
             else:
-                self._waiting.append(transit)
+                self._wait(transit)
         elif self.discipline == "lcfs-preempt":
-            self._end(heapq.heappop(self._serving)[2], Kind.SUPERSEDED, at_ns)
+            assert server.served is not None
+            server.served._yield(at_ns)
             self._start(transit, at_ns)
-        elif len(self._serving) >= self.queue_limit:
+        elif server.busy >= server.queue_limit:
             self._end(transit, Kind.DROPPED_BUSY, at_ns)
         else:
             self._start(transit, at_ns)
+
+    def _wait(self, transit: Transit) -> None:
+        self.server.waiting += 1
+        self.waiting.append(transit)
+
+    def _yield(self, at_ns: int) -> None:
+        """Give up the frame in service to a newer one."""
+        self.server.busy -= 1
+        self._end(heapq.heappop(self._serving)[2], Kind.SUPERSEDED, at_ns)
+        self._reckon()
 
     def _start(self, transit: Transit, at_ns: int) -> None:
         transit.started_ns = at_ns
@@ -209,31 +274,48 @@ class Link:
             due_ns = min(due_ns + fault.extra_ns(transit), NEVER_NS)
         transit.due_ns = due_ns
         heapq.heappush(self._serving, (due_ns, transit.number, transit))
-        self._events.append(Event(Kind.STARTED, at_ns, transit))
+        self._reckon()
+        self.server.busy += 1
+        self.server.served = self
+        self._tell(Kind.STARTED, at_ns, transit)
 
     def _complete(self, at_ns: int) -> None:
         transit = heapq.heappop(self._serving)[2]
+        self._reckon()
+        self.server.busy -= 1
         if self._faults and any(fault.loses(transit) for fault in self._faults):
             self._end(transit, Kind.LOST, at_ns)
         else:
             for fault in self._faults:
                 transit.flips += fault.flips(transit)
+            self.newest_delivered_ns = max(self.newest_delivered_ns, transit.offered_ns)
             self._end(transit, Kind.DELIVERED, at_ns)
             if self._faults and any(fault.duplicates(transit) for fault in self._faults):
                 self.counts[Kind.DUPLICATED] += 1
-                self._events.append(Event(Kind.DUPLICATED, at_ns, transit))
-        if self._waiting:
-            self._start(self._waiting.popleft(), at_ns)
+                self._tell(Kind.DUPLICATED, at_ns, transit)
+        self.server.feed(at_ns)
 
     def _break(self, at_ns: int) -> None:
+        """A fault resets the camera's stream."""
+        self._empty(at_ns)
+        self.resets += 1
+        self._reset_ns = min(f.next_reset_ns(at_ns) for f in self._faults)
+        self._reckon()
+        self.server.feed(at_ns)
+
+    def _empty(self, at_ns: int) -> None:
         for transit in self.pending():
             self._end(transit, Kind.BROKEN, at_ns)
+        self.server.busy -= len(self._serving)
+        self.server.waiting -= len(self.waiting)
         self._serving.clear()
-        self._waiting.clear()
+        self.waiting.clear()
         self._unsampled, self._sample_ns = None, NEVER_NS
+        self._news_ns = min(self._news_ns, at_ns)
+        self._reckon()
 
     def _end(self, transit: Transit, kind: Kind, at_ns: int) -> None:
         transit.outcome = kind
         transit.ended_ns = at_ns
         self.counts[kind] += 1
-        self._events.append(Event(kind, at_ns, transit))
+        self._tell(kind, at_ns, transit)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
-import heapq
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,14 +21,13 @@ import numpy as np
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from channel_emu.agenda import Agenda
 from channel_emu.channel import Channel
 from channel_emu.config import ChannelConfig
 from channel_emu.histogram import Histogram
-from channel_emu.instants import NEVER_NS
 from channel_emu.lane import HardLimit, Lane, Measures
 from channel_emu.link import Link
 from channel_emu.status import StatusFile, snapshot
-from channel_emu.timer import LoopTimer
 from channel_emu.trace import ReplayLink, Trace, TraceWriter
 from channel_emu.uniforms import stream_key
 from channel_emu.upstream import Upstream
@@ -54,8 +52,6 @@ _PATIENCE_NS = 3 * 10**9
 _STOP_GRACE_S = 0.5
 # Cameras are let in once the streams to the edge stand, or after this long without them.
 _FIRST_WAIT_S = 2.0
-# Entries that the agenda may hold beside four for each lane before the outdated ones are cleared away.
-_AGENDA_SLACK = 16
 
 
 class EmulatorFailed(RuntimeError):
@@ -101,10 +97,7 @@ class Proxy:
         self._edge = options.transport.aio_channel(options.to)
         self._exchange = self._edge.unary_unary(f"/{CLOCK_SERVICE}/Exchange")
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._timer = LoopTimer(self._fire)
-        self._due: list[tuple[int, int, Lane]] = []
-        self._armed_ns = NEVER_NS
-        self._order = 0
+        self._agenda = Agenda(self.clock, self.origin_ns, self._fail, shared=config.server.shared)
         self._streams = 0
         self._server = options.transport.aio_server()
         self._tasks: list[asyncio.Task[None]] = []
@@ -133,7 +126,7 @@ class Proxy:
             task.add_done_callback(self._ended)
             self._tasks.append(task)
         for lane in self.lanes.values():
-            self._arm(lane)
+            self._agenda.arm(lane)
         # Frames that come before the first streams to the edge would be broken for no fault of the channel.
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_FIRST_WAIT_S):
@@ -179,7 +172,7 @@ class Proxy:
                 books.callback(self._trace.close)
             for lane in self.lanes.values():
                 books.callback(lane.close)
-            books.callback(self._timer.close)
+            books.callback(self._agenda.close)
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -254,7 +247,7 @@ class Proxy:
         except Exception as error:
             self._fail(error)
             raise
-        self._arm(lane)
+        self._agenda.arm_touched(lane)
         return response, lane
 
     def _reject(self, header: frames_pb2.FrameHeader, reason: str, detail: str) -> frames_pb2.PushResponse:
@@ -274,47 +267,6 @@ class Proxy:
         except grpc.aio.AioRpcError as error:
             await context.abort(error.code(), f"edge: {error.details()}")
             raise AssertionError("abort raises") from None
-
-    def _arm(self, lane: Lane) -> None:
-        """Put the lane's next event on the agenda; an earlier entry of it is passed over when it comes up."""
-        next_ns = lane.link.next_event_ns
-        if next_ns == lane.armed_ns:
-            return
-        lane.armed_ns = next_ns
-        if next_ns >= NEVER_NS:
-            return
-        self._order += 1
-        heapq.heappush(self._due, (next_ns, self._order, lane))
-        if len(self._due) > 4 * len(self.lanes) + _AGENDA_SLACK:
-            # Where frames preempt each other, outdated entries would stay until their instants far ahead.
-            self._due = [
-                (lane.armed_ns, order, lane)
-                for order, lane in enumerate(self.lanes.values())
-                if 0 <= lane.armed_ns < NEVER_NS
-            ]
-            heapq.heapify(self._due)
-        if next_ns < self._armed_ns:
-            self._armed_ns = next_ns
-            self._timer.arm(next_ns - (self.clock.now_ns() - self.origin_ns))
-
-    def _fire(self) -> None:
-        """Called by the timer, where an exception would only be logged and every later frame be stuck."""
-        try:
-            self._advance_due()
-        except Exception as error:
-            self._fail(error)
-
-    def _advance_due(self) -> None:
-        now_ns = self.clock.now_ns() - self.origin_ns
-        while self._due and self._due[0][0] <= now_ns:
-            at_ns, _, lane = heapq.heappop(self._due)
-            if lane.armed_ns == at_ns:
-                lane.armed_ns = -1
-                lane.advance(now_ns)
-                self._arm(lane)
-        self._armed_ns = self._due[0][0] if self._due else NEVER_NS
-        if self._due:
-            self._timer.arm(self._armed_ns - (self.clock.now_ns() - self.origin_ns))
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         if not task.cancelled() and (error := task.exception()) is not None:

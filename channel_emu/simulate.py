@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from channel_emu import ages
-from channel_emu.chain import Chain
 from channel_emu.channel import Channel
-from channel_emu.config import ChannelConfig, per_state
-from channel_emu.link import DISCIPLINES, Kind, Link, Transit
+from channel_emu.config import ChannelConfig
+from channel_emu.link import Kind, Link, Transit
 from channel_emu.traffic import PeriodicArrivals, PoissonArrivals
-from channel_emu.uniforms import stream_key
 
 OUTCOMES = ("in_flight", *(str(k) for k in (Kind.DELIVERED, Kind.DROPPED_BUSY, Kind.SUPERSEDED, Kind.SKIPPED,
                                             Kind.LOST, Kind.BROKEN)))  # fmt: skip
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}
-_LAWS = ("none", "exponential", "deterministic", "gamma", "lognormal", "trace")
 DEFAULT_FRAME_PERIOD_MS = 1000 / 30
 
 
@@ -68,6 +65,24 @@ class Simulation:
     slot_ms: float
     engine: str
     runs: list[LinkRun] = field(repr=False)
+
+    def omega(self, at_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The set Omega(t) at any instants (T,), in any order: when the newest frame that had arrived of each
+        camera was generated, int64 ns (T, cameras); -1 before a camera's first delivery (thesis 5.4, 6.2).
+
+        What is delivered at an instant counts at it, as for a decision that falls on it.
+        """
+        at = np.asarray(at_ns, np.int64)
+        return np.stack([ages.newest_at(run.sawtooth(), at) for run in self.runs], -1)
+
+    def ages_ms(self, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Ages at any instants (T,) in ms, (T, cameras); NaN before a camera's first delivery (5.5)."""
+        born_ns = self.omega(at_ns)
+        return np.where(born_ns >= 0, (np.asarray(at_ns, np.int64)[..., None] - born_ns) / 1e6, np.nan)
+
+    def mean_age_ms(self) -> float | None:
+        """Continuous time average, over the cameras that had a delivery; None where there was none."""
+        return _mean([ages.mean_age_ms(run.sawtooth()) for run in self.runs])
 
     def summary(self) -> dict[str, Any]:
         """What the command prints with --json."""
@@ -114,13 +129,15 @@ def simulate(
     frame_period_ms: float | None = None,
     frame_bytes: int = 20_000,
     slot_ms: float = 1.0,
+    threads: int | None = None,
 ) -> Simulation:
     """Run every camera's link for ``seconds`` of virtual time.
 
     cameras: how many (cam00, cam01, ...) or their names. frame_period_ms: the cameras' own period. With
     Poisson arrivals frames are made by the arrivals themselves (arrival = capture, as in the thesis) unless
     it is given: then the arrivals sample the camera's newest frame, as the live emulator does.
-    engine: auto, python or kernel. Raises SimulationError.
+    engine: auto, python or kernel. threads: of the kernel; None takes what the machine has where a run is
+    long enough. The result does not depend on it. Raises SimulationError.
     """
     names = [f"cam{i:02d}" for i in range(cameras)] if isinstance(cameras, int) else cameras
     if not names:
@@ -135,7 +152,9 @@ def simulate(
     if engine == "auto":
         engine = "python" if why_not else "kernel"
     if engine == "kernel":
-        runs = _run_kernel(config, channel, names, end_ns, frame_period_ms)
+        from channel_emu import compiled
+
+        runs = compiled.run(config, channel, names, end_ns, frame_period_ms, threads)
     elif engine == "python":
         runs = _run_python(config, channel, names, end_ns, frame_period_ms, frame_bytes)
     else:
@@ -180,31 +199,42 @@ def _run_python(
 ) -> list[LinkRun]:
     sampled = frame_period_ms is not None
     links = [channel.link(name, sampled=sampled) for name in names]
-    sources = [_source(config, channel, link, frame_period_ms) for link in links]
+    rank = ranks(names)
+    sources = [
+        _source(config, channel, link, frame_period_ms, k / len(names)) for link, k in zip(links, rank)
+    ]
     fates: list[list[Transit]] = [[] for _ in names]
-    # (next offer's instant, camera, number of the offer)
-    offers = [(source.next_ns(0, 0), i, 0) for i, source in enumerate(sources)]
+    # (next offer's instant, camera's rank, camera, number of the offer)
+    offers = [(source.next_ns(0, 0), rank[i], i, 0) for i, source in enumerate(sources)]
     heapq.heapify(offers)
     while offers[0][0] <= end_ns:
-        at_ns, i, number = offers[0]
+        at_ns, _, i, number = offers[0]
         fates[i].append(links[i].offer(at_ns, None, frame_bytes)[0])
-        heapq.heapreplace(offers, (sources[i].next_ns(at_ns, number + 1), i, number + 1))
+        heapq.heapreplace(offers, (sources[i].next_ns(at_ns, number + 1), rank[i], i, number + 1))
     for link in links:
         link.advance(end_ns)
     return [_collect(link, transits, end_ns) for link, transits in zip(links, fates)]
 
 
 def _source(
-    config: ChannelConfig, channel: Channel, link: Link, frame_period_ms: float | None
+    config: ChannelConfig, channel: Channel, link: Link, frame_period_ms: float | None, turn: float
 ) -> PeriodicArrivals | PoissonArrivals:
+    """turn: in [0, 1), the part of the period by which a camera that takes turns is late."""
     if frame_period_ms is None and config.arrivals.process == "poisson":
         arrivals = channel.arrivals(link.camera, link.chain)
         assert arrivals is not None
         return arrivals
-    return PeriodicArrivals(_period_ms(config, frame_period_ms))
+    every_ms = period_ms(config, frame_period_ms)
+    return PeriodicArrivals(every_ms, turn * every_ms if config.arrivals.spread else 0.0)
 
 
-def _period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
+def ranks(names: list[str]) -> list[int]:
+    """Each camera's place in the order of names, which decides between frames of one instant."""
+    return [sorted(names).index(name) for name in names]
+
+
+def period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
+    """The cameras' own period."""
     return frame_period_ms or config.arrivals.period_ms or DEFAULT_FRAME_PERIOD_MS
 
 
@@ -237,60 +267,6 @@ def _kernel_lacks(config: ChannelConfig, channel: Channel) -> str | None:
     except ImportError:
         return "numba is not installed (pip install 'freshfield[emu]')"
     return None
-
-
-def _run_kernel(
-    config: ChannelConfig, channel: Channel, names: list[str], end_ns: int, frame_period_ms: float | None
-) -> list[LinkRun]:
-    from channel_emu.kernels import path, serve
-
-    service = config.service
-    shared = _path(channel.chain, "", channel.seed, end_ns) if channel.chain else None
-    runs = []
-    for name in names:
-        chain = channel.chain_of(name)
-        starts, states = shared or _path(chain, name, channel.seed, end_ns)
-        rates = np.array([r / 1e6 for r in per_state(config.arrivals.rate_per_ms or 0.0)])
-        key = _key(channel.seed, name, "channel.arrivals")
-        if config.arrivals.process == "poisson" and frame_period_ms is None:
-            offered = arrive = path.poisson_arrivals(rates, starts, states, key, end_ns)
-        else:
-            period_ns = round(_period_ms(config, frame_period_ms) * 1e6)
-            offered = arrive = np.arange(0, end_ns + 1, period_ns, dtype=np.int64)
-            if config.arrivals.process == "poisson":
-                arrive = path.sample_newest(offered, rates, starts, states, key)
-        outcome, started, due = serve.serve(
-            arrive,
-            DISCIPLINES.index(config.discipline),
-            config.queue_limit,
-            _LAWS.index(service.law),
-            float(service.shape or service.sigma or 0.0),
-            np.array(service.delays_ms or [0.0]),
-            np.array(per_state(service.mean_ms) if service.mean_ms is not None else [1.0]),
-            config.service_state == "modulated" and len(per_state(service.mean_ms or 0.0)) > 1,
-            starts,
-            states,
-            _key(channel.seed, name, "channel.service"),
-            end_ns,
-        )
-        share = np.bincount(states, np.diff(np.minimum(starts, end_ns)), len(config.state_names)) / end_ns
-        runs.append(LinkRun(name, offered, outcome, started, due, end_ns, share.tolist()))
-    return runs
-
-
-def _path(
-    chain: Chain | None, camera: str, seed: int, end_ns: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    if chain is None:
-        return np.array([0, 2**62], np.int64), np.zeros(1, np.int64)
-    from channel_emu.kernels import path
-
-    key = _key(seed, camera, "channel.chain")
-    return path.chain_path(chain.rates_per_ms.copy(), chain.jumps, key, chain.initial, end_ns)
-
-
-def _key(seed: int, camera: str, purpose: str) -> NDArray[np.uint64]:
-    return np.array(stream_key(seed, camera, purpose), np.uint64)
 
 
 def _mean(values: list[float | None]) -> float | None:

@@ -8,6 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 _UNITS_MS = {"": 1.0, "us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _LAWS = {"exp": "exponential", "det": "deterministic", "gamma": "gamma", "lognormal": "lognormal",
          "trace": "trace", "none": "none"}  # fmt: skip
@@ -92,7 +94,19 @@ def service_by_state(text: str) -> dict[str, Any]:
 
 
 def chain(text: str) -> dict[str, Any]:
-    """``mu1=1/30,mu2=1/30``, optionally ``scope=per-camera``, ``initial=s1``."""
+    """``mu1=1/30,mu2=1/30``, optionally ``scope=per-camera``, ``initial=s1``, ``slots=1ms``; or, for any
+    number of states, the scenario's section as it stands there, ``{generator_per_ms: [[-1, 1], [2, -2]]}``.
+    """
+    if text.lstrip().startswith("{"):
+        try:
+            section = yaml.safe_load(text)
+        except yaml.YAMLError:
+            section = None
+        if not isinstance(section, dict):
+            raise SpellingError(
+                f"--chain {text!r}: not a mapping; write {{generator_per_ms: [[-1, 1], [2, -2]]}}"
+            )
+        return section
     found: dict[str, Any] = {}
     for word in text.split(","):
         key, _, value = (part.strip() for part in word.partition("="))
@@ -100,8 +114,10 @@ def chain(text: str) -> dict[str, Any]:
             found[f"{key}_per_ms"] = rate_per_ms(value)
         elif key in ("scope", "initial") and value:
             found[key] = value
+        elif key == "slots" and value:
+            found |= {"sampled": "slots", "slot_ms": span_ms(value)}
         else:
-            expected = "mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1)"
+            expected = "mu1=1/30,mu2=1/30 (and scope=per-camera, initial=s1, slots=1ms)"
             raise SpellingError(f"--chain {text!r}: expected {expected}")
     return found
 

@@ -1,12 +1,14 @@
 """Average age of information in closed form, for the systems the links can be. Rates per ms, ages in ms.
 
 Sources: Kaul, Yates and Gruteser (INFOCOM 2012); Costa, Codreanu and Ephremides (IEEE T-IT 62(4), 2016) for
-one waiting place; the drop-new and modulated forms are renewal arguments.
+one waiting place; Yates and Kaul (IEEE T-IT 65(3), 2019) for preemption by several sources; the drop-new,
+shared and modulated forms are derived where they stand, by renewal arguments.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.linalg import expm
@@ -33,6 +35,11 @@ def mm1_blocking(lam: float, mu: float) -> float:
     return 1 / lam + 2 / mu - 1 / (lam + mu)
 
 
+def mm12(lam: float, mu: float) -> float:
+    """M/M/1/2: one waits, and what comes meanwhile is dropped."""
+    return 1 / lam + 3 / mu - 2 * (lam + mu) / (lam**2 + lam * mu + mu**2)
+
+
 def mm1_newest_waits(lam: float, mu: float) -> float:
     both = lam**2 + lam * mu + mu**2
     return 1 / lam + 2 / mu + lam / (lam + mu) ** 2 + 1 / (lam + mu) - 2 * (lam + mu) / both
@@ -51,6 +58,53 @@ def mg1_blocking(lam: float, mean: float, second_moment: float) -> float:
 def md1_preemptive(lam: float, service: float) -> float:
     """1 / (lambda E[e^(-lambda S)])."""
     return math.exp(lam * service) / lam
+
+
+def mg1_preemptive(lam: float, shape: float, mean: float) -> float:
+    """1 / (lambda E[e^(-lambda S)]) for gamma service."""
+    return (1 + lam * mean / shape) ** shape / lam
+
+
+def dg1_drop_new(
+    period: float, mean: float, survival: Callable[[np.ndarray], np.ndarray]
+) -> tuple[float, float]:
+    """Mean and peak age; survival(t) = P(S > t) of an array. E[K], E[K²] are sums of P(K > k) = P(S > kC)."""
+    above = survival(period * np.arange(2000))
+    first, second = above.sum(), ((2 * np.arange(2000) + 1) * above).sum()
+    return mean + period * second / (2 * first), mean + period * first
+
+
+def shared_mm1_fcfs(lam: float, other: float, mu: float) -> float:
+    """Of the source of rate lam where others of rate ``other`` in all use the same server, exact.
+
+    age = lam (E[X²]/2 + E[X T]): T is the workload V that the previous update left after X, and its own
+    service. V starts exponential of rate mu - lam - other and gets the others' work meanwhile, so that
+    E[V(x)] = E[V(0)] - (1 - other/mu) x + time spent empty, whose Laplace transform is
+    E[e^(-eta V(0))] / (eta s²) with eta (1 - other/(mu + eta)) = s; X weighs it with lam x e^(-lam x).
+    """
+    start = mu - lam - other
+    half = (lam + other - mu) / 2
+    eta = half + math.sqrt(half**2 + lam * mu)
+    slope = 1 / (1 - other * mu / (mu + eta) ** 2)  # of eta by s, at s = lam
+    empty = start / ((start + eta) * eta)
+    empty_slope = -start * (start + 2 * eta) / ((start + eta) * eta) ** 2 * slope
+    idle = empty / lam - empty_slope  # -lam d/ds [empty / s]
+    workload = 1 / (start * lam) - 2 * (1 - other / mu) / lam**2 + idle
+    return lam * (1 / lam**2 + workload + 1 / (lam * mu))
+
+
+def shared_mm1_preemptive(lam: float, other: float, mu: float) -> float:
+    return (1 + (lam + other) / mu) / lam
+
+
+def shared_mg1_blocking(lam: float, other: float, mean: float, second_moment: float) -> float:
+    """A source's deliveries are N server cycles S + X apart, N geometric of mean 1 + other/lam."""
+    rate = lam + other
+    cycle, spread = mean + 1 / rate, second_moment - mean**2 + 1 / rate**2
+    p = lam / rate
+    apart = cycle / p
+    variance = spread / p + (1 - p) / p**2 * cycle**2
+    return mean + (variance + apart**2) / (2 * apart)
 
 
 def dm1_drop_new(period: float, mu: float) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from channel_emu.chain import Chain, ChainError, stationary, transition_matrix, two_state_generator
+from channel_emu.instants import NEVER_NS
 from channel_emu.uniforms import Uniforms
 
 THREE = np.array([[-0.3, 0.2, 0.1], [0.05, -0.05, 0.0], [0.4, 0.4, -0.8]])
@@ -48,6 +49,29 @@ def test_stiff_transition_matrices_stay_stochastic(span_ms: float) -> None:
         p = transition_matrix(generator, span_ms)
         assert (p >= 0).all()
         np.testing.assert_allclose(p.sum(1), 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("span_ms", [1e-3, 1.0, 1e6, 3e9])
+def test_stiff_transition_matrices_keep_their_digits(span_ms: float) -> None:
+    """Rates of 1e-9 and 1e9 together, against 200 digits: every probability to ten."""
+    mpmath = pytest.importorskip("mpmath")
+    for generator in (
+        np.array([[-1e9, 1e9, 0.0], [1.0, -1.0 - 1e-9, 1e-9], [0.0, 1e-9, -1e-9]]),
+        np.array([[-1e-9, 1e-9, 0.0], [1e9, -2e9, 1e9], [0.0, 0.0, 0.0]]),
+        two_state_generator(1e-9, 1e9),
+    ):
+        with mpmath.workdps(200):
+            exact_q = mpmath.matrix(generator.tolist())
+            for i in range(len(generator)):  # the diagonal to all digits too
+                exact_q[i, i] = -sum(exact_q[i, j] for j in range(len(generator)) if j != i)
+            # By its eigenvalues: a series would need 1e18 terms.
+            values, vectors = mpmath.eig(exact_q)
+            decay = mpmath.diag([mpmath.exp(value * mpmath.mpf(span_ms)) for value in values])
+            exact = (vectors * decay * vectors**-1).apply(mpmath.re)
+            expected = np.array(
+                [[float(exact[i, j]) for j in range(len(generator))] for i in range(len(generator))]
+            )
+        np.testing.assert_allclose(transition_matrix(generator, span_ms), expected, rtol=1e-10, atol=1e-30)
 
 
 def test_stationary_distribution_keeps_its_digits() -> None:
@@ -123,10 +147,43 @@ def test_forgetting_keeps_memory_bounded_and_shares_exact() -> None:
         forgetting.segment(0)
 
 
-def test_kernel_draws_the_same_path() -> None:
+def test_a_slot_keeps_its_state_and_slots_forget_what_was_between() -> None:
+    """Switching a thousand times a slot, each slot is drawn anew: an even coin, whatever came before."""
+    chain = Chain(two_state_generator(1e3, 1e3), Uniforms(0, "", "channel.chain"), 0, 1.0)
+    assert all(chain.state(slot * 10**6 + 1) == chain.state(slot * 10**6 + 999_999) for slot in range(100))
+    states = np.array([chain.state(slot * 10**6) for slot in range(4000)])
+    assert states.mean() == pytest.approx(0.5, abs=4 * 0.5 / 4000**0.5)
+    assert np.corrcoef(states[1:], states[:-1])[0, 1] == pytest.approx(0, abs=4 / 4000**0.5)
+
+
+def test_slots_take_what_is_too_fast_to_follow() -> None:
+    fast = np.array([[-1e9, 1e9, 0.0], [1e9, -2e9, 1e9], [0.0, 1e-9, -1e-9]])
+    stiff = np.array([[-1e9, 5e8, 5e8], [1e9, -2e9, 1e9], [1e9, 1e9, -2e9]])
+    with pytest.raises(ChainError, match="sampled: slots"):
+        path(stiff)
+    chain = Chain(stiff, Uniforms(0, "", "channel.chain"), None, 1.0)
+    np.testing.assert_allclose(chain.occupancy(20_000 * 10**6), stationary(stiff), atol=0.02)
+    # The state that is left once in 1e9 ms is kept.
+    assert Chain(fast, Uniforms(0, "", "channel.chain"), 2, 1.0).segment(0)[1] > 10**6 * 10**6
+    with pytest.raises(ChainError, match="at least a nanosecond"):
+        Chain(stiff, Uniforms(0, "", "channel.chain"), None, 1e-9)
+
+
+@pytest.mark.parametrize("slot_ms", [None, 1.0])
+def test_degenerate_chains(slot_ms: float | None) -> None:
+    """One state; and an absorbing one, in which it ends."""
+    one = Chain(np.zeros((1, 1)), Uniforms(0, "", "channel.chain"), None, slot_ms)
+    assert one.segment(10**15) == (0, NEVER_NS) and one.occupancy(10**15) == [1.0]
+    absorbed = Chain(np.array([[-1.0, 1.0], [0.0, 0.0]]), Uniforms(0, "", "channel.chain"), 0, slot_ms)
+    left = absorbed.segment(0)[1]
+    assert left < 100 * 10**6 and absorbed.segment(left) == (1, NEVER_NS)
+
+
+@pytest.mark.parametrize("slot_ms", [None, 2.5])
+def test_kernel_draws_the_same_path(slot_ms: float | None) -> None:
     kernel = pytest.importorskip("channel_emu.kernels.path")
     for generator in (THREE, two_state_generator(1 / 30, 1 / 60), np.array([[-1.0, 1.0], [0.0, 0.0]])):
-        chain = path(generator, seed=9)
+        chain = Chain(np.array(generator), Uniforms(9, "", "channel.chain"), None, slot_ms)
         key = np.array(Uniforms(9, "", "channel.chain").key, np.uint64)
-        starts, states = kernel.chain_path(chain.rates_per_ms.copy(), chain.jumps, key, chain.initial, 10**11)
+        starts, states = kernel.chain_path(chain.pace, chain.jumps, chain.slot_ns, key, chain.initial, 10**11)
         assert list(zip(starts[:-1].tolist(), states.tolist())) == chain.recent(0, 10**11)

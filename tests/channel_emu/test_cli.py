@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import grpc
 import pytest
 
 from channel_emu import spell
@@ -48,6 +49,16 @@ def test_simulate_takes_short_spellings(capsys) -> None:
         "--discipline", "drop-new", "--cameras", "3", "--seconds", "120", "--seed", "4",
     )  # fmt: skip
     assert again["mean_age_ms"] == found["mean_age_ms"]  # the same channel, spelled otherwise
+
+
+def test_a_chain_of_any_number_of_states(capsys) -> None:
+    found = simulate(
+        capsys, "--service-by-state", "exp:5ms,exp:20ms,exp:80ms", "--seconds", "3000", "--chain",
+        "{generator_per_ms: [[-0.3, 0.2, 0.1], [0.05, -0.05, 0], [0.4, 0.4, -0.8]], initial: s2}",
+    )  # fmt: skip
+    shares = [0.05 * 0.8, 0.3 * 0.8 - 0.1 * 0.4, 0.1 * 0.05]  # of the balance equations, by hand
+    expected = [share / sum(shares) for share in shares]
+    assert list(found["state_share"].values()) == pytest.approx(expected, abs=0.01)
 
 
 def test_simulate_from_a_scenario_and_for_people(capsys, scenario: Path) -> None:
@@ -91,6 +102,8 @@ def test_rates(text: str, value: float) -> None:
         (["--service-by-state", "exp:1ms,exp:2ms"], "there is no chain"),
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--chain", "mu3=1"], "expected mu1="),
+        (["--chain", "{generator_per_ms: [[-1, 1]"], "not a mapping; write {generator_per_ms"),
+        (["--chain", "{generator_per_ms: [[-1, 2], [1, -1]]}"], "rows sum to zero"),
         (["--seconds", "0"], "seconds: expected"),
         (["--scenario", "/no/such.yaml"], "/no/such.yaml"),
     ],
@@ -176,3 +189,36 @@ def test_bench_loses_nothing_and_reports_its_errors(capsys) -> None:
     from channel_emu.bench import show
 
     assert "delay error" in show(found)
+
+
+def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
+    from tests.channel_emu.test_testing import HELLO, Greeter
+
+    greeter, port = Greeter(), free_port()
+    words = [
+        sys.executable,
+        "-m",
+        "channel_emu.cli",
+        "proxy",
+        "--to",
+        greeter.address,
+        "--json",
+        "--seed",
+        "2",
+    ]
+    words += ["--listen", f"127.0.0.1:{port}", "--service", "det:30ms", "--direction", "both"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+                hello = channel.unary_unary(HELLO)
+                assert hello(b"you", wait_for_ready=True, timeout=30) == b"hello you from nobody"
+            process.send_signal(signal.SIGTERM)
+            out, log = process.communicate(timeout=20)
+        finally:
+            process.kill()
+            greeter.stop()
+    assert process.returncode == 0, log
+    found = json.loads(out)
+    assert set(found["by_method"]) == {f"up {HELLO}", f"down {HELLO}"} and found["seed"] == 2
+    assert found["delivered"] == found["offered"] == 2 and found["delay_ms"]["mean"] == 30
+    assert main(["proxy", "--to", "x", "--listen", "nowhere"]) == 2

@@ -48,7 +48,7 @@ def offer(proxy: Proxy, sequence: int, camera: str = "cam00") -> None:
     request = to_request(frame_of(camera, "s", sequence, sequence))
     lane = proxy.lanes[camera]
     lane.take(request.SerializeToString(), request.header)
-    proxy._arm(lane)
+    proxy._agenda.arm(lane)
 
 
 def fill_the_disk(proxy: Proxy) -> None:
@@ -177,14 +177,16 @@ def test_the_agenda_stays_bounded_however_often_frames_preempt_each_other(tmp_pa
         most = 0
         for n in range(10_001):
             offer(proxy, n)
-            most = max(most, len(proxy._due))
+            most = max(most, len(proxy._agenda.due))
             if n % 100 == 0:
                 await asyncio.sleep(0)
         assert proxy.lanes["cam00"].link.counts["superseded"] == 10_000
         assert most <= 4 * len(cameras) + 16
         # What is still to come is on it, that of the camera which was left alone too.
         for lane in proxy.lanes.values():
-            assert (lane.link.next_event_ns, lane) in [(at_ns, found) for at_ns, _, found in proxy._due]
+            assert (lane.link.next_event_ns, lane) in [
+                (at_ns, found) for at_ns, _, found in proxy._agenda.due
+            ]
         await proxy.stop()
 
     run(live())

@@ -95,6 +95,25 @@ def test_sampling_takes_the_newest_offered_frame() -> None:
             assert t.started_ns is not None and 0 <= t.started_ns - t.offered_ns <= 10 * MS
 
 
+@pytest.mark.parametrize("discipline", DISCIPLINES)
+def test_a_flush_breaks_off_what_is_inside_and_frees_the_line(discipline: str) -> None:
+    subject = link(discipline, [10, 50, 50, 50])
+    events = [e for at in (0, 12, 14) for e in subject.offer(at * MS)[1]]
+    events += subject.flush(20 * MS)
+    events += subject.offer(21 * MS)[1] + subject.advance(100 * MS)
+    ends = Counter(str(e.kind) for e in events if e.kind is not Kind.STARTED)
+    assert ends["delivered"] == 2 and ends["broken"] >= 1 and sum(ends.values()) == 4
+    assert [e.at_ns for e in events if e.kind is Kind.DELIVERED] == [10 * MS, 71 * MS]
+    assert subject.resets == 0 and subject.in_flight == 0
+    assert subject.flush(100 * MS) == []
+
+
+def test_what_is_due_at_the_flush_arrives() -> None:
+    subject = link("drop-new", [10])
+    subject.offer(0)
+    assert [str(e.kind) for e in subject.flush(10 * MS)] == ["delivered"]
+
+
 def test_a_clock_that_runs_backwards_is_held_and_counted() -> None:
     subject = link("drop-new", [10])
     subject.offer(50 * MS)

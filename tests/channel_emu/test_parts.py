@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channel_emu import timer
+from channel_emu import ages, timer
 from channel_emu.histogram import Histogram
 from channel_emu.link import Transit
 from channel_emu.timer import LoopTimer
@@ -136,3 +136,22 @@ print(','.join(wrong))
 """
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == ""
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**9)), max_size=30), st.integers(0, 10**9))
+def test_running_ages_are_those_of_the_whole_sawtooth(steps: list[tuple[int, int]], after: int) -> None:
+    """Deliveries in order of time, of frames of any age, out of order and doubled."""
+    running, at_ns = ages.RunningAge(), 2 * 10**9
+    deliveries = []
+    for step, old in steps:
+        at_ns += step
+        deliveries.append((at_ns, at_ns - old))
+        running.add(at_ns, at_ns - old)
+    end_ns = at_ns + after
+    columns = np.array(deliveries, np.int64).reshape(-1, 2)
+    saw = ages.sawtooth(columns[:, 0], columns[:, 1], end_ns)
+    for found, expected in (
+        (running.peak_age_ms(), ages.peak_age_ms(saw)),
+        (running.mean_age_ms(end_ns), ages.mean_age_ms(saw)),
+    ):
+        assert found == (None if expected is None else pytest.approx(expected, rel=1e-9))

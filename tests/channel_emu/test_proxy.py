@@ -48,8 +48,21 @@ def books_of(out: Path):
     return books.total
 
 
-@pytest.mark.parametrize("section", [FAST, {"preset": "ch5", **QUICK}, {**QUICK, "discipline": "fcfs"}],
-                         ids=["ch6", "ch5", "fcfs"])  # fmt: skip
+SHARED = {"service": {"law": "exponential", "mean_ms": 1.5}, "queue_limit": 6}
+SECTIONS = {
+    "ch6": FAST,
+    "ch5": {"preset": "ch5", **QUICK},
+    "fcfs": {**QUICK, "discipline": "fcfs"},
+    "ch6, one line": {**FAST, "service": {"mean_ms": [2.0, 4.0]}, "server": {"shared": True}},
+    "newest waits, round-robin": {
+        **SHARED, "discipline": "newest-waits", "server": {"shared": True, "order": "round-robin"},
+    },
+    "fcfs, oldest age": {**SHARED, "discipline": "fcfs", "server": {"shared": True, "order": "oldest-age"}},
+    "preempt, one line": {**SHARED, "discipline": "lcfs-preempt", "server": {"shared": True}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTIONS.keys())
 def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict) -> None:
     """The emulator's trace, its offers decided again in virtual time: every start, due and outcome alike."""
 

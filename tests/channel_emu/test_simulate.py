@@ -9,6 +9,8 @@ from channel_emu import ages
 from channel_emu.config import channel_from_mapping
 from channel_emu.link import DISCIPLINES, Kind
 from channel_emu.simulate import OUTCOMES, LinkRun, SimulationError, replay_offers, simulate
+from edge_server.buffer import FrameBuffer
+from tests.channel_emu.live import frame_of
 
 EXPONENTIAL = {"law": "exponential", "mean_ms": [30.0, 60.0]}
 
@@ -29,6 +31,13 @@ CHANNELS = [
       for d in DISCIPLINES for s in ("at-start", "modulated")),
     *({"preset": "ch6", "discipline": d, "queue_limit": 2, "chain": {"scope": "per-camera"}}
       for d in ("fcfs", "parallel")),
+    *({"preset": "ch6", "discipline": "fcfs", "service_state": s,
+       "chain": {"sampled": "slots", "slot_ms": slot_ms, **more}}
+      for s in ("at-start", "modulated") for slot_ms, more in ((1.0, {}), (7.3, {"scope": "per-camera"}))),
+    {"preset": "ch6", "chain": {"mu1_per_ms": 1e9, "mu2_per_ms": 1e9, "sampled": "slots", "slot_ms": 0.5}},
+    {"preset": "ch6", "chain": {"mu1_per_ms": 0.01, "mu2_per_ms": 0.0, "initial": "low", "sampled": "slots",
+                                "slot_ms": 2.0}},
+    {"preset": "ch5", "arrivals": {"spread": True}},
     *({"preset": "ch6", "service": s} for s in (
         {"law": "gamma", "mean_ms": [10, 30], "shape": 0.5}, {"law": "gamma", "mean_ms": 30, "shape": 2.5},
         {"law": "lognormal", "mean_ms": [10, 30], "sigma": 0.5}, {"law": "deterministic", "mean_ms": 10},
@@ -99,6 +108,53 @@ def test_replaying_offers_gives_the_fates_of_the_simulation() -> None:
     assert [OUTCOMES.index(t.outcome or "in_flight") for t in fates] == run.outcome.tolist()
     assert [t.due_ns or -1 for t in fates] == run.due_ns.tolist()
     assert kinds.count(Kind.DELIVERED) == run.count("delivered")
+
+
+@pytest.mark.parametrize(
+    "section", [{"preset": "ch5"}, {"preset": "ch6", "chain": {"scope": "per-camera"}}], ids=str
+)
+def test_the_number_of_threads_changes_nothing(section: dict) -> None:
+    pytest.importorskip("numba")
+    config = channel_from_mapping(section)
+    alone, many = (simulate(config, 5, 60, 3, engine="kernel", threads=n) for n in (1, 4))
+    for a, b in zip(alone.runs, many.runs):
+        same(a, b)
+        assert (a.due_ns == b.due_ns).all() and a.state_share == b.state_share
+    assert alone.summary() == many.summary()
+
+
+def test_cameras_that_take_turns_are_spread_over_the_period() -> None:
+    config = channel_from_mapping({"preset": "ch5", "arrivals": {"spread": True}})
+    runs = simulate(config, ["c", "a", "b"], 1, engine="python").runs
+    assert [int(run.offered_ns[0]) for run in runs] == [20 * 10**6, 0, 10 * 10**6]
+
+
+@pytest.mark.parametrize("discipline", ["newest-waits", "parallel"])
+def test_omega_is_what_a_buffer_would_hold(discipline: str) -> None:
+    """The edge's own buffer, fed with what arrived, at instants on deliveries and between them, before the
+    first and after the last. Parallel frames overtake each other."""
+    result = simulate(channel_from_mapping({"preset": "ch6", "discipline": discipline}), 3, 20, 11)
+    rng = np.random.default_rng(0)
+    due = np.concatenate([run.due_ns[run.outcome == 1] for run in result.runs])
+    at = np.concatenate([[0], rng.integers(0, 20 * 10**9, 200), rng.choice(due, 100), [20 * 10**9]])
+    found = result.omega(at)
+    assert found.shape == (302, 3) and found.dtype == np.int64
+    buffer = FrameBuffer([run.camera for run in result.runs])
+    deliveries = sorted(
+        (int(run.due_ns[n]), run.camera, int(n), int(run.offered_ns[n]))
+        for run in result.runs
+        for n in np.flatnonzero(run.outcome == 1)
+    )
+    for row in np.argsort(at):
+        while deliveries and deliveries[0][0] <= at[row]:
+            due_ns, camera, number, born_ns = deliveries.pop(0)
+            buffer.put(frame_of(camera, "s", number, born_ns), due_ns)
+        held = buffer.newest()
+        assert [held[c].generated_ns if c in held else -1 for c in buffer.cameras] == found[row].tolist()
+    assert (found[0] == -1).all() and (found[-1] > 0).all()
+    np.testing.assert_array_equal(
+        result.ages_ms(at), np.where(found < 0, np.nan, (at[:, None] - found) / 1e6)
+    )
 
 
 def test_ages_by_hand() -> None:

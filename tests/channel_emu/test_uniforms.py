@@ -65,3 +65,12 @@ def test_kernel_finds_the_same_numbers(number: int, again: int) -> None:
 def test_seed_out_of_range_is_refused(seed: int) -> None:
     with pytest.raises(ValueError, match="seed"):
         stream_key(seed, "a", "b")
+
+
+def test_numbers_drawn_in_blocks_are_the_same() -> None:
+    philox = pytest.importorskip("channel_emu.kernels.philox")
+    stream = Uniforms(5, "cam", "x")
+    u, v = np.empty(300), np.empty(300)
+    for first in (0, 2**32 - 100):
+        philox.fill(first, u, v, np.array(stream.key, np.uint64))
+        assert list(zip(u, v)) == [stream.pair(first + i) for i in range(300)]

@@ -1,0 +1,260 @@
+"""What a recording tells about a channel, without knowing the channel: frames, delays, arrivals, losses.
+
+Two kinds of recording are read. A trace of this emulator (``trace.py``), whose recorded states are left alone
+unless asked for. Or rows of any other link, one frame a line::
+
+    # offered_ms, delivered_ms (blank: it never came), camera (optional)
+    0.0, 41.5, cam00
+    33.3, , cam00
+
+separated by commas, semicolons or tabs; lines that start with # and a first line of names are passed over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from channel_emu import trace
+from channel_emu.hidden import Timeline
+from channel_emu.instants import NEVER_NS
+from channel_emu.link import Kind
+
+# Longer than any stream lives; whatever takes longer never came.
+MAX_DELAY_MS = 1e9
+_MAX_ROWS_MS = 1e12
+
+
+# What rows can be read for: where a newer frame pushes out the one on its way, only the quick ones come, and
+# their delays are not the link's.
+ROW_DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "parallel")
+
+
+class ObservedError(ValueError):
+    """A recording from which nothing can be learnt; the message says why."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera's frames in order of offering; every array has one entry a frame.
+
+    started_ms, delay_ms: NaN where transmission did not start, or is not known to have. arrived_ms: when the
+    link's arrival process took the frame up, NaN where it did not. outcome: a ``link.Kind``'s name, or ""
+    for a frame that was still inside.
+    """
+
+    name: str
+    offered_ms: NDArray[np.float64]
+    arrived_ms: NDArray[np.float64]
+    started_ms: NDArray[np.float64]
+    delay_ms: NDArray[np.float64]
+    outcome: NDArray[np.str_]
+    state: NDArray[np.int64]
+
+    def came(self) -> NDArray[np.bool_]:
+        return self.outcome == Kind.DELIVERED
+
+
+@dataclass(frozen=True)
+class Recording:
+    """discipline: of the link. states: names, where the recording knows them. sampled: an arrival process
+    took frames up later than they were offered, or not at all (``skipped``)."""
+
+    path: Path
+    cameras: list[Camera]
+    discipline: str
+    states: list[str]
+    sampled: bool
+    endless: int = 0
+    """Delays left out because they exceed MAX_DELAY_MS."""
+
+    @property
+    def frames(self) -> int:
+        return sum(len(camera.offered_ms) for camera in self.cameras)
+
+    def delays_ms(self) -> NDArray[np.float64]:
+        """All delays, in no particular order."""
+        values = np.concatenate([camera.delay_ms for camera in self.cameras])
+        return values[~np.isnan(values)]
+
+
+def read(path: Path, discipline: str | None = None, use_states: bool = False) -> Recording:
+    """Read a trace or rows. ``discipline``: how the link of the rows treats a frame while it is busy (default
+    drop-new); a trace knows its own. Raises ObservedError, TraceError."""
+    try:
+        begin = path.read_text()[:1]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ObservedError(f"{path}: cannot be read: {error}") from None
+    if begin == "{":
+        return from_trace(path, trace.read(path), use_states)
+    if use_states:
+        raise ObservedError(f"{path}: rows of instants hold no states: leave out --use-states")
+    return _from_rows(path, discipline or "drop-new")
+
+
+def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Recording:
+    """What the emulator measured: for every frame that started, the delay it got."""
+    names = found.config.state_names
+    if use_states and len(names) != 2:
+        raise ObservedError(f"{path}: --use-states: expected a trace of two states, its has {len(names)}")
+    sampled = any(r.outcome == Kind.SKIPPED for r in found.records)
+    first_ns = min((r.offered_ns for r in found.records), default=0)
+    cameras, endless = [], 0
+    for name, records in found.by_camera().items():
+        started = _ms([r.started_ns for r in records], first_ns)
+        drawn = [None if r.drawn_ns is None or (r.due_ns or 0) >= NEVER_NS else r.drawn_ns for r in records]
+        delay = _ms(drawn, 0)
+        endless += sum(r.drawn_ns is not None for r in records) - int((delay <= MAX_DELAY_MS).sum())
+        delay[~(delay <= MAX_DELAY_MS)] = math.nan
+        offered = _ms([r.offered_ns for r in records], first_ns)
+        outcome = np.array([r.outcome or "" for r in records])
+        state = np.array([r.state if use_states and r.started_ns is not None else -1 for r in records])
+        arrived = _arrivals(offered, started, outcome, records, first_ns) if sampled else offered
+        cameras.append(Camera(name, offered, arrived, started, delay, outcome, state))
+    return Recording(path, cameras, found.config.discipline, names if use_states else [], sampled, endless)
+
+
+def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
+    return np.array([math.nan if v is None else (v - first_ns) / 1e6 for v in instants], float)
+
+
+def _arrivals(
+    offered: NDArray[np.float64],
+    started: NDArray[np.float64],
+    outcome: NDArray[np.str_],
+    records: list[trace.Record],
+    first_ns: int,
+) -> NDArray[np.float64]:
+    """When a sampling process took each frame up. A frame that found the link idle started, one that was
+    dropped ended, at that instant. One that waited did so some time between its offer and the next: the
+    middle is taken."""
+    ended = _ms([r.ended_ns for r in records], first_ns)
+    following = np.append(offered[1:], math.nan)
+    latest = np.fmin(following, np.where(np.isnan(started), ended, started))
+    arrived = np.where(np.isnan(latest), offered, (offered + latest) / 2)
+    at_once = (started < following) & ~_busy_until(started, records, first_ns)
+    arrived = np.where(at_once, started, arrived)
+    arrived = np.where(outcome == Kind.DROPPED_BUSY, ended, arrived)
+    return np.where((outcome == Kind.SKIPPED) | (outcome == ""), math.nan, arrived)
+
+
+def _busy_until(
+    started: NDArray[np.float64], records: list[trace.Record], first_ns: int
+) -> NDArray[np.bool_]:
+    """Frames that started in the instant in which another ended: they had been waiting for it (where the
+    other was not itself pushed out by them)."""
+    ends = {r.ended_ns for r in records if r.started_ns is not None and r.outcome != Kind.SUPERSEDED}
+    return np.array([r.started_ns in ends for r in records])
+
+
+def _from_rows(path: Path, discipline: str) -> Recording:
+    rows: dict[str, list[tuple[float, float]]] = {}
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = [w.strip() for w in line.replace(";", ",").replace("\t", ",").split(",")]
+        try:
+            offered = float(words[0])
+            delivered = float(words[1]) if len(words) > 1 and words[1] else math.nan
+            if len(words) > 3 or abs(offered) > _MAX_ROWS_MS or delivered < offered or math.isnan(offered):
+                raise ValueError
+        except ValueError:
+            if not rows and number == 1:
+                continue  # names of the columns
+            raise ObservedError(
+                f"{path}: line {number}: expected offered_ms, delivered_ms (not earlier, or blank) and "
+                f"perhaps a camera, got {line.strip()!r}"
+            ) from None
+        rows.setdefault(words[2] if len(words) > 2 else "cam00", []).append((offered, delivered))
+    if not rows:
+        raise ObservedError(f"{path}: there is no frame in it")
+    cameras, endless = [], 0
+    first = min(offered for given in rows.values() for offered, _ in given)
+    for name, given in rows.items():
+        table = np.array(sorted(given, key=lambda row: row[0])) - first
+        endless += int((table[:, 1] - table[:, 0] > MAX_DELAY_MS).sum())
+        table[table[:, 1] - table[:, 0] > MAX_DELAY_MS, 1] = math.nan
+        cameras.append(_camera_of_rows(name, table[:, 0], table[:, 1], discipline))
+    return Recording(path, cameras, discipline, [], False, endless)
+
+
+def _camera_of_rows(
+    name: str, offered: NDArray[np.float64], delivered: NDArray[np.float64], discipline: str
+) -> Camera:
+    """Where rows are all there is, transmission starts at the offer, or when the link becomes free; a frame
+    that did not come met a busy link if an earlier one was on its way, and was lost otherwise. After the last
+    one that came nobody knows: it may still be on its way."""
+    n = len(offered)
+    started, outcome = np.full(n, math.nan), np.full(n, str(Kind.LOST), dtype="U16")
+    free = -math.inf
+    for i in range(n):
+        if math.isnan(delivered[i]):
+            if discipline != "parallel" and offered[i] < free:
+                newest = discipline == "newest-waits"
+                outcome[i] = str(Kind.SUPERSEDED if newest else Kind.DROPPED_BUSY)
+            continue
+        outcome[i] = str(Kind.DELIVERED)
+        waits = discipline in ("newest-waits", "fcfs")
+        started[i] = max(offered[i], free) if waits and free <= delivered[i] else offered[i]
+        free = max(free, float(delivered[i]))
+    came = np.flatnonzero(outcome == Kind.DELIVERED)
+    if len(came):
+        outcome[(np.arange(n) > came[-1]) & (outcome == Kind.LOST)] = ""
+    return Camera(name, offered, offered, started, delivered - started, outcome, np.full(n, -1))
+
+
+def timelines(recording: Recording, shared: bool, arrivals: bool) -> list[Timeline]:
+    """The cameras' observations in one order where they share a chain, else one timeline each.
+
+    arrivals: whether arrivals count as observations; a sampling process waits from a frame's offer on, one
+    that makes its own frames waits all the time between the camera's first frame and its last.
+    """
+    groups = [recording.cameras] if shared else [[camera] for camera in recording.cameras]
+    return [line for group in groups if len((line := _timeline(group, recording.sampled, arrivals)).span_ms)]
+
+
+def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
+    at: list[NDArray[np.float64]] = []
+    change: list[NDArray[np.int64]] = []
+    arrived: list[NDArray[np.bool_]] = []
+    delay: list[NDArray[np.float64]] = []
+    state: list[NDArray[np.int64]] = []
+
+    def add(at_ms: NDArray[np.float64], by: int, is_arrival: bool, delays: NDArray[np.float64] | None = None,
+            states: NDArray[np.int64] | None = None) -> None:  # fmt: skip
+        n = len(at_ms)
+        at.append(at_ms)
+        change.append(np.full(n, by))
+        arrived.append(np.full(n, is_arrival))
+        delay.append(np.full(n, math.nan) if delays is None else delays)
+        state.append(np.full(n, -1) if states is None else states)
+
+    for camera in cameras:
+        went = ~np.isnan(camera.delay_ms)
+        add(camera.started_ms[went], 0, False, camera.delay_ms[went], camera.state[went])
+        if not arrivals or not len(camera.offered_ms):
+            continue
+        if sampled:
+            following = np.append(camera.offered_ms[1:], camera.offered_ms[-1])
+            taken = ~np.isnan(camera.arrived_ms)
+            add(camera.offered_ms, 1, False)
+            add(camera.arrived_ms[taken], -1, True)
+            add(following[~taken], -1, False)
+        else:
+            add(camera.offered_ms[:1], 1, False)
+            add(camera.offered_ms[1:-1], 0, True)
+            add(camera.offered_ms[-1:], -1, len(camera.offered_ms) > 1)
+    when = np.concatenate(at)
+    # Of what happens in one instant the waiting begins first: an arrival finds its camera waiting.
+    order = np.lexsort((-np.concatenate(change), when))
+    when = when[order]
+    waiting = np.concatenate([[0], np.cumsum(np.concatenate(change)[order])[:-1]]) if len(when) else order
+    return Timeline(
+        np.diff(when, prepend=when[:1]), waiting.astype(np.int64), np.concatenate(arrived)[order],
+        np.concatenate(delay)[order], np.concatenate(state)[order], float(when[0]) if len(when) else 0.0,
+    )  # fmt: skip

@@ -1,0 +1,189 @@
+"""A bad network for your own tests: the pytest fixture ``channel``.
+
+In the ``conftest.py`` at the root of your tests::
+
+    pytest_plugins = ["channel_emu.testing"]
+
+(or, in the test's module, ``from channel_emu.testing import channel``). A test then puts any gRPC service
+behind a seeded link, talks to ``link.address`` instead of the service, and asserts on what became of it::
+
+    def test_positions_stay_fresh(channel):
+        server = grpc.server(ThreadPoolExecutor())          # your own service, as it is
+        add_TrackerServicer_to_server(Tracker(), server)
+        port = server.add_insecure_port("127.0.0.1:0")
+        server.start()
+
+        link = channel("ch5", to=f"127.0.0.1:{port}", seed=1)
+        with grpc.insecure_channel(link.address) as to_server:
+            stub = TrackerStub(to_server)
+            stub.Follow(positions(every_s=0.03, count=200))  # a stream: dropped messages are left out
+        report = link.settle()
+        assert report.mean_age_ms < 200
+        assert 0.3 < report.dropped / report.offered < 0.8
+
+    def test_the_client_retries(channel, service):
+        link = channel({"faults": {"loss": {"probability": 0.5}}}, to=service, seed=3)
+        ...                                                  # a dropped unary call answers UNAVAILABLE
+
+The first argument is a preset (``ideal``, ``ch5``, ``ch6``, ...), a mapping as in a scenario's ``channel:``
+section, or a ``ChannelConfig``. The same seed gives the same decisions for messages offered at the same
+instants. When a test fails, pytest shows each link's seed and figures in a section of their own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import sys
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+
+from channel_emu import trace as traces
+from channel_emu.config import ChannelConfig, channel_from_mapping
+from channel_emu.generic import GenericOptions, GenericProxy, Report, show
+from freshfield.transport import Transport
+
+T = TypeVar("T")
+_PATIENCE_S = 30.0
+# The proxy's thread takes the interpreter's lock back from the test's threads after this long at most.
+_SWITCH_S = 0.0005
+
+
+class EmulatedLink:
+    """A running proxy in front of one service, on an event loop of its own thread. address: where clients
+    connect."""
+
+    def __init__(self, config: ChannelConfig, seed: int, options: GenericOptions) -> None:
+        self.config = config
+        self.seed = seed
+        self.options = options
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="channel", daemon=True)
+        self._thread.start()
+        self._last: Report | None = None
+        try:
+            self._proxy = self._do(self._start())
+        except BaseException:
+            self._end()
+            raise
+        host = options.listen.rpartition(":")[0] or "127.0.0.1"
+        self.address = f"{host}:{self._proxy.port}"
+
+    def report(self) -> Report:
+        """Ages, losses and delays so far, in all and by method. Raises HardLimit where the channel sets a
+        limit and it was exceeded; after ``close`` the last report."""
+        return self._last or self._do(self._report(checked=True))
+
+    def settle(self, timeout_s: float = 10.0) -> Report:
+        """Wait until nothing is inside any more, then report. Raises TimeoutError."""
+        try:
+            self._do(asyncio.wait_for(self._proxy.settled(), timeout_s), timeout_s + _PATIENCE_S)
+        except TimeoutError:
+            inside = self.report().in_flight
+            raise TimeoutError(f"{inside} messages are still inside the link after {timeout_s:g} s") from None
+        return self.report()
+
+    def close(self) -> None:
+        """End the proxy; open calls are cut. Once is enough."""
+        if self._last is None:
+            try:
+                self._last = self._do(self._report(checked=False))
+                self._do(self._proxy.stop())
+            finally:
+                self._end()
+
+    def told(self) -> str:
+        """The link in words: what to put in again to see the same, and what it did."""
+        report = self._last or self._do(self._report(checked=False))
+        head = (
+            f"channel({self._spelled()}, to={self.options.to!r}, seed={self.seed}, "
+            f"direction={self.options.direction!r})"
+        )
+        return f"{head}\n{show(report)}"
+
+    def _spelled(self) -> str:
+        preset = self.config.preset
+        if preset is not None and channel_from_mapping({"preset": preset}) == self.config:
+            return repr(preset)
+        return json.dumps(self.config.to_mapping())
+
+    async def _start(self) -> GenericProxy:
+        proxy = GenericProxy(self.config, self.seed, self.options)
+        await proxy.start()
+        return proxy
+
+    async def _report(self, checked: bool) -> Report:
+        if checked:
+            self._proxy.check()
+        return self._proxy.report()
+
+    def _do(self, work: Coroutine[Any, Any, T], patience_s: float = _PATIENCE_S) -> T:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(patience_s)
+
+    def _end(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(_PATIENCE_S)
+        self._loop.close()
+
+
+ChannelFactory = Callable[..., EmulatedLink]
+
+
+def put_behind(
+    channel: str | dict[str, Any] | ChannelConfig,
+    *,
+    to: str,
+    seed: int = 0,
+    direction: str = "up",
+    shared: bool = False,
+    listen: str = "127.0.0.1:0",
+    trace: Path | None = None,
+    replay: Path | None = None,
+    transport: Transport | None = None,
+) -> EmulatedLink:
+    """A link in front of the service at ``to``; ``close`` it. What the fixture calls.
+
+    channel: a preset's name, a ``channel:`` section, or a configuration. direction: the messages that pass
+    the link: up (to the service), down (its answers) or both. shared: one link for all methods of a
+    direction, instead of one each. trace: record to this file. replay: repeat the decisions of a recorded
+    file. transport: TLS of both sides.
+
+    Raises ScenarioError, TraceError, TransportError (all ValueErrors), one line that says what to change.
+    """
+    section: Any = {"preset": channel} if isinstance(channel, str) else channel
+    config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
+    replayed = traces.read(replay) if replay is not None else None
+    options = GenericOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
+    return EmulatedLink(config, seed, options)
+
+
+@pytest.fixture
+def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
+    """Makes seeded links in front of gRPC services: ``link = channel("ch5", to="localhost:50051", seed=1)``.
+
+    Arguments as ``put_behind``. All links end with the test.
+    """
+    links: list[EmulatedLink] = []
+
+    def make(channel: str | dict[str, Any] | ChannelConfig, **options: Any) -> EmulatedLink:
+        links.append(put_behind(channel, **options))
+        return links[-1]
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(min(before, _SWITCH_S))
+    try:
+        yield make
+    finally:
+        sys.setswitchinterval(before)
+        with contextlib.ExitStack() as ending:
+            for link in links:
+                ending.callback(link.close)
+        if links:
+            # Shown by pytest where the test failed.
+            told = "\n".join(link.told() for link in links)
+            request.node.add_report_section("teardown", "emulated channel", told)

@@ -1,0 +1,321 @@
+"""The ``channel`` fixture as a user has it: their own service, its server and clients as they are, a link
+between them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+import time
+from collections.abc import Iterator
+from concurrent import futures
+from pathlib import Path
+
+import grpc
+import pytest
+
+from channel_emu import trace
+from channel_emu.testing import EmulatedLink, channel, put_behind
+
+assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
+
+HELLO, COUNT, COLLECT, ECHO, FAIL = (f"/greet.Greeter/{name}" for name in
+                                     ("Hello", "Count", "Collect", "Echo", "Fail"))  # fmt: skip
+LOSSY = {"faults": {"loss": {"probability": 0.5}}}
+WAIT = {"service": {"law": "deterministic", "mean_ms": 40.0}}
+
+
+class Greeter:
+    """A service of all four kinds of call, by hand: bytes in, bytes out."""
+
+    def __init__(self) -> None:
+        self.collected: list[bytes] = []
+        self.cancelled = threading.Event()
+        self.deadline_s = 0.0
+        self._server = grpc.server(futures.ThreadPoolExecutor(8))
+        handlers = {
+            "Hello": grpc.unary_unary_rpc_method_handler(self.hello),
+            "Count": grpc.unary_stream_rpc_method_handler(self.count),
+            "Collect": grpc.stream_unary_rpc_method_handler(self.collect),
+            "Echo": grpc.stream_stream_rpc_method_handler(self.echo),
+            "Fail": grpc.unary_unary_rpc_method_handler(self.fail),
+        }
+        self._server.add_generic_rpc_handlers(
+            (grpc.method_handlers_generic_handler("greet.Greeter", handlers),)
+        )
+        self.address = f"127.0.0.1:{self._server.add_insecure_port('127.0.0.1:0')}"
+        self._server.start()
+
+    def hello(self, request: bytes, context: grpc.ServicerContext) -> bytes:
+        self.deadline_s = context.time_remaining() or 0.0
+        context.send_initial_metadata((("greeting", "first"),))
+        name = dict(context.invocation_metadata()).get("name", "nobody")
+        context.set_trailing_metadata((("served", "yes"), ("raw-bin", b"\x00\xff")))
+        return b"hello " + request + b" from " + str(name).encode()
+
+    def count(self, request: bytes, context: grpc.ServicerContext) -> Iterator[bytes]:
+        context.add_callback(self.cancelled.set)
+        for n in range(int(request)):
+            yield str(n).encode()
+            time.sleep(0.01)
+
+    def collect(self, requests: Iterator[bytes], context: grpc.ServicerContext) -> bytes:
+        self.collected = list(requests)
+        return str(len(self.collected)).encode()
+
+    def echo(self, requests: Iterator[bytes], context: grpc.ServicerContext) -> Iterator[bytes]:
+        yield from requests
+
+    def fail(self, request: bytes, context: grpc.ServicerContext) -> bytes:
+        context.set_trailing_metadata((("why", "because"),))
+        context.abort(grpc.StatusCode.FAILED_PRECONDITION, "not today")
+        raise AssertionError("abort raises")
+
+    def stop(self) -> None:
+        self._server.stop(None)
+
+
+@pytest.fixture
+def greeter() -> Iterator[Greeter]:
+    served = Greeter()
+    yield served
+    served.stop()
+
+
+@pytest.fixture
+def client(request: pytest.FixtureRequest):
+    """``client(link)``: a plain client channel to the link."""
+
+    def connect(link: EmulatedLink) -> grpc.Channel:
+        made = grpc.insecure_channel(link.address)
+        request.addfinalizer(made.close)
+        return made
+
+    return connect
+
+
+def paced(count: int, every_s: float) -> Iterator[bytes]:
+    begun = time.monotonic()
+    for n in range(count):
+        time.sleep(max(0.0, begun + n * every_s - time.monotonic()))
+        yield str(n).encode()
+
+
+def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client) -> None:
+    """The example: 100 messages, one each 10 ms, over a link that takes 15 ms and drops what finds it busy:
+    every second one gets through, and the newest is 15 to 35 ms old."""
+    section = {"service": {"law": "deterministic", "mean_ms": 15.0}, "discipline": "drop-new"}
+    link = channel(section, to=greeter.address, seed=1)
+    answer = client(link).stream_unary(COLLECT)(paced(100, 0.010))
+    report = link.settle()
+    assert report.offered == 100 and int(answer) == len(greeter.collected) == report.delivered
+    assert 35 <= report.delivered <= 60 and report.dropped == report.outcomes["dropped_busy"]
+    # A machine that is busy with other things hands messages on late, and says so.
+    late_ms = report.error_ms["max"]
+    assert 20 < report.mean_age_ms < 30 + late_ms
+    assert report.mean_age_ms < report.peak_age_ms < 50 + late_ms
+    assert report.delay_ms["mean"] == 15.0 <= report.latency_ms["mean"] <= 15 + late_ms
+    # What came is in order, and is what was sent.
+    numbers = [int(word) for word in greeter.collected]
+    assert numbers == sorted(set(numbers)) and report.by_method[f"up {COLLECT}"].offered == 100
+
+
+def test_a_dropped_unary_call_is_unavailable(channel, greeter, client) -> None:
+    link = channel(LOSSY, to=greeter.address, seed=3)
+    hello = client(link).unary_unary(HELLO)
+    codes = []
+    for _ in range(40):
+        try:
+            assert hello(b"you", timeout=10).startswith(b"hello you")
+            codes.append("OK")
+        except grpc.RpcError as error:
+            codes.append(error.code().name)
+            assert "dropped the request" in error.details() and "seed 3" in error.details()
+    report = link.settle()
+    assert set(codes) == {"OK", "UNAVAILABLE"} and codes.count("UNAVAILABLE") == report.outcomes["lost"]
+    assert 8 < report.dropped < 32
+    # Draws are looked up by the message's number: the same seed loses the same calls, whatever the timing.
+    again = channel(LOSSY, to=greeter.address, seed=3)
+    hello = client(again).unary_unary(HELLO)
+    repeated = [_code(lambda: hello(b"you", timeout=10)) for _ in range(40)]
+    assert repeated == codes
+    other = channel(LOSSY, to=greeter.address, seed=4)
+    hello = client(other).unary_unary(HELLO)
+    assert [_code(lambda: hello(b"you", timeout=10)) for _ in range(40)] != codes
+
+
+def _code(call) -> str:
+    try:
+        call()
+        return "OK"
+    except grpc.RpcError as error:
+        return error.code().name
+
+
+def test_a_dropped_answer_is_unavailable_too(channel, greeter, client) -> None:
+    link = channel({"faults": {"loss": {"probability": 1.0}}}, to=greeter.address, direction="down")
+    stub = client(link)
+    with pytest.raises(grpc.RpcError) as missed:
+        stub.unary_unary(HELLO)(b"you", timeout=10)
+    assert missed.value.code() is grpc.StatusCode.UNAVAILABLE
+    assert "dropped the answer" in missed.value.details()
+    # The request got through, whose answer did not; so did those of a stream.
+    assert _code(lambda: stub.stream_unary(COLLECT)(paced(5, 0.0), timeout=10)) == "UNAVAILABLE"
+    assert greeter.collected == [b"0", b"1", b"2", b"3", b"4"]
+    # A stream of several answers ends as it did, with none of them.
+    assert list(stub.unary_stream(COUNT)(b"5", timeout=10)) == []
+    assert link.settle().outcomes == {"lost": 7}
+
+
+def test_dropped_stream_messages_are_left_out_in_both_directions(channel, greeter, client) -> None:
+    link = channel(LOSSY, to=greeter.address, seed=5, direction="both")
+    answers = list(client(link).stream_stream(ECHO)(paced(60, 0.001), timeout=20))
+    report = link.settle()
+    up, down = report.by_method[f"up {ECHO}"], report.by_method[f"down {ECHO}"]
+    assert up.offered == 60 and down.offered == up.delivered and len(answers) == down.delivered
+    assert 15 < up.delivered < 45 and 4 < down.delivered < up.delivered
+    numbers = [int(answer) for answer in answers]
+    assert numbers == sorted(set(numbers)) and set(numbers) <= set(range(60))
+
+
+def test_metadata_status_trailers_and_deadline_pass(channel, greeter, client) -> None:
+    link = channel(WAIT, to=greeter.address, direction="both")
+    stub = client(link)
+    begun = time.monotonic()
+    answer, call = stub.unary_unary(HELLO).with_call(b"you", timeout=5, metadata=(("name", "a test"),))
+    took_ms = (time.monotonic() - begun) * 1e3
+    assert answer == b"hello you from a test" and 80 <= took_ms < 1000
+    assert ("greeting", "first") in call.initial_metadata()
+    trailers = dict(call.trailing_metadata())
+    assert trailers["served"] == "yes" and trailers["raw-bin"] == b"\x00\xff"
+    # The service knows how long its client still waits (gRPC rounds it to some hundredths).
+    assert 4.0 < greeter.deadline_s < 5.0
+    with pytest.raises(grpc.RpcError) as failed:
+        stub.unary_unary(FAIL)(b"", timeout=5)
+    assert failed.value.code() is grpc.StatusCode.FAILED_PRECONDITION
+    assert failed.value.details() == "not today"
+    assert dict(failed.value.trailing_metadata())["why"] == "because"
+    assert _code(lambda: stub.unary_unary("/greet.Greeter/Missing")(b"", timeout=5)) == "UNIMPLEMENTED"
+    assert _code(lambda: stub.unary_unary(HELLO)(b"you", timeout=0.02)) == "DEADLINE_EXCEEDED"
+
+
+def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter, client) -> None:
+    link = channel({"service": {"law": "deterministic", "mean_ms": 5.0}, "discipline": "fcfs"},
+                   to=greeter.address, direction="down")  # fmt: skip
+    call = client(link).unary_stream(COUNT)(b"1000", timeout=30)
+    assert [int(word) for word in itertools.islice(call, 3)] == [0, 1, 2]
+    call.cancel()
+    assert greeter.cancelled.wait(5)
+    report = link.settle()
+    assert report.offered < 100 and report.in_flight == 0
+    assert report.delivered == report.outcomes["forwarded"] + report.outcomes.get("cancelled", 0)
+
+
+def test_a_service_that_is_not_there_says_so(channel, client) -> None:
+    link = channel("ideal", to="127.0.0.1:1")
+    assert _code(lambda: client(link).unary_unary(HELLO)(b"", timeout=5)) == "UNAVAILABLE"
+
+
+def test_a_reset_cuts_the_streams_on_it(channel, greeter, client) -> None:
+    link = channel({"faults": {"reset": {"at_ms": [700.0]}}}, to=greeter.address)
+    call = client(link).stream_stream(ECHO)(paced(10_000, 0.01), timeout=20)
+    with pytest.raises(grpc.RpcError) as cut:
+        list(call)
+    assert cut.value.code() is grpc.StatusCode.UNAVAILABLE and "reset this stream" in cut.value.details()
+    assert 10 < link.report().offered < 200
+    assert list(client(link).stream_stream(ECHO)(paced(3, 0), timeout=5)) == [b"0", b"1", b"2"]
+
+
+def test_damage_and_doubles(channel, greeter, client) -> None:
+    chance = {"probability": 1.0}
+    link = channel({"faults": {"duplication": chance}}, to=greeter.address)
+    stub = client(link)
+    doubled = list(stub.stream_stream(ECHO)(iter([b"a", b"b", b"c"]), timeout=5))
+    assert doubled[1:] == [b"b", b"b", b"c", b"c"] or doubled == [b"a", b"a", b"b", b"b", b"c", b"c"]
+    assert stub.unary_unary(HELLO)(b"you", timeout=5).startswith(b"hello you")
+    link = channel({"faults": {"corruption": chance}}, to=greeter.address)
+    (answer,) = client(link).stream_stream(ECHO)(iter([b"payload"]), timeout=5)
+    assert len(answer) == 7 and sum(a != b for a, b in zip(answer, b"payload")) == 1
+
+
+def test_a_trace_is_replayed_with_the_same_decisions(channel, greeter, client, tmp_path: Path) -> None:
+    """Recorded, decided again in virtual time, and repeated live: all three agree message for message."""
+    section = {"service": {"law": "exponential", "mean_ms": 6.0}, "discipline": "drop-new"}
+    first = channel(section, to=greeter.address, seed=9, trace=tmp_path / "1.jsonl")
+    client(first).stream_unary(COLLECT)(paced(80, 0.005))
+    first.settle()
+    first.close()
+    found = trace.read(tmp_path / "1.jsonl")
+    assert trace.compare(found) == {"frames": 80, "equal": 80, "different": []}
+    second = channel("ideal", to=greeter.address, replay=tmp_path / "1.jsonl", trace=tmp_path / "2.jsonl")
+    client(second).stream_unary(COLLECT)(paced(80, 0.008))
+    report = second.settle()
+    second.close()
+    again = trace.read(tmp_path / "2.jsonl")
+    (then,), (now,) = found.by_camera().values(), again.by_camera().values()
+    assert [r.outcome for r in then] == [r.outcome for r in now]
+    assert [r.drawn_ns for r in then] == [r.drawn_ns for r in now]
+    assert report.delivered == first.report().delivered == len(greeter.collected)
+
+
+def test_one_link_may_carry_all_methods(channel, greeter, client) -> None:
+    link = channel(WAIT, to=greeter.address, shared=True)
+    stub = client(link)
+    slow = stub.unary_unary(HELLO).future(b"you", timeout=5)
+    time.sleep(0.01)
+    assert _code(lambda: stub.unary_unary(FAIL)(b"", timeout=5)) == "UNAVAILABLE"  # the link is busy
+    assert slow.result().startswith(b"hello")
+    assert set(link.report().by_method) == {"up"}
+
+
+def test_the_hard_limit_is_told_to_the_test(channel, greeter, client) -> None:
+    link = channel({**WAIT, "hard_limit_ms": 1e-6}, to=greeter.address)
+    client(link).unary_unary(HELLO)(b"you", timeout=5)
+    with pytest.raises(RuntimeError, match=r"message 0 of call 1 on 'up /greet.*Hello' left"):
+        link.report()
+
+
+@pytest.mark.parametrize(
+    ("channel_", "options", "why"),
+    [
+        ("ch7", {}, "preset: expected one of ideal"),
+        ({"rain": 1}, {}, "rain: unknown key"),
+        ("ideal", {"direction": "sideways"}, "direction: expected one of up, down, both"),
+        ("ideal", {"listen": "nowhere"}, "cannot listen on nowhere"),
+        ("ideal", {"replay": Path("/no/such/trace")}, "cannot be read"),
+    ],
+)
+def test_mistakes_are_said_in_one_line(channel_, options: dict, why: str) -> None:
+    before = threading.active_count()
+    with pytest.raises(ValueError, match=why):
+        put_behind(channel_, to="127.0.0.1:1", **options)
+    assert threading.active_count() == before
+
+
+pytest_plugins = ["pytester"]
+
+
+def test_a_failing_test_shows_the_seed_and_the_figures(pytester: pytest.Pytester) -> None:
+    pytester.makeconftest('pytest_plugins = ["channel_emu.testing"]')
+    pytester.makepyfile(
+        """
+        def test_fails(channel):
+            link = channel("ch5", to="127.0.0.1:1", seed=77)
+            assert link.report().offered == 1
+
+        def test_passes(channel):
+            assert channel("ideal", to="127.0.0.1:1").report().offered == 0
+        """
+    )
+    result = pytester.runpytest_inprocess("-p", "no:cacheprovider")
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(["*emulated channel*", "channel('ch5', to='127.0.0.1:1', seed=77, *"])
+    assert "channel('ideal'" not in result.stdout.str()
+
+
+def test_the_report_is_plain_data(channel, greeter, client) -> None:
+    link = channel("ideal", to=greeter.address)
+    client(link).unary_unary(HELLO)(b"you", timeout=5)
+    assert json.loads(json.dumps(link.report().plain()))["by_method"][f"up {HELLO}"]["delivered"] == 1
+    link.close()
+    assert link.report().delivered == 1  # the last one, after its end

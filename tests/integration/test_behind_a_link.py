@@ -1,0 +1,127 @@
+"""Our own services behind the fixture that users get (``channel_emu.testing``): as they are, over a seeded
+link that knows nothing of them."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import grpc
+import numpy as np
+import pytest
+
+from channel_emu import ages
+from channel_emu.testing import channel
+from freshfield import ledger
+from freshfield.clock import OffsetEstimator, WallClock
+from freshfield.frame import to_request
+from freshfield.transport import Transport
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
+from tests.channel_emu.live import Edge, frame_of
+
+assert channel  # the fixture
+
+DELAY_MS = 20.0
+
+
+@asynccontextmanager
+async def edge_at(out: Path) -> AsyncIterator[Edge]:
+    edge = Edge(out, ("cam00",), (), Transport())
+    await edge.start()
+    try:
+        yield edge
+    finally:
+        await edge.stop()
+
+
+def test_the_edges_frame_stream_over_a_lossy_link(channel, tmp_path: Path) -> None:
+    """Frames at 100 a second over exponential delays of 15 ms: what the link let out is what the edge
+    buffered, in order, and the edge's own age is the link's."""
+    section = {"service": {"law": "exponential", "mean_ms": 15.0}, "discipline": "drop-new"}
+    clock = WallClock()
+    born: dict[int, int] = {}
+
+    async def live() -> None:
+        async with edge_at(tmp_path) as edge:
+            link = await asyncio.to_thread(channel, section, to=f"127.0.0.1:{edge.port}", seed=6)
+            to_link = grpc.aio.insecure_channel(link.address)
+            call = frames_pb2_grpc.FrameStreamServiceStub(to_link).Push()
+            await call.wait_for_connection()
+            begun = asyncio.get_running_loop().time()
+            for n in range(150):
+                await asyncio.sleep(begun + n * 0.01 - asyncio.get_running_loop().time())
+                born[n] = clock.now_ns()
+                await call.write(to_request(frame_of("cam00", "s", n, born[n])))
+            await call.done_writing()
+            answered = [response.sequence async for response in call]
+            await to_link.close()
+            report = await asyncio.to_thread(link.settle)
+            assert report.offered == 150 and 40 < report.delivered < 110
+            assert len(answered) == edge.ingest.delivered["cam00"] == report.delivered
+            assert not edge.ingest.rejected and answered == sorted(answered)
+            assert report.dropped == report.outcomes["dropped_busy"]
+            (books,) = ledger.read_all(tmp_path)
+            arrived = [(e.t_ns, born[e.sequence]) for e in books.events if e.event == "delivered"]
+            at_ns, born_ns = (np.array(column, np.int64) for column in zip(*arrived))
+            saw = ages.sawtooth(at_ns, born_ns, int(at_ns[-1]))
+            # Two hops of gRPC on a shared machine are all that lies between the two.
+            assert ages.mean_age_ms(saw) == pytest.approx(report.mean_age_ms, abs=10)
+
+    asyncio.run(live())
+
+
+@pytest.mark.parametrize(("direction", "sign"), [("up", 1), ("down", -1), ("both", 0)])
+def test_the_clock_exchange_over_an_unequal_link(channel, tmp_path: Path, direction: str, sign: int) -> None:
+    """NTP takes both ways for equal: a delay on one way only is an error of half of it, and the bound that
+    the estimate comes with holds it."""
+    section = {"service": {"law": "deterministic", "mean_ms": DELAY_MS}}
+    estimator, clock = OffsetEstimator(), WallClock()
+
+    async def live() -> None:
+        async with edge_at(tmp_path) as edge:
+            link = await asyncio.to_thread(channel, section, to=f"127.0.0.1:{edge.port}", direction=direction)
+            to_link = grpc.aio.insecure_channel(link.address)
+            exchange = clock_pb2_grpc.ClockServiceStub(to_link).Exchange
+            for _ in range(8):
+                sent = clock.now_ns()
+                reply = await exchange(clock_pb2.ExchangeRequest(client_sent_ns=sent), timeout=10)
+                estimator.add(sent, reply.server_received_ns, reply.server_sent_ns, clock.now_ns())
+            await to_link.close()
+
+    asyncio.run(live())
+    found = estimator.estimate(clock.now_ns())
+    assert found is not None
+    ways = 2 if direction == "both" else 1
+    assert found.offset_ns / 1e6 == pytest.approx(sign * DELAY_MS / 2, abs=4)
+    assert abs(found.offset_ns) <= found.uncertainty_ns
+    assert ways * DELAY_MS / 2 <= found.uncertainty_ns / 1e6 < ways * DELAY_MS / 2 + 5
+
+
+def test_watching_decisions_leaves_out_what_the_link_drops(channel, tmp_path: Path) -> None:
+    """Two thirds of a stream of answers lost: those that come are whole and in order."""
+
+    async def answers(request: bytes, context: grpc.aio.ServicerContext) -> None:
+        for n in itertools.count():
+            await context.write(n.to_bytes(4, "big"))
+            await asyncio.sleep(0.002)
+
+    async def live() -> list[int]:
+        server = grpc.aio.server()
+        handler = {"Watch": grpc.unary_stream_rpc_method_handler(answers)}
+        server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("t.Watcher", handler),))
+        port = server.add_insecure_port("127.0.0.1:0")
+        await server.start()
+        section = {"faults": {"loss": {"probability": 0.66}}}
+        link = await asyncio.to_thread(channel, section, to=f"127.0.0.1:{port}", seed=2, direction="down")
+        async with grpc.aio.insecure_channel(link.address) as to_link:
+            call = to_link.unary_stream("/t.Watcher/Watch")(b"")
+            seen = [int.from_bytes(await call.read(), "big") for _ in range(50)]
+            call.cancel()
+        await server.stop(None)
+        return seen
+
+    seen = asyncio.run(live())
+    assert seen == sorted(set(seen)) and 100 < seen[-1] < 250
