@@ -47,8 +47,9 @@ def load(scenario: Scenario, config: SourceConfig, camera: str) -> Effects | Non
         )
     except EffectError as error:
         raise ScenarioError(f"{scenario.path}: source.effects: {error}") from None
-    if config.kind != "world" and (effects.world or effects.exposure):
+    if config.kind != "world" and (effects.world or effects.lens or effects.exposure):
         raise ScenarioError(
-            f"{scenario.path}: source.effects: effects of the kinds world and exposure need source kind world"
+            f"{scenario.path}: source.effects: effects of the kinds world, lens and exposure need "
+            "source kind world"
         )
     return effects

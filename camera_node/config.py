@@ -51,8 +51,8 @@ class SourceConfig:
 
 @dataclass(frozen=True)
 class WorldConfig(SourceConfig):
-    """A synthetic world. scene: ``room`` or ``tile``; size and lens of its cameras; how fast it moves.
-    params: further parameters of the scene by name."""
+    """A synthetic world. scene: ``room``, ``tile`` or ``tower``; size and lens of its cameras; how fast it
+    moves. params: further parameters of the scene by name."""
 
     scene: str = "room"
     width: int | None = None

@@ -77,7 +77,7 @@ def open_sources(
         return module.open_sources(scenario, config, cameras, data, effects)
     sources: dict[str, Source] = module.open_sources(scenario, config, cameras, data)
     for camera, made in effects.items():
-        if made is not None and made.image:
+        if made is not None and (made.image or made.pose):
             from camera_node.sources.affected import AffectedSource
 
             sources[camera] = AffectedSource(sources[camera], made, config.codec)

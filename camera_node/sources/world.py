@@ -13,7 +13,7 @@ from camera_node.sources.ahead import fill_in_child
 from camera_node.sources.playback import rate
 from camera_node.world import Scene, make_scene
 from camera_node.world.cache import FrameCache
-from camera_node.world.effects import NO_EFFECTS
+from camera_node.world.effects import NO_EFFECTS, EffectError
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -31,20 +31,26 @@ _MAX_RAYS = 200_000
 class WorldSource:
     """One camera of a scene, with its frames kept by ``FrameCache``."""
 
-    def __init__(self, camera: str, frames: FrameCache, fill_elsewhere: Callable[[Stopped], None]) -> None:
+    def __init__(
+        self, camera: str, frames: FrameCache, effects: Effects, fill_elsewhere: Callable[[Stopped], None]
+    ) -> None:
         self.camera = camera
         self.fps = frames.fps
-        self.intrinsics, matrix = frames.scene.cameras[frames.camera_id]
-        self.contents: int | None = frames.contents
+        lens, matrix = frames.scene.cameras[frames.camera_id]
+        self.intrinsics = effects.claimed_lens(lens)
+        # Frames that look the same but claim different poses are different shots.
+        self.contents: int | None = None if effects.pose_varies else frames.contents
         self._pose = Pose.from_matrix(matrix)
+        self._effects = effects
         self._frames = frames
         self._fill_elsewhere = fill_elsewhere
 
     def content(self, tick: int) -> int:
-        return self._frames.content(tick)
+        return tick if self.contents is None else self._frames.content(tick)
 
     def read(self, content: int) -> Shot:
-        return Shot(self._frames.read(content), self._pose, self.intrinsics)
+        pose = self._effects.claimed_pose(self._pose, content)
+        return Shot(self._frames.read(self._frames.content(content)), pose, self.intrinsics)
 
     def prepare(self, stopped: Stopped) -> None:
         rays = self.intrinsics.width * self.intrinsics.height * self._frames.scene.params.supersample**2
@@ -69,7 +75,12 @@ def open_sources(
     """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
     config = cast(WorldConfig, config)
     return {
-        camera: WorldSource(camera, frames, partial(fill_in_child, scenario, config, camera))
+        camera: WorldSource(
+            camera,
+            frames,
+            effects.get(camera) or NO_EFFECTS,
+            partial(fill_in_child, scenario, config, camera),
+        )
         for camera, frames in frame_caches(scenario, config, cameras, effects).items()
     }
 
@@ -83,17 +94,20 @@ def frame_caches(
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: source: {error}") from None
     names = _names(scenario, scene)
-    return {
-        camera: FrameCache(
-            scene,
-            names[camera],
-            rate(config.fps or WORLD_FPS),
-            effects=effects.get(camera) or NO_EFFECTS,
-            codec=config.codec,
-            quality=config.quality,
-        )
-        for camera in cameras
-    }
+    try:
+        return {
+            camera: FrameCache(
+                scene,
+                names[camera],
+                rate(config.fps or WORLD_FPS),
+                effects=effects.get(camera) or NO_EFFECTS,
+                codec=config.codec,
+                quality=config.quality,
+            )
+            for camera in cameras
+        }
+    except EffectError as error:  # one that does not go with this scene
+        raise ScenarioError(f"{scenario.path}: source.effects: {error}") from None
 
 
 def _names(scenario: Scenario, scene: Scene) -> dict[str, str]:

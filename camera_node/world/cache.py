@@ -97,7 +97,7 @@ class FrameCache:
         """What the node sends: encoded bytes, or where effects act on each frame, an image (H, W, 3) that
         is still to be encoded."""
         if self._effects.image:
-            return self._effects.apply(self.frame(content), content)
+            return self._effects.apply(self.frame(content), content, float(content / self.fps))
         return self.encoded(content)
 
     def frame(self, index: int) -> Image:
@@ -156,8 +156,8 @@ class FrameCache:
         return index % self.repeats_after if self.repeats_after else index
 
     def _render(self, place: int) -> Image:
-        renderer = self.scene.renderer(self.camera_id)
-        return self._effects.exposed(renderer.image)(float(place / self.fps))
+        view = self._effects.exposed(self.scene.renderer(self.camera_id))
+        return view.image(float(place / self.fps))
 
     def _stored(self, index: int) -> bytes:
         place = self._place(index)

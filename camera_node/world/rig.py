@@ -11,12 +11,16 @@ Array = NDArray[np.float64]
 Rig = dict[str, tuple[Pinhole, Array]]
 
 
-def on_sphere(target: ArrayLike, radius_m: float, azimuth_deg: float, elevation_deg: float) -> Array:
-    """Camera-to-world (4, 4) looking at ``target``; azimuth 0 is on its -y side, 90 on its +x side."""
+def on_sphere(
+    target: ArrayLike, radius_m: float, azimuth_deg: float, elevation_deg: float, outward: bool = False
+) -> Array:
+    """Camera-to-world (4, 4) looking at ``target``, or straight away from it; azimuth 0 is on its -y side,
+    90 on its +x side."""
     a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
     away = np.array([np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), np.sin(e)])
     target = np.asarray(target, dtype=np.float64)
-    return look_at(target + radius_m * away, target)
+    eye = target + radius_m * away
+    return look_at(eye, eye + away) if outward else look_at(eye, target)
 
 
 def spread_order(directions: Array) -> list[int]:
@@ -33,14 +37,19 @@ def spread_order(directions: Array) -> list[int]:
 
 
 def build_rig(
-    angles_deg: list[tuple[float, float]], target: ArrayLike, radius_m: float, count: int, camera: Pinhole
+    angles_deg: list[tuple[float, float]],
+    target: ArrayLike,
+    radius_m: float,
+    count: int,
+    camera: Pinhole,
+    outward: bool = False,
 ) -> Rig:
-    """Cameras cam00, cam01, ... at (azimuth, elevation) around ``target``.
+    """Cameras cam00, cam01, ... at (azimuth, elevation) around ``target``, looking at it or outward.
 
     The first entry is cam00, the held-out one; the others are numbered in spread order, so that a
     smaller ``count`` leaves out the last names and the rest keep their places.
     """
-    poses = [on_sphere(target, radius_m, a, e) for a, e in angles_deg]
+    poses = [on_sphere(target, radius_m, a, e, outward) for a, e in angles_deg]
     away = np.stack([-p[:3, 2] for p in poses])
     order = spread_order(away)
     return {f"cam{k:02d}": (camera, poses[i]) for k, i in enumerate(order[:count])}

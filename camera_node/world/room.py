@@ -9,16 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.world import textures as tx
 from camera_node.world.figure import walk_at, walking_person
+from camera_node.world.places import at as _at
+from camera_node.world.places import facing as _facing
 from camera_node.world.render import Light, Part, World
 from camera_node.world.rig import build_rig
 from camera_node.world.scene import BaseParams, Scene, pinhole
 from camera_node.world.shapes import Box, Cylinder, Quad, RoundCone, Sphere
-
-Array = NDArray[np.float64]
 
 _TARGET = (0.0, 0.75, 0.90)
 _RADIUS_M = 3.2
@@ -61,21 +60,6 @@ def build(params: Params) -> Scene:
         period_s=walk.period_s,
         moving=not walk.still,
     )
-
-
-def _at(x: float, y: float, z: float, turn_deg: float = 0.0) -> Array:
-    a = np.deg2rad(turn_deg)
-    out = np.eye(4)
-    out[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
-    out[:3, 3] = x, y, z
-    return out
-
-
-def _facing(x_axis: tuple, y_axis: tuple, centre: tuple) -> Array:
-    out = np.eye(4)
-    out[:3, 0], out[:3, 1], out[:3, 3] = x_axis, y_axis, centre
-    out[:3, 2] = np.cross(x_axis, y_axis)
-    return out
 
 
 def _shell() -> list[Part]:

@@ -19,7 +19,7 @@ from freshfield.geometry import Pinhole
 from freshfield.payload import MAX_IMAGE_SIDE
 from freshfield.scenario import ScenarioError, read_section
 
-SCENES = ("room", "tile")
+SCENES = ("room", "tile", "tower")
 HELD_OUT = "cam00"
 MAX_CAMERAS = 19
 _RANGES = (
@@ -62,8 +62,8 @@ class Scene:
     """A world seen by posed cameras.
 
     cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is the held-out one. target: the point (3,)
-    that they look at. bounds: (2, 3), lower and upper corner in metres of everything that can be seen (an
-    effect's occluder apart).
+    that they look at, or away from where they look outward. bounds: (2, 3), lower and upper corner in
+    metres of everything that can be seen (an effect's occluder apart).
     period_s: the frames repeat after this long, a multiple of 0.6 s. moving: False where every instant is
     the same.
     """
@@ -107,6 +107,10 @@ class Scene:
     def with_world(self, world: World, period_s: float, moving: bool) -> Scene:
         """The same cameras in another world (an effect adds to it)."""
         return dataclasses.replace(self, world=world, period_s=period_s, moving=moving, _renderers={})
+
+    def with_cameras(self, cameras: Rig) -> Scene:
+        """The same world through other cameras (an effect changes their lenses)."""
+        return dataclasses.replace(self, cameras=cameras, _renderers={})
 
 
 def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:

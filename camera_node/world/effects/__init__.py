@@ -1,11 +1,14 @@
 """Effects: what a scene calls for beyond itself, one file and one class each, imported only when listed.
 
-There are four kinds, by where they act:
+The kinds, by where they act:
 
-* ``world``    adds bodies to the scene (rendered ahead and cached; nothing while streaming);
-* ``exposure`` changes how an instant becomes an image (rendered ahead and cached likewise);
-* ``image``    changes each frame as it is streamed (the only kind that costs time a frame);
-* ``clock``    changes the node's clock, hence its time stamps.
+* ``world``    changes the scene: bodies, shadows, gloss, fog (rendered ahead and cached; nothing while
+  streaming);
+* ``lens``     changes the lens that a camera looks through, and what it says of it (likewise);
+* ``exposure`` changes how an instant becomes an image (likewise);
+* ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
+* ``clock``    changes the node's clock, hence its time stamps;
+* ``pose``     changes where a camera says that it is, not what it sees.
 
 Adding one is a file here with a class (attributes ``kind`` and ``Parameters``, constructor of parameters
 and a random stream) and a line in ``_CLASSES``.
@@ -23,23 +26,41 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
+from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import ScenarioError, read_section
 
 if TYPE_CHECKING:
-    from camera_node.world.render import Image
+    from camera_node.world.render import Image, Rows
     from camera_node.world.scene import Scene
 
 _CLASSES = {
     "clock_drift": "ClockDrift",
+    "exposure_drift": "ExposureDrift",
+    "fog": "Fog",
+    "hot_pixels": "HotPixels",
+    "lens_distortion": "LensDistortion",
     "motion_blur": "MotionBlur",
     "occluder": "Occluder",
+    "pose_noise": "PoseNoise",
+    "rolling_shutter": "RollingShutter",
     "sensor_noise": "SensorNoise",
+    "shadows": "Shadows",
+    "specular": "Specular",
+    "vignetting": "Vignetting",
 }
 NAMES = tuple(_CLASSES)
 
 
 class EffectError(ScenarioError):
     """An effect that cannot be had as listed; the message says what is valid."""
+
+
+def check_ranges(parameters: object, **ranges: tuple[float, float]) -> None:
+    """Raises ValueError, in one line, for an attribute outside (lowest, highest)."""
+    for name, (low, high) in ranges.items():
+        value = getattr(parameters, name)
+        if not low <= value <= high:  # nor is NaN
+            raise ValueError(f"{name} must be within {low:g} to {high:g}, got {value}")
 
 
 class WorldEffect(Protocol):
@@ -50,19 +71,42 @@ class WorldEffect(Protocol):
         ...
 
 
+class LensEffect(Protocol):
+    kind: ClassVar[str]
+
+    def through(self, camera: Pinhole) -> Pinhole:
+        """The lens that images are taken with, where the scene has ``camera``."""
+        ...
+
+    def claimed(self, camera: Pinhole) -> Pinhole:
+        """What is sent of the lens ``camera`` that ``through`` gave."""
+        ...
+
+
+class View(Protocol):
+    """A camera that shows any instant, or only some rows of it: a CameraRenderer, or one seen through
+    effects."""
+
+    @property
+    def camera(self) -> Pinhole: ...
+
+    def image(self, t_s: float, rows: Rows | None = None) -> Image: ...
+
+
 class ExposureEffect(Protocol):
     kind: ClassVar[str]
 
-    def expose(self, render: Callable[[float], Image], t_s: float) -> Image:
-        """The image of an exposure around an instant, from a function that renders any instant."""
+    def expose(self, view: View, t_s: float, rows: Rows | None = None) -> Image:
+        """The image of an exposure around an instant, or some of its rows (first, one after the last)."""
         ...
 
 
 class ImageEffect(Protocol):
     kind: ClassVar[str]
 
-    def apply(self, image: Image, index: int) -> Image:
-        """Frame number ``index`` as the camera delivers it; must not change ``image``."""
+    def apply(self, image: Image, index: int, t_s: float) -> Image:
+        """Frame number ``index``, taken ``t_s`` after the epoch, as the camera delivers it; must not change
+        ``image``."""
         ...
 
 
@@ -74,30 +118,59 @@ class ClockEffect(Protocol):
         ...
 
 
+class PoseEffect(Protocol):
+    kind: ClassVar[str]
+
+    @property
+    def varies(self) -> bool:
+        """Whether frames of one camera claim different poses."""
+        ...
+
+    def claimed(self, pose: Pose, index: int) -> Pose:
+        """The pose that frame number ``index`` claims, taken from ``pose``."""
+        ...
+
+
 @dataclass(frozen=True)
 class Effects:
     """The effects of one camera, by kind and in the order listed, and how they were listed."""
 
     world: tuple[WorldEffect, ...] = ()
+    lens: tuple[LensEffect, ...] = ()
     exposure: tuple[ExposureEffect, ...] = ()
     image: tuple[ImageEffect, ...] = ()
     clock: tuple[ClockEffect, ...] = ()
+    pose: tuple[PoseEffect, ...] = ()
     rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of those that change cached frames
 
     def extend(self, scene: Scene) -> Scene:
+        """The scene with what effects of the kinds world and lens make of it. Raises EffectError."""
         for effect in self.world:
             scene = effect.extend(scene)
+        if self.lens:
+            scene = scene.with_cameras({c: (self._through(k), p) for c, (k, p) in scene.cameras.items()})
         return scene
 
-    def exposed(self, render: Callable[[float], Image]) -> Callable[[float], Image]:
-        """``render`` seen through every exposure effect; ``render`` itself where there is none."""
-        for effect in self.exposure:
-            render = _through(effect, render)
-        return render
+    def _through(self, camera: Pinhole) -> Pinhole:
+        for effect in self.lens:
+            camera = effect.through(camera)
+        return camera
 
-    def apply(self, image: Image, index: int) -> Image:
+    def claimed_lens(self, camera: Pinhole) -> Pinhole:
+        """What is sent of the lens that the extended scene has."""
+        for effect in reversed(self.lens):
+            camera = effect.claimed(camera)
+        return camera
+
+    def exposed(self, view: View) -> View:
+        """``view`` seen through every exposure effect; ``view`` itself where there is none."""
+        for effect in self.exposure:
+            view = _Exposed(effect, view)
+        return view
+
+    def apply(self, image: Image, index: int, t_s: float) -> Image:
         for effect in self.image:
-            image = effect.apply(image, index)
+            image = effect.apply(image, index, t_s)
         return image
 
     def node_ns(self, true_ns: int) -> int:
@@ -105,12 +178,30 @@ class Effects:
             true_ns = effect.node_ns(true_ns)
         return true_ns
 
+    @property
+    def pose_varies(self) -> bool:
+        return any(effect.varies for effect in self.pose)
+
+    def claimed_pose(self, pose: Pose, index: int) -> Pose:
+        for effect in self.pose:
+            pose = effect.claimed(pose, index)
+        return pose
+
 
 NO_EFFECTS = Effects()
 
 
-def _through(effect: ExposureEffect, render: Callable[[float], Image]) -> Callable[[float], Image]:
-    return lambda t_s: effect.expose(render, t_s)
+@dataclass(frozen=True)
+class _Exposed:
+    effect: ExposureEffect
+    view: View
+
+    @property
+    def camera(self) -> Pinhole:
+        return self.view.camera
+
+    def image(self, t_s: float, rows: Rows | None = None) -> Image:
+        return self.effect.expose(self.view, t_s, rows)
 
 
 def load_effects(

@@ -7,6 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from camera_node.world.effects import check_ranges
+
 
 @dataclass(frozen=True)
 class ClockDriftParameters:
@@ -20,10 +22,13 @@ class ClockDriftParameters:
     in_truth: bool = False
 
     def __post_init__(self) -> None:
-        if self.offset_spread_ms < 0 or self.drift_spread_ppm < 0:
-            raise ValueError("offset_spread_ms and drift_spread_ppm cannot be negative")
-        if abs(self.drift_ppm) > 1e5 or self.drift_spread_ppm > 1e4:
-            raise ValueError("a clock drifts by at most 100000 ppm, with a spread of at most 10000")
+        check_ranges(
+            self,
+            offset_ms=(-1e10, 1e10),  # four months
+            drift_ppm=(-1e5, 1e5),
+            offset_spread_ms=(0.0, 1e9),
+            drift_spread_ppm=(0.0, 1e4),
+        )
 
 
 class ClockDrift:

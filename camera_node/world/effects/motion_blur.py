@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from camera_node.world.render import Image
+    from camera_node.world.effects import View
+    from camera_node.world.render import Image, Rows
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ class MotionBlur:
         share = (np.arange(parameters.samples) + 0.5) / parameters.samples - 0.5
         self._offsets_s = share * parameters.exposure_ms * 1e-3
 
-    def expose(self, render: Callable[[float], Image], t_s: float) -> Image:
+    def expose(self, view: View, t_s: float, rows: Rows | None = None) -> Image:
         total: np.ndarray | None = None
         for offset in self._offsets_s:
-            image = render(t_s + float(offset)).astype(np.uint16)  # 64 times 255 fits
+            image = view.image(t_s + float(offset), rows).astype(np.uint16)  # 64 times 255 fits
             total = image if total is None else total + image
         assert total is not None
         n = len(self._offsets_s)

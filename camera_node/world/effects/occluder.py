@@ -28,8 +28,9 @@ _JOINTS = 9  # of the arch, from the horizon to the zenith
 @dataclass(frozen=True)
 class OccluderParameters:
     """period_s: one sweep there and back, rounded to a multiple of the scene's own period. sweep_deg: how
-    far to either side. distance_share: how far from the target towards the cameras (1 = at the cameras).
-    thickness_share: diameter, as a share of the cameras' distance."""
+    far to either side. distance_share: how far from the target towards the cameras (1 = at the cameras);
+    where cameras look outward, as far beyond them. thickness_share: diameter, as a share of the cameras'
+    distance."""
 
     period_s: float = 6.0
     sweep_deg: float = 100.0
@@ -62,11 +63,15 @@ class Occluder:
     def extend(self, scene: Scene) -> Scene:
         p = self._p
         target = np.asarray(scene.target, dtype=np.float64)
-        reach = float(np.mean([np.linalg.norm(pose[:3, 3] - target) for _, pose in scene.cameras.values()]))
+        poses = np.stack([pose for _, pose in scene.cameras.values()])
+        away = poses[:, :3, 3] - target
+        reach = float(np.linalg.norm(away, axis=1).mean())
+        outward = float((away * poses[:, :3, 2]).sum()) > 0.0
+        share = 2.0 - p.distance_share if outward else p.distance_share
         base = scene.period_s if scene.moving else TICK_S
         period = max(1, round(p.period_s / base)) * base
         elevation = np.linspace(0.0, 0.5 * math.pi, _JOINTS)
-        joints = p.distance_share * reach * np.stack(
+        joints = share * reach * np.stack(
             [np.zeros(_JOINTS), -np.cos(elevation), np.sin(elevation)], axis=1
         )  # fmt: skip
         radius = 0.5 * p.thickness_share * reach

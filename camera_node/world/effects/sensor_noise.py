@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from camera_node.world.effects import check_ranges
+
 if TYPE_CHECKING:
     from camera_node.world.render import Image
 
@@ -21,8 +23,7 @@ class SensorNoiseParameters:
     in_truth: bool = False
 
     def __post_init__(self) -> None:
-        if self.read_noise_counts < 0 or self.full_well_electrons < 0:
-            raise ValueError("read_noise_counts and full_well_electrons cannot be negative")
+        check_ranges(self, read_noise_counts=(0.0, 1e4), full_well_electrons=(0.0, 1e12))
 
 
 class SensorNoise:
@@ -39,7 +40,7 @@ class SensorNoise:
         gain = 255.0 / parameters.full_well_electrons if parameters.full_well_electrons else 0.0
         self._sigma = np.sqrt(parameters.read_noise_counts**2 + signal * gain).astype(np.float32)
 
-    def apply(self, image: Image, index: int) -> Image:
+    def apply(self, image: Image, index: int, t_s: float = 0.0) -> Image:
         counter = [0, 0, 0, index]
         rng = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
         noise = rng.standard_normal(image.shape, dtype=np.float32)

@@ -25,7 +25,8 @@ def test_cameras_are_named_posed_and_look_at_the_target(name, count):
         Pose.from_matrix(pose)
         assert (camera.width, camera.height) == (48, 48)
         to = np.asarray(scene.target) - pose[:3, 3]
-        assert pose[:3, 2] @ to / np.linalg.norm(to) == pytest.approx(1.0)
+        outward = -1.0 if name == "tower" else 1.0
+        assert pose[:3, 2] @ to / np.linalg.norm(to) == pytest.approx(outward)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -66,14 +67,46 @@ def test_everything_seen_lies_within_the_bounds(name):
         assert np.isfinite(t).all() or name == "tile"
 
 
-def test_the_moving_person_stays_within_the_bounds():
-    scene = make_scene("room", {"speed_m_per_s": 3.0, **SMALL})
-    mover = scene.world.movers[0]
-    for t in np.linspace(0, scene.period_s, 41):
-        for part, m in zip(mover.parts, mover.matrices(t)):
-            centre, radius = part.shape.bounding_sphere()
-            at = m[:3, :3] @ centre + m[:3, 3]
-            assert (at + radius < scene.bounds[1]).all() and (at[:2] - radius > scene.bounds[0][:2]).all()
+@pytest.mark.parametrize("name", ["room", "tower"])
+@pytest.mark.parametrize("speed", [0.05, 1.0, 3.0, 8.0])
+def test_what_moves_stays_within_the_bounds_and_off_the_cameras(name, speed):
+    scene = make_scene(name, {"speed_m_per_s": speed, **SMALL})
+    eyes = np.stack([pose[:3, 3] for _, pose in scene.cameras.values()])
+    for mover in scene.world.movers:
+        for t in np.linspace(0, scene.period_s, 41):
+            for part, m in zip(mover.parts, mover.matrices(t)):
+                centre, radius = part.shape.bounding_sphere()
+                at = m[:3, :3] @ centre + m[:3, 3]
+                assert (at + radius < scene.bounds[1]).all() and (at[:2] - radius > scene.bounds[0][:2]).all()
+                assert np.linalg.norm(eyes - at, axis=1).min() > radius + 0.3
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.4, 1.0, 4.0])
+def test_the_cart_of_the_tower_moves_at_the_speed_asked_for(speed):
+    scene = make_scene("tower", {"speed_m_per_s": speed, **SMALL})
+    cart = scene.world.movers[1]
+    deck = np.stack([cart.matrices(t)[0] for t in np.arange(2000) / 2000 * scene.period_s])
+    steps = np.diff(deck[:, :3, 3], axis=0, append=deck[:1, :3, 3])
+    assert np.linalg.norm(steps, axis=1).sum() / scene.period_s == pytest.approx(speed, rel=1e-3)
+    # It drives forwards: its long axis along the way.
+    along = (steps / np.linalg.norm(steps, axis=1, keepdims=True) * deck[:, :3, 0]).sum(axis=1)
+    assert along.min() > 0.99
+
+
+def test_the_tower_looks_all_round_and_few_cameras_see_the_same():
+    """Every held-out pixel is seen by at least one training camera, and by some three on average."""
+    scene = make_scene("tower", {"count": 19, **SMALL, "supersample": 1})
+    camera, pose = scene.cameras["cam00"]
+    origin, d = world_rays(camera, pose)
+    points = origin + scene.renderer("cam00").distance()[..., None] * d
+    seen = np.zeros(points.shape[:2], dtype=int)
+    for name, (lens, other) in scene.cameras.items():
+        if name != "cam00":
+            uv = lens.project((points - other[:3, 3]) @ other[:3, :3])
+            seen += np.isfinite(uv).all(axis=-1) & (uv > 0).all(axis=-1) & (uv < 48).all(axis=-1)
+    assert seen.min() >= 1 and 2.5 < seen.mean() < 5.0
+    axes = np.stack([p[:3, 2] for _, p in scene.cameras.values()])
+    assert np.linalg.norm(axes[:, :2].mean(axis=0)) < 0.2  # no side is preferred
 
 
 def moving_share(scene, instants: int = 16) -> float:
@@ -94,6 +127,13 @@ def test_the_share_of_moving_pixels():
     assert shares[0.0] == 0.0
     assert 0.04 <= shares[1.0] <= 0.075
     assert shares[0.5] < shares[1.0] < shares[4.0]
+
+
+def test_the_share_of_moving_pixels_of_the_tower():
+    tower = {"width": 64, "height": 64, "supersample": 1}
+    shares = {v: moving_share(make_scene("tower", {**tower, "speed_m_per_s": v}), 8) for v in (1.0, 4.0)}
+    assert 0.05 <= shares[1.0] <= 0.09
+    assert shares[1.0] < shares[4.0]
 
 
 @pytest.mark.parametrize("params", [{"speed_m_per_s": 0.0}, None])
@@ -121,7 +161,7 @@ def test_the_same_instant_gives_the_same_bytes_in_another_process():
 @pytest.mark.parametrize(
     ("name", "params", "message"),
     [
-        ("rooom", {}, "valid scenes: room, tile"),
+        ("rooom", {}, "valid scenes: room, tile, tower"),
         ("room", {"speed": 1.0}, "valid .default.: count .13., width"),
         ("tile", {"speed_m_per_s": 1.0}, "unknown parameter 'speed_m_per_s'"),
         ("room", {"count": 20}, "count must be within 1 to 19"),
@@ -129,6 +169,7 @@ def test_the_same_instant_gives_the_same_bytes_in_another_process():
         ("room", {"width": 12.5}, "whole number"),
         ("room", {"width": 5000}, "width must be within"),
         ("room", {"speed_m_per_s": -1.0}, "speed_m_per_s must be 0 or within"),
+        ("tower", {"speed_m_per_s": 9.0}, "speed_m_per_s must be 0 or within"),
         ("room", {"speed_m_per_s": float("nan")}, "expected a number"),
         ("room", {"distortion": [0.0]}, "4 values"),
     ],
