@@ -27,7 +27,8 @@ class Buffered:
 
 
 class FrameBuffer:
-    """Newest frame per training camera. Memory is one encoded frame a camera, whatever arrives.
+    """Newest frame per training camera. Memory is one encoded frame a camera, whatever arrives; two where the
+    frame before the newest is asked for (``keep_earlier``).
 
     Thread-safe; ``wait`` lets the loop sleep until something arrives.
     """
@@ -35,6 +36,8 @@ class FrameBuffer:
     def __init__(self, cameras: Sequence[str]) -> None:
         self.cameras = tuple(cameras)
         self._newest: dict[str, Buffered] = {}
+        self._earlier: dict[str, Buffered] = {}
+        self._keep_earlier = False
         self._arrived = threading.Condition()
         self.arrivals = 0
         self.stale_on_arrival = 0
@@ -52,10 +55,38 @@ class FrameBuffer:
             impossible = known is not None and known.generated_ns > received_ns + MAX_FUTURE_NS
             if known is not None and not impossible and known.generated_ns >= item.generated_ns:
                 self.stale_on_arrival += 1
+                self._follow_up(known, item)
             else:
                 self._newest[frame.camera] = item
+                if impossible:  # nothing is known of when it was taken
+                    self._earlier.pop(frame.camera, None)
+                elif known is not None:
+                    self._follow_up(item, known)
             self.arrivals += 1
             self._arrived.notify_all()
+
+    def _follow_up(self, newest: Buffered, before: Buffered) -> None:
+        """Keep the youngest frame that is older than a camera's newest: what overtook it on the way does not
+        make it useless."""
+        known = self._earlier.get(before.frame.camera)
+        older = before.generated_ns < newest.generated_ns
+        if self._keep_earlier and older and (known is None or known.generated_ns < before.generated_ns):
+            self._earlier[before.frame.camera] = before
+
+    def keep_earlier(self, wanted: bool) -> None:
+        """From now on, keep the frame before each camera's newest as well (policies that treat stale views
+        compare the two), or keep it no longer."""
+        with self._arrived:
+            self._keep_earlier = wanted
+            if not wanted:
+                self._earlier.clear()
+
+    def newest_and_earlier(self) -> tuple[dict[str, Buffered], dict[str, Buffered]]:
+        """Omega(t) as ``newest`` gives it and, at the same instant, the frame before of every camera that has
+        one (``keep_earlier``)."""
+        with self._arrived:
+            newest = {c: self._newest[c] for c in self.cameras if c in self._newest}
+            return newest, dict(self._earlier)
 
     def newest(self) -> dict[str, Buffered]:
         """Omega(t): newest frame of every camera that has reported, in the cameras' order."""

@@ -20,6 +20,8 @@ The edge of freshfield: takes posed frames, keeps a radiance field up to date, s
   edge-server run room --listen 127.0.0.1:7000 --page-port 8080 --out runs/room
   edge-server fit ~/data/lego --field ngp --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server frontier --quick --out runs/frontier
+  edge-server simulate room --seconds 10
+  edge-server study mat --quick --out runs/study
   edge-server report runs/room
 """
 
@@ -32,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
     _add_report(commands)
-    for name in ("fit", "frontier", "bench"):
+    for name in _OFFLINE:
         # Each offline command owns its options; it is imported only when it is called or asked for help.
         sub = commands.add_parser(name, help=_OFFLINE[name], add_help=False)
         sub.set_defaults(go=None)
@@ -53,6 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 _OFFLINE = {
     "fit": "fit a recorded data set without a network and report fidelity over time",
     "frontier": "what accuracy costs in time: sweep effort, plot fidelity against seconds",
+    "simulate": "a scenario's whole deployment in virtual time, repeatable bit for bit",
+    "study": "the thesis's figures as commands, each with a verdict",
     "bench": "measure this machine: field, track, options, limits, ingest, fidelity, peer",
 }
 

@@ -19,6 +19,23 @@ class PolicyConfig:
 
 
 @dataclass(frozen=True)
+class ComputeConfig:
+    """What virtual time charges an update; live time charges what it takes. The default is nothing, as the
+    thesis has it; ``edge-server frontier`` measures what a machine takes."""
+
+    ms_per_step: float = 0.0
+    ms_per_update: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.ms_per_step < 1e9 and 0.0 <= self.ms_per_update < 1e9):
+            raise ValueError("compute: milliseconds must be finite and not negative")
+
+    def charge_ns(self, steps: int) -> int:
+        """Nanoseconds that an update of ``steps`` optimiser steps takes."""
+        return round((self.ms_per_update + self.ms_per_step * steps) * 1e6)
+
+
+@dataclass(frozen=True)
 class EdgeConfig:
     """The edge section of a scenario.
 
@@ -26,8 +43,10 @@ class EdgeConfig:
     update_ms: what one update may spend fitting. deadline_ms: instead of it, from decision to publication:
     the best way to spend it is looked up in ``frontier`` (a frontier.json of ``edge-server frontier``,
     relative to the scenario; None: the one shipped), and the time to fit follows how busy the machine is.
-    grace_ms: how long the first update waits for cameras
-    that have not reported. lpips: network scored with, where its weights are installed; none turns it off.
+    steps, compute: of an update in virtual time, where optimiser steps are counted, not seconds: how many,
+    and what is charged for them (``zero``, or ms_per_step and ms_per_update).
+    grace_ms: how long the first update waits for cameras that have not reported. lpips: network scored
+    with, where its weights are installed; none turns it off.
     noisy_truth: held-out frames are real or noisy video, so that the bound of moving pixels follows
     their noise.
     """
@@ -38,6 +57,8 @@ class EdgeConfig:
     update_ms: float = 800.0
     deadline_ms: float | None = None
     frontier: str | None = None
+    steps: int = 100
+    compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
     grace_ms: float = 3000.0
     lpips: str = "alex"
     noisy_truth: bool = False
@@ -49,6 +70,8 @@ class EdgeConfig:
             raise ValueError(f"deadline_ms: expected 20 to 3600000, got {self.deadline_ms:g}")
         if self.frontier is not None and self.deadline_ms is None:
             raise ValueError("frontier: it is read for a deadline_ms, which is not given")
+        if not 1 <= self.steps <= 10_000_000:
+            raise ValueError(f"steps: expected 1 to 10000000, got {self.steps}")
         if self.grace_ms < 0:
             raise ValueError("grace_ms: expected zero or more")
         if self.lpips not in ("alex", "squeeze", "none"):
@@ -57,4 +80,7 @@ class EdgeConfig:
 
 def read_config(scenario: Scenario) -> EdgeConfig:
     """The edge section of a scenario; raises freshfield.scenario.ScenarioError."""
-    return read_section(EdgeConfig, scenario.edge, f"{scenario.path}: edge")
+    section = dict(scenario.edge)
+    if section.get("compute") == "zero":
+        section["compute"] = {}
+    return read_section(EdgeConfig, section, f"{scenario.path}: edge")

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 from edge_server.buffer import Buffered, FrameBuffer
 from edge_server.fields import Budget, Field, FitReport, Renderer, View
 from edge_server.pacing import Pacing
-from edge_server.scheduler import Epoch, Plan, Policy
+from edge_server.scheduler import Epoch, Plan, Policy, treatment_of
 from edge_server.state import Publication
 from edge_server.views import Decoder
 from freshfield.clock import Clock
@@ -33,11 +34,26 @@ _NAP_S = 0.2
 
 @dataclass(frozen=True)
 class Selection:
-    """A finished decision: which buffered frames to use, as of ``now_ns``."""
+    """A finished decision: which buffered frames to use, as of ``now_ns``. earlier: where the policy treats
+    what it selects, the frames that these cameras delivered before, of those that did."""
 
     plan: Plan
     now_ns: int
     items: tuple[Buffered, ...]
+    earlier: tuple[Buffered, ...] = ()
+
+
+@dataclass
+class TreatmentCost:
+    """What treating stale views has taken so far: views, and wall seconds (a measurement, no part of what is
+    decided)."""
+
+    views: int = 0
+    seconds: float = 0.0
+
+    @property
+    def ms_per_view(self) -> float | None:
+        return 1e3 * self.seconds / self.views if self.views else None
 
 
 class Updates:
@@ -45,11 +61,25 @@ class Updates:
 
     def __init__(self, buffer: FrameBuffer, policy: Policy, field: Field, start_ns: int) -> None:
         self.buffer = buffer
+        self.decoder = Decoder()
         self.policy = policy
         self.field = field
-        self.decoder = Decoder()
+        self.treatment_cost = TreatmentCost()
         self.start_ns = start_ns
         self.number = 0
+
+    @property
+    def policy(self) -> Policy:
+        return self._policy
+
+    @policy.setter
+    def policy(self, policy: Policy) -> None:
+        """From the next decision on. Only a policy that compares a camera's frames has the older one kept."""
+        self._policy = policy
+        treats = treatment_of(policy) is not None
+        self.buffer.keep_earlier(treats)
+        if not treats:
+            self.decoder.forget_earlier()
 
     def epoch(self, now_ns: int) -> Epoch:
         generated = {c: item.generated_ns for c, item in self.buffer.newest().items()}
@@ -62,15 +92,32 @@ class Updates:
         """What the plan's policy admits of the buffer as it is at ``now_ns``; None: wait on."""
         if now_ns < plan.wait_until_ns:
             return None
-        newest = self.buffer.newest()
+        newest, earlier = self.buffer.newest_and_earlier()
         epoch = Epoch(now_ns, self.number, {c: item.generated_ns for c, item in newest.items()})
         cameras = self.policy.select(epoch, plan)
-        return Selection(plan, now_ns, tuple(newest[c] for c in cameras)) if cameras else None
+        if not cameras:
+            return None
+        before = tuple(earlier[c] for c in cameras if c in earlier)
+        return Selection(plan, now_ns, tuple(newest[c] for c in cameras), before)
 
     def fit(self, selection: Selection, budget: Budget) -> tuple[list[View], FitReport] | None:
-        """Decode and train; None if nothing of the selection could be decoded."""
+        """Decode, treat where the policy says so, and train; None if nothing of the selection could be
+        decoded. The views returned are as they were delivered."""
+        earlier = self.decoder.earlier(selection.earlier)
         views = self.decoder.views(selection.items)
-        return (views, self.field.fit(views, budget)) if views else None
+        if not views:
+            return None
+        return views, self.field.fit(self._treated(views, earlier, selection.now_ns), budget)
+
+    def _treated(self, views: list[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
+        treatment = treatment_of(self.policy)
+        if treatment is None:
+            return views
+        begun = time.perf_counter()
+        treated = treatment.treat(views, earlier, now_ns)
+        self.treatment_cost.views += len(views)
+        self.treatment_cost.seconds += time.perf_counter() - begun
+        return treated
 
     def publication(
         self, selection: Selection, views: Sequence[View], fit: FitReport, published_ns: int

@@ -29,7 +29,7 @@ from edge_server.ingest import Ingest, Recent
 from edge_server.journal import Journal
 from edge_server.loop import Loop, Updates
 from edge_server.pacing import Deadline, Fixed, Pacing, choose, read_points
-from edge_server.scheduler import POLICIES, make_policy
+from edge_server.scheduler import OFFERED, make_live_policy
 from edge_server.scoring import Scoring
 from edge_server.service import ClockService, EdgeService
 from edge_server.state import CameraView, Comparison, Controls, EdgeState, Publication, Renderer
@@ -116,7 +116,7 @@ class EdgeServer:
         )
         self.state = EdgeState(
             scenario=scenario.name,
-            policies=tuple(POLICIES),
+            policies=OFFERED,
             controls=Controls(policy.name, policy.value),
             cameras=self._cameras,
             now_s=lambda: (self.clock.now_ns() - self.start_ns) / 1e9,
@@ -247,7 +247,7 @@ class EdgeServer:
         self.state.last_decision = line
 
     def _policy(self, name: str, value: float | None):
-        return make_policy(name, value, self.scenario.rng("policy", name))
+        return make_live_policy(name, value, self.scenario.rng("policy", name))
 
     def _set_policy(self, name: str, value: float | None) -> None:
         policy = self._policy(name, value)
@@ -326,6 +326,10 @@ class EdgeServer:
                 "first_ms": self._first_ms,
                 "deadline_ms": self.config.deadline_ms,
                 "undecodable": self.updates.decoder.undecodable + self.scoring.undecodable,
+            },
+            "treatment": {
+                "views": self.updates.treatment_cost.views,
+                "ms_per_view": self.updates.treatment_cost.ms_per_view,
             },
             "baseline": {
                 "mean_colour_db": mean("mean_colour_db"),

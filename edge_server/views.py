@@ -20,17 +20,44 @@ class Decoder:
 
     def __init__(self) -> None:
         self._views: dict[str, tuple[Frame, View | None]] = {}
+        self._earlier: dict[str, tuple[Frame, View | None]] = {}
         self.undecodable = 0
 
     def views(self, selected: Iterable[Buffered]) -> list[View]:
         """Views of the selected frames, in their order, without those that cannot be decoded."""
         return [view for item in selected if (view := self._view(item)) is not None]
 
+    def earlier(self, items: Iterable[Buffered]) -> dict[str, View]:
+        """The views that cameras delivered before their newest, camera -> view, without those that cannot be
+        decoded. To be asked before ``views``: what was newest then need not be decoded again."""
+        found = {}
+        for item in items:
+            camera = item.frame.camera
+            known = next(
+                (c for c in (self._earlier.get(camera), self._views.get(camera)) if c and c[0] is item.frame),
+                None,
+            )
+            self._earlier[camera] = known or (item.frame, self._decode(item))
+            view = self._earlier[camera][1]
+            if view is not None:
+                found[camera] = view
+        return found
+
+    def forget_earlier(self) -> None:
+        """Give back the memory of ``earlier``: nobody compares frames any more."""
+        self._earlier.clear()
+
     def _view(self, item: Buffered) -> View | None:
         frame = item.frame
         cached = self._views.get(frame.camera)
         if cached is not None and cached[0] is frame:
             return cached[1]
+        view = self._decode(item)
+        self._views[frame.camera] = (frame, view)
+        return view
+
+    def _decode(self, item: Buffered) -> View | None:
+        frame = item.frame
         view: View | None = None
         try:
             k = frame.intrinsics
@@ -38,5 +65,4 @@ class Decoder:
             view = View(frame.camera, image, frame.pose.matrix(), k, item.generated_ns)
         except payload.PayloadError:
             self.undecodable += 1
-        self._views[frame.camera] = (frame, view)
         return view

@@ -21,6 +21,9 @@ class View:
 
     image: uint8 (H, W, 3) RGB, or (H, W, 4) straight-alpha RGBA; matches ``intrinsics``.
     camera_to_world: float64 (4, 4), OpenCV axes, metres. generated_ns: capture time, edge clock.
+    weight: float32 (H, W) in [0, 1], how much each pixel supervises; None: all of them in full.
+    carried_to_ns: the instant that the image has been carried forward to since its capture
+    (``treatments.freshen``); None: it shows the instant of its capture.
     """
 
     camera: str
@@ -28,6 +31,14 @@ class View:
     camera_to_world: NDArray[np.float64]
     intrinsics: Pinhole
     generated_ns: int = 0
+    weight: NDArray[np.float32] | None = None
+    carried_to_ns: int | None = None
+
+    @property
+    def shows_ns(self) -> int:
+        """The instant that the image shows. Ages are reported by capture; what a field makes of time (how
+        things move, whom to trust less) goes by this."""
+        return self.generated_ns if self.carried_to_ns is None else self.carried_to_ns
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ class Rig:
     def _unknown(self, view: View) -> bool:
         known = self.memory.get(view.camera)
         return known is None or (
-            known.view.generated_ns != view.generated_ns or not np.array_equal(known.view.image, view.image)
+            known.view.shows_ns != view.shows_ns or not np.array_equal(known.view.image, view.image)
         )
 
     def trusted(self, views: Sequence[View], intake: Intake, step: int, field: PixelRenderer) -> Views:
@@ -151,6 +151,7 @@ class Rig:
                 {
                     "camera": m.view.camera,
                     "generated_ns": m.view.generated_ns,
+                    "carried_to_ns": m.view.carried_to_ns,
                     "credit": m.credit,
                     **asdict(m.view.intrinsics),
                 }
@@ -180,8 +181,12 @@ class Rig:
             known = dict(entry)
             camera, generated_ns = known.pop("camera"), known.pop("generated_ns")
             credit = int(known.pop("credit", 0))
+            carried_to_ns = known.pop("carried_to_ns", None)
             known["distortion"] = tuple(known["distortion"])
-            view = View(camera, arrays[f"image_{k}"], arrays[f"pose_{k}"], Pinhole(**known), generated_ns)
+            view = View(
+                camera, arrays[f"image_{k}"], arrays[f"pose_{k}"], Pinhole(**known), generated_ns,
+                carried_to_ns=carried_to_ns,
+            )  # fmt: skip
             self.memory[camera] = CameraMemory(view, arrays.get(f"moved_{k}"), credit)
 
 

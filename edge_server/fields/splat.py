@@ -223,12 +223,12 @@ class SplatField:
             if intake.new_box:
                 self._forget_gaussians()
             assert self.rig.box is not None
-            now_ns = max(v.generated_ns for v in views)
+            now_ns = max(v.shows_ns for v in views)
             elapsed_s = 0.0 if self._now_ns is None else (now_ns - self._now_ns) / 1e9
             self._now_ns = now_ns
             self._cams = camera_rows(
                 [v.camera_to_world for v in views], [v.intrinsics for v in views], self.rig.box,
-                [max((v.generated_ns - now_ns) / 1e9, -LONGEST_S) for v in views],
+                [max((v.shows_ns - now_ns) / 1e9, -LONGEST_S) for v in views],
             )  # fmt: skip
             if not known:
                 self._before = self.cloud.params[:, :3].copy()
@@ -455,7 +455,7 @@ def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], Clo
 def _equal(a: Sequence[View], b: Sequence[View]) -> bool:
     return len(a) == len(b) and all(
         x is y
-        or (x.camera == y.camera and x.generated_ns == y.generated_ns and x.intrinsics == y.intrinsics
+        or (x.camera == y.camera and x.shows_ns == y.shows_ns and x.intrinsics == y.intrinsics
             and np.array_equal(x.camera_to_world, y.camera_to_world) and np.array_equal(x.image, y.image))
         for x, y in zip(a, b)
     )  # fmt: skip

@@ -48,6 +48,16 @@ def check_view(view: View) -> None:
         raise ValueError(f"camera {view.camera}: intrinsics must be finite, focal lengths positive")
     if not invertible(camera):
         raise ValueError(f"camera {view.camera}: its distortion cannot be undone over the whole image")
+    weight = view.weight
+    if weight is not None and not (
+        weight.dtype == np.float32
+        and weight.shape == image.shape[:2]
+        and bool(((weight >= 0.0) & (weight <= 1.0)).all())  # not of NaN
+    ):
+        raise ValueError(
+            f"camera {view.camera}: weight must be float32 of shape {image.shape[:2]} within 0..1, "
+            f"not {weight.dtype} of shape {weight.shape}"
+        )
 
 
 def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
@@ -84,7 +94,7 @@ def remember(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
         if known is not None:
             # The same frame decoded once more says nothing new; an equal but newer one says: nothing moved.
             # What one wrong picture seemed to move would otherwise count as moving for as long as all stands.
-            again = known.view.generated_ns == view.generated_ns
+            again = known.view.shows_ns == view.shows_ns
             same = again and np.array_equal(known.view.image, view.image)
             moved = known.moved if same else moved_pixels(known.view, view)
         # What a camera sees from elsewhere may be what no other camera has seen: no reason to doubt it.
@@ -115,7 +125,7 @@ def pack_views(
 ) -> Views:
     """Everything one fit reads. Opaque and transparent pictures may be mixed.
 
-    weights: float32 (H, W) of each view, of which some are above 0 (``trust.weights``); None: all 1.
+    weights: float32 (H, W) of each view (``trust.weights``); None: all 1.
     """
     packed = pack_cameras(views, box)
     channels = max(v.image.shape[2] for v in views)

@@ -1,8 +1,9 @@
 """How far each pixel of each view is to be trusted: a stale view is only wrong where something moved.
 
-Every representation multiplies a pixel's loss by these weights. Two options make them, both off by default:
-``age_tau_ms`` trusts a view less the older it is, ``mask_stale_ms`` leaves out of an old view what was moving
-when it was taken. ``refused`` is for pictures that cannot be of this scene at all.
+Every representation multiplies a pixel's loss by these weights. A view may bring its own (``View.weight``:
+what a policy's treatment made of a stale view). Two options make others, both off by default: ``age_tau_ms``
+trusts a view less the older it is, ``mask_stale_ms`` leaves out of an old view what was moving when it was
+taken. They are multiplied. ``refused`` is for pictures that cannot be of this scene at all.
 """
 
 from __future__ import annotations
@@ -58,25 +59,27 @@ def weights(
 ) -> list[NDArray[np.float32]] | None:
     """A weight in [0, 1] for each pixel of each view, float32 (H, W); None: all of them count in full.
 
-    Ages are differences of ``generated_ns`` to the newest view of the set, so that view is always trusted
-    whole and some pixels always remain. What moved is known of cameras that stood still between their own
-    last two views. Of one that was moving, or that has sent a single view, it is unknown: its views are
-    not masked, since a field of few views loses more with a whole view than through what moved in it, and
-    are weighed by age alone.
+    Ages are differences of ``shows_ns`` to the newest view of the set: that view is always trusted whole, and
+    one that was carried forward to the present is not doubted for an age that it no longer has. What moved
+    is known of cameras that stood still between their own last two views. Of one that was moving, or that
+    has sent a single view, it is unknown: its views are not masked, since a field of few views loses more
+    with a whole view than through what moved in it, and are weighed by age alone.
     """
     tau_ms, stale_ms = settings.age_tau_ms, settings.mask_stale_ms
-    if not views or (tau_ms <= 0.0 and stale_ms <= 0.0):
+    if tau_ms <= 0.0 and stale_ms <= 0.0 and all(view.weight is None for view in views):
         return None
-    newest_ns = max(view.generated_ns for view in views)
+    newest_ns = max(view.shows_ns for view in views)
     result, whole = [], True
     for view in views:
-        age_ms = (newest_ns - view.generated_ns) / 1e6
+        age_ms = (newest_ns - view.shows_ns) / 1e6
         trust = np.exp(-age_ms / tau_ms) if tau_ms > 0.0 else 1.0
         weight = np.full(view.image.shape[:2], trust, np.float32)
         known = memory.get(view.camera)
         moved = known.moved if known is not None and known.view is view else None
         if moved is not None and 0.0 < stale_ms < age_ms:
             weight[_grown(moved, settings.mask_grow_px_s * age_ms / 1e3)] = 0.0
+        if view.weight is not None:
+            weight *= view.weight
         whole = whole and bool((weight == 1.0).all())
         result.append(weight)
     return None if whole else result

@@ -9,6 +9,7 @@ from camera_node.build import build_cameras, load
 from camera_node.capture import Camera
 from camera_node.config import SourceConfig, WorldConfig, source_config
 from camera_node.world import Scene, make_scene
+from camera_node.world.effects import NO_EFFECTS, Effects
 from channel_emu.config import channel_from_mapping
 from edge_server.buffer import FrameBuffer
 from edge_server.config import EdgeConfig, read_config
@@ -34,11 +35,13 @@ def deploy(
     cameras: list[Camera] | None = None,
     data: Path | None = None,
     on_published: Callable[[Publication], None] | None = None,
+    truth: Truth | None = None,
 ) -> VirtualDeployment:
     """``scenario`` in virtual time, from its seed.
 
     field: one to go on with; None makes the scenario's. scorer: None scores without LPIPS. cameras: of
     ``training_cameras``, when several runs share what was rendered. data: folder of recorded data sets.
+    truth: of ``truth_of``, when several runs share it.
     Raises ScenarioError or DatasetError.
     """
     edge = read_config(scenario)
@@ -56,7 +59,7 @@ def deploy(
         updates,
         terms,
         scenario.seed,
-        truth_of(scenario, source, edge, scorer or Scorer(), data),
+        truth or truth_of(scenario, source, edge, scorer or Scorer(), data),
         on_published,
     )
 
@@ -73,27 +76,30 @@ def truth_of(
     if not scenario.held_out:
         return None
     if isinstance(source, WorldConfig):
-        scene = exact_scene(scenario, source)
+        scene, effects = exact_scene(scenario, source)
         names = dict(zip(scenario.cameras, scene.cameras))
         if all(camera in scene.cameras for camera in scenario.cameras):
             names = {camera: camera for camera in scenario.cameras}
+        lenses = {camera: scene.cameras[names[camera]] for camera in scenario.held_out}
         return ExactTruth(
             scorer,
-            {camera: scene.cameras[names[camera]] for camera in scenario.held_out},
-            lambda camera, t_s: scene.render(names[camera], t_s),
+            {camera: (effects.claimed_lens(lens), pose) for camera, (lens, pose) in lenses.items()},
+            lambda camera, t_s: effects.exposed(scene.renderer(names[camera])).image(t_s),
         )
     cameras = build_cameras(scenario, source, scenario.held_out, data, _CACHE_BYTES)
     return CapturedTruth(scorer, cameras, edge.noisy_truth)
 
 
-def exact_scene(scenario: Scenario, source: WorldConfig) -> Scene:
-    """The world as the held-out cameras see it, with the effects that are listed to be in the truth."""
+def exact_scene(scenario: Scenario, source: WorldConfig) -> tuple[Scene, Effects]:
+    """The world as the held-out cameras see it, and the effects that are listed to be in the truth: those of
+    the kinds lens and exposure are the caller's to apply. Noise and wrong poses belong to captured frames, of
+    which an exact truth has none."""
     try:
         scene = make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: source: {error}") from None
     effects = load(scenario, source, scenario.held_out[0])
-    return scene if effects is None else effects.extend(scene)
+    return (scene, NO_EFFECTS) if effects is None else (effects.extend(scene), effects)
 
 
 def _field(edge: EdgeConfig, seed: int) -> Field:

@@ -17,6 +17,8 @@ import yaml
 from numpy.typing import NDArray
 
 from camera_node.sources.records import DatasetError
+from camera_node.sources.world import WORLD_FPS
+from camera_node.world import SCENES
 from edge_server.fidelity.baselines import Baseline, baseline
 from edge_server.fidelity.images import Colour, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -25,6 +27,7 @@ from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import field_names, option_help
 from edge_server.offline.fitting import Scored, evaluate, fit_in_slices, marks_s
 from edge_server.offline.recorded import Recorded, load_recorded
+from edge_server.offline.still import synthetic
 from edge_server.offline.usage import Usage
 from edge_server.scoring import to_bytes
 from freshfield.files import write_json
@@ -34,16 +37,19 @@ Fit a recorded data set as fast as this machine can, and measure fidelity on vie
 
   edge-server fit ~/data/lego --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server fit ~/data/kitchen --field splat --holdout cam00 --frame 12
+  edge-server fit tower --field splat --seconds 10
   edge-server fit --field splat --list-options
   edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --option samples=256
 
 DATA is a transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), the calibration JSON of a rig's videos,
-or a folder with either. A set that moves is fitted at one instant (--frame). Time spent on evaluation is not
+a folder with either, or one of our own scenes: room, tile, tower. What moves is fitted at one instant
+(--frame, 15 a second in a scene). Time spent on evaluation is not
 counted as fitting. Ctrl-C ends it early; report, pictures and checkpoint are written all the same, and
 --resume goes on from there.
 """
 
 BACKGROUNDS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+_SCENE_SIZE = 128  # pixels a side of a scene of ours, before --scale
 # Enough to tell how far a field is from the views it was trained on, where nothing is held out.
 _SCORED_OF_TRAINING = 8
 
@@ -112,7 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("name a data set: a folder, or a JSON file")
     job = Job(args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background,
               args.seed)  # fmt: skip
-    name = (args.data if args.data.is_dir() else args.data.parent).resolve().name
+    name = str(args.data)
+    if not _is_scene(args.data):
+        name = (args.data if args.data.is_dir() else args.data.parent).resolve().name
     out = args.out or Path("runs") / f"fit-{name}"
     try:
         job.options.update(parse_options(args.option))
@@ -146,7 +154,7 @@ def run(job: Job, out: Path, lpips_folder: Path | None = None, resume: bool = Fa
 
     if not 0.0 < job.seconds <= 1e6:
         raise FitError(f"--seconds {job.seconds:g}: expected more than 0")
-    data = load_recorded(job.data, job.holdout, job.scale, job.frame)
+    data = _open(job)
     transparent = any(v.image.shape[2] == 4 for v in data.training)
     options = {"background": job.background, **job.options} if transparent else job.options
     try:
@@ -162,6 +170,18 @@ def run(job: Job, out: Path, lpips_folder: Path | None = None, resume: bool = Fa
     if warm_up is not None:
         print(f"kernels ready after {warm_up():.1f} s", flush=True)
     return run_.go()
+
+
+def _is_scene(data: Path) -> bool:
+    return str(data) in SCENES and not data.exists()
+
+
+def _open(job: Job) -> Recorded:
+    if not _is_scene(job.data):
+        return load_recorded(job.data, job.holdout, job.scale, job.frame)
+    t_s = job.frame / WORLD_FPS
+    still = synthetic(str(job.data), size=max(8, round(_SCENE_SIZE / job.scale)), t_s=t_s)
+    return Recorded(job.data, still.training, still.held_out, f"at {t_s:g} s")
 
 
 class _Run:
@@ -307,7 +327,8 @@ class _Run:
         return baseline(self.data.training, view.image, view.camera_to_world, self.background)
 
     def _name(self) -> str:
-        return f"fit {self.data.file.resolve().parent.name}"
+        file = self.data.file
+        return f"fit {file if _is_scene(file) else file.resolve().parent.name}"
 
 
 def progress(at: Scored, outside: float | None) -> str:

@@ -40,7 +40,7 @@ def synthetic(name: str, cameras: int = 19, size: int = 128, t_s: float = 0.0) -
 
 
 def open_still(scene: str, size: int = 128, holdout: str = "8", scale: float = 1.0, frame: int = 0) -> Still:
-    """``room``, ``tile``, or the path of a recorded data set. Raises SceneError or DatasetError."""
+    """A scene of ours by name, or the path of a recorded data set. Raises SceneError or DatasetError."""
     if scene in SCENES:
         return synthetic(scene, size=size)
     data = load_recorded(Path(scene), holdout, scale, frame)

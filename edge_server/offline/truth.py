@@ -17,6 +17,8 @@ from freshfield import payload
 from freshfield.geometry import Pinhole
 
 _NOISE_FRAMES = 8
+# Image uint8 (H, W, 3), intrinsics, camera-to-world (4, 4).
+Seen = tuple[NDArray[np.uint8], Pinhole, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,10 @@ class ExactTruth:
     scorer: Scorer
     cameras: dict[str, tuple[Pinhole, NDArray[np.float64]]]
     image: Callable[[str, float], NDArray[np.uint8]]
+
+    def view(self, camera: str, present_ns: int) -> Seen:
+        """What a held-out camera sees at an instant, its lens and its camera-to-world pose."""
+        return self.image(camera, present_ns / 1e9), *self.cameras[camera]
 
     def score(self, field: Any, present_ns: int) -> Score:
         """Mean score over the held-out cameras; moving pixels by what the scene looked like before, which
@@ -52,11 +58,17 @@ class CapturedTruth:
         self._cameras = tuple(cameras)
         self._bounds = {c.name: _noise_bound(c) if noisy else BOUND for c in cameras}
 
+    def view(self, camera: str, present_ns: int) -> Seen:
+        """What a held-out camera captured nearest to an instant, its lens and its camera-to-world pose."""
+        source = next(c for c in self._cameras if c.name == camera)
+        shot = source.capture(_nearest(source, present_ns))
+        return _image(source, shot), shot.intrinsics, shot.pose.matrix()
+
     def score(self, field: Any, present_ns: int) -> Score:
         """Mean score over the held-out cameras."""
         scores = []
         for camera in self._cameras:
-            tick = round(present_ns * camera.fps.numerator / (camera.fps.denominator * 1e9))
+            tick = _nearest(camera, present_ns)
             shot = camera.capture(tick)
             ticks = range(max(0, tick - round(1.5 * LAGS_MS[-1] * float(camera.fps) / 1e3)), tick + 1)
             times = [_instant_ns(camera, k) for k in ticks]
@@ -71,6 +83,10 @@ class CapturedTruth:
                 )
             )  # fmt: skip
         return mean_score(scores)
+
+
+def _nearest(camera: Camera, at_ns: int) -> int:
+    return round(at_ns * camera.fps.numerator / (camera.fps.denominator * 1e9))
 
 
 def _instant_ns(camera: Camera, tick: int) -> int:

@@ -22,6 +22,7 @@ from channel_emu.config import ChannelConfig
 from channel_emu.instants import NEVER_NS
 from channel_emu.link import Event, Kind, Link
 from edge_server.buffer import Buffered
+from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget
 from edge_server.ingest import Gate
@@ -36,20 +37,9 @@ SESSION = "virtual"
 _NO_POSE = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-@dataclass(frozen=True)
-class Compute:
-    """What an update costs in virtual time. The default charges nothing, as the thesis does; ``frontier``
-    measures what this machine takes."""
-
-    ms_per_step: float = 0.0
-    ms_per_update: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (0.0 <= self.ms_per_step < 1e9 and 0.0 <= self.ms_per_update < 1e9):
-            raise ValueError("compute: milliseconds must be finite and not negative")
-
-    def charge_ns(self, steps: int) -> int:
-        return round((self.ms_per_update + self.ms_per_step * steps) * 1e6)
+# What an update costs in virtual time.
+Compute = ComputeConfig
+_FREE = Compute()
 
 
 class Wake(NamedTuple):
@@ -63,9 +53,13 @@ _AT_ARRIVAL = Wake(on_arrival=True)
 
 
 class Truth(Protocol):
-    """Scores what the field shows at the present. See ``virtual_truth``."""
+    """Scores what the field shows at the present. See ``offline.truth``."""
 
     def score(self, field: Any, present_ns: int) -> Score | None: ...
+
+    def view(self, camera: str, present_ns: int) -> tuple[Any, Any, Any]:
+        """Image, intrinsics and pose of a held-out camera at an instant."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -73,14 +67,32 @@ class Terms:
     """How a deployment runs. steps: the optimiser's, of one update. first_steps: of the first update (0: as
     the others). epoch_ms: least time between two decisions. grace_ms: how long the first update waits for
     cameras that have not reported. score_every_ms: publications nearer than this to the last scored one are
-    not scored; None scores nothing."""
+    not scored; None scores nothing. first_ms: no decision before this instant of the run, and from it on only
+    at whole numbers of epochs after it, so that policies that take different times decide at the same
+    instants. scratch: every update begins with a field that knows nothing, as in the thesis."""
 
     steps: int
     first_steps: int = 0
-    compute: Compute = Compute()
+    compute: Compute = _FREE
     epoch_ms: float = 0.0
     grace_ms: float = 3000.0
     score_every_ms: float | None = 0.0
+    first_ms: float | None = None
+    scratch: bool = False
+
+    def __post_init__(self) -> None:
+        if self.first_ms is not None and not (self.first_ms >= 0.0 and self.epoch_ms > 0.0):
+            raise ValueError("first_ms: expected zero or more, and an epoch_ms of decisions")
+
+    def next_ns(self, decided_ns: int, done_ns: int, origin_ns: int) -> int:
+        """Instant of the decision after one that was taken at ``decided_ns`` and whose update is done."""
+        epoch_ns = round(self.epoch_ms * 1e6)
+        if self.first_ms is None:
+            return decided_ns + epoch_ns
+        first_ns = origin_ns + round(self.first_ms * 1e6)
+        # One epoch on at least, and none that has passed meanwhile.
+        passed = max(decided_ns + 1, done_ns) - first_ns
+        return first_ns + -(-passed // epoch_ns) * epoch_ns
 
 
 class VirtualDeployment:
@@ -122,8 +134,11 @@ class VirtualDeployment:
         self._gate = Gate(updates.buffer.cameras, ())
         self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
         self._tick = dict.fromkeys(self._cameras, 0)
-        self._used: dict[str, Frame] = {}
+        self._used: dict[str, tuple[Frame, ...]] = {}
+        """The last two frames of each camera that were made: one that is used again is the same object."""
         self._scored_ns: int | None = None
+        self.decided_ns = updates.start_ns
+        """Instant of the decision that is being carried out, or was last."""
         self._edge = self._run_edge()
         self._wake = next(self._edge)
 
@@ -199,6 +214,11 @@ class VirtualDeployment:
             if event.kind in (Kind.DELIVERED, Kind.DUPLICATED):
                 self._deliver(event.transit.item, event.transit.flips)
 
+    def _flush(self, now_ns: int) -> None:
+        """Break off what is on its way (thesis 6.5: none of it is considered to be in transit)."""
+        for link in self._links.values():
+            self._take(link.flush(now_ns - self._origin_ns))
+
     def _deliver(self, frame: Frame, flips: tuple[tuple[float, int], ...]) -> None:
         now_ns = self.clock.now_ns()
         try:
@@ -235,12 +255,23 @@ class VirtualDeployment:
         updates, terms = self.updates, self.terms
         yield from self._await_cameras()
         steps = terms.first_steps or terms.steps
+        if terms.first_ms is not None:
+            now_ns = self.clock.now_ns()
+            first_ns = self._origin_ns + round(terms.first_ms * 1e6)
+            if now_ns <= first_ns:
+                yield Wake(first_ns)
+            else:
+                yield Wake(terms.next_ns(now_ns, now_ns, self._origin_ns))
         while True:
-            decided_ns = self.clock.now_ns()
+            decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
+            if plan.flush:
+                self._flush(decided_ns)
             while (selection := updates.select(plan, self.clock.now_ns())) is None:
                 waits = plan.wait_until_ns > self.clock.now_ns()
                 yield Wake(plan.wait_until_ns) if waits else _AT_ARRIVAL
+            if terms.scratch:
+                updates.field.reset()
             fitted = updates.fit(self._exposed_all(selection), Budget(steps=steps))
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
@@ -250,7 +281,7 @@ class VirtualDeployment:
             yield Wake(self.clock.now_ns() + terms.compute.charge_ns(report.steps))
             published_ns = self.clock.now_ns()
             self._publish(updates.publication(selection, views, report, published_ns))
-            next_ns = decided_ns + round(terms.epoch_ms * 1e6)
+            next_ns = terms.next_ns(decided_ns, published_ns, self._origin_ns)
             if next_ns > published_ns:
                 yield Wake(next_ns)
             elif published_ns == decided_ns:
@@ -266,19 +297,27 @@ class VirtualDeployment:
             yield Wake(until_ns, on_arrival=True)
 
     def _exposed_all(self, selection: Selection) -> Selection:
-        """The selection with images. A frame used again stays the same object: it is decoded once."""
-        items = []
-        for item in selection.items:
-            camera = item.frame.camera
-            used = self._used.get(camera)
-            if used is None or used.sequence != item.frame.sequence:
+        """The selection with images."""
+        earlier = self._exposed_once(selection.earlier)  # first: what a camera made last is kept longest
+        return dataclasses.replace(selection, items=self._exposed_once(selection.items), earlier=earlier)
+
+    def _exposed_once(self, items: Sequence[Buffered]) -> tuple[Buffered, ...]:
+        """With images, those that a source could give. A frame used again stays the same object: it is
+        decoded once."""
+        made = []
+        for item in items:
+            camera, sequence = item.frame.camera, item.frame.sequence
+            known = self._used.get(camera, ())
+            used = next((frame for frame in known if frame.sequence == sequence), None)
+            if used is None:
                 try:
-                    used = self._used[camera] = self._exposed(item.frame)
+                    used = self._exposed(item.frame)
                 except ValueError:
                     self.failed[camera] += 1
                     continue
-            items.append(Buffered(used, item.generated_ns, item.received_ns))
-        return dataclasses.replace(selection, items=tuple(items))
+                self._used[camera] = (used, *known)[:2]
+            made.append(Buffered(used, item.generated_ns, item.received_ns))
+        return tuple(made)
 
     def _publish(self, publication: Publication) -> None:
         publication = self._with_score(publication)

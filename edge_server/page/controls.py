@@ -16,7 +16,7 @@ import numpy as np
 import viser
 
 from edge_server.page.markup import note
-from edge_server.scheduler import POLICIES, make_policy
+from edge_server.scheduler import help_of, make_policy
 from edge_server.state import EdgeState
 
 log = logging.getLogger(__name__)
@@ -139,8 +139,7 @@ def _label(parameter: str | None) -> str:
 
 def _help(policy: str) -> str:
     """The scheduler's line on the policy, without what only readers of its source need."""
-    line = POLICIES[policy][2] if policy in POLICIES else ""
-    return note(re.sub(r" \([\d.-]+\)", "", line.split("; value:")[0]))
+    return note(re.sub(r" \([\d.-]+\)", "", help_of(policy).split("; value:")[0]))
 
 
 def _notify(client: Any, title: str, body: str, bad: bool = False, seconds: float = NOTICE_S) -> None:

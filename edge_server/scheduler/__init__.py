@@ -4,7 +4,9 @@ A decision has two halves, because a policy may wait in between: ``plan`` at the
 when to wait, ``select`` then picks cameras from what is in the buffer. Both are pure functions of what
 they are given (and of the policy's own seeded stream), so that live and virtual time share them.
 
-Adding a policy is one file here and a line in ``POLICIES``.
+Adding a policy is one file here and a line in ``POLICIES``. A name may go on with a treatment of the views
+that are selected: ``threshold+freshen`` (``edge_server.treatments``, a line in ``TREATMENTS``); a treatment's
+name alone treats all views.
 """
 
 from __future__ import annotations
@@ -12,9 +14,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+
+if TYPE_CHECKING:  # nothing of it is loaded where no policy asks for it
+    from edge_server.treatments import Treatment
 
 
 @dataclass(frozen=True)
@@ -34,18 +39,22 @@ class Epoch:
 class Plan:
     """The first half of a decision. omega_ms: as shown to people, None for policies without one.
     wait_until_ns: earliest instant of selection. generated_after_ns: frames not generated after it do not
-    qualify (omega-wait), None admits all."""
+    qualify (omega-wait), None admits all. flush: what is on its way at the decision is to be broken off."""
 
     decided_ns: int
     omega_ms: float | None = None
     wait_until_ns: int = 0
     generated_after_ns: int | None = None
+    flush: bool = False
 
 
 class Policy(Protocol):
     name: str
-    parameter: str | None
-    """Name and unit of the one value a user may set, such as ``omega_ms``; None if there is none."""
+
+    @property
+    def parameter(self) -> str | None:
+        """Name and unit of the one value a user may set, such as ``omega_ms``; None if there is none."""
+        ...
 
     @property
     def value(self) -> float | None: ...
@@ -67,7 +76,23 @@ POLICIES: dict[str, tuple[str, str, str]] = {
     "age-driven": ("age_driven", "AgeDriven", "the largest set whose mean age is minimal"),
     "threshold": ("threshold", "Threshold", "frames no older than omega (6.12-6.14); value: omega_ms"),
     "wait": ("wait", "Wait", "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
+    "wait-flush": ("wait", "WaitFlush", "as wait, what is on its way at the decision broken off (6.5)"),
 }
+
+
+# name -> (module, class, one line of help)
+TREATMENTS: dict[str, tuple[str, str, str]] = {
+    "mask": ("mask", "Mask", "of stale views, pixels that were moving count for less"),
+    "freshen": ("freshen", "Freshen", "stale views are carried forward to now by their optical flow"),
+}
+
+# A live edge cannot take back what the network carries; virtual time can, to show what the thesis assumes.
+VIRTUAL_ONLY = ("wait-flush",)
+# What is offered where people choose; any other combination may be typed.
+OFFERED: tuple[str, ...] = (
+    *(policy for policy in POLICIES if policy not in VIRTUAL_ONLY), *TREATMENTS,
+    *(f"{policy}+{treatment}" for policy in ("threshold", "wait", "freshest-k") for treatment in TREATMENTS),
+)  # fmt: skip
 
 
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
@@ -75,10 +100,61 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
 
     Raises ValueError for an unknown name or a value out of range, saying what is possible.
     """
-    if name not in POLICIES:
-        raise ValueError(f"policy {name!r} is not known; choose one of {', '.join(POLICIES)}")
-    module, cls, _ = POLICIES[name]
-    return getattr(importlib.import_module(f"{__name__}.{module}"), cls)(value, rng)
+    chooses, treats = _parts(name)
+    if chooses not in POLICIES:
+        raise ValueError(
+            f"policy {chooses!r} is not known; choose one of {', '.join((*POLICIES, *TREATMENTS))}, "
+            "or join a policy and a treatment, as in threshold+freshen"
+        )
+    module, cls, _ = POLICIES[chooses]
+    policy: Policy = getattr(importlib.import_module(f"{__name__}.{module}"), cls)(value, rng)
+    if not treats:
+        return policy
+    if treats not in TREATMENTS:
+        raise ValueError(
+            f"policy {name!r}: there is no treatment {treats!r}; after the + choose one of "
+            f"{', '.join(TREATMENTS)}"
+        )
+    from edge_server.scheduler.treated import Treated
+
+    module, cls, _ = TREATMENTS[treats]
+    return Treated(name, policy, getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)())
+
+
+def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
+    """``make_policy`` for a live edge. Raises ValueError also for what only virtual time can do."""
+    if _parts(name)[0] in VIRTUAL_ONLY:
+        raise ValueError(
+            f"policy {name!r} breaks off what the network carries, which a live edge cannot: it runs in "
+            "virtual time only (edge-server simulate, edge-server study); live, use wait"
+        )
+    return make_policy(name, value, rng)
+
+
+def treatment_of(policy: Policy) -> Treatment | None:
+    """What ``policy`` has done to the views it selects; None: nothing, as for most."""
+    return getattr(policy, "treatment", None)
+
+
+def help_of(name: str) -> str:
+    """One line on a policy; empty for one that is not known."""
+    chooses, treats = _parts(name)
+    if chooses not in POLICIES or (treats and treats not in TREATMENTS):
+        return ""
+    if not treats:
+        return POLICIES[chooses][2]
+    line, said = POLICIES[chooses][2], TREATMENTS[treats][2]
+    what, _, parameter = line.partition("; value:")
+    both = said if name in TREATMENTS else f"{what}; {said}"
+    return f"{both}; value:{parameter}" if parameter else both
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """The policy that chooses and the treatment, or nothing, that ``name`` asks for."""
+    if name in TREATMENTS:
+        return "all", name
+    chooses, _, treats = name.partition("+")
+    return chooses, treats
 
 
 def freshest(epoch: Epoch, count: int) -> tuple[str, ...]:

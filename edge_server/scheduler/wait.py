@@ -2,9 +2,14 @@
 
 The horizon is (t, t + omega] and ages are taken at its end. omega = 0 uses the buffer as it is (6.34). If
 nothing qualifies at the end, the wait goes on until the first frame that does.
+
+What is on its way at the decision blocks a link that serves one frame at a time, though it will not be used.
+``wait-flush`` has it broken off: the thesis's reading (6.5: "no packets are considered in transit").
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,3 +35,11 @@ class Wait:
     def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
         after = plan.generated_after_ns
         return tuple(c for c, g in epoch.generated_ns.items() if after is None or g > after)
+
+
+class WaitFlush(Wait):
+    name = "wait-flush"
+
+    def plan(self, epoch: Epoch) -> Plan:
+        plan = super().plan(epoch)
+        return replace(plan, flush=plan.generated_after_ns is not None)

@@ -86,11 +86,11 @@ class Transport:
         """Per-call metadata of a client."""
         return (("authorization", f"Bearer {self.token}"),) if self.token else ()
 
-    def aio_channel(self, target: str) -> grpc.aio.Channel:
+    def aio_channel(self, target: str, options: list[tuple[str, Any]] = CLIENT_OPTIONS) -> grpc.aio.Channel:
         """Client channel; must be called with an event loop running."""
         if self.ca is None:
-            return grpc.aio.insecure_channel(target, options=CLIENT_OPTIONS)
-        return grpc.aio.secure_channel(target, self._client_credentials(), options=CLIENT_OPTIONS)
+            return grpc.aio.insecure_channel(target, options=options)
+        return grpc.aio.secure_channel(target, self._client_credentials(), options=options)
 
     def channel(self, target: str) -> grpc.Channel:
         """Blocking client channel, for tools and tests."""

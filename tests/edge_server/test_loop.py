@@ -49,6 +49,33 @@ def test_wait_selects_nothing_before_its_horizon_and_goes_on_until_something_qua
     assert [i.frame.sequence for i in u.select(plan, 180 * MS).items] == [1]
 
 
+def test_a_treatment_sees_the_frame_before_and_what_was_delivered_is_handed_on():
+    u = updates("freshen")
+    for k in range(2):
+        for camera in ("cam01", "cam02"):
+            image = frame(camera, sequence=5 * k, generated_ns=(60 * k + 1) * MS)
+            u.buffer.put(image, (60 * k + 10) * MS)
+    fed = []
+    fit = u.field.fit
+    u.field.fit = lambda views, budget: fed.extend(views) or fit(views, budget)
+    views, _ = u.fit(u.select(u.plan(120 * MS), 120 * MS), Budget(steps=1))
+    assert [v.carried_to_ns for v in views] == [None, None] and all(v.weight is None for v in views)
+    assert [v.carried_to_ns for v in fed] == [120 * MS, 120 * MS]
+    assert u.treatment_cost.views == 2 and u.treatment_cost.ms_per_view > 0
+
+
+def test_a_policy_without_treatment_gives_the_memory_back():
+    u = updates("all")
+    u.policy = make_policy("mask", None, np.random.default_rng(0))
+    for k in range(3):
+        u.buffer.put(frame("cam01", sequence=k, generated_ns=30 * k * MS), 30 * k * MS)
+        u.fit(u.select(u.plan(99 * MS), 99 * MS), Budget(steps=1))
+    assert u.buffer.newest_and_earlier()[1] and u.decoder._earlier
+    u.policy = make_policy("all", None, np.random.default_rng(0))
+    assert not u.buffer.newest_and_earlier()[1] and not u.decoder._earlier
+    assert u.select(u.plan(99 * MS), 99 * MS).earlier == ()
+
+
 def test_an_empty_buffer_selects_nothing():
     u = updates()
     assert u.select(u.plan(5), 5) is None

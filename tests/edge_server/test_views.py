@@ -41,3 +41,26 @@ def test_memory_is_one_view_a_camera():
     for i in range(200):
         decoder.views([Buffered(frame(sequence=i), i, i)])
     assert len(decoder._views) == 1
+
+
+def test_what_was_newest_is_not_decoded_again_as_the_one_before():
+    decoder = Decoder()
+    items = [Buffered(frame(sequence=i, generated_ns=i), i, i) for i in range(3)]
+    (first,) = decoder.views([items[0]])
+    assert decoder.earlier([items[0]])["cam01"] is first
+    (second,) = decoder.views([items[1]])
+    assert decoder.earlier([items[0]])["cam01"] is first, "used again"
+    assert decoder.earlier([items[1]])["cam01"] is second
+    assert decoder.earlier([items[2]])["cam01"].generated_ns == 2, "one that never was the newest"
+    assert len(decoder._earlier) == len(decoder._views) == 1
+    decoder.forget_earlier()
+    assert not decoder._earlier
+
+
+def test_a_damaged_frame_before_is_counted_once_and_is_missing():
+    decoder = Decoder()
+    cut = Buffered(frame("cam01", codec="png", payload=_png_without_data()), 0, 0)
+    whole = Buffered(frame("cam02"), 0, 0)
+    for _ in range(2):
+        assert list(decoder.earlier([cut, whole])) == ["cam02"]
+    assert decoder.undecodable == 1

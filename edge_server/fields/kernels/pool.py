@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 
+# For who runs several processes side by side.
+THREADS_VARIABLE = "FRESHFIELD_THREADS"
+
 
 class _Job:
     def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...]) -> None:
@@ -28,11 +31,17 @@ class Pool:
     the kernel draws task numbers from ``counter`` until none are left (see ``kernels.intrinsics``).
 
     Any number of Python threads may call ``run``: jobs are served in the order in which they come.
-    threads: default, the number of cores this process may use. nice: added to the workers' own priority
+    threads: default, the environment's FRESHFIELD_THREADS, else the number of cores this process may use.
+    Results do not depend on it. nice: added to the workers' own priority
     where the system allows it (Linux counts it per thread), so that who ingests frames goes first.
     """
 
     def __init__(self, threads: int | None = None, nice: int = 10) -> None:
+        given = os.environ.get(THREADS_VARIABLE, "")
+        if threads is None and given:
+            if not given.isdigit():
+                raise ValueError(f"{THREADS_VARIABLE}: expected a number of threads, got {given!r}")
+            threads = int(given)
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self.threads = int(threads or available)
         if self.threads < 1:

@@ -41,6 +41,21 @@ def test_it_learns_and_leaves_report_pictures_and_checkpoint(tmp_path, capsys):
     assert "PSNR" in capsys.readouterr().out
 
 
+def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["fit", "tower", *SMALL_WORDS, "--seconds", "1", "--scale", "4", "--frame", "6"]
+    assert edge_server(words) == 0
+    printed = capsys.readouterr().out
+    assert "tower: 18 views of 32 x 32, at 0.4 s, 1 held out" in printed
+    report = report_of(tmp_path / "runs" / "fit-tower")
+    series = report["fidelity"]["series"]
+    assert series[-1]["psnr_db"] > 10.0
+    # A folder of that name is the user's own.
+    write_photos(tmp_path / "tower", 9)
+    assert edge_server(words) == 0
+    assert "at 0.4 s" not in capsys.readouterr().out
+
+
 def test_resume_goes_on_where_it_stopped(tmp_path, capsys):
     write_photos(tmp_path / "set", 5)
     out = tmp_path / "out"

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from camera_node.world.effects import NAMES
 from channel_emu.config import channel_from_mapping
 from channel_emu.simulate import simulate
 from edge_server.offline.deployment import deploy
+from edge_server.offline.truth import ExactTruth
 from edge_server.offline.virtual import Compute, Terms, VirtualDeployment
 from freshfield.scenario import Scenario, parse
 from tests.conftest import data_dir
@@ -71,6 +73,28 @@ def test_one_seed_gives_the_same_run_bit_for_bit(channel):
     assert [p.ages_ms for p in other.publications] != [p.ages_ms for p in first.publications]
 
 
+@pytest.mark.parametrize("policy", ["mask", "freshest-k+mask", "freshen", "wait+freshen"])
+@pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
+def test_treated_views_are_the_same_in_every_run(policy, channel):
+    small = {"gaussians": 300, "start": 200, "seed_cells": 12}
+    edge = {"field": "splat", "field_options": small, "policy": {"name": policy}}
+    source = {
+        "kind": "world", "scene": "room", "width": 64, "height": 64, "fps": 15, "speed_m_per_s": 3.0,
+        "params": {"supersample": 1},
+    }  # fmt: skip
+    first, second = (run(scenario(channel, edge=edge, source=source), seconds=1.5) for _ in range(2))
+    assert first.publications and first.publications == second.publications
+    a, b = (d.updates.field.state() for d in (first, second))
+    assert all(np.array_equal(a[name], b[name]) for name in a)
+    untreated = {**edge, "policy": {"name": "all" if policy in ("mask", "freshen") else policy.split("+")[0]}}
+    plain = run(scenario(channel, edge=untreated, source=source), seconds=1.5)
+    assert [p.selected for p in plain.publications] == [p.selected for p in first.publications]
+    assert [p.ages_ms for p in plain.publications] == [p.ages_ms for p in first.publications]
+    assert not np.array_equal(plain.updates.field.state()["params"], a["params"]), "they are treated"
+    assert first.updates.treatment_cost.views >= sum(len(p.selected) for p in first.publications)
+    assert plain.updates.treatment_cost.views == 0 and plain.updates.treatment_cost.ms_per_view is None
+
+
 def test_going_on_is_the_same_as_running_through():
     through = run(scenario(), seconds=1.2)
     parts = deploy(scenario(), TERMS)
@@ -86,8 +110,14 @@ def test_the_books_close_with_every_fault_and_damage_is_refused():
     assert frames["lost"] > 0 and frames["broken"] > 0 and frames["skipped"] > 0
 
 
-def test_the_links_decide_as_the_simulation_does():
-    what = scenario({"preset": "ch5"})
+@pytest.mark.parametrize(
+    "channel",
+    [{"preset": "ch5"},
+     {"preset": "ch5", "discipline": "newest-waits", "server": {"shared": True, "order": "round-robin"}}],
+    ids=["own lines", "one line"],
+)  # fmt: skip
+def test_the_links_decide_as_the_simulation_does(channel):
+    what = scenario(channel)
     deployment = run(what, Terms(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
     config = channel_from_mapping(what.channel)
     alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15, engine="python")
@@ -168,3 +198,46 @@ def test_compute_refuses_what_is_no_time():
         Compute(ms_per_step=-1.0)
     with pytest.raises(ValueError, match="not negative"):
         Compute(ms_per_update=float("nan"))
+
+
+def world_with(effects: dict[str, Any], scene: str = "tower", **source: Any) -> dict[str, Any]:
+    size = {"kind": "world", "scene": scene, "width": 32, "height": 32, "fps": 15}
+    return {**size, "params": {"supersample": 1}, "effects": effects, **source}
+
+
+def test_every_effect_at_once_repeats_bit_for_bit():
+    listed = {**dict.fromkeys(NAMES), "rolling_shutter": {"rows_at_once": 16}, "motion_blur": {"samples": 2}}
+    what = world_with(listed, speed_m_per_s=8.0)
+    first, second = (run(scenario(source=what)) for _ in range(2))
+    assert len(first.publications) > 5 and first.publications == second.publications
+    a, b = (d.updates.field.state() for d in (first, second))
+    assert all(np.array_equal(a[name], b[name]) for name in a)
+    plain = run(scenario(source=world_with({}, speed_m_per_s=8.0)))
+    # Ages are the channel's; what is seen is not.
+    assert [p.ages_ms for p in first.publications] == [p.ages_ms for p in plain.publications]
+    assert [p.psnr_db for p in first.publications] != [p.psnr_db for p in plain.publications]
+
+
+def test_the_exact_truth_is_seen_through_what_is_listed_to_be_in_it():
+    def truth(effects: dict[str, Any]) -> np.ndarray:
+        found = deploy(scenario(source=world_with(effects)), TERMS).truth
+        assert isinstance(found, ExactTruth)
+        return found.image("cam00", 0.4)
+
+    plain = truth({})
+    assert np.array_equal(truth({"vignetting": {}, "fog": {}, "lens_distortion": {}}), plain)
+    # The field is asked for what is claimed of the lens.
+    for calibrated, distortion in ((True, -0.05), (False, 0.0)):
+        lens = {"k1": -0.05, "k2": 0.0, "p1": 0.0, "p2": 0.0, "calibrated": calibrated, "in_truth": True}
+        found = deploy(scenario(source=world_with({"lens_distortion": lens})), TERMS).truth
+        assert isinstance(found, ExactTruth) and found.cameras["cam00"][0].distortion[0] == distortion
+    for name in ("vignetting", "fog", "lens_distortion"):
+        assert not np.array_equal(truth({name: {"in_truth": True}}), plain), name
+
+
+def test_wrong_poses_reach_the_field_and_wrong_lenses_are_believed():
+    plain = run(scenario(source=world_with({})))
+    for effects in ({"pose_noise": {"rotation_deg": 5.0}}, {"lens_distortion": {"calibrated": False}}):
+        wrong = run(scenario(source=world_with(effects)))
+        assert [p.ages_ms for p in wrong.publications] == [p.ages_ms for p in plain.publications]
+        assert [p.psnr_db for p in wrong.publications] != [p.psnr_db for p in plain.publications]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_server.scheduler import POLICIES, Epoch, make_policy
+from edge_server.scheduler import POLICIES, Epoch, make_live_policy, make_policy
 
 MS = 1_000_000
 
@@ -96,7 +96,7 @@ def test_every_policy_selects_known_cameras_once_and_at_least_one(name, ages, no
     chosen = policy.select(at, plan)
     assert len(set(chosen)) == len(chosen) and set(chosen) <= set(generated)
     # omega-wait may go on waiting: nothing was generated after the decision yet.
-    assert bool(chosen) == bool(generated) or name == "wait"
+    assert bool(chosen) == bool(generated) or name in ("wait", "wait-flush")
 
 
 @pytest.mark.parametrize(
@@ -111,3 +111,18 @@ def test_a_value_out_of_range_is_refused_by_name(name, value):
 def test_an_unknown_policy_lists_the_known_ones():
     with pytest.raises(ValueError, match="freshest-k"):
         make_policy("best", None, np.random.default_rng(0))
+
+
+def test_flushing_is_asked_for_only_where_something_is_waited_for():
+    at = Epoch(50 * MS, 0, {"a": 0})
+    make = lambda name, value: make_policy(name, value, np.random.default_rng(0)).plan(at)  # noqa: E731
+    assert make("wait-flush", 40.0).flush and make("wait-flush", 40.0).wait_until_ns == 90 * MS
+    assert not make("wait-flush", 0.0).flush and not make("wait", 40.0).flush
+
+
+def test_a_live_edge_refuses_what_only_virtual_time_can_do():
+    rng = np.random.default_rng(0)
+    assert make_live_policy("wait", 40.0, rng).name == "wait"
+    for name in ("wait-flush", "wait-flush+mask"):
+        with pytest.raises(ValueError, match="live, use wait"):
+            make_live_policy(name, 40.0, rng)

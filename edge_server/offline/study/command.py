@@ -1,0 +1,134 @@
+"""``edge-server study``: the thesis's figures as commands, each with a verdict."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from camera_node.sources.records import DatasetError
+from edge_server.offline.study.base import Ask, Verdict, run_study
+from edge_server.offline.study.engine import Engine, StudyError
+from edge_server.offline.study.trial import SCENARIOS, Folders
+from freshfield.files import write_json
+from freshfield.scenario import ScenarioError
+
+# name -> (module, class)
+STUDIES = {
+    "metrics": ("metrics", "Metrics"),
+    "mat": ("mat", "Mat"),
+    "mat-delay": ("mat_delay", "MatDelay"),
+    "lambda": ("weighing", "Weighing"),
+    "omega": ("omega", "Omega"),
+    "images": ("images", "Images"),
+    "representations": ("representations", "Representations"),
+    "phase": ("phase", "Phase"),
+}
+DESCRIPTION = """\
+The thesis's figures, each with a table (CSV), a figure (PNG) and a verdict: the claim, what was found here
+with 95 % intervals over seeds, and whether it holds.
+
+  edge-server study mat --quick --out runs/study
+  edge-server study all --quick --data ~/data
+  edge-server study omega --seeds 20 --jobs 8 --scene kitchen --data ~/data
+  edge-server study phase --ray auto
+
+  metrics           figure 3.6: what PSNR, SSIM and LPIPS say of three artefacts
+  mat               figures 5.6, 5.7: fidelity against the maximum age of used views
+  mat-delay         figure 5.8: the best maximum age against the mean delay
+  lambda            equation 5.8: the weight of timeliness
+  omega             figures 6.3, 6.4: threshold and wait, two traffic states, with and without flush
+  images            figures 6.5, 6.6: LPIPS and age against the number of images
+  representations   figure 6.7: the same trade with other representations
+  phase             where the trade exists: speed x delay x memory x compute, and what mask and freshen gain
+
+Everything runs in virtual time from seeds: a trial gives the same figures bit for bit wherever it runs.
+Results are kept in OUT/trials by content; after Ctrl-C the same command goes on with what is missing.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
+    lpips = args.lpips or (Path(d) if (d := os.environ.get("FRESHFIELD_LPIPS")) else None)
+    if lpips is None and base is not None and (base / "lpips").is_dir():
+        lpips = base / "lpips"
+    folders = Folders(base, lpips)
+    ask = Ask(args.quick, args.out, folders, args.seeds, tuple(args.scene.split(",")) if args.scene else None)
+    names = list(STUDIES) if args.study == "all" else [args.study]
+    engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
+    try:
+        _check(ask, args.jobs)
+        for name in names:
+            _run(name, ask, engine)
+    except (ScenarioError, DatasetError, StudyError) as error:
+        print(f"edge-server study: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nstopped; what is finished is in {engine.folder}: the same command goes on", flush=True)
+        return 130
+    return 0
+
+
+def make_study(name: str) -> Any:
+    """The study of that name; its module is imported only now."""
+    module, cls = STUDIES[name]
+    return getattr(importlib.import_module(f"edge_server.offline.study.{module}"), cls)()
+
+
+def _run(name: str, ask: Ask, engine: Engine) -> list[Verdict]:
+    study, began = make_study(name), time.monotonic()
+    print(f"== {name}: {study.title}", flush=True)
+    verdicts = run_study(study, ask, engine)
+    for verdict in verdicts:
+        print("  " + verdict.line())
+    seconds = time.monotonic() - began
+    found = {
+        "study": name, "title": study.title, "quick": ask.quick, "seconds": round(seconds, 1),
+        "verdicts": [vars(v) for v in verdicts],
+    }  # fmt: skip
+    write_json(ask.out / f"{name}.json", found)
+    print(f"  {seconds:.0f} s; {ask.out / name}.csv, .md, .json and figures", flush=True)
+    return verdicts
+
+
+def _check(ask: Ask, jobs: int) -> None:
+    if ask.seeds is not None and not 1 <= ask.seeds <= 10_000:
+        raise StudyError(f"--seeds: expected 1 to 10000, got {ask.seeds}")
+    if jobs < 1:
+        raise StudyError(f"--jobs: expected at least 1, got {jobs}")
+    for scene in ask.scenes or ():
+        if scene not in SCENARIOS:
+            raise StudyError(f"--scene {scene}: expected {', '.join(SCENARIOS)}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server study", description=DESCRIPTION, formatter_class=raw)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    add = parser.add_argument
+    add("study", choices=[*STUDIES, "all"], metavar="NAME", help=f"{', '.join(STUDIES)} or all")
+    add(
+        "--quick",
+        action="store_true",
+        help="small pictures, few points and seeds: all in a quarter of an hour",
+    )
+    add("--seeds", type=int, metavar="N", help="repetitions of every point [the study's own]")
+    add("--jobs", type=int, default=cores, metavar="J", help="processes [%(default)s]")
+    add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
+    add("--scene", metavar="NAME,...", help=f"{', '.join(SCENARIOS)} [the study's own]")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add(
+        "--lpips",
+        type=Path,
+        metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]",
+    )
+    add("--out", type=Path, default=Path("runs/study"), metavar="DIR", help="[%(default)s]")
+    return parser

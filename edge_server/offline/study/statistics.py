@@ -1,0 +1,162 @@
+"""Means, intervals and optima over seeds: the seed is the unit that repeats, so all intervals are over seeds.
+
+Nothing here knows what a study is about. Everything random is drawn from a fixed stream: the same figures
+give the same intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+_LEVEL = 0.95
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean with the ends of its 95 % interval; the ends are NaN where one value cannot give them."""
+
+    mean: float
+    low: float
+    high: float
+    count: int
+
+    def __str__(self) -> str:
+        if self.count < 2:
+            return f"{self.mean:.2f}"
+        return f"{self.mean:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+    @property
+    def half(self) -> float:
+        return (self.high - self.low) / 2
+
+    def above(self, bound: float) -> bool | None:
+        """Whether the mean lies above ``bound``; None: the interval does not tell."""
+        if self.low > bound:
+            return True
+        return False if self.high < bound else None
+
+
+def interval(values: Sequence[float | None]) -> Interval:
+    """Student's t interval of the mean, over the values that there are."""
+    known = np.array([v for v in values if v is not None], float)
+    if not len(known):
+        return Interval(np.nan, np.nan, np.nan, 0)
+    mean = float(known.mean())
+    if len(known) < 2:
+        return Interval(mean, np.nan, np.nan, len(known))
+    half = float(stats.t.ppf(0.5 + _LEVEL / 2, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known)))
+    return Interval(mean, mean - half, mean + half, len(known))
+
+
+def negated(answer: bool | None) -> bool | None:
+    """Not; what cannot be told stays so."""
+    return None if answer is None else not answer
+
+
+def paired(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> Interval:
+    """Of a - b over the seeds that have both."""
+    return interval([x - y for s in a if (x := a[s]) is not None and (y := b.get(s)) is not None])
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Where a curve over ``xs`` is best, over seeds.
+
+    x: of the best mean. low, high: 95 % of resampled seeds have their best there. over_first, over_last: how
+    much better the best is than the curve's two ends. They are measured on seeds that had no part in choosing
+    the best (chosen on one half, measured on the other, and the other way round): a best point chosen and
+    measured on the same seeds looks better than it is.
+    """
+
+    x: float
+    low: float
+    high: float
+    over_first: Interval
+    over_last: Interval
+
+    def interior(self, least: float = 0.0) -> bool | None:
+        """Whether the curve rises and falls by more than ``least``; None: the seeds do not tell."""
+        sides = (self.over_first.above(least), self.over_last.above(least))
+        if False in sides:
+            return False
+        return None if None in sides else True
+
+
+def optimum(curve: Mapping[float, Mapping[int, float | None]], lower_is_better: bool = False) -> Optimum:
+    """``curve``: x -> seed -> value. Seeds that lack a value anywhere are left out. ValueError: none left."""
+    xs = sorted(curve)
+    common = set.intersection(*(set(curve[x]) for x in xs))
+    seeds = sorted(s for s in common if all(curve[x][s] is not None for x in xs))
+    if not seeds:
+        raise ValueError("no seed has a value at every point of the curve")
+    table = np.array([[curve[x][s] for x in xs] for s in seeds], float)  # (seeds, xs)
+    if lower_is_better:
+        table = -table
+    rng = np.random.default_rng(5)
+    picks = rng.integers(0, len(seeds), (_RESAMPLES, len(seeds)))
+    bests = np.array(xs)[table[picks].mean(1).argmax(1)]
+    low, high = np.percentile(bests, [2.5, 97.5], method="nearest")
+    gains = _held_out_gains(table)
+    return Optimum(
+        float(xs[int(table.mean(0).argmax())]), float(low), float(high),
+        interval(list(gains[:, 0])), interval(list(gains[:, 1])),
+    )  # fmt: skip
+
+
+def _held_out_gains(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of each seed (S, 2): the best minus the first and minus the last, the best as the others chose."""
+    count = len(table)
+    if count < 2:
+        best = table.mean(0).argmax()
+        return np.stack([table[:, best] - table[:, 0], table[:, best] - table[:, -1]], 1)
+    gains = np.empty((count, 2))
+    halves = np.arange(count) % 2
+    for half in (0, 1):
+        chosen = table[halves != half].mean(0).argmax()
+        mine = table[halves == half]
+        gains[halves == half, 0] = mine[:, chosen] - mine[:, 0]
+        gains[halves == half, 1] = mine[:, chosen] - mine[:, -1]
+    return gains
+
+
+def slope(xs: Sequence[float], tables: Mapping[float, Mapping[int, float]]) -> Interval:
+    """Slope of a straight line through x -> seed -> y, with its interval over seeds (one line a seed).
+
+    ValueError: fewer than two x.
+    """
+    if len(xs) < 2:
+        raise ValueError("a slope needs two points")
+    common = sorted(set.intersection(*(set(tables[x]) for x in xs)))
+    return interval([float(np.polyfit(xs, [tables[x][s] for x in xs], 1)[0]) for s in common])
+
+
+def share_closed(
+    policy: Mapping[int, float | None], base: Mapping[int, float | None], limit: Mapping[int, float | None]
+) -> Interval:
+    """(policy - base) / (limit - base): the share of the way from ``base`` to ``limit``, a ratio of means
+    over the seeds that have all three; its interval by resampling seeds. NaN where the limit is no better."""
+    rows = [
+        (p, b, n) for s in policy
+        if (p := policy[s]) is not None and (b := base.get(s)) is not None and (n := limit.get(s)) is not None
+    ]  # fmt: skip
+    if not rows:
+        return Interval(np.nan, np.nan, np.nan, 0)
+    table = np.array(rows, float)
+    gap = table[:, 2].mean() - table[:, 1].mean()
+    if gap <= 0:
+        return Interval(np.nan, np.nan, np.nan, len(rows))
+    share = float((table[:, 0].mean() - table[:, 1].mean()) / gap)
+    if len(rows) < 2:
+        return Interval(share, np.nan, np.nan, 1)
+    rng = np.random.default_rng(7)
+    means = table[rng.integers(0, len(rows), (_RESAMPLES, len(rows)))].mean(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = (means[:, 0] - means[:, 1]) / (means[:, 2] - means[:, 1])
+    low, high = np.nanpercentile(shares, [2.5, 97.5])
+    return Interval(share, float(low), float(high), len(rows))

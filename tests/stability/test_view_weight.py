@@ -1,0 +1,119 @@
+"""Weights that views bring: what weighs nothing teaches nothing, in every representation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, View
+from edge_server.fields.nerfacto import NerfactoField
+from edge_server.fields.ngp import NgpField
+from edge_server.fields.ngp_torch_field import NgpTorchField
+from edge_server.fields.splat import SplatField
+from edge_server.fields.tensorf import TensorfField
+from edge_server.fields.voxel import VoxelField
+from tests.edge_server.fields.scenes import mean_psnr, ring
+from tests.stability import (
+    test_field_nerfacto,
+    test_field_ngp,
+    test_field_splat,
+    test_field_tensorf,
+    test_field_voxel,
+)
+
+VIEWS = ring(7, size=24)
+
+
+class Case(NamedTuple):
+    kind: Callable[[Any], Any]
+    tiny: Any
+
+
+CASES = {
+    "ngp": Case(NgpField, test_field_ngp.TINY),
+    "ngp-torch": Case(lambda settings: NgpTorchField(settings, "cpu"), test_field_ngp.TINY),
+    "tensorf": Case(TensorfField, test_field_tensorf.TINY),
+    "voxel": Case(VoxelField, test_field_voxel.TINY),
+    "nerfacto": Case(NerfactoField, test_field_nerfacto.TINY),
+    "splat": Case(SplatField, test_field_splat.TINY),
+}
+every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+# Plain torch takes a minute for what the kernels do in a second.
+long = pytest.mark.parametrize(
+    "case", [pytest.param(c, id=k, marks=[pytest.mark.slow] * (k == "ngp-torch")) for k, c in CASES.items()]
+)
+
+
+def weighed(view: View, weight: float) -> View:
+    return replace(view, weight=np.full(view.image.shape[:2], weight, np.float32))
+
+
+def fitted(case: Case, *sets: list[View], steps: int = 12) -> Any:
+    # The colour behind everything and what contradicts are judged by whole pictures, not by what they teach.
+    field = case.kind(replace(case.tiny, background="#808080", refuse_beyond=0.0))
+    for views in sets:
+        field.fit(views, Budget(steps=steps))
+    return field
+
+
+def finite(field: Any) -> None:
+    for view in VIEWS[:2]:
+        out = field.render(view.camera_to_world, view.intrinsics)
+        assert all(np.isfinite(part).all() for part in (out.color, out.depth, out.opacity))
+
+
+@every
+def test_a_view_of_no_weight_teaches_nothing(case: Case) -> None:
+    rng = np.random.default_rng(0)
+    noise = replace(VIEWS[3], image=rng.integers(0, 256, VIEWS[3].image.shape, dtype=np.uint8))
+    shown = []
+    for third in (VIEWS[3], noise):
+        field = fitted(case, [*VIEWS[:3], weighed(third, 0.0), *VIEWS[4:]])
+        shown.append(field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color)
+    assert np.array_equal(*shown)
+
+
+@long
+def test_views_of_no_weight_at_all_break_nothing(case: Case) -> None:
+    nothing = [weighed(view, 0.0) for view in VIEWS]
+    finite(fitted(case, nothing))
+    field = fitted(case, VIEWS, nothing, [weighed(VIEWS[0], 0.0)], steps=40)
+    finite(field)
+    field.fit(VIEWS, Budget(steps=120))
+    assert mean_psnr(field, VIEWS) > 14.0, "and it goes on learning"
+
+
+@every
+def test_full_weights_are_the_same_as_none(case: Case) -> None:
+    a, b = (fitted(case, views) for views in (VIEWS, [weighed(view, 1.0) for view in VIEWS]))
+    colors = [f.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color for f in (a, b)]
+    assert np.array_equal(*colors)
+
+
+@long
+def test_of_two_that_disagree_the_heavier_one_is_believed(case: Case) -> None:
+    red, blue = (
+        np.broadcast_to(np.array(c, np.uint8), (24, 24, 3)).copy() for c in ((230, 20, 20), (20, 20, 230))
+    )
+    views = []
+    for k, view in enumerate(VIEWS):
+        views.append(replace(view, camera=f"red{k}", image=red, weight=np.full((24, 24), 1.0, np.float32)))
+        views.append(replace(view, camera=f"blue{k}", image=blue, weight=np.full((24, 24), 0.05, np.float32)))
+    color = fitted(case, views, steps=150).render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
+    assert color[..., 0].mean() > 2.0 * color[..., 2].mean()
+
+
+@pytest.mark.parametrize(
+    "weight",
+    [np.ones((24, 23), np.float32), np.ones((24, 24)), np.full((24, 24), np.nan, np.float32),
+     np.full((24, 24), 1.5, np.float32), np.full((24, 24), -0.1, np.float32)],
+    ids=["shape", "float64", "nan", "above", "below"],
+)  # fmt: skip
+def test_a_weight_that_is_none_is_refused_by_camera(weight) -> None:
+    field = VoxelField(test_field_voxel.TINY)
+    with pytest.raises(ValueError, match=r"cam02: weight must be float32 of shape .24, 24. within 0..1"):
+        field.fit([*VIEWS[:2], replace(VIEWS[2], weight=weight)], Budget(steps=1))

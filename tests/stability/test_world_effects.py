@@ -1,0 +1,130 @@
+"""Hard cases of effects: the ends of every parameter's range, extreme images, instants and frame numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import math
+import typing
+
+import numpy as np
+import pytest
+
+from camera_node.world import effects as fx
+from camera_node.world import make_scene
+from camera_node.world.cache import FrameCache
+from freshfield.geometry import Pose
+
+SCENE = {"width": 16, "height": 12, "supersample": 1, "speed_m_per_s": 8.0}
+# The ends of the ranges that the docstrings and messages promise.
+EXTREMES: dict[str, list[dict]] = {
+    "exposure_drift": [
+        {"amplitude_stops": 8.0, "offset_spread_stops": 8.0, "period_s": 0.01},
+        {"amplitude_stops": 0.0, "offset_spread_stops": 0.0, "period_s": 1e6},
+    ],
+    "fog": [
+        {"visibility_m": 0.01, "contrast_threshold": 1e-6},
+        {"visibility_m": 1e6, "contrast_threshold": 0.5},
+        {"airlight": [0.0, 0.0, 0.0]},
+        {"airlight": [1.0, 1.0, 1.0]},
+    ],
+    "hot_pixels": [
+        {"hot_ppm": 1e6, "hot_counts": 1e6, "hits_per_megapixel": 1e6, "hit_counts": 1e6},
+        {"growth_ppm_per_h": 1e6},
+        {"hot_ppm": 0.0, "hits_per_megapixel": 0.0, "hot_counts": 0.0, "hit_counts": 0.0},
+    ],
+    "lens_distortion": [{"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}, {"k1": 10.0}, {"k1": -1e-9}],
+    "pose_noise": [
+        {"translation_mm": 1e5, "rotation_deg": 180.0},
+        {"translation_bias_mm": 1e5, "rotation_bias_deg": 180.0},
+        {"translation_mm": 0.0, "rotation_deg": 0.0},
+        {"translation_mm": 1e-300, "rotation_deg": 1e-300},
+    ],
+    "rolling_shutter": [
+        {"readout_ms": 1000.0, "stamped_share": 0.0},
+        {"readout_ms": 0.0, "stamped_share": 1.0},
+        {"rows_at_once": 4096},
+    ],
+    "shadows": [{"opacity": 0.0}, {"opacity": 1.0}],
+    "specular": [
+        {"refractive_index": 1.0, "roughness": 0.02},
+        {"refractive_index": 50.0, "roughness": 0.02},
+        {"refractive_index": 50.0, "roughness": 1.0},
+    ],
+    "vignetting": [{"exponent": 0.0}, {"exponent": 64.0}],
+}  # fmt: skip
+CASES = [(name, parameters) for name, some in EXTREMES.items() for parameters in some]
+
+
+def load(name: str, parameters: dict) -> fx.Effects:
+    return fx.load_effects({name: parameters}, lambda _: np.random.default_rng(4))
+
+
+@pytest.mark.parametrize(("name", "parameters"), CASES, ids=str)
+@pytest.mark.filterwarnings("error")
+def test_the_ends_of_the_ranges_give_sound_frames_in_every_scene(name, parameters):
+    made = load(name, parameters)
+    for scene_name in ("room", "tile", "tower"):
+        given = {k: v for k, v in SCENE.items() if scene_name != "tile" or k != "speed_m_per_s"}
+        scene = make_scene(scene_name, given)
+        if parameters == {"k1": 10.0}:
+            with pytest.raises(fx.EffectError, match="cannot be undone"):
+                made.extend(scene)
+            continue
+        frames = FrameCache(scene, "cam01", 15, effects=made, codec="zstd", on_disk=False)
+        pose = Pose.from_matrix(scene.cameras["cam01"][1])
+        for k in (0, 4, 10**12):
+            image = frames.read(k)
+            if isinstance(image, np.ndarray):
+                assert image.shape == (12, 16, 3) and image.dtype == np.uint8
+            claimed = made.claimed_pose(pose, k)
+            assert np.isfinite(claimed.matrix()).all()
+        assert np.array_equal(frames.frame(4), frames.frame(4))
+
+
+@pytest.mark.parametrize("level", [0, 255])
+@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 7, 3), (7, 1, 4), (64, 3, 4)])
+@pytest.mark.filterwarnings("error")
+def test_image_effects_take_any_image(level, shape):
+    for name in ("exposure_drift", "hot_pixels", "sensor_noise"):
+        for parameters in EXTREMES.get(name, [{}]):
+            out = load(name, parameters).apply(np.full(shape, level, np.uint8), 2**62, 1e12)
+            assert out.shape == shape and out.dtype == np.uint8
+
+
+def numbers() -> list[tuple[str, str]]:
+    """Every number among the parameters of every effect."""
+    found = []
+    for name in fx.NAMES:
+        module = importlib.import_module(f"{fx.__name__}.{name}")
+        model = getattr(module, fx._CLASSES[name]).Parameters
+        hints = typing.get_type_hints(model)
+        found += [(name, f.name) for f in dataclasses.fields(model) if hints[f.name] in (int, float)]
+    return found
+
+
+@pytest.mark.parametrize(("name", "parameter"), numbers())
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300, "much", None, [1.0], True])
+def test_no_number_may_be_nonsense(name, parameter, value):
+    """Refused in one line that names the effect and the parameter."""
+    with pytest.raises(fx.EffectError, match=name) as error:
+        load(name, {parameter: value})
+    assert "\n" not in str(error.value) and parameter in str(error.value)
+
+
+def test_there_are_numbers_to_refuse():
+    assert len(numbers()) >= 25
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_camera_within_a_fog_of_a_thousand_suns():
+    """A veil, a coat and shadows where every ray starts inside a shape and where nothing is hit at all."""
+    made = fx.load_effects(
+        {"fog": {"visibility_m": 0.05}, "specular": {"roughness": 0.02}, "shadows": {}},
+        lambda _: np.random.default_rng(0),
+    )
+    scene = made.extend(make_scene("tile", {"width": 12, "height": 12, "supersample": 1}))
+    inside = np.eye(4)
+    inside[:3, 3] = 0.0, 0.0, 0.03
+    for pose in (inside, np.diag([1.0, -1.0, -1.0, 1.0])):
+        assert scene.view(scene.cameras["cam00"][0], pose).image(0.0).shape == (12, 12, 3)
