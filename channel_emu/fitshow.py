@@ -113,8 +113,7 @@ def _draw_states(fit: Fit, figure: Any, axes: Any, start_s: np.ndarray, delay_ms
             mean = fit.parameters[f"mean_{i}_ms"].value
             top.axhline(mean, color=colour, lw=0.8, label=f"{name}: mean {mean:.3g} ms")
     for line, states in zip(fit.lines, fit.estimate.expectation.states):
-        # A timeline keeps spans; these are its events' instants.
-        at_s = (line.origin_ms + np.cumsum(line.span_ms)) / 1e3
+        at_s = line.at_ms() / 1e3
         bottom.plot(at_s[at_s <= start_s[-1]], states[at_s <= start_s[-1], 1], lw=0.8, color=_COLOURS[1])
         if len(fit.lines) == 1:
             second = states[np.minimum(np.searchsorted(at_s, start_s), len(at_s) - 1), 1]

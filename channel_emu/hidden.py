@@ -51,6 +51,10 @@ class Timeline:
     state: NDArray[np.int64]
     origin_ms: float = 0.0
 
+    def at_ms(self) -> Array:
+        """Instants of the events."""
+        return self.origin_ms + np.cumsum(self.span_ms)
+
     def head(self, events: int) -> Timeline:
         return Timeline(self.span_ms[:events], self.waiting[:events], self.arrived[:events],
                         self.delay_ms[:events], self.state[:events], self.origin_ms)  # fmt: skip
@@ -236,7 +240,8 @@ def _improve(model: TwoStates, lines: Sequence[Timeline], found: Expectation) ->
     return TwoStates(np.maximum(leave, 1e-15), mean, rate)
 
 
-def _climb(model: TwoStates, lines: Sequence[Timeline], steps: int) -> tuple[TwoStates, float]:
+def climb(model: TwoStates, lines: Sequence[Timeline], steps: int) -> tuple[TwoStates, float]:
+    """At most so many steps of EM: the model, and a log likelihood it has reached."""
     before = -math.inf
     for _ in range(steps):
         found = expect(model, lines)
@@ -265,16 +270,18 @@ def starts(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> list[TwoS
     return out
 
 
-def fit(lines: Sequence[Timeline], delays: bool, arrivals: bool) -> Estimate:
+def fit(lines: Sequence[Timeline], delays: bool, arrivals: bool, begin: TwoStates | None = None) -> Estimate:
     """Most likely two states. delays, arrivals: what the states may differ in; at least one of them.
 
-    Deterministic: several starts on the first part of the data, EM from the best of them, then Newton.
+    Deterministic: several starts on the first part of the data, EM from the best of them (from ``begin``
+    where it is given), then Newton.
     """
-    first = [line.head(_START_EVENTS) for line in lines]
-    climbed = [_climb(model, first, _START_STEPS) for model in starts(lines, delays, arrivals)]
-    model, _ = _climb(max(climbed, key=lambda pair: pair[1])[0], lines, _EM_STEPS)
-    model = model.ordered()
-    model, best, log_sd = _newton(model, lines)
+    if begin is None:
+        first = [line.head(_START_EVENTS) for line in lines]
+        climbed = [climb(model, first, _START_STEPS) for model in starts(lines, delays, arrivals)]
+        begin = max(climbed, key=lambda pair: pair[1])[0]
+    model, _ = climb(begin, lines, _EM_STEPS)
+    model, best, log_sd = _newton(model.ordered(), lines)
     return Estimate(model, best, log_sd, expect(model, lines))
 
 

@@ -13,8 +13,8 @@ separated by commas, semicolons or tabs; lines that start with # and a first lin
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +55,10 @@ class Camera:
     delay_ms: NDArray[np.float64]
     outcome: NDArray[np.str_]
     state: NDArray[np.int64]
+    since_ms: NDArray[np.float64] | None = None
+    window_ms: NDArray[np.float64] | None = None
+    """Where arrivals sample frames: a frame was taken up within ``window_ms`` from ``since_ms`` on, if no
+    more is known (``arrived_ms`` is a guess); NaN elsewhere."""
 
     def came(self) -> NDArray[np.bool_]:
         return self.outcome == Kind.DELIVERED
@@ -114,8 +118,8 @@ def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Reco
         offered = _ms([r.offered_ns for r in records], first_ns)
         outcome = np.array([r.outcome or "" for r in records])
         state = np.array([r.state if use_states and r.started_ns is not None else -1 for r in records])
-        arrived = _arrivals(offered, started, outcome, records, first_ns) if sampled else offered
-        cameras.append(Camera(name, offered, arrived, started, delay, outcome, state))
+        camera = Camera(name, offered, offered, started, delay, outcome, state)
+        cameras.append(_sampled(camera, records, first_ns, found.config.discipline) if sampled else camera)
     return Recording(path, cameras, found.config.discipline, names if use_states else [], sampled, endless)
 
 
@@ -123,29 +127,64 @@ def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
     return np.array([math.nan if v is None else (v - first_ns) / 1e6 for v in instants], float)
 
 
-def _arrivals(
-    offered: NDArray[np.float64],
-    started: NDArray[np.float64],
-    outcome: NDArray[np.str_],
-    records: list[trace.Record],
-    first_ns: int,
-) -> NDArray[np.float64]:
-    """When a sampling process took each frame up. A frame that found the link idle started, one that was
-    dropped ended, at that instant. One that waited did so some time between its offer and the next: the
-    middle is taken."""
+def _sampled(camera: Camera, records: list[trace.Record], first_ns: int, discipline: str) -> Camera:
+    """The camera with what its frames' fates tell of when a sampling process took each up.
+
+    A frame that found the link idle started, one that was dropped ended, in that instant. One that waited was
+    taken up between its offer and the next one or its start. Where the newest frame waits there is more: the
+    one whose place it took was superseded in that instant; and if another still began to be served meanwhile,
+    it had not been taken up before.
+    """
+    offered, started, outcome = camera.offered_ms, camera.started_ms, camera.outcome
     ended = _ms([r.ended_ns for r in records], first_ns)
     following = np.append(offered[1:], math.nan)
     latest = np.fmin(following, np.where(np.isnan(started), ended, started))
-    arrived = np.where(np.isnan(latest), offered, (offered + latest) / 2)
-    at_once = (started < following) & ~_busy_until(started, records, first_ns)
-    arrived = np.where(at_once, started, arrived)
-    arrived = np.where(outcome == Kind.DROPPED_BUSY, ended, arrived)
-    return np.where((outcome == Kind.SKIPPED) | (outcome == ""), math.nan, arrived)
+    exact = np.where((started < following) & ~_waited(started, records), started, math.nan)
+    exact = np.where(outcome == Kind.DROPPED_BUSY, ended, exact)
+    since = offered.copy()
+    if discipline == "newest-waits":
+        pushed = np.sort(ended[outcome == Kind.SUPERSEDED])
+        place = np.searchsorted(pushed, offered, side="right")
+        after = np.append(pushed, math.inf)[place]
+        exact = np.where(np.isnan(exact) & (after <= latest), after, exact)
+        begun = np.sort(started[~np.isnan(started)])
+        # The last to begin before the window's end; a frame's own start is that end or lies beyond it.
+        before = np.append(-math.inf, begun)[np.searchsorted(begun, latest, side="left")]
+        since = np.where(before > offered, before, offered)
+    never = (outcome == Kind.SKIPPED) | (outcome == "")
+    window = np.where(never | ~np.isnan(exact) | np.isnan(latest), math.nan, latest - since)
+    guess = np.where(np.isnan(window), offered, since + window / 2)
+    arrived = np.where(never, math.nan, np.where(np.isnan(exact), guess, exact))
+    return replace(camera, arrived_ms=arrived, since_ms=since, window_ms=window)
 
 
-def _busy_until(
-    started: NDArray[np.float64], records: list[trace.Record], first_ns: int
-) -> NDArray[np.bool_]:
+def refined(
+    recording: Recording, rates: float | Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+) -> Recording:
+    """The recording with better guesses of arrivals that are known to a window only: the mean of an
+    exponential of the rate in force, given that it ended within the window.
+
+    rates: in 1/ms, one for all, or (place of the camera, instants in ms) to one for each instant.
+    """
+    cameras = []
+    for place, camera in enumerate(recording.cameras):
+        if (
+            camera.window_ms is not None
+            and camera.since_ms is not None
+            and (vague := camera.window_ms > 0).any()
+        ):
+            window, arrived = camera.window_ms[vague], camera.arrived_ms.copy()
+            rate = rates(place, arrived[vague]) if callable(rates) else rates
+            load = np.maximum(rate * window, 1e-6)
+            # 1/x - 1/(e^x - 1): 1/2 for a window that is short against the gaps between arrivals.
+            share = np.where(load < 1e-3, 0.5 - load / 12, 1 / load - 1 / np.expm1(np.minimum(load, 700.0)))
+            arrived[vague] = camera.since_ms[vague] + share * window
+            camera = replace(camera, arrived_ms=arrived)
+        cameras.append(camera)
+    return replace(recording, cameras=cameras)
+
+
+def _waited(started: NDArray[np.float64], records: list[trace.Record]) -> NDArray[np.bool_]:
     """Frames that started in the instant in which another ended: they had been waiting for it (where the
     other was not itself pushed out by them)."""
     ends = {r.ended_ns for r in records if r.started_ns is not None and r.outcome != Kind.SUPERSEDED}

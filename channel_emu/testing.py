@@ -1,6 +1,7 @@
 """A bad network for your own tests: the pytest fixture ``channel``.
 
-In the ``conftest.py`` at the root of your tests::
+It needs pytest and nothing else (``pip install freshfield[test]``). In the ``conftest.py`` at the root of
+your tests::
 
     pytest_plugins = ["channel_emu.testing"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import json
 import math
@@ -19,7 +20,9 @@ from channel_emu.fit import Fit, Value, fit
 from channel_emu.hidden import Timeline, TwoStates
 from channel_emu.kernels import hidden as kernel
 from freshfield import scenario
+from tests.channel_emu.live import rig
 from tests.channel_emu.recordings import write_rows, write_trace
+from tests.channel_emu.test_proxy import FAST
 
 # A slow Gilbert-Elliott channel: periodic frames, delays of 20 and 120 ms.
 GILBERT = {
@@ -79,6 +82,38 @@ def test_recovers_rates_from_frames_that_arrivals_sampled(tmp_path: Path) -> Non
     found = fit(path)
     assert found.recording.sampled
     check(found, SLOW_TRUE)
+
+
+def test_frames_that_waited_to_be_served_do_not_bias_the_rate(tmp_path: Path) -> None:
+    """A frame that found the link busy was taken up some time after its offer: on a link that is busy most of
+    the time, with arrivals as frequent as offers, the middle of what is possible makes the rate 5 % low."""
+    section = {"preset": "ch6-high", "service": {"mean_ms": 150.0}}
+    path = write_trace(tmp_path / "t.jsonl", section, 4, cameras=6, seconds=200, frame_period_ms=90.0)
+    recording, found = observed.read(path), fit(path, "1").parameters["rate_per_ms"]
+    assert found.interval is not None and found.interval[1] / found.interval[0] < 1.05
+    assert holds(found, 1 / 60)
+    (line,) = observed.timelines(recording, True, True)
+    assert not holds(found, line.arrived.sum() / (line.span_ms @ line.waiting))
+
+
+def test_a_guess_within_a_window_is_the_mean_of_a_cut_off_exponential(tmp_path: Path) -> None:
+    path = write_trace(tmp_path / "t.jsonl", {"preset": "ch6-high"}, 1, cameras=1, seconds=30,
+                       frame_period_ms=90.0)  # fmt: skip
+    recording = observed.read(path)
+    (before,) = recording.cameras
+    assert before.window_ms is not None and before.since_ms is not None
+    vague = before.window_ms > 0
+    assert 20 < vague.sum() < (~np.isnan(before.arrived_ms)).sum()
+    for rate in (1e-9, 1 / 60, 10.0):
+        (after,) = observed.refined(recording, rate).cameras
+        known = ~np.isnan(before.arrived_ms) & ~vague
+        assert (after.arrived_ms[known] == before.arrived_ms[known]).all()
+        for since, window, arrived in zip(
+            before.since_ms[vague], before.window_ms[vague], after.arrived_ms[vague]
+        ):
+            at = (np.arange(20_000) + 0.5) / 20_000 * window
+            weight = np.exp(-rate * at)
+            assert arrived - since == pytest.approx((at * weight).sum() / weight.sum(), rel=2e-3)
 
 
 def test_cameras_with_chains_of_their_own(tmp_path: Path) -> None:
@@ -356,3 +391,40 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
             for value in (*found.parameters.values(), *found.bursts.values()):
                 assert all(math.isfinite(v) for v in (value.value, *(value.interval or ())))
                 assert value.interval is None or value.interval[0] <= value.value <= value.interval[1]
+
+
+def test_faults_leave_the_estimates_alone(tmp_path: Path) -> None:
+    """Frames lost, doubled, damaged and cut off by resets, on a link whose arrivals sample frames."""
+    chance = {"probability": 0.1}
+    faults = {
+        "loss": chance,
+        "duplication": chance,
+        "corruption": chance,
+        "reset": {"mean_interval_ms": 4000.0},
+    }
+    section = {"preset": "ch6-slow", "faults": faults}
+    found = fit(write_trace(tmp_path / "t.jsonl", section, 6, cameras=2, seconds=120, frame_period_ms=33.3))
+    check(found, SLOW_TRUE)
+    lost = found.bursts["lost_share"]
+    assert lost.interval is not None and lost.interval[1] > 0.1  # resets cost frames beside those lost
+    assert 0.1 < found.channel["faults"]["loss"]["probability"] < 0.16
+
+
+@pytest.mark.slow
+def test_a_live_recording_is_fitted_to_the_channel_that_made_it(tmp_path: Path) -> None:
+    """Some seconds on the wall clock: cameras, emulator and the edge's ingest; only the trace is known."""
+    section = {**FAST, "chain": {"mu1_per_ms": 1 / 400, "mu2_per_ms": 1 / 400}}
+
+    async def live() -> None:
+        async with rig(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
+            await asyncio.gather(*(c.stream(2000, 0.005) for c in r.cameras.values()))
+            await r.settled()
+
+    asyncio.run(live())
+    found = fit(tmp_path / "t.jsonl")
+    assert found.states == 2 and found.recording.sampled
+    true = {"mu1_per_ms": 1 / 400, "mu2_per_ms": 1 / 400, "mean_1_ms": 5.0, "mean_2_ms": 10.0,
+            "rate_1_per_ms": 1 / 20, "rate_2_per_ms": 1 / 5}  # fmt: skip
+    for name, value in true.items():
+        # Offers fall as the machine lets them, so this is no fixed sample: four standard deviations.
+        assert holds(found.parameters[name], value, 2.0), (name, found.parameters[name])

@@ -259,11 +259,13 @@ def test_a_trace_is_replayed_with_the_same_decisions(channel, greeter, client, t
 
 
 def test_one_link_may_carry_all_methods(channel, greeter, client) -> None:
-    link = channel(WAIT, to=greeter.address, shared=True)
+    section = {"service": {"law": "deterministic", "mean_ms": 700.0}}
+    link = channel(section, to=greeter.address, shared=True)
     stub = client(link)
-    slow = stub.unary_unary(HELLO).future(b"you", timeout=5)
-    time.sleep(0.01)
-    assert _code(lambda: stub.unary_unary(FAIL)(b"", timeout=5)) == "UNAVAILABLE"  # the link is busy
+    slow = stub.unary_unary(HELLO).future(b"you", timeout=20)
+    while not link.report().offered:
+        time.sleep(0.005)
+    assert _code(lambda: stub.unary_unary(FAIL)(b"", timeout=20)) == "UNAVAILABLE"  # the link is busy
     assert slow.result().startswith(b"hello")
     assert set(link.report().by_method) == {"up"}
 
