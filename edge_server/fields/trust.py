@@ -66,7 +66,7 @@ def weights(
     with a whole view than through what moved in it, and are weighed by age alone.
     """
     tau_ms, stale_ms = settings.age_tau_ms, settings.mask_stale_ms
-    if tau_ms <= 0.0 and stale_ms <= 0.0 and all(view.weight is None for view in views):
+    if not views or (tau_ms <= 0.0 and stale_ms <= 0.0 and all(view.weight is None for view in views)):
         return None
     newest_ns = max(view.shows_ns for view in views)
     result, whole = [], True

@@ -112,4 +112,5 @@ def carry(
 
 def _added(at: NDArray[np.int64], values: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
     """The values (N,) added up at pixel numbers (N,): float64 (H, W)."""
-    return np.bincount(at, values, shape[0] * shape[1]).reshape(shape).astype(np.float64)
+    sums: NDArray[np.float64] = np.asarray(np.bincount(at, values, shape[0] * shape[1]), np.float64)
+    return sums.reshape(shape)

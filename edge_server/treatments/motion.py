@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.treatments.changes import Changes, blurred, difference, dilated
 
-_ENLARGE_TO = 512  # pixels a side that a crop is enlarged to, as long as that is no more than _ENLARGE times
-_ENLARGE = 4.0  # DIS matches 8 x 8 patches: on small pictures these span whole limbs
+_ENLARGE_TO = 384  # pixels a side that a crop is enlarged to, as long as that is no more than _ENLARGE times
+_ENLARGE = 3.0  # DIS matches 8 x 8 patches: on small pictures these span whole limbs
 _MARGIN_PX = 12  # around what changed: where the motion came from
 _SPREAD_PX = 2.0  # over which neighbours agree on their motion
 _DOUBTED = 1e-3  # share of a flow that is not believed, for where there is no other
@@ -82,8 +82,8 @@ def _flows(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[NDArray[np.float
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        pairs = ((gray[1], gray[0]), (gray[0], gray[1]))
-        flows = [search.calc(x, y, None) for x, y in pairs]  # type: ignore[call-overload]
+        room = np.zeros((*gray[0].shape, 2), np.float32)  # no first guess
+        flows = [search.calc(x, y, room.copy()) for x, y in ((gray[1], gray[0]), (gray[0], gray[1]))]
     finally:
         cv2.setNumThreads(threads)
     unit = np.array([w / size[0], h / size[1]], np.float32)
