@@ -98,7 +98,7 @@ class Omega:
             claim = "has an optimum inside once freshness counts (6.5.2)."
             answer = best.interior(LEAST_F_W)
         else:
-            claim = f"rises to a plateau and stays there ({STATES[state][2]:g} ms, 6.5.2)."
+            claim = f"waiting longer never makes it worse (a plateau from {STATES[state][2]:g} ms on, 6.5.2)."
             # Not seen to fall is not enough: what it loses by the end must be known to be small.
             answer = negated(loss.above(_NEAR[metric]))
         better = over.above(0.0) if not lower else negated(over.above(0.0))

@@ -167,11 +167,13 @@ def test_phase_says_what_can_be_won_and_by_whom(tmp_path: Path):
 
     study = make_study("phase")
     found = run_study(study, ask(tmp_path, seeds=4, scenes=("room",)), invented(tmp_path, rule))
-    assert {v.verdict for v in found} == {"holds"}
-    assert "75 %" in found[0].found and "no delay is 2.00" in found[0].found
-    gains["threshold"] = -1.0
+    trade, mask, freshen = (found[i::3] for i in range(3))
+    assert {v.verdict for v in (*trade, *freshen, *mask)} == {"holds"}
+    assert "75 % [7" in freshen[0].found and "no delay is 2.00" in trade[0].found
+    gains |= {"threshold": -1.0, "mask": -1.5, "freshen": 2.1}
     found = run_study(study, ask(tmp_path, seeds=4, scenes=("room",)), invented(tmp_path, rule))
-    assert {v.verdict for v in found} == {"does not hold"}
+    trade, mask, freshen = ({v.verdict for v in found[i::3]} for i in range(3))
+    assert (trade, mask, freshen) == ({"does not hold"}, {"does not hold"}, {"holds"})
     assert (tmp_path / "phase-room.png").exists()
 
 
