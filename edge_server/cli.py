@@ -48,6 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ScenarioError, TransportError) as error:
         print(f"edge-server: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # a folder or file that cannot be made, read or written
+        print(f"edge-server: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
 

@@ -21,18 +21,21 @@ class PolicyConfig:
 @dataclass(frozen=True)
 class ComputeConfig:
     """What virtual time charges an update; live time charges what it takes. The default is nothing, as the
-    thesis has it; ``edge-server frontier`` measures what a machine takes."""
+    thesis has it; ``edge-server frontier`` measures what a machine takes. ms_per_treated_view: of policies
+    that mask or freshen views."""
 
     ms_per_step: float = 0.0
     ms_per_update: float = 0.0
+    ms_per_treated_view: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.ms_per_step < 1e9 and 0.0 <= self.ms_per_update < 1e9):
+        if not all(0.0 <= ms < 1e9 for ms in dataclasses.astuple(self)):
             raise ValueError("compute: milliseconds must be finite and not negative")
 
-    def charge_ns(self, steps: int) -> int:
-        """Nanoseconds that an update of ``steps`` optimiser steps takes."""
-        return round((self.ms_per_update + self.ms_per_step * steps) * 1e6)
+    def charge_ns(self, steps: int, treated: int = 0) -> int:
+        """Nanoseconds that an update of ``steps`` optimiser steps takes, ``treated`` views treated before."""
+        views_ms = self.ms_per_treated_view * treated
+        return round((self.ms_per_update + self.ms_per_step * steps + views_ms) * 1e6)
 
 
 @dataclass(frozen=True)

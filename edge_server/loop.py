@@ -100,14 +100,17 @@ class Updates:
         before = tuple(earlier[c] for c in cameras if c in earlier)
         return Selection(plan, now_ns, tuple(newest[c] for c in cameras), before)
 
-    def fit(self, selection: Selection, budget: Budget) -> tuple[list[View], FitReport] | None:
+    def fit(
+        self, selection: Selection, budget: Budget, publishes_ns: int | None = None
+    ) -> tuple[list[View], FitReport] | None:
         """Decode, treat where the policy says so, and train; None if nothing of the selection could be
-        decoded. The views returned are as they were delivered."""
+        decoded. The views returned are as they were delivered. publishes_ns: when the update is expected to
+        be published, the present that stale views are treated for; None: when they were selected."""
         earlier = self.decoder.earlier(selection.earlier)
         views = self.decoder.views(selection.items)
         if not views:
             return None
-        return views, self.field.fit(self._treated(views, earlier, selection.now_ns), budget)
+        return views, self.field.fit(self._treated(views, earlier, publishes_ns or selection.now_ns), budget)
 
     def _treated(self, views: list[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
         treatment = treatment_of(self.policy)
@@ -170,6 +173,7 @@ class Loop:
         self._lock = threading.Lock()
         self._next_policy: Policy | None = None
         self._reset = False
+        self._update_ms = 0.0
         self.paused = False
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
@@ -245,13 +249,16 @@ class Loop:
             return
         self._on_status(f"fitting {len(selection.items)} views")
         budget = self._pacing.budget()
-        fitted = self._updates.fit(selection, budget)
+        # An update takes about as long as the last one: its present lies that far ahead.
+        publishes_ns = self._clock.now_ns() + round(self._update_ms * 1e6)
+        fitted = self._updates.fit(selection, budget, publishes_ns)
         if fitted is None:
             self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come
             return
         views, report = fitted
         renderer = self._updates.field.snapshot(present_ns=self._clock.now_ns())
         publication = self._updates.publication(selection, views, report, self._clock.now_ns())
+        self._update_ms = publication.update_ms
         self._pacing.done(budget, publication.update_ms)
         self._on_published(publication, renderer, views)
 

@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         scenario = _scenario(args)
         config = read_config(scenario)
         terms = Terms(
-            steps=args.steps or config.steps,
+            steps=config.steps if args.steps is None else args.steps,
             first_steps=args.first_steps,
             compute=config.compute,
             epoch_ms=args.epoch_ms,
@@ -95,6 +95,7 @@ def summary(
         "last_fifth": {name: _mean([getattr(p, name) for p in late]) for name in _METRICS},
         "views": _mean([float(len(p.selected)) for p in publications]),
         "update_ms": _mean([p.update_ms for p in publications]),
+        "treated_ms_per_view": deployment.updates.treatment_cost.ms_per_view,
         "digest": digest(deployment),
         "versions": versions(),
     }
@@ -161,6 +162,8 @@ def _scenario(args: argparse.Namespace) -> Scenario:
             raise ScenarioError(f"--policy {args.policy}: {value!r} is not a number") from None
     if args.compute:
         edge["compute"] = dataclasses.asdict(_compute(args.compute))
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
     if not 0.0 < args.seconds <= 1e6:
         raise ScenarioError(f"--seconds: expected more than 0 and at most 1e6, got {args.seconds:g}")
     return dataclasses.replace(scenario, edge=edge)

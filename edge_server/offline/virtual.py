@@ -27,6 +27,7 @@ from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget
 from edge_server.ingest import Gate
 from edge_server.loop import Selection, Updates
+from edge_server.scheduler import treatment_of
 from edge_server.state import Publication
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame, FrameRejected, from_request, to_request
@@ -81,6 +82,11 @@ class Terms:
     scratch: bool = False
 
     def __post_init__(self) -> None:
+        if self.steps < 1 or self.first_steps < 0:
+            raise ValueError("steps: expected at least 1, of the first update at least 0")
+        waits = (self.epoch_ms, self.grace_ms, self.score_every_ms or 0.0)
+        if not all(0.0 <= ms < 1e12 for ms in waits):
+            raise ValueError("epoch_ms, grace_ms and score_every_ms: expected finite numbers of at least 0")
         if self.first_ms is not None and not (self.first_ms >= 0.0 and self.epoch_ms > 0.0):
             raise ValueError("first_ms: expected zero or more, and an epoch_ms of decisions")
 
@@ -253,15 +259,11 @@ class VirtualDeployment:
     def _run_edge(self) -> Iterator[Wake]:
         """The edge's loop, which says after each step when it wants to go on."""
         updates, terms = self.updates, self.terms
-        yield from self._await_cameras()
         steps = terms.first_steps or terms.steps
-        if terms.first_ms is not None:
-            now_ns = self.clock.now_ns()
-            first_ns = self._origin_ns + round(terms.first_ms * 1e6)
-            if now_ns <= first_ns:
-                yield Wake(first_ns)
-            else:
-                yield Wake(terms.next_ns(now_ns, now_ns, self._origin_ns))
+        if terms.first_ms is None:
+            yield from self._await_cameras()
+        else:  # whoever has reported by then: the instants are given
+            yield Wake(self._origin_ns + round(terms.first_ms * 1e6))
         while True:
             decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
@@ -272,13 +274,15 @@ class VirtualDeployment:
                 yield Wake(plan.wait_until_ns) if waits else _AT_ARRIVAL
             if terms.scratch:
                 updates.field.reset()
-            fitted = updates.fit(self._exposed_all(selection), Budget(steps=steps))
+            treated = len(selection.items) if treatment_of(updates.policy) is not None else 0
+            publishes_ns = self.clock.now_ns() + terms.compute.charge_ns(steps, treated)
+            fitted = updates.fit(self._exposed_all(selection), Budget(steps=steps), publishes_ns)
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
                 continue
             views, report = fitted
             steps = terms.steps
-            yield Wake(self.clock.now_ns() + terms.compute.charge_ns(report.steps))
+            yield Wake(self.clock.now_ns() + terms.compute.charge_ns(report.steps, treated))
             published_ns = self.clock.now_ns()
             self._publish(updates.publication(selection, views, report, published_ns))
             next_ns = terms.next_ns(decided_ns, published_ns, self._origin_ns)

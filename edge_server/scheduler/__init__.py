@@ -101,9 +101,10 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
     Raises ValueError for an unknown name or a value out of range, saying what is possible.
     """
     chooses, treats = _parts(name)
-    if chooses not in POLICIES:
+    if chooses not in POLICIES or name.endswith("+"):
+        wrong = name if chooses in POLICIES else chooses
         raise ValueError(
-            f"policy {chooses!r} is not known; choose one of {', '.join((*POLICIES, *TREATMENTS))}, "
+            f"policy {wrong!r} is not known; choose one of {', '.join((*POLICIES, *TREATMENTS))}, "
             "or join a policy and a treatment, as in threshold+freshen"
         )
     module, cls, _ = POLICIES[chooses]

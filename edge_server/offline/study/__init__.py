@@ -1,4 +1,4 @@
-"""Studies: the thesis's figures and a few it does not have, as commands with verdicts (spec rows 9.1, 9.2).
+"""Studies: the thesis's figures and a few it does not have, as commands with verdicts.
 
 A study names its points (``base.Study``), each a ``trial.Trial``; ``engine`` runs what is not known yet;
 ``statistics`` says what the seeds tell. Adding a study is one file with a class and a line in

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from edge_server.offline.study.engine import Engine
-from edge_server.offline.study.statistics import Interval, interval
+from edge_server.offline.study.engine import Engine, StudyError
+from edge_server.offline.study.statistics import Interval, interval, paired
 from edge_server.offline.study.trial import Folders, Row, Trial
 from freshfield.files import write_text
 
@@ -24,8 +24,9 @@ METRICS: dict[str, tuple[str, bool, int]] = {
     "aaoi_ms": ("mean age of used views (ms)", True, 1),
     "f_w": ("F_w (6.37)", True, 3),
 }
-# Differences in PSNR below this are not worth a claim.
+# Differences in PSNR below this are not worth a claim; nor are these of the other metrics.
 LEAST_DB = 0.1
+LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips": 0.002, "f_w": 0.01}
 
 Curve = dict[float, dict[int, float | None]]
 
@@ -144,13 +145,29 @@ def objective(
     """F_w of (6.36) and (6.37), smaller is better; ages in slots of 1 ms. None where a metric is missing.
 
     The weights are the thesis's (6.5): its w_s = +0.2 counts a better SSIM as worse; -0.2 is what the text
-    means. See ``OBJECTIVES``.
+    means.
     """
     needed = (row.get("psnr_db"), row.get("ssim"), row.get("lpips"), row.get("aaoi_ms"))
     if any(v is None for v in needed):
         return None
     psnr, ssim, lpips, age = (float(v) for v in needed)  # type: ignore[arg-type]
     return w_p * psnr + w_s * ssim + w_l * lpips + w_t * age
+
+
+def to_win(table: Table, metric: str, **labels: Any) -> str:
+    """How much better no delay at all is than using everything, in words: what any scheduler could win."""
+    kept = {k: v for k, v in labels.items() if k in ("scene", "field")}
+    use_all = table.values(metric, policy="all", **labels)
+    limit = table.values(metric, policy="no delay", **kept)
+    _, lower, digits = METRICS[metric]
+    gap = paired(use_all, limit) if lower else paired(limit, use_all)
+    if metric == "aaoi_ms":
+        return f"with no delay it is {tell(interval(list(limit.values())).mean, digits)}"
+    nothing = " (nothing to win)" if gap.above(LEAST[metric]) is False else ""
+    return (
+        f"no delay at all is {tell(gap.mean, digits)} [{tell(gap.low, digits)}, {tell(gap.high, digits)}] "
+        f"better than use-all{nothing}"
+    )
 
 
 def mean_curve(curve: Curve) -> tuple[list[float], list[Interval]]:
@@ -177,4 +194,6 @@ def with_data(ask: Ask, scenes: Sequence[str], needs: Callable[[str], str | None
             found.append(scene)
         else:
             print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
+    if not found:
+        raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
     return found

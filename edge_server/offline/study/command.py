@@ -84,6 +84,7 @@ def make_study(name: str) -> Any:
 
 def _run(name: str, ask: Ask, engine: Engine) -> list[Verdict]:
     study, began = make_study(name), time.monotonic()
+    ask.out.mkdir(parents=True, exist_ok=True)
     print(f"== {name}: {study.title}", flush=True)
     verdicts = run_study(study, ask, engine)
     for verdict in verdicts:

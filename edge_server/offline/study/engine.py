@@ -29,6 +29,7 @@ import edge_server
 import freshfield
 from edge_server.fields.kernels.pool import THREADS_VARIABLE
 from edge_server.offline.study.trial import Folders, Row, Trial, run_trial
+from edge_server.report.machine import versions
 from freshfield.files import write_json
 
 # Trials of one task: enough to share pictures, few enough that little is lost by Ctrl-C.
@@ -160,12 +161,14 @@ class Engine:
 
 def content_key(trial: Trial, folders: Folders) -> str:
     """What a result is kept under: the trial, the source that computes it, the data it reads."""
-    scene = trial.scenario().source
+    scenario = trial.scenario()
     parts = {
         "trial": trial.mapping(),
+        "scenario": [scenario.source, scenario.channel, scenario.edge, scenario.cameras, scenario.held_out],
         "source": source_digest(),
-        "data": _data_digest(folders.data, scene.get("data")),
-        "lpips": bool(trial.lpips and folders.lpips),
+        "versions": _versions(),
+        "data": _data_digest(folders.data, scenario.source.get("data")),
+        "lpips": _weights_digest(folders.lpips) if trial.lpips else None,
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:40]
 
@@ -197,6 +200,19 @@ def _data_digest(folder: Path | None, name: str | None) -> str | None:
             digest.update(f"{file.relative_to(home)} {size}".encode())
             if file.suffix in (".json", ".txt") and size < 10_000_000:
                 digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+_versions = cache(versions)
+
+
+@cache
+def _weights_digest(folder: Path | None) -> str | None:
+    if folder is None or not folder.is_dir():
+        return None
+    digest = hashlib.sha256()
+    for file in sorted(folder.glob("*.npz")):
+        digest.update(file.name.encode() + file.read_bytes())
     return digest.hexdigest()[:16]
 
 

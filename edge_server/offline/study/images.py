@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 
-from edge_server.offline.study.base import METRICS, Ask, Point, Table, Verdict, by_bool, tell, with_data
+from edge_server.offline.study.base import (
+    METRICS,
+    Ask,
+    Point,
+    Table,
+    Verdict,
+    by_bool,
+    tell,
+    to_win,
+    with_data,
+)
 from edge_server.offline.study.drawing import draw_metrics
 from edge_server.offline.study.mat import RECORDED, trial_of
 from edge_server.offline.study.statistics import interval, negated, paired
@@ -29,7 +39,11 @@ class Images:
             field = SCENES[scene][0] if scene in SCENES and not ask.quick else "splat"
             for seed in ask.repeats(6, 40):
                 base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5"}, field=field)
-                for count in QUICK_COUNTS if ask.quick else COUNTS:
+                cameras = len(base.scenario().training)
+                found.append(Point({"scene": scene, "field": field, "policy": "all"}, base))
+                ideal = dataclasses.replace(base, channel={"preset": "ideal"})
+                found.append(Point({"scene": scene, "field": field, "policy": "no delay"}, ideal))
+                for count in [c for c in (QUICK_COUNTS if ask.quick else COUNTS) if c <= cameras]:
                     trial = dataclasses.replace(base, policy="freshest-k", value=float(count))
                     found.append(Point({"scene": scene, "field": field, "images": count}, trial))
         return found
@@ -62,7 +76,7 @@ class Images:
                         f"more images: {'higher' if rises else 'lower'} (thesis: {thesis}).",
                         f"from {xs[0]:g} to {xs[-1]:g} images {tell(first, digits)} to {tell(last, digits)}, "
                         f"change {tell(change.mean, digits)} [{tell(change.low, digits)}, "
-                        f"{tell(change.high, digits)}].",
+                        f"{tell(change.high, digits)}]; {to_win(table, metric, scene=scene)}.",
                         by_bool(change.above(0.0) if rises else negated(change.above(0.0))),
                     )
                 )

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from edge_server.offline.study.base import (
-    LEAST_DB,
+    LEAST,
     METRICS,
     Ask,
     Point,
@@ -14,10 +14,11 @@ from edge_server.offline.study.base import (
     Verdict,
     by_bool,
     tell,
+    to_win,
     with_data,
 )
 from edge_server.offline.study.drawing import Image, draw_metrics, draw_pictures
-from edge_server.offline.study.statistics import interval, optimum, paired
+from edge_server.offline.study.statistics import interval, optimum
 from edge_server.offline.study.trial import Trial, picture
 
 GAMMAS = (15.0, 21.0, 30.0, 45.0, 51.0, 60.0, 75.0, 90.0, 105.0, 120.0, 150.0, 200.0, 300.0, 400.0)
@@ -26,8 +27,6 @@ DISCIPLINES = ("drop-new", "parallel")
 PICTURED = (21.0, 51.0, 120.0)
 CLAIM = "fidelity first rises and then falls as the maximum age grows (5.6; best at 51 ms there)."
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
-# What a difference must exceed to be worth a word, by metric.
-LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips": 0.002}
 # Where a recorded scene lies below the data folder, and how much smaller its pictures are in a quick pass.
 RECORDED = {
     "kitchen": "blender_kitchen/transforms.json",
@@ -84,7 +83,6 @@ class Mat:
     def _judge(self, table: Table, scene: str, discipline: str) -> list[Verdict]:
         found = []
         labels = {"scene": scene, "discipline": discipline}
-        limit = {m: table.values(m, scene=scene, policy="no delay") for m in _METRICS}
         for metric in _METRICS:
             curve = table.curve("gamma_ms", metric, policy="threshold", **labels)
             if not curve:
@@ -94,9 +92,6 @@ class Mat:
             views = interval(
                 list(table.curve("gamma_ms", "views", policy="threshold", **labels)[best.x].values())
             )
-            use_all = table.values(metric, policy="all", **labels)
-            to_win = paired(use_all, limit[metric]) if lower else paired(limit[metric], use_all)
-            nothing = " (nothing to win)" if to_win.above(LEAST[metric]) is False else ""
             found.append(
                 Verdict(
                     f"{scene}, {discipline}, {name}",
@@ -104,8 +99,7 @@ class Mat:
                     f"best at {best.x:g} ms ({best.low:g} to {best.high:g}) with {views.mean:.1f} views; "
                     f"{tell(best.over_last.mean, digits)} [{tell(best.over_last.low, digits)}, "
                     f"{tell(best.over_last.high, digits)}] better than the largest threshold; "
-                    f"no delay at all is {tell(to_win.mean, digits)} [{tell(to_win.low, digits)}, "
-                    f"{tell(to_win.high, digits)}] better than use-all{nothing}.",
+                    f"{to_win(table, metric, **labels)}.",
                     by_bool(best.interior(LEAST[metric])),
                 )
             )

@@ -101,11 +101,10 @@ class Metrics:
         if missing:
             print(f"  LPIPS is left out: {missing}")
             return verdicts
-        order = [
-            interval(scores[c]["lpips"]) for c in ("brightness shift", "local ghosting", "Gaussian blur")
-        ]
-        rising = all(a.high < b.low for a, b in pairwise(order))
-        told = " < ".join(f"{i.mean:.3f}" for i in order) if rising else ", ".join(str(i) for i in order)
+        order = [scores[c]["lpips"] for c in ("brightness shift", "local ghosting", "Gaussian blur")]
+        steps = [paired(dict(enumerate(b)), dict(enumerate(a))).above(0.0) for a, b in pairwise(order)]
+        rising = False if False in steps else None if None in steps else True
+        told = ", ".join(f"{interval(values).mean:.3f}" for values in order)
         verdicts.append(
             Verdict(
                 "LPIPS",

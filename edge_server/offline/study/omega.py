@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 
-from edge_server.offline.study.base import METRICS, Ask, Point, Table, Verdict, by_bool, tell, with_data
+from edge_server.offline.study.base import (
+    LEAST,
+    METRICS,
+    Ask,
+    Point,
+    Table,
+    Verdict,
+    by_bool,
+    tell,
+    to_win,
+    with_data,
+)
 from edge_server.offline.study.drawing import Image, draw_metrics, draw_pictures
-from edge_server.offline.study.mat import LEAST, RECORDED, trial_of
-from edge_server.offline.study.statistics import Interval, interval, negated, optimum, paired
+from edge_server.offline.study.mat import RECORDED, trial_of
+from edge_server.offline.study.statistics import Interval, at_its_best, interval, negated, optimum, paired
 from edge_server.offline.study.trial import picture
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
@@ -17,7 +28,6 @@ STATES = {"high": ("ch6-high", 50.0, 62.0), "low": ("ch6-low", 72.0, 105.0)}
 POLICIES = ("threshold", "wait", "wait-flush")
 PICTURED = (30.0, 60.0, 120.0)
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "f_w")
-LEAST_F_W = 0.01
 # A curve has reached its plateau where it is this near to its end.
 _NEAR = {"psnr_db": 0.3, "psnr_moving_db": 0.3, "ssim": 0.01, "lpips": 0.01, "f_w": 0.05}
 
@@ -76,8 +86,9 @@ class Omega:
                 f"{scene}, {state} traffic, threshold, {name}",
                 f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1).",
                 f"best at {best.x:g} ms ({best.low:g} to {best.high:g}), {tell(loss.mean, digits)} "
-                f"[{tell(loss.low, digits)}, {tell(loss.high, digits)}] better than the largest omega.",
-                by_bool(best.interior(LEAST.get(metric, LEAST_F_W))),
+                f"[{tell(loss.low, digits)}, {tell(loss.high, digits)}] better than the largest omega; "
+                f"{to_win(table, metric, scene=scene, state=state)}.",
+                by_bool(best.interior(LEAST[metric])),
             )
         ]
 
@@ -96,9 +107,12 @@ class Omega:
         about = f"{scene}, {state} traffic, {policy}, {name}"
         if metric == "f_w":
             claim = "has an optimum inside once freshness counts (6.5.2)."
-            answer = best.interior(LEAST_F_W)
+            answer = best.interior(LEAST[metric])
         else:
-            claim = f"waiting longer never makes it worse (a plateau from {STATES[state][2]:g} ms on, 6.5.2)."
+            claim = (
+                f"waiting longer never makes it worse by more than {_NEAR[metric]:g} "
+                f"(a plateau from {STATES[state][2]:g} ms on, 6.5.2)."
+            )
             # Not seen to fall is not enough: what it loses by the end must be known to be small.
             answer = negated(loss.above(_NEAR[metric]))
         better = over.above(0.0) if not lower else negated(over.above(0.0))
@@ -142,11 +156,11 @@ class Omega:
 
 
 def _best_against(table: Table, metric: str, policy: str, labels: dict) -> Interval:
-    """Best of ``policy`` minus best of threshold, each at its own omega, paired by seed."""
-    bests = []
-    for name in (policy, "threshold"):
-        curve = table.curve("omega_ms", metric, policy=name, **labels)
-        if not curve:
-            return interval([])
-        bests.append(curve[optimum(curve, METRICS[metric][1]).x])
-    return paired(bests[0], bests[1])
+    """Best of ``policy`` minus best of threshold, paired by seed; each at the omega that is best for the
+    other seeds, so that neither is flattered by having been chosen."""
+    lower = METRICS[metric][1]
+    ours, theirs = (
+        at_its_best(table.curve("omega_ms", metric, policy=name, **labels), lower)
+        for name in (policy, "threshold")
+    )
+    return paired(ours, theirs)

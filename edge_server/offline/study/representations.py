@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from edge_server.offline.study.base import METRICS, Ask, Point, Table, Verdict, by_bool, tell
+from edge_server.offline.study.base import LEAST, METRICS, Ask, Point, Table, Verdict, by_bool, tell, to_win
 from edge_server.offline.study.drawing import draw_metrics
-from edge_server.offline.study.mat import LEAST, trial_of
+from edge_server.offline.study.mat import trial_of
 from edge_server.offline.study.statistics import optimum
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
@@ -29,10 +29,14 @@ class Representations:
                 for seed in ask.repeats(4, 20):
                     base = trial_of(ask, scene, seed=seed, channel={"preset": "ch6-high"}, every_ms=2400.0)
                     base = dataclasses.replace(base, field=field, steps=steps)
+                    ideal = dataclasses.replace(base, channel={"preset": "ideal"})
+                    labels = {"scene": scene, "field": field}
+                    found.append(Point({**labels, "policy": "all"}, base))
+                    found.append(Point({**labels, "policy": "no delay"}, ideal))
                     for policy in POLICIES:
                         for omega in QUICK_OMEGAS if ask.quick else OMEGAS:
-                            labels = {"scene": scene, "field": field, "policy": policy, "omega_ms": omega}
-                            found.append(Point(labels, dataclasses.replace(base, policy=policy, value=omega)))
+                            trial = dataclasses.replace(base, policy=policy, value=omega)
+                            found.append(Point({**labels, "policy": policy, "omega_ms": omega}, trial))
         return found
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
@@ -57,8 +61,11 @@ class Representations:
             curve = table.curve("omega_ms", metric, scene=scene, field=field, policy=policy)
             if curve:
                 best = optimum(curve, lower)
-                answers.append(best.interior(LEAST.get(metric, 0.01)))
-                told.append(f"{field} {tell(best.x, 0)} ms ({best.low:g} to {best.high:g})")
+                answers.append(best.interior(LEAST[metric]))
+                told.append(
+                    f"{field} {tell(best.x, 0)} ms ({best.low:g} to {best.high:g}; "
+                    f"{to_win(table, metric, scene=scene, field=field)})"
+                )
         if not told:
             return []
         same = all(answers) if None not in answers else False if False in answers else None

@@ -15,6 +15,8 @@ from scipy import stats
 
 _LEVEL = 0.95
 _RESAMPLES = 2000
+# Resampling fewer seeds than this tells nothing of how seeds differ: no interval is given.
+FEWEST = 5
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ def paired(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> Inte
 class Optimum:
     """Where a curve over ``xs`` is best, over seeds.
 
-    x: of the best mean. low, high: 95 % of resampled seeds have their best there. over_first, over_last: how
+    x: of the best mean. low, high: 95 % of resampled seeds have their best there (NaN for fewer than
+    ``FEWEST``). over_first, over_last: how
     much better the best is than the curve's two ends. They are measured on seeds that had no part in choosing
     the best (chosen on one half, measured on the other, and the other way round): a best point chosen and
     measured on the same seeds looks better than it is.
@@ -98,10 +101,10 @@ def optimum(curve: Mapping[float, Mapping[int, float | None]], lower_is_better: 
     table = np.array([[curve[x][s] for x in xs] for s in seeds], float)  # (seeds, xs)
     if lower_is_better:
         table = -table
-    rng = np.random.default_rng(5)
-    picks = rng.integers(0, len(seeds), (_RESAMPLES, len(seeds)))
-    bests = np.array(xs)[table[picks].mean(1).argmax(1)]
-    low, high = np.percentile(bests, [2.5, 97.5], method="nearest")
+    low, high = np.nan, np.nan
+    if len(seeds) >= FEWEST:
+        bests = np.array(xs)[table[_picks(len(seeds))].mean(1).argmax(1)]
+        low, high = np.percentile(bests, [2.5, 97.5], method="nearest")
     gains = _held_out_gains(table)
     return Optimum(
         float(xs[int(table.mean(0).argmax())]), float(low), float(high),
@@ -109,31 +112,72 @@ def optimum(curve: Mapping[float, Mapping[int, float | None]], lower_is_better: 
     )  # fmt: skip
 
 
+def _picks(count: int) -> NDArray[np.int64]:
+    """The same resamples for every figure of so many seeds: (R, count) indices."""
+    return np.random.default_rng(5).integers(0, count, (_RESAMPLES, count))
+
+
 def _held_out_gains(table: NDArray[np.float64]) -> NDArray[np.float64]:
     """Of each seed (S, 2): the best minus the first and minus the last, the best as the others chose."""
-    count = len(table)
-    if count < 2:
-        best = table.mean(0).argmax()
-        return np.stack([table[:, best] - table[:, 0], table[:, best] - table[:, -1]], 1)
-    gains = np.empty((count, 2))
-    halves = np.arange(count) % 2
+    chosen = _chosen(table)
+    return np.stack([chosen - table[:, 0], chosen - table[:, -1]], 1)
+
+
+def _chosen(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Each seed's value (S,) at the point that is best for the other half of the seeds."""
+    if len(table) < 2:
+        return table[:, table.mean(0).argmax()]
+    halves = np.arange(len(table)) % 2
+    found = np.empty(len(table))
     for half in (0, 1):
-        chosen = table[halves != half].mean(0).argmax()
-        mine = table[halves == half]
-        gains[halves == half, 0] = mine[:, chosen] - mine[:, 0]
-        gains[halves == half, 1] = mine[:, chosen] - mine[:, -1]
-    return gains
+        found[halves == half] = table[halves == half, table[halves != half].mean(0).argmax()]
+    return found
 
 
-def slope(xs: Sequence[float], tables: Mapping[float, Mapping[int, float]]) -> Interval:
-    """Slope of a straight line through x -> seed -> y, with its interval over seeds (one line a seed).
+def at_its_best(
+    curve: Mapping[float, Mapping[int, float | None]], lower_is_better: bool = False
+) -> dict[int, float]:
+    """seed -> the curve's value where it is best, chosen by seeds that it is not measured on."""
+    xs = sorted(curve)
+    common = set.intersection(*(set(curve[x]) for x in xs)) if xs else set()
+    seeds = sorted(s for s in common if all(curve[x][s] is not None for x in xs))
+    if not seeds:
+        return {}
+    sign = -1.0 if lower_is_better else 1.0
+    values = sign * _chosen(sign * np.array([[curve[x][s] for x in xs] for s in seeds], float))
+    return dict(zip(seeds, values.tolist()))
 
-    ValueError: fewer than two x.
-    """
-    if len(xs) < 2:
-        raise ValueError("a slope needs two points")
-    common = sorted(set.intersection(*(set(tables[x]) for x in xs)))
-    return interval([float(np.polyfit(xs, [tables[x][s] for x in xs], 1)[0]) for s in common])
+
+def move_of_optimum(
+    curves: Mapping[float, Mapping[float, Mapping[int, float | None]]], lower_is_better: bool = False
+) -> tuple[Interval, Interval]:
+    """How a curve's best x moves with a parameter: parameter -> x -> seed -> value. Returns the slope of best
+    x against the parameter, and best x at the last parameter minus that at the first; both by resampling
+    seeds, the same ones for every parameter. Ends are NaN for fewer than ``FEWEST`` seeds."""
+    sign = -1.0 if lower_is_better else 1.0
+    parameters, tables, grids = list(curves), [], []
+    common = set.intersection(*(set(v) for curve in curves.values() for v in curve.values()))
+    seeds = sorted(s for s in common if all(v[s] is not None for c in curves.values() for v in c.values()))
+    for curve in curves.values():
+        xs = sorted(curve)
+        grids.append(np.array(xs))
+        tables.append(sign * np.array([[curve[x][s] for x in xs] for s in seeds], float))
+
+    def told(picks: NDArray[np.int64]) -> tuple[float, float]:
+        best = [grid[table[picks].mean(0).argmax()] for grid, table in zip(grids, tables)]
+        # A level line has a slope of 1e-16 or so, of either sign.
+        line = round(float(np.polyfit(parameters, best, 1)[0]), 9) if len(parameters) > 1 else np.nan
+        return line, float(best[-1] - best[0])
+
+    if not seeds:
+        nothing = Interval(np.nan, np.nan, np.nan, 0)
+        return nothing, nothing
+    means = told(np.arange(len(seeds)))
+    lows = highs = np.full(2, np.nan)
+    if len(seeds) >= FEWEST:
+        lows, highs = np.percentile([told(p) for p in _picks(len(seeds))], [2.5, 97.5], axis=0)
+    line, move = (Interval(m, float(a), float(b), len(seeds)) for m, a, b in zip(means, lows, highs))
+    return line, move
 
 
 def share_closed(
@@ -152,10 +196,9 @@ def share_closed(
     if gap <= 0:
         return Interval(np.nan, np.nan, np.nan, len(rows))
     share = float((table[:, 0].mean() - table[:, 1].mean()) / gap)
-    if len(rows) < 2:
-        return Interval(share, np.nan, np.nan, 1)
-    rng = np.random.default_rng(7)
-    means = table[rng.integers(0, len(rows), (_RESAMPLES, len(rows)))].mean(1)
+    if len(rows) < FEWEST:
+        return Interval(share, np.nan, np.nan, len(rows))
+    means = table[_picks(len(rows))].mean(1)
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = (means[:, 0] - means[:, 1]) / (means[:, 2] - means[:, 1])
     low, high = np.nanpercentile(shares, [2.5, 97.5])

@@ -34,6 +34,7 @@ SCENARIOS = {"room": "room19", "tile": "tile", "tower": "tower", "kitchen": "kit
 # meet the captures at every phase.
 _STAGGER_MS = 217.0
 _TRUTHS_KEPT = 4096
+_MOMENT_S = 1e-6
 
 Row = dict[str, Any]
 
@@ -71,6 +72,11 @@ class Trial:
         """What decides the pictures: trials of one stage share what was rendered and decoded."""
         return (self.scene, self.size, self.scale, self.cameras, self.speed_m_per_s)
 
+    @property
+    def first_ms(self) -> float:
+        """Instant of the first decision."""
+        return 900.0 + _STAGGER_MS * (self.seed % 64)
+
     def mapping(self) -> Row:
         return dataclasses.asdict(self)
 
@@ -98,13 +104,13 @@ class Trial:
         return parse(data, Path(f"study {self.scene}"))
 
     def terms(self) -> Terms:
-        first_ms = 900.0 + _STAGGER_MS * (self.seed % 64)
+        first_ms = self.first_ms
         return Terms(
             steps=self.steps,
             first_steps=self.first_steps,
             compute=Compute(**self.compute),
             epoch_ms=self.every_ms,
-            grace_ms=first_ms,
+            grace_ms=0.0,
             first_ms=first_ms,
             scratch=self.scratch,
         )
@@ -183,12 +189,12 @@ def _deploy(trial: Trial, folders: Folders, on_published: Any) -> VirtualDeploym
 def _finish(deployment: VirtualDeployment, trial: Trial) -> None:
     """Run until the last decision has been published, however long its policy waits."""
     wanted = trial.settle + trial.decisions
-    seconds = (trial.terms().first_ms or 0.0) / 1e3
+    # Up to just before the decision after the first, or an update would be made that nobody looks at.
+    deployment.run((trial.first_ms + trial.every_ms) / 1e3 - _MOMENT_S)
     for _ in range(4 * wanted + 16):
-        deployment.run(seconds)
         if len(deployment.publications) >= wanted:
             return
-        seconds = trial.every_ms / 1e3
+        deployment.run(trial.every_ms / 1e3)
 
 
 def _row(publication: Publication, deployment: VirtualDeployment) -> Row:

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
-from edge_server.offline.study.base import Ask, Curve, Point, Row, Table, Verdict, by_bool, with_data
+from edge_server.offline.study.base import Ask, Curve, Point, Row, Table, Verdict, by_bool, to_win, with_data
 from edge_server.offline.study.mat import GAMMAS, QUICK_GAMMAS, RECORDED, trial_of
-from edge_server.offline.study.statistics import optimum
+from edge_server.offline.study.statistics import Interval, move_of_optimum, optimum
 from edge_server.report.style import CYCLE, figure, label_lines
 
 # Weight of one second of age against a mean squared error of 0.01 (20 dB).
@@ -30,6 +30,9 @@ class Weighing:
             for seed in ask.repeats(10, 40):
                 # The thresholds are the very trials of ``mat``: where that has been run, they are known.
                 base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5", "discipline": "drop-new"})
+                found.append(Point({"scene": scene, "policy": "all"}, base))
+                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"})
+                found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
                 for policy, values in (
                     ("threshold", QUICK_GAMMAS if ask.quick else GAMMAS),
                     ("wait", QUICK_WAITS if ask.quick else WAITS),
@@ -45,34 +48,32 @@ class Weighing:
         verdicts = []
         for scene in table.distinct("scene"):
             best: dict[tuple[str, str], list[float]] = {}
-            for policy in table.distinct("policy"):
-                for label, column in SUMS.items():
-                    found = [optimum(_curve(table, scene, policy, column, w), True) for w in LAMBDAS]
-                    best[policy, label] = [o.x for o in found]
-                    falls = None
-                    if found[-1].high < found[0].low:
-                        falls = True
-                    elif found[-1].x >= found[0].x:
-                        falls = False
-                    told = ", ".join(f"{w:g}: {o.x:g}" for w, o in zip(LAMBDAS, found))
-                    verdicts.append(
-                        Verdict(
-                            f"{scene}, {policy}, ages of {label}", CLAIM,
-                            f"best omega in ms by lambda {told}; at the largest {found[-1].low:g} to "
-                            f"{found[-1].high:g}.", by_bool(falls),
+            for metric, where in (("psnr_moving_db", "where it moves"), ("psnr_db", "whole image")):
+                for policy in ("threshold", "wait"):
+                    for label, column in SUMS.items():
+                        curves = {w: _curve(table, scene, policy, metric, column, w) for w in LAMBDAS}
+                        if not all(curves.values()):
+                            continue
+                        found = [optimum(curve, True).x for curve in curves.values()]
+                        best[f"{policy}, {where}", label] = found
+                        _, move = move_of_optimum(curves, lower_is_better=True)
+                        told = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
+                        verdicts.append(
+                            Verdict(
+                                f"{scene}, {policy}, {where}, ages of {label}",
+                                CLAIM,
+                                f"best omega in ms by lambda {told}; it moves by {move} ms; "
+                                f"{to_win(table, metric, scene=scene)}.",
+                                by_bool(_falls(move)),
+                            )
                         )
-                    )  # fmt: skip
-            with figure(ask.out / f"lambda-{scene}.png", 1, height_inch=3.0) as (_, axes):
+            with figure(ask.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
                 at = axes[0, 0]
                 for k, ((policy, label), xs) in enumerate(best.items()):
                     at.plot(
-                        range(len(LAMBDAS)),
-                        xs,
-                        marker="o",
-                        markersize=4,
-                        color=CYCLE[k],
-                        label=f"{policy}, {label}",
-                    )
+                        range(len(LAMBDAS)), xs, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
+                        linestyle="-" if k < len(CYCLE) else "--", label=f"{policy}, {label}",
+                    )  # fmt: skip
                 at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
                 label_lines(
                     at, "best omega (ms)", "lambda (per 0.01 of squared error and second of age)", scene
@@ -80,14 +81,21 @@ class Weighing:
         return verdicts
 
 
-def loss(row: Row, column: str, weight: float) -> float:
+def _falls(move: Interval) -> bool | None:
+    """Whether the best omega falls: yes, no (it stays or rises), or the seeds do not tell."""
+    if move.high < 0.0:
+        return True
+    return False if move.low >= 0.0 else None
+
+
+def loss(row: Row, metric: str, column: str, weight: float) -> float:
     """(5.8) for one update: squared error in units of 0.01, plus the weighted sum of ages in seconds."""
-    return float(10.0 ** (-row["psnr_db"] / 10.0) / 0.01 + weight * row[column] / 1e3)
+    return float(10.0 ** (-row[metric] / 10.0) / 0.01 + weight * row[column] / 1e3)
 
 
-def _curve(table: Table, scene: str, policy: str, column: str, weight: float) -> Curve:
+def _curve(table: Table, scene: str, policy: str, metric: str, column: str, weight: float) -> Curve:
     found: Curve = {}
     for row in table.where(scene=scene, policy=policy):
-        if np.isfinite(row["psnr_db"]):
-            found.setdefault(float(row["omega_ms"]), {})[row["seed"]] = loss(row, column, weight)
+        if row[metric] is not None and np.isfinite(row[metric]):
+            found.setdefault(float(row["omega_ms"]), {})[row["seed"]] = loss(row, metric, column, weight)
     return found

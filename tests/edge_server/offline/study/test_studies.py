@@ -100,16 +100,41 @@ def test_mat_finds_an_optimum_and_its_absence(tmp_path: Path):
     assert {r["policy"] for r in rows} == {"all", "threshold", "no delay"} and rows[0]["seed"] == "0"
 
 
-def test_mat_delay_finds_a_rising_best_threshold_and_a_constant_one(tmp_path: Path):
-    def rising(trial):
-        return peak(30.0 + 1.5 * trial.channel["service"]["mean_ms"])(trial)
+def at_delay(peak_of):
+    """A rule whose best threshold follows the mean delay as ``peak_of`` says."""
 
-    assert set(verdicts("mat-delay", tmp_path, rising).values()) == {"holds"}
+    def rule(trial):
+        return peak(peak_of(trial.channel.get("service", {"mean_ms": 60.0})["mean_ms"]))(trial)
 
-    def falling(trial):
-        return peak(400.0 - trial.channel["service"]["mean_ms"])(trial)
+    return rule
 
-    assert "holds" not in verdicts("mat-delay", tmp_path, falling).values()
+
+def test_mat_delay_finds_a_rising_best_threshold_and_no_other(tmp_path: Path):
+    rising = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 60.0 + 1.5 * delay))
+    assert set(rising.values()) == {"holds"}
+    falling = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 400.0 - 1.5 * delay))
+    assert set(falling.values()) == {"does not hold"}
+    same = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 150.0))
+    assert "holds" not in same.values()
+
+
+@pytest.mark.parametrize("only", [lambda x: math.log(x), lambda x: -math.log(x), lambda x: 0.0])
+def test_mat_delay_claims_nothing_where_no_threshold_is_best(tmp_path: Path, only):
+    """Rising, falling and flat: a grid that grew with the delay would show a best that grows with it."""
+
+    def rule(trial):
+        value = trial.value or 1000.0
+        return figures(only(value) + noise(trial.seed, value), value)
+
+    assert set(verdicts("mat-delay", tmp_path, rule).values()) == {"undecided"}
+
+
+def test_one_seed_decides_nothing(tmp_path: Path):
+    for name in ("mat", "mat-delay", "lambda", "omega", "images", "phase"):
+        found = run_study(
+            make_study(name), ask(tmp_path, seeds=1, scenes=("room",)), invented(tmp_path, peak(90.0))
+        )
+        assert {v.verdict for v in found} == {"undecided"}, name
 
 
 def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_path: Path):
@@ -118,9 +143,19 @@ def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_pat
         return {**row, "age_sum_ms": 2000.0} if trial.policy == "threshold" else row
 
     found = verdicts("lambda", tmp_path, rule)
-    assert found["room, threshold, ages of all cameras (5.8)"] == "does not hold"
-    assert found["room, threshold, ages of used views (6.35)"] == "holds"
-    assert found["room, wait, ages of all cameras (5.8)"] == "holds"
+    for where in ("whole image", "where it moves"):
+        assert found[f"room, threshold, {where}, ages of all cameras (5.8)"] == "does not hold"
+        assert found[f"room, threshold, {where}, ages of used views (6.35)"] == "holds"
+        assert found[f"room, wait, {where}, ages of all cameras (5.8)"] == "holds"
+
+
+def test_lambda_leaves_noise_undecided(tmp_path: Path):
+    def rule(trial):
+        return figures(
+            4.0 * noise(trial.seed, trial.value), 100.0 + 2000.0 * noise(trial.seed + 9, trial.value)
+        )
+
+    assert "holds" not in verdicts("lambda", tmp_path, rule).values()
 
 
 def test_omega_tells_a_plateau_from_a_peak(tmp_path: Path):
@@ -139,12 +174,14 @@ def test_omega_tells_a_plateau_from_a_peak(tmp_path: Path):
 
 def test_images_judges_both_directions(tmp_path: Path):
     def rule(trial):
-        return figures(math.log(trial.value) + noise(trial.seed, trial.value), 10.0 * trial.value)
+        count = trial.value or 18.0
+        return figures(math.log(count) + noise(trial.seed, count), 10.0 * count)
 
     assert set(verdicts("images", tmp_path, rule).values()) == {"holds"}
 
     def wrong(trial):
-        return figures(-math.log(trial.value) + noise(trial.seed, trial.value), 100.0 / trial.value)
+        count = trial.value or 18.0
+        return figures(-math.log(count) + noise(trial.seed, count), 100.0 / count)
 
     assert set(verdicts("images", tmp_path, wrong).values()) == {"does not hold"}
 
@@ -166,12 +203,12 @@ def test_phase_says_what_can_be_won_and_by_whom(tmp_path: Path):
         return figures(gain + noise(trial.seed, trial.value), 50.0)
 
     study = make_study("phase")
-    found = run_study(study, ask(tmp_path, seeds=4, scenes=("room",)), invented(tmp_path, rule))
+    found = run_study(study, ask(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
     trade, mask, freshen = (found[i::3] for i in range(3))
     assert {v.verdict for v in (*trade, *freshen, *mask)} == {"holds"}
     assert "75 % [7" in freshen[0].found and "no delay is 2.00" in trade[0].found
     gains |= {"threshold": -1.0, "mask": -1.5, "freshen": 2.1}
-    found = run_study(study, ask(tmp_path, seeds=4, scenes=("room",)), invented(tmp_path, rule))
+    found = run_study(study, ask(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
     trade, mask, freshen = ({v.verdict for v in found[i::3]} for i in range(3))
     assert (trade, mask, freshen) == ({"does not hold"}, {"does not hold"}, {"holds"})
     assert (tmp_path / "phase-room.png").exists()
