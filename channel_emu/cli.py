@@ -58,6 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:  # a scenario, a spelling, a transport option, a trace: all say what to change
         print(f"channel-emu: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # a path that cannot be written, an address that is taken
+        print(f"channel-emu: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
 
@@ -143,7 +146,8 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
     source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
     source.add_argument("--scenario", help="take the channel section of a scenario")
     sub.add_argument("--arrivals", metavar="SPEC", help="as-offered, periodic:30ms, poisson:1/30ms, or a "
-                     "rate for each state: mmpp:1/120ms,1/30ms")  # fmt: skip
+                     "rate for each state: mmpp:1/120ms,1/30ms; mmpp alone: these, the "
+                     "thesis's (6.4.2)")  # fmt: skip
     sub.add_argument("--service", metavar="SPEC", help="none, exp:60ms, det:10ms, gamma:60ms:SHAPE, "
                      "lognormal:60ms:SIGMA, trace:FILE")  # fmt: skip
     sub.add_argument("--service-by-state", metavar="SPEC,SPEC", help="exp:30ms,exp:60ms")
@@ -355,7 +359,8 @@ def _bench(args: argparse.Namespace) -> int:
     if args.simulate:
         from channel_emu.bench_virtual import LOOPS, bench_simulate, show_simulate
 
-        found = [bench_simulate(args.cameras, args.seconds or 2000.0, preset=preset) for preset in LOOPS]
+        seconds = 2000.0 if args.seconds is None else args.seconds
+        found = [bench_simulate(args.cameras, seconds, preset=preset) for preset in LOOPS]
         print(json.dumps(found) if args.json else "\n".join(show_simulate(each) for each in found))
         return 0
     from channel_emu.bench import bench, show
@@ -382,6 +387,8 @@ def _add_accuracy(commands: Any) -> None:
 def _accuracy(args: argparse.Namespace) -> int:
     from channel_emu.accuracy import measure, show, write
 
+    if args.out:  # before measuring: it takes minutes
+        args.out.mkdir(parents=True, exist_ok=True)
     tables = measure(args.quick, args.seed)
     print(json.dumps(tables) if args.json else show(tables))
     for path in write(tables, args.out) if args.out else ():

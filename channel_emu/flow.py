@@ -17,7 +17,9 @@ from channel_emu.histogram import Histogram
 from channel_emu.link import Event, Kind, Link, Transit
 from channel_emu.trace import ReplayLink, TraceWriter
 
-# Messages of one direction of a call that wait to be written: beyond it the sender waits.
+# Messages of one direction of a call that are held once the first can be written: beyond it the sender waits.
+# Behind a first one that is still in the link any number come in, for the link decides about each at once;
+# what it drops is held without its bytes.
 _MOST_READY = 64
 ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
 
@@ -191,6 +193,8 @@ class Flow:
     def settle(self, message: Message, kept: bool) -> None:
         """The link has decided about a message."""
         message.kept = kept
+        if not kept:
+            message.raw = b""
         self._wake.set()
 
     def close(self) -> None:

@@ -106,8 +106,10 @@ def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Reco
     names = found.config.state_names
     if use_states and len(names) != 2:
         raise ObservedError(f"{path}: --use-states: expected a trace of two states, its has {len(names)}")
+    if not found.records:
+        raise ObservedError(f"{path}: there is no frame in it")
     sampled = any(r.outcome == Kind.SKIPPED for r in found.records)
-    first_ns = min((r.offered_ns for r in found.records), default=0)
+    first_ns = min(r.offered_ns for r in found.records)
     cameras, endless = [], 0
     for name, records in found.by_camera().items():
         started = _ms([r.started_ns for r in records], first_ns)
@@ -212,22 +214,29 @@ def _from_rows(path: Path, discipline: str) -> Recording:
         rows.setdefault(words[2] if len(words) > 2 else "cam00", []).append((offered, delivered))
     if not rows:
         raise ObservedError(f"{path}: there is no frame in it")
-    cameras, endless = [], 0
+    tables: dict[str, NDArray[np.float64]] = {}
+    endless = 0
     first = min(offered for given in rows.values() for offered, _ in given)
     for name, given in rows.items():
         table = np.array(sorted(given, key=lambda row: row[0])) - first
         endless += int((table[:, 1] - table[:, 0] > MAX_DELAY_MS).sum())
         table[table[:, 1] - table[:, 0] > MAX_DELAY_MS, 1] = math.nan
-        cameras.append(_camera_of_rows(name, table[:, 0], table[:, 1], discipline))
+        tables[name] = table
+    instants = np.concatenate([table.ravel() for table in tables.values()])
+    delays = np.concatenate([table[:, 1] - table[:, 0] for table in tables.values()])
+    # Frames offered after this may still be on their way where others do not wait for them.
+    sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
+    cameras = [_camera_of_rows(name, t[:, 0], t[:, 1], discipline, sure_ms) for name, t in tables.items()]
     return Recording(path, cameras, discipline, [], False, endless)
 
 
 def _camera_of_rows(
-    name: str, offered: NDArray[np.float64], delivered: NDArray[np.float64], discipline: str
+    name: str, offered: NDArray[np.float64], delivered: NDArray[np.float64], discipline: str, sure_ms: float
 ) -> Camera:
     """Where rows are all there is, transmission starts at the offer, or when the link becomes free; a frame
     that did not come met a busy link if an earlier one was on its way, and was lost otherwise. After the last
-    one that came nobody knows: it may still be on its way."""
+    one that came nobody knows: it may still be on its way; so may one that is younger at the recording's end
+    than the longest delay seen (offered at ``sure_ms`` or later), if the link is parallel."""
     n = len(offered)
     started, outcome = np.full(n, math.nan), np.full(n, str(Kind.LOST), dtype="U16")
     free = -math.inf
@@ -243,7 +252,10 @@ def _camera_of_rows(
         free = max(free, float(delivered[i]))
     came = np.flatnonzero(outcome == Kind.DELIVERED)
     if len(came):
-        outcome[(np.arange(n) > came[-1]) & (outcome == Kind.LOST)] = ""
+        unknown = np.arange(n) > came[-1]
+        if discipline == "parallel":
+            unknown |= offered >= sure_ms
+        outcome[unknown & (outcome == Kind.LOST)] = ""
     return Camera(name, offered, offered, started, delivered - started, outcome, np.full(n, -1))
 
 

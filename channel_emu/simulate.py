@@ -7,6 +7,7 @@ Two engines give the same frames the same fates: ``python`` drives ``link.Link``
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +25,7 @@ OUTCOMES = ("in_flight", *(str(k) for k in (Kind.DELIVERED, Kind.DROPPED_BUSY, K
                                             Kind.LOST, Kind.BROKEN)))  # fmt: skip
 _CODES = {name: code for code, name in enumerate(OUTCOMES)}
 DEFAULT_FRAME_PERIOD_MS = 1000 / 30
+_MOST_FRAMES = 1e9
 
 
 class SimulationError(ValueError):
@@ -144,6 +146,13 @@ def simulate(
         raise SimulationError("cameras: expected at least one")
     if not 0 < seconds <= 1e9:
         raise SimulationError(f"seconds: expected more than 0 and at most 1e9, got {seconds:g}")
+    if frame_period_ms is not None and not 1e-3 <= frame_period_ms < math.inf:
+        raise SimulationError(f"frame_period_ms: expected at least 0.001, got {frame_period_ms:g}")
+    if not 1e-3 <= slot_ms < math.inf:
+        raise SimulationError(f"slot_ms: expected at least 0.001, got {slot_ms:g}")
+    frames = len(names) * seconds * 1e3 * _frames_per_ms(config, frame_period_ms)
+    if frames > _MOST_FRAMES:
+        raise SimulationError(f"about {frames:.1e} frames: expected at most {_MOST_FRAMES:.0e} in one run")
     end_ns = round(seconds * 1e9)
     channel = Channel(config, seed)
     why_not = _kernel_lacks(config, channel)
@@ -236,6 +245,15 @@ def ranks(names: list[str]) -> list[int]:
 def period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
     """The cameras' own period."""
     return frame_period_ms or config.arrivals.period_ms or DEFAULT_FRAME_PERIOD_MS
+
+
+def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
+    """Of one camera, at most: frames, or arrivals where these sample them more often."""
+    rates = config.arrivals.rate_per_ms
+    if rates is None:
+        return 1 / period_ms(config, frame_period_ms)
+    most = max(rates) if isinstance(rates, list) else rates
+    return most if frame_period_ms is None else max(most, 1 / frame_period_ms)
 
 
 def _collect(link: Link, transits: list[Transit], end_ns: int) -> LinkRun:

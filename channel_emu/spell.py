@@ -48,17 +48,21 @@ def rate_per_ms(text: str) -> float:
 
 
 def arrivals(text: str) -> dict[str, Any]:
-    """``as-offered``, ``periodic:30ms``, ``poisson:1/30ms``, or by state ``mmpp:1/120ms,1/30ms``."""
+    """``as-offered``, ``periodic:30ms``, ``poisson:1/30ms``, or by state ``mmpp:1/120ms,1/30ms``; bare
+    ``mmpp`` is that, the thesis's rates (6.4.2)."""
     kind, _, rest = text.partition(":")
     if kind == "as-offered" and not rest:
         return {"process": "as-offered"}
     if kind == "periodic" and rest:
         return {"process": "periodic", "period_ms": span_ms(rest)}
+    if text == "mmpp":
+        return {"process": "poisson", "rate_per_ms": [1 / 120, 1 / 30]}
     if kind in ("poisson", "mmpp") and rest:
         rates = [rate_per_ms(word) for word in rest.split(",")]
         return {"process": "poisson", "rate_per_ms": rates if len(rates) > 1 else rates[0]}
     raise SpellingError(
-        f"--arrivals {text!r}: expected as-offered, periodic:30ms, poisson:1/30ms or mmpp:1/120ms,1/30ms"
+        f"--arrivals {text!r}: expected as-offered, periodic:30ms, poisson:1/30ms, mmpp or "
+        "mmpp:1/120ms,1/30ms"
     )
 
 

@@ -222,3 +222,48 @@ def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
     assert set(found["by_method"]) == {f"up {HELLO}", f"down {HELLO}"} and found["seed"] == 2
     assert found["delivered"] == found["offered"] == 2 and found["delay_ms"]["mean"] == 30
     assert main(["proxy", "--to", "x", "--listen", "nowhere"]) == 2
+
+
+def test_bare_mmpp_is_the_thesiss() -> None:
+    assert spell.arrivals("mmpp") == spell.arrivals("mmpp:1/120ms,1/30ms")
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--frame-period-ms", "-5"], "frame_period_ms: expected"),
+        (["--frame-period-ms", "0"], "frame_period_ms: expected"),
+        (["--frame-period-ms", "1e-9"], "frame_period_ms: expected"),
+        (["--slot-ms", "0"], "slot_ms: expected"),
+        (["--slot-ms", "-1"], "slot_ms: expected"),
+        (["--slot-ms", "nan"], "slot_ms: expected"),
+        (["--seconds", "1e9", "--cameras", "18"], "frames: expected at most"),
+        (["--arrivals", "poisson:1e12"], "frames: expected at most"),
+    ],
+)
+def test_edge_values_of_a_simulation_are_refused(capsys, words: list[str], why: str) -> None:
+    assert main(["simulate", *words]) == 2
+    said = capsys.readouterr().err
+    assert why in said and said.count("\n") == 1
+
+
+def test_a_bench_of_no_seconds_is_refused(capsys) -> None:
+    assert main(["bench", "--simulate", "--seconds", "0"]) == 2
+    assert "seconds: expected more than 0" in capsys.readouterr().err
+
+
+def test_a_path_that_cannot_be_written_is_said_in_one_line(capsys, scenario: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    rows = tmp_path / "rows.csv"
+    rows.write_text("".join(f"{n * 100},{n * 100 + 5 + n * 7 % 11}\n" for n in range(200)))
+    nowhere, listen = str(tmp_path / "file" / "x"), f"127.0.0.1:{free_port()}"
+    for words in (
+        ["fit", str(rows), "--states", "1", "--out", nowhere],
+        ["fit", str(rows), "--states", "1", "--plot", nowhere],
+        ["accuracy", "--quick", "--out", nowhere],
+        ["run", str(scenario), "--no-priority", "--listen", listen, "--out", nowhere],
+        ["proxy", "--no-priority", "--to", "127.0.0.1:1", "--listen", listen, "--trace", nowhere],
+    ):
+        assert main(words) == 2, words
+        said = capsys.readouterr().err
+        assert "channel-emu: " in said and str(tmp_path / "file") in said and "Traceback" not in said, words

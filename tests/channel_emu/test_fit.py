@@ -428,3 +428,28 @@ def test_a_live_recording_is_fitted_to_the_channel_that_made_it(tmp_path: Path) 
     for name, value in true.items():
         # Offers fall as the machine lets them, so this is no fixed sample: four standard deviations.
         assert holds(found.parameters[name], value, 2.0), (name, found.parameters[name])
+
+
+def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
+    """A parallel link recorded until 10 s: late frames that had not come by then are no losses."""
+    rng = np.random.default_rng(5)
+    offered = np.arange(0.0, 10_000.0, 10.0)
+    came = offered + rng.exponential(60.0, len(offered))
+    path = tmp_path / "rows.csv"
+    path.write_text("".join(f"{o},{c if c <= 10_000 else ''}\n" for o, c in zip(offered, came)))
+    assert (came > 10_000).sum() > 2
+    (camera,) = observed.read(path, "parallel").cameras
+    assert not (camera.outcome == "lost").any() and (camera.outcome == "").sum() == (came > 10_000).sum()
+    # One that is missing long before the end is lost.
+    lines = path.read_text().splitlines()
+    lines[300] = f"{offered[300]},"
+    path.write_text("\n".join(lines))
+    (camera,) = observed.read(path, "parallel").cameras
+    assert np.flatnonzero(camera.outcome == "lost").tolist() == [300]
+
+
+def test_a_trace_without_a_frame_says_so(tmp_path: Path, capsys) -> None:
+    path = write_trace(tmp_path / "t.jsonl", {"preset": "ch5"}, 1, seconds=1)
+    path.write_text(path.read_text().splitlines()[0] + "\n")
+    assert main(["fit", str(path)]) == 2
+    assert "there is no frame in it" in capsys.readouterr().err

@@ -155,3 +155,13 @@ def test_running_ages_are_those_of_the_whole_sawtooth(steps: list[tuple[int, int
         (running.mean_age_ms(end_ns), ages.mean_age_ms(saw)),
     ):
         assert found == (None if expected is None else pytest.approx(expected, rel=1e-9))
+
+
+def test_dropped_messages_hold_no_bytes() -> None:
+    from channel_emu.flow import Flow, Message
+
+    flow = Flow(0, None, lambda: None)
+    dropped, kept = Message(b"x" * 100, flow, 0), Message(b"y", flow, 1)
+    flow.settle(dropped, False)
+    flow.settle(kept, True)
+    assert dropped.raw == b"" and kept.raw == b"y"
