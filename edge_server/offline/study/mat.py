@@ -96,7 +96,7 @@ class Mat:
                 Verdict(
                     f"{scene}, {discipline}, {name}",
                     CLAIM,
-                    f"best at {best.x:g} ms ({best.low:g} to {best.high:g}) with {views.mean:.1f} views; "
+                    f"best at {best.x:g} ms{best.spread} with {views.mean:.1f} views; "
                     f"{tell(best.over_last.mean, digits)} [{tell(best.over_last.low, digits)}, "
                     f"{tell(best.over_last.high, digits)}] better than the largest threshold; "
                     f"{to_win(table, metric, **labels)}.",

@@ -73,7 +73,7 @@ class MatDelay:
         slope, _ = move_of_optimum(curves, METRICS[metric][1])
         inside = {d: o.interior(LEAST[metric]) for d, o in best.items()}
         without = [f"{d:g}" for d, yes in inside.items() if yes is not True]
-        told = ", ".join(f"{d:g} ms: {o.x:g} ({o.low:g} to {o.high:g})" for d, o in best.items())
+        told = ", ".join(f"{d:g} ms: {o.x:g}{o.spread}" for d, o in best.items())
         # On one grid for all delays, fidelity that only rises or only falls has its best at the same end of
         # it at every delay: no slope, no claim.
         none = f"; that it falls on both sides is not shown at {', '.join(without)} ms" if without else ""

@@ -85,7 +85,7 @@ class Omega:
             Verdict(
                 f"{scene}, {state} traffic, threshold, {name}",
                 f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1).",
-                f"best at {best.x:g} ms ({best.low:g} to {best.high:g}), {tell(loss.mean, digits)} "
+                f"best at {best.x:g} ms{best.spread}, {tell(loss.mean, digits)} "
                 f"[{tell(loss.low, digits)}, {tell(loss.high, digits)}] better than the largest omega; "
                 f"{to_win(table, metric, scene=scene, state=state)}.",
                 by_bool(best.interior(LEAST[metric])),
@@ -120,7 +120,7 @@ class Omega:
             Verdict(
                 about,
                 claim,
-                f"best at {best.x:g} ms ({best.low:g} to {best.high:g}), {tell(loss.mean, digits)} "
+                f"best at {best.x:g} ms{best.spread}, {tell(loss.mean, digits)} "
                 f"[{tell(loss.low, digits)}, {tell(loss.high, digits)}] better than the largest omega; "
                 f"within {_NEAR[metric]:g} of the best from {plateau:g} ms on.",
                 by_bool(answer),

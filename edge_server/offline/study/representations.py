@@ -63,7 +63,7 @@ class Representations:
                 best = optimum(curve, lower)
                 answers.append(best.interior(LEAST[metric]))
                 told.append(
-                    f"{field} {tell(best.x, 0)} ms ({best.low:g} to {best.high:g}; "
+                    f"{field} {tell(best.x, 0)} ms{best.spread} ("
                     f"{to_win(table, metric, scene=scene, field=field)})"
                 )
         if not told:

@@ -83,6 +83,11 @@ class Optimum:
     over_first: Interval
     over_last: Interval
 
+    @property
+    def spread(self) -> str:
+        """`` (low to high)``, or nothing where it is not known."""
+        return "" if np.isnan(self.low) else f" ({self.low:g} to {self.high:g})"
+
     def interior(self, least: float = 0.0) -> bool | None:
         """Whether the curve rises and falls by more than ``least``; None: the seeds do not tell."""
         sides = (self.over_first.above(least), self.over_last.above(least))
