@@ -153,7 +153,7 @@ def test_a_peer_that_talks_nonsense_or_not_at_all_is_left(tmp_path, respond):
         async def work():
             await peer.until(4)
             peer.respond = answer()
-            await peer.until(24)
+            await peer.until(48)
 
         await run_while(node, work())
         await peer.stop()
