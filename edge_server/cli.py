@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -99,6 +98,7 @@ def _run(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from edge_server.config import PolicyConfig, read_config
+    from edge_server.fidelity.lpips_weights import weights_folder
     from edge_server.server import EdgeServer, Options
 
     scenario = load(args.scenario, args.seed)
@@ -109,11 +109,6 @@ def _run(args: argparse.Namespace) -> int:
             config = replace(config, policy=PolicyConfig(name, float(value) if value else None))
         except ValueError:
             raise ScenarioError(f"--policy {args.policy}: {value!r} is not a number") from None
-    lpips = args.lpips
-    if lpips is None and "FRESHFIELD_LPIPS" not in os.environ:
-        base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
-        if base is not None and (base / "lpips").is_dir():
-            lpips = base / "lpips"
     options = Options(
         listen=args.listen,
         out=args.out,
@@ -121,7 +116,7 @@ def _run(args: argparse.Namespace) -> int:
         page_host=args.page_host,
         page_port=args.page_port,
         metrics_port=args.metrics_port,
-        lpips_folder=lpips,
+        lpips_folder=weights_folder(args.lpips, args.data),
         resume=args.resume,
         checkpoint_s=args.checkpoint_every,
     )

@@ -16,7 +16,7 @@ from camera_node.world.places import at as _at
 from camera_node.world.places import facing as _facing
 from camera_node.world.render import Light, Part, World
 from camera_node.world.rig import build_rig
-from camera_node.world.scene import BaseParams, Scene, pinhole
+from camera_node.world.scene import MovingParams, Scene, pinhole
 from camera_node.world.shapes import Box, Cylinder, Quad, RoundCone, Sphere
 
 _TARGET = (0.0, 0.75, 0.90)
@@ -30,16 +30,10 @@ _LOOP_CENTRE, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 
 
 @dataclass(frozen=True)
-class Params(BaseParams):
+class Params(MovingParams):
     """speed_m_per_s: mean speed of the person's parts; 0 stands still."""
 
     horizontal_fov_deg: float = 64.0
-    speed_m_per_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= 8.0:
-            raise ValueError(f"speed_m_per_s must be 0 or within 0.05 to 8, got {self.speed_m_per_s}")
 
 
 def build(params: Params) -> Scene:

@@ -58,6 +58,18 @@ class BaseParams:
 
 
 @dataclass(frozen=True)
+class MovingParams(BaseParams):
+    """speed_m_per_s: mean speed of what moves; 0 stands still."""
+
+    speed_m_per_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= 8.0:
+            raise ValueError(f"speed_m_per_s must be 0 or within 0.05 to 8, got {self.speed_m_per_s}")
+
+
+@dataclass(frozen=True)
 class Scene:
     """A world seen by posed cameras.
 

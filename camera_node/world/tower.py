@@ -17,7 +17,7 @@ from camera_node.world.motion import phase_of
 from camera_node.world.places import at, facing
 from camera_node.world.render import Light, Mover, Part, World
 from camera_node.world.rig import build_rig
-from camera_node.world.scene import BaseParams, Scene, pinhole
+from camera_node.world.scene import MovingParams, Scene, pinhole
 from camera_node.world.shapes import Array, Box, Cylinder, Quad, RoundCone, Sphere, capsule
 
 _MAST = (0.0, 0.0, 1.70)
@@ -36,16 +36,10 @@ _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
 @dataclass(frozen=True)
-class Params(BaseParams):
+class Params(MovingParams):
     """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still."""
 
     horizontal_fov_deg: float = 90.0
-    speed_m_per_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= 8.0:
-            raise ValueError(f"speed_m_per_s must be 0 or within 0.05 to 8, got {self.speed_m_per_s}")
 
 
 def build(params: Params) -> Scene:

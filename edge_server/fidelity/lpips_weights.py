@@ -24,6 +24,17 @@ FILES: dict[str, tuple[str, str]] = {
 }
 
 
+def weights_folder(given: Path | None = None, data: Path | None = None) -> Path | None:
+    """Where the weights are looked for: the folder given, else FRESHFIELD_LPIPS, else ``lpips`` in the folder
+    of data sets (``data``, else FRESHFIELD_DATA), if there is one."""
+    if given is not None:
+        return given
+    if named := os.environ.get(FOLDER_VARIABLE):
+        return Path(named)
+    base = data or (Path(named) if (named := os.environ.get("FRESHFIELD_DATA")) else None)
+    return base / "lpips" if base is not None and (base / "lpips").is_dir() else None
+
+
 def open_lpips(
     folder: str | Path | None = None, network: Network = "alex"
 ) -> tuple[Lpips | None, str | None]:

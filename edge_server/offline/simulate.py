@@ -17,7 +17,7 @@ import numpy as np
 
 from camera_node.sources.records import DatasetError
 from edge_server.config import ComputeConfig, PolicyConfig, read_config
-from edge_server.fidelity.lpips_weights import Network, open_lpips
+from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
 from edge_server.fidelity.scorer import Scorer
 from edge_server.offline.deployment import deploy
 from edge_server.offline.virtual import Terms, VirtualDeployment
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
     base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
-    lpips = args.lpips or (base / "lpips" if base is not None and (base / "lpips").is_dir() else None)
+    lpips = weights_folder(args.lpips, base)
     try:
         scenario = _scenario(args)
         config = read_config(scenario)
@@ -201,7 +201,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--score-every-ms", type=float, default=250.0, metavar="MS", help="[%(default)g]")
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [lpips/ below the data folder]")
+    add(
+        "--lpips",
+        type=Path,
+        metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]",
+    )
     add("--out", type=Path, metavar="DIR", help="write simulation.json and series.jsonl there")
     add("--json", action="store_true", help="everything, as one JSON object")
     return parser

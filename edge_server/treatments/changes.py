@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -58,6 +58,23 @@ def compare(before: View, now: View) -> Changes | None:
     sigma = pair_noise(a[..., :3].astype(np.float64), b[..., :3].astype(np.float64))
     bound = max(BOUND, NOISE_SIGMAS * min(sigma or 0.0, _NOISE_LIMIT))
     return Changes(without_specks(difference(a, b) > bound), bound, gap_ms)
+
+
+@dataclass(frozen=True)
+class Aged:
+    """A view with the one its camera delivered before, its age, and that of the youngest views."""
+
+    view: View
+    before: View | None
+    age_ms: float
+    young_ms: float
+
+
+def aged(views: Sequence[View], earlier: Mapping[str, View], now_ns: int, young: float) -> list[Aged]:
+    """The views in their order. young: share of them, youngest first, that count as young."""
+    ages_ms = [(now_ns - view.generated_ns) / 1e6 for view in views]
+    young_ms = young_age_ms(ages_ms, young)
+    return [Aged(view, earlier.get(view.camera), age, young_ms) for view, age in zip(views, ages_ms)]
 
 
 def young_age_ms(ages_ms: Sequence[float], share: float) -> float:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.treatments.changes import compare, dilated, young_age_ms
+from edge_server.treatments.changes import Aged, aged, compare, dilated
 from edge_server.treatments.motion import Motion, grid, motion_of, sample
 
 _FRONT = 4.0  # the fastest pixel hides a still one by e^4
@@ -49,14 +49,10 @@ class Freshen:
 
     def treat(self, views: Sequence[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
         """See ``treatments.Treatment``."""
-        ages_ms = [(now_ns - view.generated_ns) / 1e6 for view in views]
-        young_ms = young_age_ms(ages_ms, self.young)
-        return [
-            self._treated(view, earlier.get(view.camera), age_ms, young_ms)
-            for view, age_ms in zip(views, ages_ms)
-        ]
+        return [self._treated(each) for each in aged(views, earlier, now_ns, self.young)]
 
-    def _treated(self, view: View, before: View | None, age_ms: float, young_ms: float) -> View:
+    def _treated(self, each: Aged) -> View:
+        view, before, age_ms, young_ms = each.view, each.before, each.age_ms, each.young_ms
         changes = compare(before, view) if before is not None and age_ms > 0.0 else None
         if before is None or changes is None:
             return view

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.treatments.changes import Changes, blurred, compare, difference, dilated, young_age_ms
+from edge_server.treatments.changes import Aged, Changes, aged, blurred, compare, difference, dilated
 
 _STEEP = 0.02  # change of the blurred picture from pixel to pixel above which it tells a speed
 _FASTEST = 0.25  # of the picture's longer side: nothing is grown by more
@@ -34,14 +34,10 @@ class Mask:
 
     def treat(self, views: Sequence[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
         """See ``treatments.Treatment``."""
-        ages_ms = [(now_ns - view.generated_ns) / 1e6 for view in views]
-        young_ms = young_age_ms(ages_ms, self.young)
-        return [
-            self._treated(view, earlier.get(view.camera), age_ms, young_ms)
-            for view, age_ms in zip(views, ages_ms)
-        ]
+        return [self._treated(each) for each in aged(views, earlier, now_ns, self.young)]
 
-    def _treated(self, view: View, before: View | None, age_ms: float, young_ms: float) -> View:
+    def _treated(self, each: Aged) -> View:
+        view, before, age_ms, young_ms = each.view, each.before, each.age_ms, each.young_ms
         if before is None or age_ms <= young_ms:
             return view
         changes = compare(before, view)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.records import DatasetError
+from edge_server.fidelity.lpips_weights import weights_folder
 from edge_server.offline.study.base import Ask, Verdict, run_study
 from edge_server.offline.study.engine import Engine, StudyError
 from edge_server.offline.study.trial import SCENARIOS, Folders
@@ -56,10 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
     base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
-    lpips = args.lpips or (Path(d) if (d := os.environ.get("FRESHFIELD_LPIPS")) else None)
-    if lpips is None and base is not None and (base / "lpips").is_dir():
-        lpips = base / "lpips"
-    folders = Folders(base, lpips)
+    folders = Folders(base, weights_folder(args.lpips, base))
     ask = Ask(args.quick, args.out, folders, args.seeds, tuple(args.scene.split(",")) if args.scene else None)
     names = list(STUDIES) if args.study == "all" else [args.study]
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)

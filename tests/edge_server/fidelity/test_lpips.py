@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from edge_server.fidelity.images import ImageError
-from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips
+from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
 from tests.conftest import data_dir
 
 # Values published with the weights: (reference, p0) and (reference, p1) of the authors' example images.
@@ -99,3 +99,16 @@ def test_torn_and_wrong_weights_give_a_reason_and_no_metric(tmp_path):
     np.savez(tmp_path / features, **{"features.0.weight": np.zeros((1, 3, 11, 11), np.float32)})
     lpips, reason = open_lpips(tmp_path)
     assert lpips is None and "0.bias" in reason
+
+
+def test_the_weights_folder_is_the_nearest_that_was_named(tmp_path, monkeypatch):
+    data, named = tmp_path / "data", tmp_path / "named"
+    monkeypatch.delenv("FRESHFIELD_LPIPS", raising=False)
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    assert weights_folder() is None and weights_folder(None, data) is None
+    (data / "lpips").mkdir(parents=True)
+    assert weights_folder(None, data) == data / "lpips"
+    monkeypatch.setenv("FRESHFIELD_DATA", str(data))
+    assert weights_folder() == data / "lpips"
+    monkeypatch.setenv("FRESHFIELD_LPIPS", str(named))
+    assert weights_folder(None, data) == named and weights_folder(tmp_path, data) == tmp_path
