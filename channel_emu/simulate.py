@@ -248,12 +248,11 @@ def period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
 
 
 def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
-    """Of one camera, at most: frames, or arrivals where these sample them more often."""
+    """Of one camera, at most. Arrivals that only sample a camera's frames make none."""
     rates = config.arrivals.rate_per_ms
-    if rates is None:
+    if rates is None or frame_period_ms is not None:
         return 1 / period_ms(config, frame_period_ms)
-    most = max(rates) if isinstance(rates, list) else rates
-    return most if frame_period_ms is None else max(most, 1 / frame_period_ms)
+    return max(rates) if isinstance(rates, list) else rates
 
 
 def _collect(link: Link, transits: list[Transit], end_ns: int) -> LinkRun:
