@@ -221,7 +221,7 @@ def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
     found = json.loads(out)
     assert set(found["by_method"]) == {f"up {HELLO}", f"down {HELLO}"} and found["seed"] == 2
     assert found["delivered"] == found["offered"] == 2 and found["delay_ms"]["mean"] == 30
-    assert main(["proxy", "--to", "x", "--listen", "nowhere"]) == 2
+    assert main(["proxy", "--to", "x", "--listen", "nowhere", "--no-priority"]) == 2
 
 
 def test_bare_mmpp_is_the_thesiss() -> None:
