@@ -1,0 +1,36 @@
+"""Points with colours and the cameras that see them, from depth maps: what COLMAP calls a sparse model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from edge_server.export.colmap import Cloud
+from edge_server.surface.depth import DepthMap
+from edge_server.surface.sharpen import shows
+
+SAME = 0.01  # of the distance, within which a camera's depth shows the same point
+
+
+def cloud_of(maps: Sequence[DepthMap], count: int) -> Cloud:
+    """Up to ``count`` points, evenly many of the pixels of each map that see a surface, with the maps that
+    show a surface there."""
+    points, colors, source = [], [], []
+    share = count // max(len(maps), 1)
+    for k, found in enumerate(maps):
+        at = np.flatnonzero(found.seen)
+        at = at[np.linspace(0, len(at) - 1, min(share, len(at))).round().astype(np.int64)] if len(at) else at
+        lens, pose = found.intrinsics, found.camera_to_world
+        pixels = np.stack([at % lens.width, at // lens.width], axis=-1) + 0.5
+        rays = lens.rays(pixels) @ pose[:3, :3].T
+        points.append(pose[:3, 3] + rays * found.depth.ravel()[at, None].astype(np.float64))
+        colors.append(found.color.reshape(-1, 3)[at])
+        source.append(np.full(len(at), k))
+    every = np.concatenate(points) if points else np.zeros((0, 3))
+    seen = np.zeros((len(every), len(maps)), np.bool_)
+    for k, found in enumerate(maps):
+        seen[:, k] = shows(found, every, SAME)
+    if len(every):
+        seen[np.arange(len(every)), np.concatenate(source)] = True
+    return Cloud(every, np.concatenate(colors) if colors else np.zeros((0, 3), np.uint8), seen)

@@ -1,0 +1,153 @@
+"""COLMAP models: cameras, images and points3D, as text or binary (COLMAP's documentation, "Output Format").
+
+COLMAP's poses are world-to-camera with OpenCV axes, its quaternions w-first and its pixels counted from the
+image's corner, as here. A camera without distortion becomes PINHOLE, another one OPENCV (k1 k2 p1 p2).
+Points have tracks: where in which images they are seen.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.export import ExportError, Shot
+from freshfield.files import write_bytes, write_text
+from freshfield.geometry import Pinhole, matrix_to_quaternion, se3_inverse
+
+_PINHOLE, _OPENCV = 1, 4
+_NAMES = {_PINHOLE: "PINHOLE", _OPENCV: "OPENCV"}
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """points: float64 (N, 3), metres. color: uint8 (N, 3). seen: bool (N, S), in which shots."""
+
+    points: NDArray[np.float64]
+    color: NDArray[np.uint8]
+    seen: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Image:
+    number: int
+    name: str
+    camera: int
+    quaternion: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    pixels: NDArray[np.float64]  # (M, 2)
+    points: NDArray[np.int64]  # (M,), numbers of points from 1
+
+
+def write_model(folder: Path, shots: Sequence[Shot], cloud: Cloud, binary: bool = False) -> None:
+    """Write cameras, images and points3D (.txt, or .bin) to ``folder``, which is made. Images are called
+    NAME.png. ExportError: no shots."""
+    if not shots:
+        raise ExportError("no camera has reported: there is nothing to write")
+    folder.mkdir(parents=True, exist_ok=True)
+    lenses = list(dict.fromkeys(shot.intrinsics for shot in shots))
+    images = [_image(k, shot, lenses, cloud) for k, shot in enumerate(shots)]
+    # Of a point: number of the image, place of its pixel among that image's.
+    tracks: list[list[tuple[int, int]]] = [[] for _ in cloud.points]
+    for image in images:
+        for place, point in enumerate(image.points):
+            tracks[point - 1].append((image.number, place))
+    if binary:
+        write_bytes(folder / "cameras.bin", _cameras_binary(lenses))
+        write_bytes(folder / "images.bin", _images_binary(images))
+        write_bytes(folder / "points3D.bin", _points_binary(cloud, tracks))
+    else:
+        write_text(folder / "cameras.txt", _cameras_text(lenses))
+        write_text(folder / "images.txt", _images_text(images))
+        write_text(folder / "points3D.txt", _points_text(cloud, tracks))
+
+
+def _image(k: int, shot: Shot, lenses: list[Pinhole], cloud: Cloud) -> _Image:
+    inverse = se3_inverse(shot.camera_to_world)
+    which = np.flatnonzero(cloud.seen[:, k])
+    pixels = shot.intrinsics.project(cloud.points[which] @ inverse[:3, :3].T + inverse[:3, 3])
+    return _Image(
+        number=k + 1,
+        name=f"{shot.name}.png",
+        camera=lenses.index(shot.intrinsics) + 1,
+        quaternion=matrix_to_quaternion(inverse[:3, :3]),
+        translation=inverse[:3, 3],
+        pixels=pixels,
+        points=which + 1,
+    )
+
+
+def _model(lens: Pinhole) -> tuple[int, list[float]]:
+    focal = [lens.fx, lens.fy, lens.cx, lens.cy]
+    return (_OPENCV, [*focal, *lens.distortion]) if lens.distorted else (_PINHOLE, focal)
+
+
+def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
+    return " ".join(repr(float(v)) for v in values)  # the shortest text that reads back to the same bits
+
+
+def _cameras_text(lenses: list[Pinhole]) -> str:
+    lines = [
+        "# Camera list with one line of data per camera:",
+        "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+    ]
+    for k, lens in enumerate(lenses):
+        model, params = _model(lens)
+        lines.append(f"{k + 1} {_NAMES[model]} {lens.width} {lens.height} {_numbers(params)}")
+    return "\n".join(lines) + "\n"
+
+
+def _images_text(images: list[_Image]) -> str:
+    lines = [
+        "# Image list with two lines of data per image:",
+        "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+        "#   POINTS2D[] as (X, Y, POINT3D_ID)",
+    ]
+    for i in images:
+        pose = f"{_numbers(i.quaternion)} {_numbers(i.translation)}"
+        lines.append(f"{i.number} {pose} {i.camera} {i.name}")
+        lines.append(" ".join(f"{_numbers(pixel)} {point}" for pixel, point in zip(i.pixels, i.points)))
+    return "\n".join(lines) + "\n"
+
+
+def _points_text(cloud: Cloud, tracks: list[list[tuple[int, int]]]) -> str:
+    lines = [
+        "# 3D point list with one line of data per point:",
+        "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    ]
+    for k, (point, color, track) in enumerate(zip(cloud.points, cloud.color, tracks)):
+        places = " ".join(f"{image} {place}" for image, place in track)
+        lines.append(f"{k + 1} {_numbers(point)} {color[0]} {color[1]} {color[2]} 0.0 {places}".rstrip())
+    return "\n".join(lines) + "\n"
+
+
+def _cameras_binary(lenses: list[Pinhole]) -> bytes:
+    out = [struct.pack("<Q", len(lenses))]
+    for k, lens in enumerate(lenses):
+        model, params = _model(lens)
+        out.append(struct.pack("<iiQQ", k + 1, model, lens.width, lens.height))
+        out.append(struct.pack(f"<{len(params)}d", *params))
+    return b"".join(out)
+
+
+def _images_binary(images: list[_Image]) -> bytes:
+    out = [struct.pack("<Q", len(images))]
+    for i in images:
+        out.append(struct.pack("<I7dI", i.number, *i.quaternion, *i.translation, i.camera))
+        out.append(i.name.encode() + b"\0" + struct.pack("<Q", len(i.points)))
+        rows = np.zeros(len(i.points), dtype=[("pixel", "<f8", 2), ("point", "<i8")])
+        rows["pixel"], rows["point"] = i.pixels, i.points
+        out.append(rows.tobytes())
+    return b"".join(out)
+
+
+def _points_binary(cloud: Cloud, tracks: list[list[tuple[int, int]]]) -> bytes:
+    out = [struct.pack("<Q", len(cloud.points))]
+    for k, (point, color, track) in enumerate(zip(cloud.points, cloud.color, tracks)):
+        out.append(struct.pack("<Q3d3BdQ", k + 1, *point, *map(int, color), 0.0, len(track)))
+        out.append(np.array(track, dtype="<i4").tobytes())
+    return b"".join(out)

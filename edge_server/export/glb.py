@@ -1,0 +1,29 @@
+"""GLB (glTF 2.0, binary) of a mesh with colours, by trimesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.export import ExportError
+from freshfield.files import write_bytes
+
+# glTF's y points up, our z does.
+_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def write_mesh(
+    path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32], color: NDArray[np.uint8]
+) -> None:
+    """vertices (V, 3) in metres with colour (V, 3), faces (F, 3). The file's scene is turned so that our z is
+    its y, up. ExportError: trimesh is missing."""
+    try:
+        import trimesh
+    except ImportError:
+        raise ExportError("GLB needs trimesh: pip install 'freshfield[surface]', or write .ply") from None
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=color, process=False)
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, transform=_UP)
+    write_bytes(path, scene.export(file_type="glb"))

@@ -1,0 +1,122 @@
+"""What there is to export: a field from a checkpoint, its cameras with their last pictures, its poses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edge_server.export import ExportError, Shot, file_names
+from edge_server.fields import Field, View, checkpoint
+from edge_server.fields.registry import make_field, option_help
+from freshfield.geometry import GeometryError, Pose
+
+# In this order: a run's last checkpoint, a fit's.
+NAMES = ("field.npz", "field")
+POSES = "poses.jsonl"
+
+
+@dataclass(frozen=True)
+class Source:
+    """file: the checkpoint. field: as it was saved. views: the last one of every camera. name: of the
+    representation."""
+
+    file: Path
+    name: str
+    field: Field
+    views: tuple[View, ...]
+
+    @property
+    def shots(self) -> list[Shot]:
+        """The views as pictures to be written."""
+        names = file_names([v.camera for v in self.views])
+        return [
+            Shot(name, v.image, np.asarray(v.camera_to_world, np.float64), v.intrinsics, v.generated_ns / 1e9)
+            for name, v in zip(names, self.views)
+        ]
+
+
+def open_source(path: Path) -> Source:
+    """The field saved in ``path``: a checkpoint, or the folder of a run or fit. ExportError: there is none,
+    or it cannot be read."""
+    file = find_checkpoint(path)
+    try:
+        state, about = checkpoint.load(file)
+        name = str(about["field"])
+        options: dict[str, Any] = dict(about.get("options") or {})
+        field = make_field(name, _as_made(name, options, state), seed=int(about.get("seed", 0)))
+        field.load_state(state)
+    except KeyError:
+        raise ExportError(f"{file}: does not say which representation it is of") from None
+    except ValueError as error:
+        raise ExportError(f"{file}: {error}") from None
+    views: tuple[View, ...] = tuple(getattr(field.snapshot(), "cameras", ()))
+    if not views:
+        raise ExportError(f"{file}: its field has seen no camera yet: let the run publish an update first")
+    return Source(file, name, field, views)
+
+
+def _as_made(name: str, options: dict[str, Any], state: dict[str, Any]) -> dict[str, Any]:
+    """The options a field was made with: those of the state where it tells, since a deadline may have chosen
+    them, but on this machine's threads and device."""
+    try:
+        settings = json.loads(str(state["meta"]))["settings"]
+    except (KeyError, ValueError, TypeError):
+        return options
+    known = set(option_help(name)) - {"threads", "nice", "device", "seed"}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items() if k in known}
+
+
+def find_checkpoint(path: Path) -> Path:
+    """The checkpoint that ``path`` is or holds: of several, a run's last one, else its newest snapshot."""
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise ExportError(f"{path}: no such file or folder")
+    snapshots = sorted(path.glob("snapshot-*.npz"))[::-1]
+    for file in (*(path / name for name in NAMES), *snapshots):
+        if file.is_file():
+            return file
+    raise ExportError(
+        f"{path}: holds no checkpoint ({' or '.join(NAMES)}); a run writes it when it ends, "
+        "with --checkpoint-every S also meanwhile"
+    )
+
+
+def poses_of(source: Source) -> dict[str, list[tuple[int, Pose]]]:
+    """(ns, pose) of every camera: all that its run wrote down, else its last one."""
+    found: dict[str, list[tuple[int, Pose]]] = {}
+    path = source.file.parent / POSES
+    if path.is_file():
+        lines = path.read_text().splitlines()
+        for number, line in enumerate(lines, 1):
+            try:
+                row = json.loads(line)
+                pose = Pose(tuple(row["q"]), tuple(row["t_m"]))
+                found.setdefault(str(row["camera"]), []).append((int(row["ns"]), pose))
+            except (ValueError, KeyError, TypeError):
+                if number == len(lines):
+                    break  # a run that was killed leaves half a line
+                raise ExportError(f"{path}: line {number} is not a pose") from None
+        return found
+    for number, view in enumerate(source.views):
+        try:
+            pose = Pose.from_matrix(view.camera_to_world)
+        except GeometryError as error:
+            raise ExportError(f"camera {view.camera}: {error}") from None
+        # A recorded data set has no time: its views follow each other by a second.
+        found[view.camera] = [(view.generated_ns or number * 10**9, pose)]
+    return found
+
+
+def write_images(folder: Path, shots: list[Shot]) -> None:
+    """NAME.png of every shot, transparency kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for shot in shots:
+        code = cv2.COLOR_RGBA2BGRA if shot.image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+        if not cv2.imwrite(str(folder / f"{shot.name}.png"), cv2.cvtColor(shot.image, code)):
+            raise ExportError(f"{folder / shot.name}.png: cannot be written")

@@ -1,0 +1,69 @@
+"""Gaussians as PLY in the layout of Kerbl et al.'s code, which the common splat viewers open.
+
+There, colour is .5 + Y0 f_dc + sum of Y_k f_rest, with spherical harmonics whose odd ones run the other way
+round than ours; scales are logarithms, opacities before their sigmoid, quaternions w-first: as here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.export import ExportError
+from edge_server.export.ply import write_table
+from edge_server.fields.kernels.splat_project import (
+    BASE,
+    COLOR,
+    OPACITY,
+    POSITION,
+    QUATERNION,
+    SCALE,
+    SCALE_HIGH,
+    SCALE_LOW,
+    Gaussians,
+)
+from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.splat_planar import directed
+
+Y0 = 0.28209479177387814
+# Signs of harmonics 1 to 8: Kerbl et al. negate those of odd order.
+SIGNS = np.array([-1, 1, -1, 1, -1, 1, -1, 1], np.float32)
+
+
+def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
+    """Write all Gaussians; returns how many. ExportError: there are none."""
+    table = splat_table(gaussians, box)
+    if not len(table):
+        raise ExportError("the field has no Gaussians yet: fit it first")
+    write_table(path, table)
+    return len(table)
+
+
+def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
+    """The rows (N,) of the file, in world metres."""
+    p, extra = gaussians.params.astype(np.float64), gaussians.harmonics - 1
+    rest = p[:, BASE:].reshape(len(p), extra, 3) * SIGNS[:extra, None]
+    columns = {
+        **_three("xyz", p[:, POSITION:SCALE] * box.radius_m + np.array(box.centre_m)),
+        **_three(("nx", "ny", "nz"), np.zeros((len(p), 3))),
+        **_three(("f_dc_0", "f_dc_1", "f_dc_2"), (p[:, COLOR:BASE] - 0.5) / Y0),
+        # Channel by channel: all of red, then green, then blue.
+        **{f"f_rest_{c * extra + k}": rest[:, k, c] for c in range(3) for k in range(extra)},
+        "opacity": p[:, OPACITY],
+        **_three(
+            ("scale_0", "scale_1", "scale_2"),
+            np.clip(p[:, SCALE:QUATERNION], SCALE_LOW, SCALE_HIGH) + np.log(box.radius_m),
+        ),
+    }
+    turn = directed(gaussians.params)
+    columns |= {f"rot_{k}": turn[:, k] for k in range(4)}
+    table = np.zeros(len(p), dtype=[(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        table[name] = values
+    return table
+
+
+def _three(names: str | tuple[str, ...], values: NDArray) -> dict[str, NDArray]:
+    return {name: values[:, k] for k, name in enumerate(names)}

@@ -1,0 +1,247 @@
+"""Triangle meshes: extracted from a volume by marching cubes, cleaned, closed where asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.surface import SurfaceError
+from edge_server.surface.kernels.fuse import CELLS, SIDE
+from edge_server.surface.volume import Volume, unblocked
+
+Floats = NDArray[np.float32]
+
+SLAB_CELLS = 1 << 24  # voxels that marching cubes is given at once: 64 MB, and a few times that inside
+LAYER_CELLS = 1 << 23  # of the thinnest slab, which is SIDE layers
+# A distance of exactly 0 puts a vertex on a voxel, where several triangles shrink to nothing.
+LEAST = 1e-3  # voxels
+KEEP_SHARE = 0.02  # of the largest component's area: smaller ones are taken for dirt
+INSTALL = "marching cubes needs scikit-image: pip install 'freshfield[surface]'"
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices: float32 (V, 3), world metres. faces: int32 (F, 3), counter-clockwise seen from outside.
+    color: uint8 (V, 3)."""
+
+    vertices: Floats
+    faces: NDArray[np.int32]
+    color: NDArray[np.uint8]
+
+    @property
+    def watertight(self) -> bool:
+        """Whether every edge belongs to exactly two faces, which run along it in opposite directions."""
+        if not len(self.faces):
+            return False
+        edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+        count = len(self.vertices)
+        one, other = np.sort(edges[:, 0] * count + edges[:, 1]), np.sort(edges[:, 1] * count + edges[:, 0])
+        return bool((one[1:] != one[:-1]).all() and np.array_equal(one, other))
+
+    def areas_m2(self) -> NDArray[np.float64]:
+        """Area of every face (F,), square metres."""
+        corners = self.vertices[self.faces].astype(np.float64)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas: NDArray[np.float64] = 0.5 * np.linalg.norm(cross, axis=1)
+        return areas
+
+
+def extracted(
+    volume: Volume,
+    min_weight: float = 0.0,
+    watertight: bool = False,
+    on_slab: Callable[[float], None] | None = None,
+) -> Mesh:
+    """The zero level of a volume's distances (Lorensen and Cline 1987, in Lewiner's topologically sound
+    form).
+
+    min_weight: voxels that were fused with no more weight are not known. Faces stand only between voxels
+    that are known; watertight: what no camera looked through counts as solid, as far as the box reaches, so
+    that the surface is closed. on_slab: told the share that is done. SurfaceError: scikit-image is missing,
+    or there is no surface.
+    """
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError:
+        raise SurfaceError(INSTALL) from None
+    dense = _Dense(volume, min_weight, watertight)
+    vertices: list[NDArray[np.float64]] = []
+    faces: list[NDArray[np.int64]] = []
+    seams: dict[bytes, int] = {}
+    count = 0
+    for first, last in dense.slabs():
+        distance, known = dense.slab(first, last)
+        # Of a cell, scikit-image reads the mask at its upper corner.
+        cells = np.zeros(known.shape, np.bool_)
+        cells[1:, 1:, 1:] = _all_corners(known) & _crossed(distance)
+        if cells.any():
+            points, triangles, *_ = marching_cubes(distance, 0.0, mask=cells)
+            points = points.astype(np.float64) + np.array([first, 0, 0])
+            number = _joined(points, count, (first, last), seams)
+            new = number >= count
+            vertices.append(points[new])
+            faces.append(number[triangles])
+            count += int(new.sum())
+        if on_slab is not None:
+            on_slab(last / (dense.span[0] - 1))
+    if not count:
+        raise SurfaceError("the depth maps hold no surface within the bounds")
+    index = np.concatenate(vertices)
+    color = dense.colors(index)
+    metres = dense.metres(index)
+    mesh = Mesh(metres.astype(np.float32), np.concatenate(faces).astype(np.int32), color)
+    return without_degenerate(mesh)
+
+
+def _joined(
+    points: NDArray[np.float64], count: int, planes: tuple[int, int], seams: dict[bytes, int]
+) -> NDArray[np.int64]:
+    """Numbers of ``points`` (N, 3), new ones from ``count`` on: those on the planes between two slabs have
+    the number they have in the neighbour, which computes them from the same voxels and so to the same
+    bits."""
+    number = np.full(len(points), -1, np.int64)
+    at_seam = np.isin(points[:, 0], planes)
+    for k in np.flatnonzero(at_seam):
+        number[k] = seams.get(points[k].tobytes(), -1)
+    fresh = number < 0
+    number[fresh] = count + np.arange(int(fresh.sum()))
+    for k in np.flatnonzero(at_seam & fresh):
+        seams[points[k].tobytes()] = int(number[k])
+    return number
+
+
+def _all_corners(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Of cells (X - 1, Y - 1, Z - 1): whether all their corners are known."""
+    a = known[1:] & known[:-1]
+    a = a[:, 1:] & a[:, :-1]
+    found: NDArray[np.bool_] = a[:, :, 1:] & a[:, :, :-1]
+    return found
+
+
+def _crossed(distance: Floats) -> NDArray[np.bool_]:
+    """Of cells: whether the surface passes through them; the others need not be looked at."""
+    inside = distance < 0
+    some, every = inside, inside
+    for axis in range(3):
+        a, b = [slice(None)] * 3, [slice(None)] * 3
+        a[axis], b[axis] = slice(1, None), slice(None, -1)
+        some = some[tuple(a)] | some[tuple(b)]
+        every = every[tuple(a)] & every[tuple(b)]
+    return some & ~every
+
+
+class _Dense:
+    """Slabs of a volume as dense arrays. Indices count voxels from the first one of ``low``; where the
+    surface is to be closed, from an empty layer before it, and another follows the last."""
+
+    def __init__(self, volume: Volume, min_weight: float, watertight: bool) -> None:
+        self.volume, self.min_weight, self.watertight = volume, min_weight, watertight
+        place = volume.blocks.place
+        if not len(place):
+            raise SurfaceError("the depth maps hold no surface within the bounds")
+        low, high = place.min(axis=0), place.max(axis=0) + 1
+        if watertight:
+            low, high = np.zeros(3, np.int64), volume.grid.blocks
+        self.pad = int(watertight)
+        self.low, self.high = low.astype(np.int64), high.astype(np.int64)
+        self.span = tuple(int(n) for n in (self.high - self.low) * SIDE + 2 * self.pad)
+        if self.span[1] * self.span[2] > LAYER_CELLS:
+            raise SurfaceError("the volume is too wide for one slab: take larger voxels or smaller bounds")
+
+    def slabs(self) -> list[tuple[int, int]]:
+        """(first, last) layers along x; neighbours share one."""
+        layers = max(SIDE, SLAB_CELLS // (self.span[1] * self.span[2]))
+        end = self.span[0] - 1
+        return [(x, min(x + layers, end)) for x in range(0, end, layers)]
+
+    def slab(self, first: int, last: int) -> tuple[Floats, NDArray[np.bool_]]:
+        """Distances and whether they are known, of layers first to last inclusive."""
+        grid, blocks, pad = self.volume.grid, self.volume.blocks, self.pad
+        inner = self.span[0] - 2 * pad
+        begin, end = max(first - pad, 0), min(last + 1 - pad, inner)  # voxels
+        b0, b1 = begin // SIDE, -(-end // SIDE)
+        box = (slice(self.low[0] + b0, self.low[0] + b1), *map(slice, self.low[1:], self.high[1:]))
+        part = self.volume.table[box]
+        known = part >= 0
+        distance = np.full((*part.shape, CELLS), grid.band_m, np.float32)
+        sure = np.zeros((*part.shape, CELLS), np.bool_)
+        distance[known] = blocks.distance[part[known]]
+        sure[known] = blocks.weight[part[known]] > self.min_weight
+        if self.watertight:
+            distance = np.where(sure, distance, np.float32(-grid.band_m))
+            free = self.volume.through[box] & ~known
+            distance[free] = grid.band_m
+            sure[:] = True
+        cut = slice(begin - b0 * SIDE, end - b0 * SIDE)
+        least = np.float32(LEAST * grid.voxel_m)
+        dense, known = unblocked(distance)[cut], unblocked(sure)[cut]
+        dense = np.where(np.abs(dense) < least, np.where(dense < 0, -least, least), dense)
+        if pad:
+            width = ((pad - (first > 0), pad - (last < self.span[0] - 1)), (1, 1), (1, 1))
+            dense = np.pad(dense, width, constant_values=grid.band_m)
+            known = np.pad(known, width, constant_values=True)
+        return np.ascontiguousarray(dense), known
+
+    def metres(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
+        """World metres of indices (N, 3)."""
+        grid = self.volume.grid
+        voxels = index - self.pad + SIDE * self.low
+        metres: NDArray[np.float64] = np.array(grid.lower) + voxels * grid.voxel_m
+        return metres
+
+    def colors(self, index: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Colours (N, 3) at indices (N, 3), which lie between two voxels: between theirs; grey: unknown."""
+        low, high = np.floor(index).astype(np.int64), np.ceil(index).astype(np.int64)
+        share = (index - low).max(axis=1, keepdims=True)
+        sums = (1.0 - share) * self._color_sums(low) + share * self._color_sums(high)
+        mean = sums[:, :3] / np.maximum(sums[:, 3:], 1e-9)
+        return np.where(sums[:, 3:] > 0, np.rint(mean), 128).astype(np.uint8)
+
+    def _color_sums(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Weighted colours and their weights (N, 4) of voxels; 0 where there are none."""
+        table = self.volume.table
+        block, inside = np.divmod(index - self.pad + SIDE * self.low, SIDE)
+        within = ((block >= 0) & (block < table.shape)).all(axis=1)
+        number = np.where(within, table[tuple(np.where(within[:, None], block, 0).T)], -1)
+        cell = (inside[:, 0] * SIDE + inside[:, 1]) * SIDE + inside[:, 2]
+        sums = self.volume.blocks.color[np.maximum(number, 0), cell].astype(np.float64)
+        return np.where(number[:, None] >= 0, sums, 0.0)
+
+
+def without_degenerate(mesh: Mesh) -> Mesh:
+    """The mesh without faces of no area and without vertices that no face uses."""
+    corners = mesh.faces
+    apart = (
+        (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
+    )
+    return _of_faces(mesh, apart & (mesh.areas_m2() > 0.0))
+
+
+def cleaned(mesh: Mesh, keep_share: float = KEEP_SHARE, most: int | None = None) -> Mesh:
+    """The mesh's components of at least ``keep_share`` of the largest one's area, at most ``most`` of them,
+    largest first."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(mesh.faces):
+        return mesh
+    a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    count = len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    of_face = label[mesh.faces[:, 0]]
+    area = np.bincount(of_face, weights=mesh.areas_m2())
+    order = np.argsort(-area, kind="stable")
+    kept = order[area[order] >= keep_share * area.max()][:most]
+    return _of_faces(mesh, np.isin(of_face, kept))
+
+
+def _of_faces(mesh: Mesh, which: NDArray[np.bool_]) -> Mesh:
+    faces = mesh.faces[which]
+    used = np.zeros(len(mesh.vertices), np.bool_)
+    used[faces] = True
+    number = np.cumsum(used) - 1
+    return Mesh(mesh.vertices[used], number[faces].astype(np.int32), mesh.color[used])

@@ -1,0 +1,115 @@
+"""How good a mesh is, against the exact surface of a synthetic scene.
+
+The truth is what the scene's own rays meet: points of the analytic surface, one a cell of ``spacing_m``, with
+the number of cameras that see each. A camera sees a point that lies in its picture, that its ray meets first,
+and that is turned towards it by at least ``STEEPEST_DEG``. Depth from pictures needs two cameras:
+completeness is asked of points that two or more see, accuracy is measured against all that any camera sees.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.surface import SurfaceError
+from edge_server.surface.mesh import Mesh
+
+Points = NDArray[np.float64]
+
+STEEPEST_DEG = 75.0
+SEEN_BY = 2
+WITHIN_M = 0.003
+SAMPLES = 200_000
+
+
+@dataclass(frozen=True)
+class Truth:
+    """points: (N, 3), metres. cameras: int64 (N,), how many see each."""
+
+    points: Points
+    cameras: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Distances in millimetres. accuracy: from the mesh to the surface; completeness: from the surface that
+    two cameras see to the mesh; chamfer: the mean of the two means. complete: share of that surface within
+    ``WITHIN_M`` of the mesh; precise: share of the mesh so near to the surface."""
+
+    chamfer_mm: float
+    accuracy_mm: float
+    accuracy_median_mm: float
+    accuracy_p95_mm: float
+    completeness_mm: float
+    complete: float
+    precise: float
+
+
+def thinned(points: Points, spacing_m: float) -> NDArray[np.int64]:
+    """Numbers of points (N, 3), the first one in every cell of a grid."""
+    cells = np.floor(points / spacing_m).astype(np.int64)
+    cells -= cells.min(axis=0, initial=0)
+    x, y, z = (int(n) + 1 for n in cells.max(axis=0, initial=0))
+    if x * y * z > 1 << 62:
+        raise SurfaceError(f"points are too far apart for cells of {1e3 * spacing_m:g} mm")
+    key = (cells[:, 0] * y + cells[:, 1]) * z + cells[:, 2]
+    _, first = np.unique(key, return_index=True)
+    return np.sort(first)
+
+
+def on_mesh(mesh: Mesh, count: int = SAMPLES, seed: int = 0) -> Points:
+    """``count`` points (N, 3) spread evenly over a mesh's area."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 56]))
+    area = mesh.areas_m2()
+    edges = np.cumsum(area)
+    # Evenly along the faces laid end to end: less noise than drawing each.
+    at = (np.arange(count) + rng.random(count)) / count * edges[-1]
+    face = np.minimum(np.searchsorted(edges, at, side="right"), len(area) - 1)
+    a, b = rng.random((2, count))
+    over = a + b > 1.0
+    a, b = np.where(over, 1.0 - a, a), np.where(over, 1.0 - b, b)
+    corner = mesh.vertices[mesh.faces[face]].astype(np.float64)
+    points: Points = (
+        corner[:, 0] + a[:, None] * (corner[:, 1] - corner[:, 0]) + b[:, None] * (corner[:, 2] - corner[:, 0])
+    )
+    return points
+
+
+def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> Comparison:
+    """Measure ``mesh``. SurfaceError: one of the two has no surface."""
+    from scipy.spatial import cKDTree
+
+    asked = truth.points[truth.cameras >= SEEN_BY]
+    if not len(mesh.faces) or not len(asked):
+        raise SurfaceError("nothing to compare: the mesh, or what two cameras see, is empty")
+    points = on_mesh(mesh, samples)
+    to_truth, _ = cKDTree(truth.points).query(points)
+    to_mesh, _ = cKDTree(points).query(asked)
+    return Comparison(
+        chamfer_mm=500.0 * float(to_truth.mean() + to_mesh.mean()),
+        accuracy_mm=1e3 * float(to_truth.mean()),
+        accuracy_median_mm=1e3 * float(np.median(to_truth)),
+        accuracy_p95_mm=1e3 * float(np.percentile(to_truth, 95)),
+        completeness_mm=1e3 * float(to_mesh.mean()),
+        complete=float((to_mesh <= WITHIN_M).mean()),
+        precise=float((to_truth <= WITHIN_M).mean()),
+    )
+
+
+def depth_error_mm(depth: NDArray[np.float32], exact: NDArray[np.float64]) -> dict[str, float]:
+    """Bias (mean of what is too far less what is too near), median and 90th percentile of the size of
+    depth's error, mm, over pixels that have both. A pixel of more than 50 mm is a miss and counted apart."""
+    both = (depth > 0) & np.isfinite(depth) & np.isfinite(exact)
+    error = 1e3 * (depth[both].astype(np.float64) - exact[both])
+    near = np.abs(error) <= 50.0
+    error = error[near]
+    if not error.size:
+        return {"bias_mm": float("nan"), "median_mm": float("nan"), "p90_mm": float("nan"), "missed": 1.0}
+    return {
+        "bias_mm": float(error.mean()),
+        "median_mm": float(np.median(np.abs(error))),
+        "p90_mm": float(np.percentile(np.abs(error), 90)),
+        "missed": float(1.0 - near.mean()),
+    }

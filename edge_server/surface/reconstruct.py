@@ -1,0 +1,134 @@
+"""From a renderer and its cameras to a mesh in one call: what the export command, the page and the bench
+do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge_server.fields import Renderer, View
+from edge_server.fields.kernels.pool import Pool
+from edge_server.surface import SurfaceError
+from edge_server.surface.depth import SOLID, STEEPEST_DEG, DepthMap, rendered
+from edge_server.surface.mesh import KEEP_SHARE, Mesh, cleaned, extracted
+from edge_server.surface.sharpen import sharpened
+from edge_server.surface.volume import TRUNCATION, Grid, bounds_of, fused
+
+METHODS = ("tsdf", "sdf")
+GUESS = 0.5  # opacity of a surface that is only a first guess
+FINEST = 512  # voxels along the longest side, where no voxel size is given
+Corner = tuple[float, float, float]
+Say = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """method: tsdf (3.8-3.10) or sdf (3.12-3.15). voxel_m: None takes what a pixel spans at the surface.
+    truncation: voxels. bounds: lower and upper corner, metres; None: of what cameras see. watertight: close
+    the surface where nothing was seen. min_weight: voxels of no more weight (a camera that looks straight on
+    counts 1) are not known. solid, steepest_deg: which pixels count. keep_share, most: which components stay.
+    memory_mb: of the volume. sharpen: move depth to where the pictures agree (``sharpen``)."""
+
+    method: str = "tsdf"
+    sharpen: bool = True
+    voxel_m: float | None = None
+    truncation: float = TRUNCATION
+    bounds: tuple[Corner, Corner] | None = None
+    watertight: bool = False
+    min_weight: float = 0.2
+    solid: float = SOLID
+    steepest_deg: float = STEEPEST_DEG
+    keep_share: float = KEEP_SHARE
+    most: int | None = None
+    memory_mb: float = 2048.0
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise SurfaceError(f"method must be one of {', '.join(METHODS)}, not {self.method!r}")
+        for name, low, high in (
+            ("truncation", 1.0, 100.0), ("min_weight", 0.0, 1e6), ("solid", 0.01, 1.0),
+            ("steepest_deg", 1.0, 89.9), ("keep_share", 0.0, 1.0), ("memory_mb", 1.0, 1e6),
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise SurfaceError(f"{name} must be in {low:g}..{high:g}, not {getattr(self, name):g}")
+
+
+def silent(what: str, share: float) -> None:
+    """Says nothing of the progress."""
+
+
+def mesh_of(
+    renderer: Renderer,
+    views: Sequence[View],
+    settings: MeshSettings | None = None,
+    say: Say = silent,
+    pool: Pool | None = None,
+) -> Mesh:
+    """The surface that ``renderer`` shows to the cameras of ``views``. say: told of each stage how much of it
+    is done. SurfaceError: there is none, or it cannot be had as asked."""
+    settings = settings or MeshSettings()
+    return mesh_of_maps(maps_of(renderer, views, settings, say, pool), settings, say, pool)
+
+
+def maps_of(
+    renderer: Renderer,
+    views: Sequence[View],
+    settings: MeshSettings,
+    say: Say = silent,
+    pool: Pool | None = None,
+) -> list[DepthMap]:
+    """The depth maps that ``mesh_of`` fuses."""
+    if not views:
+        raise SurfaceError("the field knows no cameras yet: fit it first")
+    cameras = [(v.camera_to_world, v.intrinsics) for v in views]
+    # Where the pictures decide, a translucent first guess will do.
+    solid = min(settings.solid, GUESS) if settings.sharpen else settings.solid
+    maps = list(
+        rendered(
+            renderer, cameras, solid, settings.steepest_deg, lambda done: say("depth", done / len(views))
+        )
+    )
+    if not settings.sharpen or len(maps) < 2:
+        return maps
+    return sharpened(maps, [v.image for v in views], pool=pool, on_map=lambda share: say("sharpen", share))
+
+
+def mesh_of_maps(
+    maps: Sequence[DepthMap], settings: MeshSettings, say: Say = silent, pool: Pool | None = None
+) -> Mesh:
+    """The surface of depth maps; see ``mesh_of``."""
+    grid = grid_for(maps, settings)
+    if settings.method == "sdf":
+        from edge_server.surface.sdf import fitted  # torch, only where it is asked for
+
+        volume = fitted(grid, maps, settings.memory_mb, say, pool)
+    else:
+        volume = fused(grid, maps, settings.memory_mb, pool, lambda done: say("fuse", done / len(maps)))
+    mesh = extracted(volume, settings.min_weight, settings.watertight, lambda share: say("extract", share))
+    return cleaned(mesh, settings.keep_share, settings.most)
+
+
+def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
+    """The grid of a mesh: as set, else found from the maps."""
+    voxel_m = settings.voxel_m or pixel_m(maps)
+    if settings.bounds is not None:
+        lower, upper = settings.bounds
+    else:
+        lower, upper = bounds_of(maps, 2.0 * settings.truncation * voxel_m)
+    if settings.voxel_m is None:
+        voxel_m = max(voxel_m, float(np.subtract(upper, lower).max()) / FINEST)
+    return Grid(lower, upper, voxel_m, settings.truncation * voxel_m)
+
+
+def pixel_m(maps: Sequence[DepthMap]) -> float:
+    """What a pixel spans at the surface, metres: the median over the maps. SurfaceError: they show none."""
+    spans = [
+        float(np.median(m.depth[m.seen])) / min(m.intrinsics.fx, m.intrinsics.fy)
+        for m in maps
+        if m.seen.any()
+    ]
+    if not spans:
+        raise SurfaceError("no camera sees anything solid: fit the field longer, or lower --solid")
+    return float(np.median(spans))

@@ -1,0 +1,183 @@
+"""A signed distance function fitted to depth (thesis 3.12-3.15), as another way from depth maps to a mesh.
+
+d_theta of (3.14) is a grid of distances with trilinear interpolation, fitted from coarse to fine by Adam. The
+loss is that of (3.15): |d| at points seen on the surface, and the eikonal term (|grad d| - 1)^2 over the
+domain Omega. (3.15) alone does not say which side is inside, so a third term does: before a surface point on
+its ray d is positive, behind it negative (3.12), by at least half of what a plane there would give.
+
+What comes out replaces the distances of a fused volume, whose evidence and colours stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.pool import Pool
+from edge_server.surface import SurfaceError
+from edge_server.surface.depth import DepthMap
+from edge_server.surface.kernels.fuse import CELLS, SIDE
+from edge_server.surface.volume import Grid, Volume, fused
+
+MOST_NODES = 1 << 24
+
+
+@dataclass(frozen=True)
+class SdfSettings:
+    """levels: grids, each twice as fine as the one before. steps: of Adam on each. points: surface points of
+    a step, and as many of each other kind. eikonal: lambda of (3.15). sides: weight of the third term. rate:
+    of Adam, in voxels of the level."""
+
+    levels: int = 3
+    steps: int = 60
+    points: int = 20_000
+    eikonal: float = 0.1
+    sides: float = 1.0
+    rate: float = 0.1
+    seed: int = 0
+
+
+def fitted(
+    grid: Grid,
+    maps: Sequence[DepthMap],
+    memory_mb: float = 2048.0,
+    say: Callable[[str, float], None] | None = None,
+    pool: Pool | None = None,
+    settings: SdfSettings | None = None,
+) -> Volume:
+    """A volume whose distances are those of a fitted function. SurfaceError: torch is missing, the grid is
+    too fine, or there is nothing to fit."""
+    settings = settings or SdfSettings()
+    volume = fused(grid, maps, memory_mb, pool)
+    samples = _Samples.of(maps, grid)
+    if not len(samples.points):
+        raise SurfaceError("no camera sees anything solid within the bounds")
+    nodes = int(np.prod(grid.blocks * SIDE))
+    if nodes > MOST_NODES:
+        least = grid.voxel_m * (nodes / MOST_NODES) ** (1 / 3)
+        raise SurfaceError(
+            f"a distance function at {1e3 * grid.voxel_m:g} mm has too many nodes: take {1e3 * least:.2g} mm "
+            "or more, smaller bounds, or method tsdf"
+        )
+    distance = _optimised(grid, samples, settings, say)
+    x, y, z = grid.blocks
+    blocked = distance.reshape(x, SIDE, y, SIDE, z, SIDE).transpose(0, 2, 4, 1, 3, 5).reshape(x, y, z, CELLS)
+    clipped = np.clip(blocked[tuple(volume.blocks.place.T)], -grid.band_m, grid.band_m)
+    return replace(volume, blocks=volume.blocks._replace(distance=clipped.astype(np.float32)))
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """points: float32 (N, 3), on the surface, metres from the grid's lower corner. rays: (N, 3), on from the
+    camera. cosine, trust: (N,)."""
+
+    points: NDArray[np.float32]
+    rays: NDArray[np.float32]
+    cosine: NDArray[np.float32]
+    trust: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, maps: Sequence[DepthMap], grid: Grid) -> _Samples:
+        points, rays, cosine, trust = [], [], [], []
+        for m in maps:
+            at = m.points() - np.array(grid.lower)
+            inside = ((at > 0) & (at < np.subtract(grid.upper, grid.lower))).all(axis=1)
+            points.append(at[inside])
+            rays.append((m.intrinsics.rays()[m.seen] @ m.camera_to_world[:3, :3].T)[inside])
+            cosine.append(m.cosine[m.seen][inside])
+            trust.append(m.trust[m.seen][inside])
+        every = (np.concatenate(part).astype(np.float32) for part in (points, rays, cosine, trust))
+        return cls(*every)
+
+
+def _optimised(
+    grid: Grid, samples: _Samples, s: SdfSettings, say: Callable[[str, float], None] | None
+) -> NDArray[np.float32]:
+    """Distances (X, Y, Z) at the grid's voxels, metres."""
+    try:
+        import torch
+        from torch.nn.functional import interpolate
+    except ImportError:
+        raise SurfaceError("method sdf needs torch: pip install 'freshfield[edge]'") from None
+    generator = torch.Generator().manual_seed(s.seed)
+    points, rays = torch.from_numpy(samples.points), torch.from_numpy(samples.rays)
+    cosine, trust = torch.from_numpy(samples.cosine), torch.from_numpy(samples.trust)
+    chances = (trust.double() / trust.double().sum()).cumsum(0)
+    size = tuple(int(n) for n in grid.blocks * SIDE)
+    # Everything starts a little outside: sides and surface points carve the inside out of it.
+    values = torch.full((1, 1, *_coarser(size, s.levels - 1)), 0.5 * grid.band_m)
+    for level in range(s.levels):
+        scale = 2 ** (s.levels - 1 - level)
+        voxel = grid.voxel_m * scale
+        shape = _coarser(size, s.levels - 1 - level)
+        if level:
+            values = interpolate(values, size=shape, mode="trilinear", align_corners=True)
+        values = values.detach().clone().requires_grad_()
+        extent = torch.tensor([(n - 1) * voxel for n in shape])
+        optimiser = torch.optim.Adam([values], lr=s.rate * voxel, betas=(0.9, 0.95))
+        for step in range(s.steps):
+            # Drawn by trust; numpy's searchsorted is what multinomial would do, without its limit of 2^24.
+            drawn = torch.searchsorted(
+                chances, torch.rand(s.points, generator=generator, dtype=torch.float64)
+            ).clamp_(max=len(chances) - 1)
+            loss = _loss(
+                values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], s, generator
+            )
+            optimiser.param_groups[0]["lr"] = s.rate * voxel * 0.1 ** (step / s.steps)
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            optimiser.step()
+            if say is not None and (step + 1) % 20 == 0:
+                say("sdf", (level + (step + 1) / s.steps) / s.levels)
+    found: NDArray[np.float32] = values.detach().numpy()[0, 0]
+    return found
+
+
+def _coarser(size: tuple[int, ...], halvings: int) -> tuple[int, ...]:
+    return tuple(max(2, -(-n // 2**halvings)) for n in size)
+
+
+def _loss(values, extent, voxel, band, points, rays, cosine, s, generator):
+    """(3.15) with the term of the sides, on distances in voxels, so that it weighs the same on every
+    level."""
+    import torch
+
+    reach = torch.rand(len(points), generator=generator) * band
+    along = (reach * cosine)[:, None]
+    before, behind = points - rays * reach[:, None], points + rays * reach[:, None]
+    # Somewhere between the camera and the band before the surface: free.
+    far = torch.rand(len(points), generator=generator)[:, None]
+    free = points - rays * (band + far * (extent.max() - band))
+    inside = ((free > 0) & (free < extent)).all(dim=1)
+    on = at(values, points, extent)
+    front, back, clear = at(values, before, extent), at(values, behind, extent), at(values, free, extent)
+    sides = torch.relu(0.5 * along[:, 0] - front).mean() + torch.relu(0.5 * along[:, 0] + back).mean()
+    sides = sides + (torch.relu(0.5 * band - clear) * inside).mean()
+    domain = torch.cat([points, before, behind])[
+        torch.randperm(3 * len(points), generator=generator)[: len(points)]
+    ]
+    steep = slope(values, domain, extent, voxel)
+    eikonal = ((steep - 1.0) ** 2).mean()
+    return on.abs().mean() / voxel + s.sides * sides / voxel + s.eikonal * eikonal
+
+
+def at(values, points, extent):
+    """Distances (N,) at points (N, 3), metres from the grid's corner, between its nodes (1, 1, X, Y, Z)."""
+    from torch.nn.functional import grid_sample
+
+    where = (
+        (2.0 * points / extent - 1.0).flip(-1).view(1, -1, 1, 1, 3)
+    )  # grid_sample wants the last axis first
+    return grid_sample(values, where, mode="bilinear", padding_mode="border", align_corners=True).view(-1)
+
+
+def slope(values, points, extent, voxel):
+    """|grad d| (N,) by differences over a voxel to both sides (3.13)."""
+    import torch
+
+    steps = torch.eye(3) * voxel
+    parts = [at(values, points + e, extent) - at(values, points - e, extent) for e in steps]
+    return (torch.stack(parts).pow(2).sum(0) / (2.0 * voxel) ** 2 + 1e-12).sqrt()

@@ -1,0 +1,186 @@
+"""A truncated signed distance field from depth maps (thesis 3.8-3.10), kept only around surfaces.
+
+Space is divided into blocks of 8 x 8 x 8 voxels; those within the truncation of some depth map's surface have
+memory, the others are one entry in a table. Fusing costs time for these blocks alone, and every voxel's sums
+are made in the order of the maps, so that the result is the same bit for bit on any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.kernels.pool import Pool, shared_pool
+from edge_server.fields.supervision import lens_row
+from edge_server.surface import SurfaceError
+from edge_server.surface.depth import DepthMap
+from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, Look, fuse
+
+BYTES = CELLS * 4 * (1 + 1 + 4)  # of a block
+MOST_ENTRIES = 1 << 24  # of the table of blocks: 24 bytes each while maps are fused
+TRUNCATION = 4.0  # voxels, unless said otherwise
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where voxels are. lower, upper: (3,) metres, corners of the box. band_m: truncation, d_max of (3.8)."""
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    voxel_m: float
+    band_m: float
+
+    def __post_init__(self) -> None:
+        values = np.array([*self.lower, *self.upper, self.voxel_m, self.band_m])
+        if not np.isfinite(values).all():
+            raise SurfaceError("bounds, voxel size and truncation must be finite")
+        if not self.voxel_m > 0:
+            raise SurfaceError(f"voxel size must be more than 0, not {1e3 * self.voxel_m:g} mm")
+        if self.band_m < self.voxel_m:
+            raise SurfaceError(
+                f"truncation must be at least one voxel ({1e3 * self.voxel_m:g} mm), "
+                f"not {1e3 * self.band_m:g} mm"
+            )
+        if not all(low < high for low, high in zip(self.lower, self.upper)):
+            raise SurfaceError(f"bounds: each lower corner must be below its upper one: {self.describe()}")
+        entries = np.prod(self.blocks.astype(float))
+        if entries > MOST_ENTRIES:
+            least = self.voxel_m * (entries / MOST_ENTRIES) ** (1 / 3)
+            raise SurfaceError(
+                f"{1e3 * self.voxel_m:g} mm voxels are too many in {self.describe()}: "
+                f"take {1e3 * least:.2g} mm or more, or smaller bounds"
+            )
+
+    @property
+    def blocks(self) -> NDArray[np.int64]:
+        """Blocks along each axis (3,)."""
+        span = np.subtract(self.upper, self.lower)
+        return np.maximum(np.ceil(span / (SIDE * self.voxel_m)), 1).astype(np.int64)
+
+    def describe(self) -> str:
+        """The box, for people."""
+        return " x ".join(f"{a:.3g}..{b:.3g}" for a, b in zip(self.lower, self.upper)) + " m"
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Fused blocks. table: int32 (X, Y, Z) of all blocks in the box: number of a block, or -1. through: bool
+    (X, Y, Z), blocks whose middle some map sees in front of its surface."""
+
+    grid: Grid
+    blocks: Blocks
+    table: NDArray[np.int32]
+    through: NDArray[np.bool_]
+
+
+def bounds_of(maps: Sequence[DepthMap], margin_m: float, spare: float = 0.002) -> tuple[
+    tuple[float, float, float], tuple[float, float, float]
+]:  # fmt: skip
+    """Lower and upper corner, metres, of what the maps show, with a margin. spare: share of points at each
+    end of each axis that may be strays. SurfaceError: they show nothing."""
+    points = [m.points()[:: max(1, m.depth.size // 20000)] for m in maps]
+    every = np.concatenate(points) if points else np.zeros((0, 3))
+    if not len(every):
+        raise SurfaceError("no camera sees anything solid: fit the field longer, or lower --solid")
+    low, high = np.quantile(every, [spare, 1.0 - spare], axis=0)
+    a, b = low - margin_m, high + margin_m
+    return (float(a[0]), float(a[1]), float(a[2])), (float(b[0]), float(b[1]), float(b[2]))
+
+
+def fused(
+    grid: Grid,
+    maps: Iterable[DepthMap],
+    memory_mb: float = 2048.0,
+    pool: Pool | None = None,
+    on_map: Callable[[int], None] | None = None,
+) -> Volume:
+    """Fuse ``maps`` in their order. on_map: told how many are done. SurfaceError: more blocks than
+    ``memory_mb`` holds."""
+    maps = list(maps)
+    pool = pool or shared_pool()
+    table = np.full(tuple(grid.blocks), -1, np.int32)
+    place = np.argwhere(near_surfaces(grid, maps)).astype(np.int32)
+    needed_mb = len(place) * BYTES / 1e6
+    if needed_mb > memory_mb:
+        # Blocks near a surface grow with the square of the resolution.
+        least_m = grid.voxel_m * np.sqrt(needed_mb / memory_mb)
+        raise SurfaceError(
+            f"{1e3 * grid.voxel_m:g} mm voxels need {needed_mb:.0f} MB, more than the {memory_mb:.0f} "
+            f"allowed: take {1e3 * least_m:.2g} mm or more, smaller bounds, or more memory"
+        )
+    table[tuple(place.T)] = np.arange(len(place), dtype=np.int32)
+    blocks = _blocks(place, np.array(grid.lower), grid.band_m)
+    # The same for blocks as wholes: what is free and what is hidden where no voxels are.
+    side = SIDE * grid.voxel_m
+    across = -(-grid.blocks // SIDE)
+    coarse = np.argwhere(np.ones(across, np.bool_)).astype(np.int32)
+    middles = _blocks(coarse, np.array(grid.lower) + 0.5 * (side - grid.voxel_m), grid.band_m)
+    for done, found in enumerate(maps, 1):
+        look = as_look(found)
+        pool.run(fuse, blocks, look, float(grid.voxel_m), float(grid.band_m))
+        pool.run(fuse, middles, look, float(side), float(grid.band_m))
+        if on_map is not None:
+            on_map(done)
+    free = unblocked(((middles.weight > 0) & (middles.distance > 0)).reshape(*across, CELLS))
+    return Volume(grid, blocks, table, free[: table.shape[0], : table.shape[1], : table.shape[2]])
+
+
+def _blocks(place: NDArray[np.int32], lowest: NDArray[np.float64], band_m: float) -> Blocks:
+    return Blocks(
+        place=place,
+        lowest=lowest.astype(np.float64),
+        distance=np.full((len(place), CELLS), band_m, np.float32),
+        weight=np.zeros((len(place), CELLS), np.float32),
+        color=np.zeros((len(place), CELLS, 4), np.float32),
+    )
+
+
+def unblocked(blocks: NDArray) -> NDArray:
+    """Voxels (X, Y, Z, CELLS) of a box of blocks as one array (SIDE X, SIDE Y, SIDE Z)."""
+    x, y, z = blocks.shape[:3]
+    layers = blocks.reshape(x, y, z, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5)
+    return layers.reshape(x * SIDE, y * SIDE, z * SIDE)
+
+
+def as_look(found: DepthMap) -> Look:
+    """A depth map as the kernel reads it."""
+    return Look(
+        lens=np.array(lens_row(found.intrinsics), dtype=np.float64),
+        rotation=np.ascontiguousarray(found.camera_to_world[:3, :3]),
+        origin=np.ascontiguousarray(found.camera_to_world[:3, 3]),
+        depth=np.where(found.depth < np.inf, found.depth, np.float32(FAR)),
+        trust=np.ascontiguousarray(found.trust),
+        cosine=np.ascontiguousarray(found.cosine),
+        color=np.ascontiguousarray(found.color),
+    )
+
+
+def near_surfaces(grid: Grid, maps: Sequence[DepthMap]) -> NDArray[np.bool_]:
+    """Which blocks (X, Y, Z) come within the truncation of a depth map's points."""
+    wanted = np.zeros(tuple(grid.blocks), np.bool_)
+    side = SIDE * grid.voxel_m
+    # Half a block beyond the band, so that a block that it only touches is there too.
+    reach = grid.band_m + 0.5 * side
+    offsets = np.linspace(-reach, reach, 1 + 2 * max(1, int(np.ceil(2.0 * reach / side))))
+    for found in maps:
+        pose, seen = found.camera_to_world, found.seen
+        if not seen.any():
+            continue
+        rays = found.intrinsics.rays()[seen] @ pose[:3, :3].T
+        depth = found.depth[seen].astype(np.float64)
+        # Pixels wider than half a block leave gaps: points between them are added.
+        wide = float(np.median(depth)) / min(found.intrinsics.fx, found.intrinsics.fy)
+        spread = int(np.ceil(wide / (0.5 * side))) - 1
+        for offset in offsets:
+            points = pose[:3, 3] + rays * (depth + offset)[:, None]
+            at = np.floor((points - np.array(grid.lower)) / side).astype(np.int64)
+            at = at[((at >= 0) & (at < grid.blocks)).all(axis=1)]
+            if spread > 0:
+                steps = np.stack(np.meshgrid(*[np.arange(-spread, spread + 1)] * 3), axis=-1).reshape(-1, 3)
+                at = (np.unique(at, axis=0)[:, None] + steps).reshape(-1, 3)
+                at = at[((at >= 0) & (at < grid.blocks)).all(axis=1)]
+            wanted[tuple(at.T)] = True
+    return wanted

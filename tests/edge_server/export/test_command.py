@@ -1,0 +1,144 @@
+"""``edge-server export`` on what real fields leave behind, and what it says where it cannot."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from edge_server.cli import main as edge_server
+from edge_server.export.source import open_source, poses_of
+from edge_server.fields import Budget, checkpoint
+from edge_server.fields.registry import field_names, make_field
+from edge_server.offline.still import synthetic
+from freshfield.geometry import Pose, look_at
+
+OPTIONS = {
+    "splat": {"gaussians": 512, "start": 256, "seed_cells": 16},
+    "voxel": {"sizes": [16, 32], "refine_at": [10], "rays": 1024, "cells": 16},
+}
+SMALL = {"rays": 512, "batch_samples": 4096, "samples": 48, "cells": 16}
+
+
+def saved(folder, name: str, steps: int = 30):
+    """A checkpoint of a field that has learnt ``tile`` a little, as a run leaves it."""
+    options = OPTIONS.get(name, SMALL)
+    field = make_field(name, options, seed=3)
+    field.fit(synthetic("tile", cameras=9, size=32).training, Budget(steps=steps))
+    checkpoint.save(folder / "field.npz", field.state(), {"field": name, "options": {}, "seed": 3})
+    return field
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    saved(folder, "splat", steps=120)
+    return folder
+
+
+def export(*words) -> int:
+    return edge_server(["export", *map(str, words)])
+
+
+def test_everything_at_once(run, tmp_path, capsys):
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    status = export(
+        run, "--mesh", tmp_path / "m.ply", "--splats", tmp_path / "s.ply", "--points", tmp_path / "p.ply",
+        "--colmap", tmp_path / "colmap", "--transforms", tmp_path / "nerf",
+        "--trajectory", tmp_path / "t.tum", "--voxel", 10, "--count", 500, "--min-weight", 0,
+    )  # fmt: skip
+    said = capsys.readouterr().out
+    assert status == 0, said
+    for name in ("m.ply", "s.ply", "p.ply", "colmap/sparse/0/images.txt", "nerf/transforms.json", "t.tum"):
+        assert (tmp_path / name).stat().st_size > 100, name
+    assert len(list((tmp_path / "colmap" / "images").glob("*.png"))) == 8
+    assert "8 cameras" in said and "triangles" in said and "sharpen" in said
+    assert len((tmp_path / "t.tum").read_text().splitlines()) == 1 + 8  # a rig that stands still: one file
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_every_representation_comes_back_as_it_was(tmp_path, name):
+    field = saved(tmp_path, name)
+    source = open_source(tmp_path)
+    assert source.name == name and len(source.views) == 8
+    view = source.views[0]
+    before, after = (f.render(view.camera_to_world, view.intrinsics) for f in (field, source.field))
+    np.testing.assert_array_equal(before.color, after.color)
+    np.testing.assert_array_equal(before.depth, after.depth)
+
+
+def test_a_camera_that_moved_has_its_whole_way(run, tmp_path, capsys):
+    folder = tmp_path / "moved"
+    folder.mkdir()
+    (folder / "field.npz").write_bytes((run / "field.npz").read_bytes())
+    poses = [Pose.from_matrix(look_at((0.3, 0.1 * k, 0.4), (0, 0, 0))) for k in range(4)]
+    rows = [("arm", 10**9 + k, pose) for k, pose in enumerate(poses)] + [("still", 5, poses[0])]
+    (folder / "poses.jsonl").write_text(
+        "\n".join(
+            json.dumps({"camera": c, "ns": t, "q": p.quaternion, "t_m": p.translation_m}) for c, t, p in rows
+        )
+        + '\n{"camera": "ar'
+    )
+    assert poses_of(open_source(folder))["arm"] == [(10**9 + k, pose) for k, pose in enumerate(poses)]
+    assert export(folder, "--trajectory", tmp_path / "arm.tum") == 0
+    assert "4 poses of arm" in capsys.readouterr().out
+
+
+def test_a_run_writes_down_where_its_cameras_were(tmp_path):
+    from edge_server.fields import View
+    from edge_server.journal import Journal
+    from freshfield.geometry import Pinhole
+
+    lens, picture = Pinhole.from_fov(8, 8, 50), np.zeros((8, 8, 3), np.uint8)
+    places = [(0.3, 0.0, 0.4), (0.3, 0.0, 0.4), (0.3, 0.1, 0.4)]
+    journal = Journal(tmp_path, dict)
+    for k, place in enumerate(places):
+        views = [
+            View("arm", picture, look_at(place, (0, 0, 0)), lens, k),
+            View("wall", picture, np.eye(4), lens, k),
+        ]
+        journal.poses(views)
+    journal.close()
+    rows = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
+    assert [(row["camera"], row["ns"]) for row in rows] == [("arm", 0), ("wall", 0), ("arm", 2)]
+    np.testing.assert_allclose(rows[2]["t_m"], places[2])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--mesh", "m.obj"), "--mesh m.obj: expected a file that ends in .ply or .glb"),
+        (("--mesh", "m.ply", "--voxel", "0"), "--voxel 0: expected more than 0 mm"),
+        (("--mesh", "m.ply", "--method", "poisson"), "method must be one of tsdf, sdf"),
+        (("--mesh", "m.ply", "--solid", "2"), "solid must be in 0.01..1"),
+        (("--points", "p.ply", "--binary"), "--binary is for --colmap"),
+        (("--points", "p.ply", "--count", "0"), "--count 0"),
+        (("--mesh", "m.ply", "--voxel", "10", "--bounds", *["1", "1", "1", "0", "0", "0"]), "lower corner"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_said_in_a_line(run, tmp_path, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    assert export(run, *words) == 2
+    error = capsys.readouterr().err
+    assert said in error and len(error.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_checkpoint_and_the_wrong_field(tmp_path, capsys):
+    assert export(tmp_path / "nowhere", "--points", tmp_path / "p.ply") == 2
+    assert "no such file or folder" in capsys.readouterr().err
+    assert export(tmp_path, "--points", tmp_path / "p.ply") == 2
+    assert "holds no checkpoint" in capsys.readouterr().err
+    (tmp_path / "field.npz").write_bytes(b"half of it")
+    assert export(tmp_path, "--points", tmp_path / "p.ply") == 2
+    assert "damaged or not a checkpoint" in capsys.readouterr().err
+    saved(tmp_path, "voxel", steps=2)
+    assert export(tmp_path, "--splats", tmp_path / "s.ply") == 2
+    assert "voxel has no Gaussians" in capsys.readouterr().err
+
+
+def test_nothing_asked_for_is_an_error(run, capsys):
+    with pytest.raises(SystemExit):
+        export(run)
+    assert "say what to write" in capsys.readouterr().err

@@ -1,0 +1,229 @@
+"""What is written reads back: by libraries that are not ours where there are any, to the bit where not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from edge_server.export import ExportError, Shot, file_names, glb, ply
+from edge_server.export.cloud import cloud_of
+from edge_server.export.colmap import Cloud, write_model
+from edge_server.export.source import write_images
+from edge_server.export.splats import Y0, write_splats
+from edge_server.export.trajectory import write_tum
+from edge_server.export.transforms import write_transforms
+from edge_server.fields.kernels.composite import harmonic
+from edge_server.fields.kernels.splat_project import Gaussians
+from edge_server.fields.scene_box import SceneBox
+from edge_server.offline.recorded import load_recorded
+from freshfield.geometry import Pose, quaternion_to_matrix, se3_inverse
+from tests.edge_server.surface.shapes import BENT, LENS, ball_maps
+
+RNG = np.random.default_rng(5)
+
+
+def shots(count: int = 4) -> list[Shot]:
+    maps = ball_maps(count)
+    lenses = [LENS, BENT]
+    pictures = RNG.integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
+    return [
+        Shot(f"view{k}", pictures[k], m.camera_to_world, lenses[k % 2], float(k)) for k, m in enumerate(maps)
+    ]
+
+
+def cloud(of: list[Shot]) -> Cloud:
+    """Points in front of all cameras, each seen where its pixel lies in the picture."""
+    points = RNG.uniform(-0.08, 0.08, (50, 3))
+    seen = np.zeros((50, len(of)), np.bool_)
+    for k, shot in enumerate(of):
+        at = pixels(shot, points)
+        seen[:, k] = ((at > 0) & (at < 64)).all(axis=1)
+    return Cloud(points, RNG.integers(0, 255, (50, 3), dtype=np.uint8), seen)
+
+
+def pixels(shot: Shot, points: np.ndarray) -> np.ndarray:
+    inverse = se3_inverse(shot.camera_to_world)
+    return shot.intrinsics.project(points @ inverse[:3, :3].T + inverse[:3, 3])
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+def test_colmap_opens_in_colmap(tmp_path, binary):
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed (extra colmap)")
+    of = shots()
+    points = cloud(of)
+    write_model(tmp_path, of, points, binary)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert model.num_images() == 4 and model.num_points3D() == 50 and model.num_cameras() == 2
+    images = {image.name: image for image in model.images.values()}
+    for k, shot in enumerate(of):
+        image = images[f"{shot.name}.png"]
+        matrix = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        np.testing.assert_allclose(matrix, se3_inverse(shot.camera_to_world), atol=1e-12)
+        which = np.flatnonzero(points.seen[:, k])
+        found = np.array([image.project_point(p) for p in points.points[which]])
+        assert np.abs(found - pixels(shot, points.points[which])).max() < 0.01
+        assert sorted(p.point3D_id for p in image.points2D) == sorted(which + 1)
+    for k, point in model.points3D.items():
+        np.testing.assert_array_equal(point.xyz, points.points[k - 1])
+        assert tuple(point.color) == tuple(points.color[k - 1])
+        assert point.track.length() == points.seen[k - 1].sum()
+    assert model.compute_mean_reprojection_error() < 0.01
+
+
+def test_colmap_text_keeps_every_bit(tmp_path):
+    of = shots()
+    points = cloud(of)
+    write_model(tmp_path, of, points)
+    rows = [line.split() for line in (tmp_path / "points3D.txt").read_text().splitlines() if line[0] != "#"]
+    np.testing.assert_array_equal(np.array([row[1:4] for row in rows], dtype=float), points.points)
+    lines = (tmp_path / "images.txt").read_text().splitlines()[3:]
+    pose = np.array(lines[0].split()[1:8], dtype=float)
+    np.testing.assert_allclose(
+        quaternion_to_matrix(pose[:4]), se3_inverse(of[0].camera_to_world)[:3, :3], atol=1e-12
+    )
+    assert len(lines) == 2 * len(of)
+    cameras = (tmp_path / "cameras.txt").read_text().splitlines()[2:]
+    assert [line.split()[1] for line in cameras] == ["PINHOLE", "OPENCV"]
+
+
+def test_transforms_read_back_as_they_were(tmp_path):
+    of = shots()
+    write_images(tmp_path / "images", of)
+    write_transforms(tmp_path, of)
+    views = load_recorded(tmp_path, holdout="0").training
+    assert len(views) == 4
+    for shot, view in zip(of, views):
+        np.testing.assert_array_equal(view.image, shot.image)
+        assert view.intrinsics == shot.intrinsics
+        point = RNG.uniform(-0.05, 0.05, (20, 3))
+        again = Shot("", view.image, view.camera_to_world, view.intrinsics)
+        assert np.abs(pixels(again, point) - pixels(shot, point)).max() < 0.01
+    assert "ply_file_path" not in json.loads((tmp_path / "transforms.json").read_text())
+
+
+def test_transparent_pictures_stay_transparent(tmp_path):
+    picture = RNG.integers(0, 255, (64, 64, 4), dtype=np.uint8)
+    write_images(tmp_path, [Shot("a", picture, np.eye(4), LENS)])
+    back = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(cv2.cvtColor(back, cv2.COLOR_BGRA2RGBA), picture)
+
+
+def test_trajectories_keep_nanoseconds(tmp_path):
+    poses = [
+        (1_763_000_000_123_456_789 + k, Pose.from_matrix(s.camera_to_world)) for k, s in enumerate(shots())
+    ]
+    assert write_tum(tmp_path / "path.tum", reversed(poses)) == 4
+    rows = [line.split() for line in (tmp_path / "path.tum").read_text().splitlines()[1:]]
+    for row, (t_ns, pose) in zip(rows, poses):
+        seconds, _, rest = row[0].partition(".")
+        assert int(seconds) * 10**9 + int(rest) == t_ns
+        assert tuple(map(float, row[1:4])) == pose.translation_m
+        assert (float(row[7]), *map(float, row[4:7])) == pose.quaternion  # theirs is w-last
+    with pytest.raises(ExportError, match="no pose"):
+        write_tum(tmp_path / "none.tum", [])
+
+
+@pytest.mark.parametrize("harmonics", [1, 4, 9])
+def test_splats_stand_as_viewers_expect_them(tmp_path, harmonics):
+    params = RNG.normal(size=(30, 14 + 3 * (harmonics - 1))).astype(np.float32)
+    box = SceneBox((1.0, -2.0, 0.5), 2.5, 0.1, False, 3.0, 0.01)
+    gaussians = Gaussians(params, harmonics, np.zeros((30, 3), np.float32))
+    assert write_splats(tmp_path / "s.ply", gaussians, box) == 30
+    data = read_floats(tmp_path / "s.ply")
+    rest = [f"f_rest_{k}" for k in range(3 * (harmonics - 1))]
+    assert list(data) == [
+        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity",
+        "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+    ]  # fmt: skip
+    position = np.stack([data[n] for n in "xyz"], axis=-1)
+    np.testing.assert_array_equal(
+        position, (params[:, :3] * np.float64(2.5) + (1.0, -2.0, 0.5)).astype(np.float32)
+    )
+    np.testing.assert_array_equal(data["opacity"], params[:, 10])
+    np.testing.assert_allclose(
+        np.exp(np.stack([data[f"scale_{k}"] for k in range(3)], axis=-1)),
+        2.5 * np.exp(params[:, 3:6]),
+        rtol=1e-5,
+    )
+    # The colour a viewer works out is ours, from any side: its basis has the other sign for odd orders.
+    way = RNG.normal(size=3)
+    x, y, z = (way / np.linalg.norm(way)).astype(np.float32)
+    theirs = kerbl(x, y, z)
+    for c in range(3):
+        ours = params[:, 11 + c] + sum(
+            harmonic(k, x, y, z) * params[:, 14 + 3 * (k - 1) + c] for k in range(1, harmonics)
+        )
+        shown = 0.5 + Y0 * data[f"f_dc_{c}"]
+        shown = shown + sum(
+            theirs[k] * data[f"f_rest_{c * (harmonics - 1) + k}"] for k in range(harmonics - 1)
+        )
+        np.testing.assert_allclose(shown, ours, atol=1e-5)
+
+
+def kerbl(x: float, y: float, z: float) -> list[float]:
+    """Spherical harmonics 1 to 8 as the reference implementation of Kerbl et al. has them."""
+    c1, c2 = 0.4886025119029199, (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+    return [
+        -c1 * y, c1 * z, -c1 * x,
+        c2[0] * x * y, -c2[0] * y * z, c2[1] * (2 * z * z - x * x - y * y), -c2[0] * x * z,
+        c2[2] * (x * x - y * y),
+    ]  # fmt: skip
+
+
+def read_floats(path: Path) -> dict[str, np.ndarray]:
+    """The properties of a PLY of nothing but floats."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = head.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    names = [line.split()[2] for line in lines if line.startswith("property float ")]
+    table = np.frombuffer(body, np.dtype([(n, "<f4") for n in names]))
+    assert f"element vertex {len(table)}" in lines
+    return {n: table[n] for n in names}
+
+
+def test_meshes_open_in_trimesh(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed (extra surface)")
+    vertices = RNG.normal(size=(20, 3)).astype(np.float32)
+    faces = RNG.permutation(20)[:18].reshape(6, 3).astype(np.int32)
+    color = RNG.integers(0, 255, (20, 3), dtype=np.uint8)
+    ply.write_mesh(tmp_path / "m.ply", vertices, faces, color)
+    read = trimesh.load(tmp_path / "m.ply", process=False)
+    np.testing.assert_array_equal(read.vertices, vertices)
+    np.testing.assert_array_equal(read.faces, faces)
+    np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], color)
+    glb.write_mesh(tmp_path / "m.glb", vertices, faces, color)
+    scene = trimesh.load(tmp_path / "m.glb", process=False)
+    read = scene.to_geometry()  # y up
+    np.testing.assert_allclose(read.vertices, vertices[:, [0, 2, 1]] * (1, 1, -1), atol=1e-6)
+    np.testing.assert_array_equal(read.visual.vertex_colors[:, :3], color)
+
+
+def test_points_open_in_trimesh(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed (extra surface)")
+    points, color = RNG.normal(size=(9, 3)).astype(np.float32), RNG.integers(0, 255, (9, 3), dtype=np.uint8)
+    ply.write_points(tmp_path / "p.ply", points, color)
+    read = trimesh.load(tmp_path / "p.ply")
+    np.testing.assert_array_equal(read.vertices, points)
+    np.testing.assert_array_equal(read.colors[:, :3], color)
+
+
+def test_points_know_who_sees_them():
+    maps = ball_maps(12)
+    found = cloud_of(maps, 1200)
+    assert 1000 < len(found.points) <= 1200
+    assert np.abs(np.linalg.norm(found.points, axis=1) - 0.1).max() < 1e-3
+    # Who sees a point of a ball stands on its side; nobody sees it through the ball.
+    for k, m in enumerate(maps):
+        front = found.points @ m.camera_to_world[:3, 3] > 0
+        assert front[found.seen[:, k]].all()
+    assert (found.seen.sum(axis=1) >= 2).mean() > 0.8
+
+
+def test_names_of_files_are_safe_and_different():
+    assert file_names(["images/0001.png", "a b"]) == ["0001", "a_b"]
+    assert file_names(["x/1.png", "y/1.png"]) == ["00000_1", "00001_1"]
+    assert file_names(["../../etc"]) == ["etc"]

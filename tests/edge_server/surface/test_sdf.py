@@ -1,0 +1,73 @@
+"""A distance function fitted to depth: the ball it is of, its slope, and the same bits on any threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from edge_server.surface import SurfaceError
+from edge_server.surface.kernels.fuse import SIDE
+from edge_server.surface.mesh import cleaned, extracted
+from edge_server.surface.sdf import SdfSettings, at, fitted, slope
+from edge_server.surface.volume import Grid
+from tests.edge_server.surface.shapes import RADIUS_M, ball_maps
+
+GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
+SHORT = SdfSettings(levels=2, steps=60, points=4000)
+
+
+def exact(volume) -> np.ndarray:
+    cell = np.arange(SIDE**3)
+    inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
+    points = np.array(GRID.lower) + GRID.voxel_m * (SIDE * volume.blocks.place[:, None] + inside)
+    return np.linalg.norm(points, axis=-1) - RADIUS_M
+
+
+def test_the_distances_are_those_of_the_ball():
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    volume = fitted(GRID, ball_maps(16), settings=SHORT)
+    truth = exact(volume)
+    near = np.abs(truth) < 0.01
+    assert np.abs(volume.blocks.distance - truth)[near].mean() < 0.0015
+    mesh = cleaned(extracted(volume))
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert abs(radius.mean() - RADIUS_M) < 0.0007
+
+
+def test_the_eikonal_term_makes_it_a_distance():
+    maps = ball_maps(12)
+    steep = []
+    for weight in (0.0, 0.3):
+        volume = fitted(GRID, maps, settings=SdfSettings(levels=2, steps=60, points=4000, eikonal=weight))
+        distance = volume.blocks.distance.reshape(-1, SIDE, SIDE, SIDE)
+        known = (np.abs(exact(volume)) < 0.02).reshape(distance.shape)[:, 1:-1, 1:-1, 1:-1]
+        parts = [np.gradient(distance, GRID.voxel_m, axis=k)[:, 1:-1, 1:-1, 1:-1] for k in (1, 2, 3)]
+        steep.append(np.abs(np.sqrt(sum(p**2 for p in parts)) - 1.0)[known].mean())
+    assert steep[1] < 0.6 * steep[0]
+
+
+def test_values_between_nodes_and_their_slope():
+    x, y, z = torch.meshgrid(*[torch.arange(n) * 0.5 for n in (5, 6, 7)], indexing="ij")
+    plane = (0.6 * x + 0.8 * z + 0.0 * y)[None, None]
+    extent, points = torch.tensor([2.0, 2.5, 3.0]), torch.tensor([[1.0, 1.2, 1.1], [0.8, 0.9, 2.2]])
+    torch.testing.assert_close(at(plane, points, extent), 0.6 * points[:, 0] + 0.8 * points[:, 2])
+    torch.testing.assert_close(slope(plane, points, extent, 0.5), torch.ones(2))
+
+
+def test_the_number_of_threads_changes_no_bit():
+    maps, before = ball_maps(4), torch.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            volume = fitted(GRID, maps, settings=SdfSettings(levels=2, steps=10, points=2000))
+            found.append(volume.blocks.distance)
+    finally:
+        torch.set_num_threads(before)
+    np.testing.assert_array_equal(*found)
+
+
+def test_too_many_nodes_say_what_would_do():
+    with pytest.raises(SurfaceError, match=r"too many nodes: take [\d.]+ mm or more"):
+        fitted(Grid((-0.13,) * 3, (0.13,) * 3, 0.0009, 0.004), ball_maps(2))

@@ -1,0 +1,76 @@
+"""Truncated signed distances: the kernel against plain numpy, and a volume's limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_server.fields.kernels.pool import Pool
+from edge_server.surface import SurfaceError
+from edge_server.surface.kernels.fuse import SIDE
+from edge_server.surface.volume import BYTES, Grid, bounds_of, fused
+from tests.edge_server.surface.shapes import BENT, LENS, RADIUS_M, ball_maps, plain_fuse
+
+BOX = Grid((-0.13,) * 3, (0.13,) * 3, 0.008, 0.032)
+
+
+@pytest.mark.parametrize("camera", [LENS, BENT], ids=["straight", "distorted"])
+def test_the_kernel_fuses_as_the_equations_say(camera):
+    maps = ball_maps(5, camera)
+    volume = fused(BOX, maps)
+    rng = np.random.default_rng(0)
+    number, cell = rng.integers(0, len(volume.blocks.place), 400), rng.integers(0, SIDE**3, 400)
+    inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
+    points = np.array(BOX.lower) + BOX.voxel_m * (SIDE * volume.blocks.place[number] + inside)
+    distance, weight = plain_fuse(BOX, maps, points)
+    assert (weight > 0).mean() > 0.3
+    np.testing.assert_allclose(volume.blocks.weight[number, cell], weight, atol=2e-5)
+    np.testing.assert_allclose(volume.blocks.distance[number, cell], distance, atol=1e-6)
+
+
+def test_blocks_hold_every_voxel_near_the_surface():
+    volume = fused(BOX, ball_maps())
+    size = np.array(volume.table.shape) * SIDE
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in size], indexing="ij"), axis=-1).reshape(-1, 3)
+    away = np.abs(np.linalg.norm(np.array(BOX.lower) + BOX.voxel_m * index, axis=1) - RADIUS_M)
+    near = index[away < BOX.voxel_m * 2]
+    assert (volume.table[tuple((near // SIDE).T)] >= 0).all()
+
+
+def test_distances_are_those_of_the_ball():
+    volume = fused(BOX, ball_maps())
+    cell = np.arange(SIDE**3)
+    inside = np.stack([cell // SIDE**2, cell // SIDE % SIDE, cell % SIDE], axis=-1)
+    points = np.array(BOX.lower) + BOX.voxel_m * (SIDE * volume.blocks.place[:, None] + inside)
+    exact = np.linalg.norm(points, axis=-1) - RADIUS_M
+    near = (np.abs(exact) < 0.01) & (volume.blocks.weight > 0.5)
+    assert near.sum() > 1000
+    assert np.abs(volume.blocks.distance - exact)[near].mean() < 0.0012
+
+
+def test_the_number_of_threads_changes_no_bit():
+    maps = ball_maps(6)
+    one, three = (fused(BOX, maps, pool=pool) for pool in (Pool(1, nice=0), Pool(3, nice=0)))
+    for a, b in zip(one.blocks, three.blocks):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(one.through, three.through)
+
+
+def test_too_fine_a_grid_says_what_would_do():
+    maps = ball_maps(4)
+    with pytest.raises(
+        SurfaceError, match=r"2 mm voxels need \d+ MB, more than the 5 allowed: take [\d.]+ mm"
+    ):
+        fused(Grid((-0.13,) * 3, (0.13,) * 3, 0.002, 0.008), maps, memory_mb=5)
+    with pytest.raises(SurfaceError, match="voxels are too many"):
+        Grid((-50.0,) * 3, (50.0,) * 3, 0.001, 0.004)
+    with pytest.raises(SurfaceError, match="at least one voxel"):
+        Grid((0, 0, 0), (1, 1, 1), 0.1, 0.05)
+    with pytest.raises(SurfaceError, match="lower corner"):
+        Grid((0, 0, 1), (1, 1, 1), 0.1, 0.4)
+    assert BYTES == SIDE**3 * 24
+
+
+def test_bounds_are_those_of_what_is_seen():
+    low, high = bounds_of(ball_maps(), 0.01)
+    assert np.allclose(low, -0.11, atol=0.006) and np.allclose(high, 0.11, atol=0.006)
