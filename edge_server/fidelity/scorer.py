@@ -43,7 +43,7 @@ Render = NDArray | Callable[[int], NDArray]
 
 
 class PerceptualMetric(Protocol):
-    """LPIPS, as far as the scorer needs it."""
+    """LPIPS, or its stand-in (fidelity.perceptual), as far as the scorer needs it."""
 
     network: str
     minimum_side: int
@@ -57,7 +57,8 @@ class Score:
 
     published_ns: the present. psnr_moving_db: None where nothing moves or nothing is known to. ssim and
     lpips: None where the image is too small for them, lpips also without weights. truth_gap_ms: truth's
-    capture minus the present (None on selected views). on: what it was compared with.
+    capture minus the present (None on selected views). on: what it was compared with. perceptual: None unless
+    it is asked for; it is not LPIPS, see fidelity.perceptual.
     """
 
     camera: str
@@ -69,6 +70,7 @@ class Score:
     truth_gap_ms: float | None
     moving_share: float = 0.0
     on: Literal["held-out", "selected"] = "held-out"
+    perceptual: float | None = None
 
 
 @dataclass(eq=False)
@@ -108,7 +110,8 @@ class Scorer:
 
     lpips: an ``Lpips`` or None. noisy_truth: held-out frames are real video, so the bound of moving pixels
     follows their noise. period_ms: of the held-out cameras; None takes the median gap of their frames.
-    background: under held-out images with alpha. Not thread-safe: one owner.
+    background: under held-out images with alpha. perceptual: a ``Perceptual`` or None. Not thread-safe: one
+    owner.
     """
 
     def __init__(
@@ -117,8 +120,10 @@ class Scorer:
         noisy_truth: bool = False,
         period_ms: float | None = None,
         background: Colour = BLACK,
+        perceptual: PerceptualMetric | None = None,
     ) -> None:
         self._lpips = lpips
+        self._perceptual = perceptual
         self._noisy_truth = noisy_truth
         self._period_ms = period_ms
         self._background = background
@@ -175,14 +180,18 @@ class Scorer:
         total = psnr(a, b)
         assert total is not None  # no mask was given
         side = min(a.shape[:2])
-        metric = self._lpips if self._lpips is not None and side >= self._lpips.minimum_side else None
+
+        def by(metric: PerceptualMetric | None) -> float | None:
+            return metric(a, b) if metric is not None and side >= metric.minimum_side else None
+
         return Score(
             camera=camera,
             published_ns=published_ns,
             psnr_db=total,
             psnr_moving_db=psnr(a, b, moving),
             ssim=ssim(a, b) if side >= TAPS else None,
-            lpips=metric(a, b) if metric is not None else None,
+            lpips=by(self._lpips),
+            perceptual=by(self._perceptual),
             truth_gap_ms=(generated_ns - published_ns) / 1e6,
             moving_share=float(moving.mean()),
         )
@@ -250,6 +259,19 @@ class Scorer:
         return self.score(camera, image, published_ns, truth, times[nearest], earlier, bound)
 
 
+def listed_metric(metrics: Sequence[str]) -> PerceptualMetric | None:
+    """The stand-in for LPIPS where a scenario's ``edge.metrics`` lists it. Raises ValueError with the reason
+    where it cannot be had."""
+    if "perceptual" not in metrics:
+        return None
+    from edge_server.fidelity.perceptual import open_perceptual
+
+    metric, missing = open_perceptual()
+    if metric is None:
+        raise ValueError(f"edge.metrics: {missing}")
+    return metric
+
+
 def mean_score(scores: Sequence[Score]) -> Score:
     """Mean over several held-out cameras of one publication; a metric that some lack is averaged over
     those that have it."""
@@ -267,6 +289,7 @@ def mean_score(scores: Sequence[Score]) -> Score:
         psnr_moving_db=mean([s.psnr_moving_db for s in scores]),
         ssim=mean([s.ssim for s in scores]),
         lpips=mean([s.lpips for s in scores]),
+        perceptual=mean([s.perceptual for s in scores]),
         truth_gap_ms=mean([s.truth_gap_ms for s in scores]),
         moving_share=float(np.mean([s.moving_share for s in scores])),
     )

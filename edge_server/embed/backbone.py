@@ -1,0 +1,322 @@
+"""Finds the end of a YOLO detector's backbone in its ONNX graph and cuts everything behind it off.
+
+A detector of the YOLO family is a backbone, which ends in a coarse feature map, and a neck, which begins by
+enlarging that map and joining it with a finer one. So the backbone's end is what the first enlargement
+reads. That holds for YOLOv8, where it is module 9, for YOLO11, where it is module 10, for quantised files
+and for those whose nodes an optimiser has renamed. The neck and the head are not run, not even loaded.
+
+The file may come from anywhere: it is checked before anything in it is run or allocated.
+"""
+
+from __future__ import annotations
+
+import ast
+import base64
+import difflib
+import hashlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+from onnx import TensorProto, helper
+from onnx.utils import Extractor
+
+from edge_server.embed import EmbeddingError, SizeError
+
+OUTPUT = "pooled"
+# The largest detectors of the family have 230 MB.
+MAX_FILE_BYTES = 512 * 2**20
+# Of any one tensor and image: six times the largest of YOLO11x at 640 pixels.
+MAX_ELEMENTS = 2**26
+MAX_SIDE = 2048
+# The size that these detectors are trained at where a file does not say another.
+USUAL_SIDE = 640
+# Written by edge_server.offline.detector.export: mean (C,) and axes (C, K) of the pooled features.
+PROJECTION_KEY = "freshfield.projection"
+
+_ENLARGE = ("Resize", "Upsample")
+_PER_IMAGE = "DynamicQuantizeLinear"
+_CONVOLVE = ("Conv", "ConvInteger", "QLinearConv")
+# What backbones are made of. Operators whose output size is in their data (Expand, Tile, ConstantOfShape,
+# Range, loops) are not among them: with these, a few bytes can ask for any amount of memory.
+_KNOWN = frozenset(
+    {
+        "Abs", "Add", "AveragePool", "BatchNormalization", "Cast", "Clip", "Concat", "Constant", "Conv",
+        "ConvInteger", "DequantizeLinear", "Div", "DynamicQuantizeLinear", "Elu", "Exp", "Flatten",
+        "Gather", "GlobalAveragePool", "HardSigmoid", "HardSwish", "Identity", "LeakyRelu", "MatMul",
+        "MatMulInteger", "MaxPool", "Mish", "Mul", "PRelu", "Pow", "QLinearConv", "QuantizeLinear",
+        "ReduceMean", "ReduceMax", "Relu", "Reshape", "Shape", "Sigmoid", "Slice", "Softmax", "Softplus",
+        "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
+    }
+)  # fmt: skip
+_TYPES: dict[int, type[np.floating]] = {TensorProto.FLOAT: np.float32, TensorProto.FLOAT16: np.float16}
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A model's own learnt projection: rows are (features - mean) @ axes; mean (C,), axes (C, K)."""
+
+    mean: NDArray[np.float32]
+    axes: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """A detector up to its backbone's end: images (n, 3, height, width) in [0, 1] -> ``pooled`` (n,
+    channels).
+
+    model: the ONNX bytes. batch: images a run takes; None, any number. digest: of the file it came from.
+    """
+
+    name: str
+    model: bytes
+    input: str
+    dtype: type[np.floating]
+    tap: str
+    channels: int
+    batch: int | None
+    height: int
+    width: int
+    digest: str
+    projection: Projection | None = None
+
+
+def load_backbone(path: Path, tap: str | None = None, size: int | None = None) -> Backbone:
+    """Read the detector at ``path``. ``tap`` and ``size`` as in EmbeddingConfig. Raises EmbeddingError."""
+    data = _read(path)
+    model = _parse(data, path)
+    meta = {p.key: p.value for p in model.metadata_props}
+    image = _image_input(model, path)
+    at = _find_tap(model, tap, path)
+    cut = _cut(model, image.name, {at: OUTPUT}, path)
+    batch, (height, width) = _shape_of(cut, size, meta, path)
+    channels = _check_shapes(cut, batch or 1, height, width, path)
+    return Backbone(
+        name=path.stem,
+        model=cut.SerializeToString(),
+        input=image.name,
+        dtype=_TYPES[image.type.tensor_type.elem_type],
+        tap=at,
+        channels=channels,
+        batch=batch,
+        height=height,
+        width=width,
+        digest=hashlib.sha256(data).hexdigest()[:8],
+        projection=_projection(meta, channels, path) if tap is None else None,
+    )
+
+
+def cut_layers(path: Path, taps: tuple[str, ...]) -> tuple[bytes, str]:
+    """(ONNX bytes of the detector at ``path`` up to the feature maps ``taps``, name of its input): the maps
+    themselves are its outputs, under their own names. Raises EmbeddingError."""
+    model = _parse(_read(path), path)
+    image = _image_input(model, path)
+    cut = _cut(model, image.name, {_find_tap(model, tap, path): None for tap in taps}, path)
+    return cut.SerializeToString(), image.name
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if not path.is_file():
+            raise EmbeddingError(f"{path}: no such file; name a YOLO detection model in ONNX format")
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise EmbeddingError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MB, which no YOLO detector is")
+        return path.read_bytes()
+    except OSError as error:
+        raise EmbeddingError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _parse(data: bytes, path: Path) -> onnx.ModelProto:
+    try:
+        model = onnx.load_model_from_string(data)
+    except (DecodeError, ValueError, RuntimeError):
+        raise EmbeddingError(f"{path}: not an ONNX file, or cut short; export the detector again") from None
+    if not model.graph.node or not model.opset_import:
+        raise EmbeddingError(f"{path}: not an ONNX model; export the detector with format=onnx")
+    words = [w for n in model.graph.node for w in (n.op_type, n.name, *n.input, *n.output)]
+    words += [named.name for part in (model.graph.initializer, model.graph.input) for named in part]
+    if not all(isinstance(word, str) for word in words):  # bytes: no UTF-8
+        raise EmbeddingError(f"{path}: a damaged ONNX file; export the detector again")
+    if any(t.data_location == TensorProto.EXTERNAL for t in model.graph.initializer):
+        raise EmbeddingError(f"{path}: its weights lie in a second file; export the detector as one file")
+    return model
+
+
+def _image_input(model: onnx.ModelProto, path: Path) -> onnx.ValueInfoProto:
+    weights = {t.name for t in model.graph.initializer}
+    inputs = [i for i in model.graph.input if i.name not in weights]
+    if len(inputs) != 1:
+        names = ", ".join(i.name for i in inputs) or "none"
+        raise EmbeddingError(f"{path}: expected one input, the images; it has {len(inputs)}: {names}")
+    kind = inputs[0].type.tensor_type
+    shape = [d.dim_value for d in kind.shape.dim]
+    if kind.elem_type not in _TYPES or len(shape) != 4 or shape[1] not in (0, 3):
+        raise EmbeddingError(
+            f"{path}: the input {inputs[0].name} is not (n, 3, height, width) of float32 or float16: this is "
+            "not a YOLO detection model"
+        )
+    return inputs[0]
+
+
+def _find_tap(model: onnx.ModelProto, tap: str | None, path: Path) -> str:
+    """The tensor asked for, or the backbone's end."""
+    nodes = model.graph.node
+    if tap is not None:
+        outputs = [o for node in nodes for o in node.output if o]
+        if tap in outputs:
+            return tap
+        module = f"/{tap.strip('/')}/"
+        of_module = [
+            node.output[0]
+            for node in nodes
+            if node.name.startswith(module) and node.op_type not in ("QuantizeLinear", _PER_IMAGE)
+        ]
+        if of_module:
+            return of_module[-1]
+        near = difflib.get_close_matches(tap, outputs, n=3)
+        hint = f"; nearest: {', '.join(near)}" if near else ""
+        raise EmbeddingError(f"{path}: tap: no tensor and no module is called {tap!r}{hint}")
+    readers: dict[str, list[onnx.NodeProto]] = {}
+    for node in nodes:
+        for name in node.input:
+            readers.setdefault(name, []).append(node)
+    seen: set[str] = set()  # tensors behind a convolution: an enlargement before is the user's preprocessing
+    for node in nodes:
+        behind = node.op_type in _CONVOLVE or any(i in seen for i in node.input)
+        if node.op_type in _ENLARGE and behind and _is_joined(node, readers):
+            return node.input[0]
+        if behind:
+            seen.update(node.output)
+    raise EmbeddingError(
+        f"{path}: no neck that enlarges and joins feature maps was found, so this is not a YOLO detection "
+        "model; if it is one, name the last tensor of its backbone with tap"
+    )
+
+
+def _is_joined(node: onnx.NodeProto, readers: dict[str, list[onnx.NodeProto]]) -> bool:
+    """Whether an enlarged map meets another one, maybe after having been quantised."""
+    following = [reader for name in node.output for reader in readers.get(name, [])]
+    return any(
+        reader.op_type == "Concat"
+        or (reader.op_type in ("QuantizeLinear", "DequantizeLinear", "Cast") and _is_joined(reader, readers))
+        for reader in following
+    )
+
+
+def _cut(model: onnx.ModelProto, image: str, taps: dict[str, str | None], path: Path) -> onnx.ModelProto:
+    """The graph from the images to ``taps``: tensor -> name of its mean over the image, or None for the
+    map itself."""
+    # An earlier export's shapes may be wrong for another size; the extractor wants some value all the same.
+    model.graph.name = "backbone"
+    del model.graph.value_info[:]
+    model.graph.value_info.extend(helper.make_empty_tensor_value_info(name) for name in taps)
+    try:
+        cut = Extractor(model).extract_model([image], list(taps))
+    except (ValueError, AssertionError) as error:
+        raise EmbeddingError(f"{path}: the backbone cannot be cut out: {error}") from None
+    unknown = sorted({node.op_type for node in cut.graph.node} - _KNOWN)
+    if unknown or cut.functions:
+        raise EmbeddingError(
+            f"{path}: the backbone holds {', '.join(unknown) or 'functions'}, which no YOLO backbone does"
+        )
+    if any(node.op_type == _PER_IMAGE and tap in node.output for node in cut.graph.node for tap in taps):
+        raise EmbeddingError(
+            f"{path}: tap: {', '.join(taps)} is quantised with another scale for every image; name the "
+            "tensor before it"
+        )
+    if not any(node.op_type in _CONVOLVE for node in cut.graph.node):
+        raise EmbeddingError(f"{path}: no convolution lies between the images and {', '.join(taps)}")
+    del cut.graph.value_info[:]
+    del cut.graph.output[:]
+    for tap, pooled in taps.items():
+        if pooled is None:
+            cut.graph.output.append(helper.make_tensor_value_info(tap, TensorProto.FLOAT, None))
+            continue
+        # A map that is quantised for good is whole numbers: its offset and scale are the same in every image.
+        cut.graph.node.extend(
+            [
+                helper.make_node("Cast", [tap], ["pooled.float"], to=TensorProto.FLOAT),
+                helper.make_node("GlobalAveragePool", ["pooled.float"], ["pooled.mean"]),
+                helper.make_node("Flatten", ["pooled.mean"], [pooled]),
+            ]
+        )
+        cut.graph.output.append(helper.make_tensor_value_info(pooled, TensorProto.FLOAT, None))
+    return cut
+
+
+def _shape_of(
+    cut: onnx.ModelProto, size: int | None, meta: dict[str, str], path: Path
+) -> tuple[int | None, tuple[int, int]]:
+    """(fixed batch or None, (height, width)) that the model will be fed."""
+    batch, _, height, width = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
+    if height and width:
+        if size is not None and (height, width) != (size, size):
+            raise SizeError(
+                f"{path}: size: this model was exported for {width} x {height} only; leave size out, or "
+                "export it with dynamic=True"
+            )
+    elif size is not None:
+        height = width = size
+    else:
+        height, width = _exported_for(meta)
+    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE):
+        raise EmbeddingError(f"{path}: images of {width} x {height} are not within 1 to {MAX_SIDE} a side")
+    return batch or None, (height, width)
+
+
+def _exported_for(meta: dict[str, str]) -> tuple[int, int]:
+    """(height, width) that the exporter noted, such as ``[640, 640]``."""
+    try:
+        height, width = (int(side) for side in ast.literal_eval(meta["imgsz"]))
+        return height, width
+    except (KeyError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        return USUAL_SIDE, USUAL_SIDE
+
+
+def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, path: Path) -> int:
+    """Channels of the tap; refuses what would take more memory than any YOLO backbone."""
+    fed = onnx.ModelProto()
+    fed.CopyFrom(cut)
+    for dim, value in zip(fed.graph.input[0].type.tensor_type.shape.dim, (batch, 3, height, width)):
+        dim.Clear()
+        dim.dim_value = value
+    try:
+        known = onnx.shape_inference.infer_shapes(fed, data_prop=True)
+    except (onnx.shape_inference.InferenceError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise EmbeddingError(f"{path}: takes no images of {width} x {height}: {reason}") from None
+    shapes = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in known.graph.value_info}
+    shapes |= {t.name: list(t.dims) for t in cut.graph.initializer}
+    for name, shape in shapes.items():
+        if math.prod(max(d, 1) for d in shape) > MAX_ELEMENTS * batch:
+            raise EmbeddingError(f"{path}: the tensor {name} of shape {shape} is larger than any backbone's")
+    pooled = shapes.get("pooled.float", [])
+    if len(pooled) != 4 or pooled[1] < 1:
+        raise EmbeddingError(
+            f"{path}: the tap is not a feature map (n, channels, height, width) but {pooled or 'unknown'}; "
+            "name another with tap"
+        )
+    return int(pooled[1])
+
+
+def _projection(meta: dict[str, str], channels: int, path: Path) -> Projection | None:
+    """The projection that a model of ours carries: float32, mean and then the axes."""
+    if PROJECTION_KEY not in meta:
+        return None
+    try:
+        values = np.frombuffer(base64.b64decode(meta[PROJECTION_KEY], validate=True), "<f4")
+        mean, axes = values[:channels], values[channels:].reshape(channels, -1)
+    except ValueError:
+        raise EmbeddingError(f"{path}: its projection is damaged: fetch the file again") from None
+    if len(mean) != channels or not np.isfinite(values).all():
+        raise EmbeddingError(f"{path}: its projection is damaged: fetch the file again")
+    return Projection(mean.astype(np.float32), axes.astype(np.float32))
+
+
+def pack_projection(mean: NDArray[np.float32], axes: NDArray[np.float32]) -> str:
+    """The text of the metadata ``PROJECTION_KEY`` for mean (C,) and axes (C, K)."""
+    return base64.b64encode(mean.astype("<f4").tobytes() + axes.astype("<f4").tobytes()).decode()

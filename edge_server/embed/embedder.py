@@ -1,0 +1,140 @@
+"""Runs a backbone and projects what it gives: images -> embeddings (6.31)."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from edge_server.embed import EmbeddingError
+from edge_server.embed.backbone import OUTPUT, Backbone
+from edge_server.embed.letterbox import GREY, blob, checked
+
+log = logging.getLogger(__name__)
+
+# Images a run where the model takes any number. On a CPU more of them leave its caches: these small networks
+# then take longer a frame, not shorter.
+_BATCH = {"cpu": 4, "cuda": 32}
+# Of the random projection: one model, one embedding, whatever the scenario's seed.
+_PROJECTION_SEED = 20240631
+_NAMES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+
+
+class Embedder:
+    """A frozen map from images to ``dim`` numbers each.
+
+    Two embedders of one ``name`` give the same numbers, so what was learnt with one holds with the other.
+    ``failed`` counts images for which the model gave NaN or infinity.
+    """
+
+    def __init__(self, backbone: Backbone, dim: int, provider: str = "auto", threads: int = 1) -> None:
+        """Raises EmbeddingError: ``dim`` beyond the backbone's channels, a provider that ONNX Runtime does
+        not have here, a model that does not run."""
+        self.backbone, self.dim = backbone, dim
+        self._mean, self._axes = _projection(backbone, dim)
+        self.failed = 0
+        self.name = (
+            f"{backbone.name}-{backbone.digest} {backbone.tap} {backbone.width}x{backbone.height} d{dim}"
+        )
+        self._session, self.provider = open_session(backbone.model, provider, threads, backbone.name)
+        self.step = backbone.batch or _BATCH[self.provider]
+        """Images a run takes."""
+        # What cannot run fails here, with the file's name, and not at the first decision.
+        self.pooled([np.full((8, 8, 3), GREY, np.uint8)])
+
+    def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+        """Embeddings (n, dim), finite, of uint8 RGB images (H, W, 3) of any sizes; RGBA is laid over grey.
+
+        An image for which the model gives NaN or infinity gets a row of zeros, which no other image gets,
+        and is counted in ``failed``; its neighbours in the batch keep theirs. Raises EmbeddingError for what
+        is no image.
+        """
+        features = self.pooled(images)
+        # A finite feature beyond float32's square root may still overflow in the product.
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows = np.asarray((features - self._mean) @ self._axes, dtype=np.float32)
+        bad = ~np.isfinite(rows).all(axis=1)
+        self.failed += int(bad.sum())
+        rows[bad] = 0.0
+        return rows
+
+    def pooled(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+        """Means over the image (n, channels) of the backbone's last feature map, as the model gives them."""
+        whole = [checked(image, number) for number, image in enumerate(images)]
+        b = self.backbone
+        out = np.empty((len(whole), b.channels), dtype=np.float32)
+        step = self.step
+        for first in range(0, len(whole), step):
+            part = blob(whole[first : first + step], b.height, b.width, b.dtype)
+            n = len(part)
+            if b.batch is not None and n < b.batch:
+                part = np.concatenate([part, np.zeros((b.batch - n, *part.shape[1:]), part.dtype)])
+            out[first : first + n] = self.run(part)[:n]
+        return out
+
+    def run(self, part: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Features (n, channels) of ready-made input (n, 3, height, width), one run of the model."""
+        try:
+            found = np.asarray(self._session.run([OUTPUT], {self.backbone.input: part})[0])
+        except Exception as error:  # ONNX Runtime's exceptions share no base class
+            reason = " ".join(str(error).split())[:200]
+            raise EmbeddingError(f"{self.backbone.name}: ONNX Runtime cannot run it: {reason}") from None
+        if found.shape != (len(part), self.backbone.channels):
+            raise EmbeddingError(
+                f"{self.backbone.name}: {len(part)} images gave features of shape {found.shape}, expected "
+                f"({len(part)}, {self.backbone.channels})"
+            )
+        return found
+
+
+def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[ort.InferenceSession, str]:
+    """(session, the provider it runs on: cpu or cuda). Raises EmbeddingError."""
+    available = [short for short, long in _NAMES.items() if long in ort.get_available_providers()]
+    chosen = ("cuda" if "cuda" in available else "cpu") if provider == "auto" else provider
+    if chosen not in available:
+        raise EmbeddingError(
+            f"provider: ONNX Runtime has no {chosen} here, it has {', '.join(available)}; "
+            "for CUDA install onnxruntime-gpu instead of onnxruntime"
+        )
+    options = ort.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 3
+    # Waiting threads would spin on the cores that the field is being fitted on.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    names = [_NAMES[chosen]] if chosen == "cpu" else [_NAMES[chosen], _NAMES["cpu"]]
+    try:
+        # It prints what it then raises.
+        with contextlib.redirect_stdout(io.StringIO()):
+            session = ort.InferenceSession(model, options, providers=names)
+    except Exception as error:  # as above
+        reason = " ".join(str(error).split())[:200]
+        raise EmbeddingError(f"{name}: ONNX Runtime cannot load it: {reason}") from None
+    # Where CUDA's libraries do not load, ONNX Runtime falls back without a word.
+    if chosen == "cuda" and _NAMES["cuda"] not in session.get_providers():
+        if provider == "cuda":
+            raise EmbeddingError("provider: CUDA cannot be used here: its driver or libraries do not load")
+        log.warning("CUDA does not load: embeddings are computed on the CPU")
+        chosen = "cpu"
+    return session, chosen
+
+
+def _projection(backbone: Backbone, dim: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean (C,) and axes (C, dim): the model's own where it has one, else fixed, random and orthonormal,
+    which keeps distances as well as any projection that knows nothing of the data."""
+    channels = backbone.channels
+    if backbone.projection is not None:
+        mean, axes = backbone.projection.mean, backbone.projection.axes
+        if dim > axes.shape[1]:
+            raise EmbeddingError(f"dim: {backbone.name} has {axes.shape[1]} axes, {dim} were asked for")
+        return mean, np.ascontiguousarray(axes[:, :dim])
+    if dim > channels:
+        raise EmbeddingError(f"dim: {backbone.tap} has {channels} channels, {dim} numbers were asked for")
+    draw = np.random.default_rng(_PROJECTION_SEED).standard_normal((channels, dim))
+    q, r = np.linalg.qr(draw)
+    # QR is unique only up to signs: fixing them makes libraries agree.
+    return np.zeros(channels, np.float32), (q * np.sign(np.diag(r))).astype(np.float32)

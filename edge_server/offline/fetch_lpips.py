@@ -1,0 +1,96 @@
+"""``edge-server fetch-lpips``: the public LPIPS package's weights as the plain arrays that we read."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, Network, open_lpips
+
+DESCRIPTION = f"""\
+Fetch the weights of LPIPS with its authors' package and convert them to a weights folder of ours.
+
+  pip install 'freshfield[edge,lpips]'
+  edge-server fetch-lpips --out ~/lpips
+  export {FOLDER_VARIABLE}=~/lpips            # or --lpips ~/lpips where a command takes it
+
+The package lpips holds the learned channel weights; torchvision fetches the ImageNet backbones from the
+network at this command's first call (240 MB for alex, 5 MB for squeeze).
+"""
+# torchvision's model of each network.
+_BACKBONES = {"alex": "alexnet", "squeeze": "squeezenet1_1"}
+
+
+class FetchError(ValueError):
+    """Weights that cannot be had or converted; one line says why."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server fetch-lpips", description=DESCRIPTION, formatter_class=raw)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="weights folder to write")
+    parser.add_argument("--network", choices=get_args(Network), action="append", help="[both]")
+    args = parser.parse_args(argv)
+    try:
+        for network in args.network or get_args(Network):
+            features, lins = _fetched(network)
+            for path in convert(network, features, lins, args.out):
+                print(path)
+    except FetchError as error:
+        print(f"edge-server fetch-lpips: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _fetched(network: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """State dictionaries of the backbone's features and of the learned weights."""
+    try:
+        import lpips
+        import torch
+        import torchvision
+    except ImportError as error:
+        raise FetchError(f"needs {error.name}: pip install 'freshfield[edge,lpips]'") from None
+    file = Path(lpips.__file__).parent / "weights" / "v0.1" / f"{network}.pth"
+    try:
+        lins = torch.load(file, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise FetchError(
+            f"{file}: the package lpips has no such weights ({error}): install lpips 0.1.4"
+        ) from None
+    try:
+        backbone = getattr(torchvision.models, _BACKBONES[network])(weights="IMAGENET1K_V1")
+    except (OSError, RuntimeError) as error:  # no network, or a download that was cut short
+        raise FetchError(
+            f"torchvision cannot fetch {_BACKBONES[network]}: {error}; is there a network?"
+        ) from None
+    return backbone.features.state_dict(), lins
+
+
+def convert(network: str, features: Mapping[str, Any], lins: Mapping[str, Any], out: Path) -> list[Path]:
+    """Write the two files of ``network`` into ``out`` and try them; returns their paths.
+
+    features: torchvision's ``features`` of the backbone, "0.weight" and so on. lins: the package's
+    "lin0.model.1.weight" (1, C, 1, 1) and so on. Raises FetchError where they do not make a working LPIPS.
+    """
+    learned = {}
+    for k in range(len(lins)):
+        name = f"lin{k}.model.1.weight"
+        if name not in lins:
+            raise FetchError(f"the learned weights of {network} have no {name}: another version of lpips?")
+        learned[f"lin{k}"] = np.asarray(lins[name], dtype=np.float32).reshape(-1)
+    arrays = {f"features.{name}": np.asarray(value, dtype=np.float32) for name, value in features.items()}
+    out.mkdir(parents=True, exist_ok=True)
+    paths = [out / name for name in FILES[network]]
+    for path, content in zip(paths, (arrays, learned)):
+        with path.open("wb") as file:
+            np.savez(file, **content)  # type: ignore[arg-type]  # arrays by name, not its one option
+    metric, missing = open_lpips(out, network)  # type: ignore[arg-type]
+    if metric is None:
+        raise FetchError(str(missing))
+    return paths

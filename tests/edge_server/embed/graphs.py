@@ -1,0 +1,90 @@
+"""Small ONNX graphs of a detector's form, and of forms that are none, for the embedder's tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+RNG = np.random.default_rng(4)
+CHANNELS = 6
+
+
+def detector(
+    path: Path,
+    size: int | None = 32,
+    batch: int | None = None,
+    gain: float = 1.0,
+    neck: bool = True,
+    extra: tuple[onnx.NodeProto, ...] = (),
+    weights: tuple[onnx.TensorProto, ...] = (),
+    meta: dict[str, str] | None = None,
+) -> Path:
+    """Two convolutions, and where ``neck``, an enlargement that is joined with the finer map.
+
+    size, batch: None makes them free. gain: factor on the second map. extra: nodes behind the backbone's
+    end, which is called ``end``. Weights are the same in every file.
+    """
+    rng = np.random.default_rng(7)
+    first = rng.normal(0, 0.3, (4, 3, 3, 3)).astype(np.float32)
+    second = rng.normal(0, 0.3, (CHANNELS, 4, 3, 3)).astype(np.float32)
+    nodes = [
+        helper.make_node("Conv", ["images", "a"], ["c0"], strides=[2, 2], pads=[1] * 4, name="/model.0/Conv"),
+        helper.make_node("Relu", ["c0"], ["fine"], name="/model.0/Relu"),
+        helper.make_node("Conv", ["fine", "b"], ["c1"], strides=[2, 2], pads=[1] * 4, name="/model.1/Conv"),
+        helper.make_node("Mul", ["c1", "gain"], ["end"], name="/model.1/Mul"),
+        *extra,
+    ]
+    last = extra[-1].output[0] if extra else "end"
+    if neck:
+        nodes += [
+            helper.make_node(
+                "Resize", [last, "", "scales"], ["large"], mode="nearest", name="/model.2/Resize"
+            ),
+            helper.make_node("Concat", ["large", "fine"], ["joined"], axis=1, name="/model.3/Concat"),
+            # A head that cannot run shows that it is not run.
+            helper.make_node("Reshape", ["joined", "impossible"], ["output0"], name="/model.4/Reshape"),
+        ]
+    graph = helper.make_graph(
+        nodes,
+        "detector",
+        [
+            helper.make_tensor_value_info(
+                "images", TensorProto.FLOAT, [batch or "n", 3, size or "h", size or "w"]
+            )
+        ],
+        [helper.make_tensor_value_info("output0" if neck else last, TensorProto.FLOAT, None)],
+        [
+            numpy_helper.from_array(first, "a"),
+            numpy_helper.from_array(second, "b"),
+            numpy_helper.from_array(np.float32(gain), "gain"),
+            numpy_helper.from_array(np.array([1, 1, 2, 2], np.float32), "scales"),
+            numpy_helper.from_array(np.array([7, 11, 13], np.int64), "impossible"),
+            *weights,
+        ],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, meta or {})
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def expected(images: np.ndarray) -> np.ndarray:
+    """The pooled features (n, CHANNELS) of ready-made input (n, 3, H, W), by plain loops over the kernel."""
+    rng = np.random.default_rng(7)
+    first, second = rng.normal(0, 0.3, (4, 3, 3, 3)), rng.normal(0, 0.3, (CHANNELS, 4, 3, 3))
+
+    def convolve(x: np.ndarray, w: np.ndarray) -> np.ndarray:
+        n, _, height, width = x.shape
+        padded = np.pad(x, ((0, 0), (0, 0), (1, 1), (1, 1)))
+        out = np.zeros((n, len(w), height // 2, width // 2))
+        for dy in range(3):
+            for dx in range(3):
+                part = padded[:, :, dy : dy + height : 2, dx : dx + width : 2]
+                out += np.einsum("nchw,oc->nohw", part, w[:, :, dy, dx].astype(np.float32))
+        return out
+
+    fine = np.maximum(convolve(images.astype(np.float64), first), 0.0)
+    return convolve(fine, second).mean(axis=(2, 3))

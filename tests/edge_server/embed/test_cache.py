@@ -1,0 +1,121 @@
+"""Frames are embedded when a decision uses them, once, and one bad frame costs only its own camera."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_server.buffer import Buffered
+from edge_server.embed.cache import EmbeddingCache
+from edge_server.views import Decoder
+from freshfield import payload
+from tests.edge_server.frames import frame
+
+DIM = 4
+
+
+class Means:
+    """Embeds a picture as its mean colours, and notes what it was asked for."""
+
+    dim = DIM
+
+    def __init__(self) -> None:
+        self.asked: list[int] = []
+
+    def embed(self, images):
+        self.asked.append(len(images))
+        return np.array([[*i.reshape(-1, 3).mean(0), 1.0] for i in images], np.float32)
+
+
+class NanForTheFirst(Means):
+    def embed(self, images):
+        rows = super().embed(images)
+        rows[0, 1] = np.nan
+        return rows
+
+
+def buffered(camera: str = "cam01", sequence: int = 0, **other) -> Buffered:
+    return Buffered(frame(camera, sequence, **other), sequence, sequence)
+
+
+def damaged(camera: str) -> Buffered:
+    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
+    return buffered(camera, codec="png", payload=payload.encode(image, "png")[:60])
+
+
+def test_a_frame_is_embedded_once_whoever_asks_again():
+    means = Means()
+    cache = EmbeddingCache(means, Decoder())
+    items = [buffered("cam01"), buffered("cam02", 3)]
+    first, ok = cache.of(items)
+    again, _ = cache.of(list(reversed(items)))
+    assert ok.tolist() == [True, True] and first.dtype == np.float32 and first.shape == (2, DIM)
+    assert (again == first[::-1]).all()
+    assert means.asked == [2] and cache.computed == 2
+    cache.of([*items, buffered("cam01", 1)])
+    assert means.asked == [2, 1], "only what is new"
+
+
+def test_another_session_with_the_same_number_is_another_frame():
+    means = Means()
+    cache = EmbeddingCache(means, Decoder())
+    cache.of([buffered("cam01", 1)])
+    cache.of([buffered("cam01", 1, session="s2")])
+    assert means.asked == [1, 1]
+
+
+def test_the_same_frame_twice_in_one_question_is_embedded_once():
+    means = Means()
+    rows, ok = EmbeddingCache(means, Decoder()).of([buffered()] * 3)
+    assert means.asked == [1] and ok.all() and (rows == rows[0]).all()
+
+
+def test_nothing_is_embedded_for_nothing():
+    means = Means()
+    rows, ok = EmbeddingCache(means, Decoder()).of([])
+    assert rows.shape == (0, DIM) and ok.shape == (0,) and means.asked == []
+
+
+def test_a_nan_costs_its_own_camera_and_is_counted_once():
+    cache = EmbeddingCache(NanForTheFirst(), Decoder())
+    items = [buffered("cam01"), buffered("cam02")]
+    for _ in range(3):
+        rows, ok = cache.of(items)
+        assert ok.tolist() == [False, True]
+        assert (rows[0] == 0).all() and rows[1].any() and np.isfinite(rows).all()
+    assert cache.failed == 1
+
+
+def test_a_frame_that_cannot_be_decoded_is_a_camera_without_embedding():
+    means, decoder = Means(), Decoder()
+    cache = EmbeddingCache(means, decoder)
+    for _ in range(3):
+        rows, ok = cache.of([damaged("cam01"), buffered("cam02")])
+        assert ok.tolist() == [False, True] and (rows[0] == 0).all()
+    assert cache.failed == 1 and decoder.undecodable == 1 and means.asked == [1]
+
+
+def test_memory_is_bounded_and_the_latest_used_stay():
+    means = Means()
+    cache = EmbeddingCache(means, Decoder(), capacity=4)
+    kept = buffered("cam02")
+    for k in range(20):
+        cache.of([buffered("cam01", k), kept])
+    assert len(cache._rows) == 4
+    assert sum(means.asked) == 21, "the frame that every decision used was embedded once"
+
+
+def test_a_decision_larger_than_the_cache_is_answered_whole():
+    cache = EmbeddingCache(Means(), Decoder(), capacity=2)
+    items = [buffered(f"cam{k:02d}") for k in range(9)]
+    for _ in range(2):
+        rows, ok = cache.of(items)
+        assert ok.all() and len(rows) == 9
+    assert len(cache._rows) == 2
+
+
+def test_a_caller_that_writes_into_its_rows_does_not_change_the_cache():
+    cache = EmbeddingCache(Means(), Decoder())
+    rows, _ = cache.of([buffered()])
+    rows[:] = np.nan
+    again, ok = cache.of([buffered()])
+    assert ok.all() and np.isfinite(again).all()

@@ -1,0 +1,74 @@
+"""``edge.embedding`` and ``edge.metrics`` of a scenario: strict, and nothing where they are absent."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from edge_server.config import read_config
+from edge_server.embed import EmbeddingConfig, model_path
+from freshfield.scenario import Scenario, ScenarioError, load, parse
+
+FILE = Path("/somewhere/room.yaml")
+
+
+def scenario(**edge) -> Scenario:
+    return parse({"cameras": {"count": 2}, "edge": edge}, FILE)
+
+
+def test_absent_it_is_none_and_nothing_of_it_is_imported():
+    assert read_config(load("room")).embedding is None
+    code = (
+        "import sys\n"
+        "from edge_server.config import read_config\n"
+        "from freshfield.scenario import load\n"
+        "read_config(load('room'))\n"
+        "found = [m for m in sys.modules if m.startswith(('edge_server.embed', 'onnx', 'torch'))]\n"
+        "assert not found, found\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_defaults_and_values():
+    assert read_config(scenario(embedding={})).embedding == EmbeddingConfig()
+    found = read_config(
+        scenario(embedding={"dim": 16, "provider": "cpu", "size": 320, "tap": "model.9"})
+    ).embedding
+    assert (found.dim, found.provider, found.size, found.tap) == (16, "cpu", 320, "model.9")
+    assert model_path(EmbeddingConfig().model).name == "detector_int8.onnx"
+
+
+def test_a_model_is_relative_to_the_scenario():
+    assert (
+        read_config(scenario(embedding={"model": "m/yolo.onnx"})).embedding.model == "/somewhere/m/yolo.onnx"
+    )
+    assert read_config(scenario(embedding={"model": "/a/yolo.onnx"})).embedding.model == "/a/yolo.onnx"
+    assert read_config(scenario(embedding={"model": "default"})).embedding.model == "default"
+
+
+@pytest.mark.parametrize(
+    "section, told",
+    [
+        ({"dims": 3}, "edge.embedding.dims: unknown key; did you mean 'dim'?"),
+        ({"dim": 0}, "edge.embedding: dim: expected 1 to 4096, got 0"),
+        ({"dim": "32"}, "edge.embedding.dim: expected a whole number"),
+        ({"size": 8}, "edge.embedding: size: expected 32 to 2048 pixels, got 8"),
+        ({"provider": "tpu"}, "edge.embedding: provider: expected one of auto, cpu, cuda, got 'tpu'"),
+        ({"threads": 0}, "edge.embedding: threads"),
+        ("default", "edge.embedding: expected a mapping"),
+    ],
+)
+def test_one_line_for_what_is_wrong(section, told):
+    with pytest.raises(ScenarioError) as caught:
+        read_config(scenario(embedding=section))
+    assert str(caught.value).startswith(f"{FILE}: {told}") and "\n" not in str(caught.value)
+
+
+def test_metrics_are_perceptual_or_nothing():
+    assert read_config(scenario()).metrics == ()
+    assert read_config(scenario(metrics=["perceptual"])).metrics == ("perceptual",)
+    with pytest.raises(ScenarioError, match="edge: metrics: expected perceptual, got fid"):
+        read_config(scenario(metrics=["fid"]))

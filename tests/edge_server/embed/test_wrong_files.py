@@ -1,0 +1,132 @@
+"""A file that is no detector: one clear line that names it, and no memory or time spent on it."""
+
+from __future__ import annotations
+
+import resource
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
+onnx = pytest.importorskip("onnx", reason="the extra embed is not installed")
+
+from onnx import TensorProto, helper, numpy_helper  # noqa: E402
+
+from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder  # noqa: E402
+from tests.edge_server.embed.graphs import detector  # noqa: E402
+
+
+def refused(path, match: str, **options) -> None:
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(EmbeddingError, match=match) as caught:
+        make_embedder(EmbeddingConfig(model=str(path), **{"dim": 4, "provider": "cpu", **options}))
+    assert "\n" not in str(caught.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000, "kilobytes"
+
+
+def node(kind: str, read: list[str], write: str, **attributes):
+    return helper.make_node(kind, read, [write], name=f"/model.1/{write}", **attributes)
+
+
+def test_missing(tmp_path):
+    refused(tmp_path / "none.onnx", "none.onnx: no such file")
+    refused(tmp_path, "no such file")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04not an onnx", b"\x00" * 4096, b"\xff" * 64])
+def test_not_onnx(tmp_path, content):
+    path = tmp_path / "a.onnx"
+    path.write_bytes(content)
+    refused(path, "a.onnx: not an ONNX")
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9, 0.999])
+def test_cut_short(tmp_path, share):
+    whole = detector(tmp_path / "whole.onnx").read_bytes()
+    path = tmp_path / "cut.onnx"
+    path.write_bytes(whole[: int(len(whole) * share)])
+    refused(path, "cut.onnx: ")
+
+
+def test_every_kind_of_damage_ends_in_one_line(tmp_path):
+    whole = detector(tmp_path / "whole.onnx").read_bytes()
+    rng = np.random.default_rng(5)
+    path, refusals = tmp_path / "damaged.onnx", 0
+    for _ in range(150):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(data), 3):
+            data[at] = rng.integers(0, 256)
+        path.write_bytes(data)
+        try:
+            rows = make_embedder(EmbeddingConfig(str(path), 4, provider="cpu")).embed(
+                [np.zeros((9, 9, 3), np.uint8)]
+            )
+        except EmbeddingError as error:
+            assert "\n" not in str(error)
+            refusals += 1
+        else:
+            assert np.isfinite(rows).all(), "damage in a weight is no damage to the format"
+    assert refusals > 20
+
+
+def test_a_classifier_and_a_plain_enlargement_are_no_detectors(tmp_path):
+    refused(detector(tmp_path / "c.onnx", neck=False), "not a YOLO detection model; if it is one, name")
+    model = onnx.load(str(detector(tmp_path / "d.onnx")))
+    model.graph.node[5].CopyFrom(node("Relu", ["large"], "joined"))  # enlarged, but joined with nothing
+    onnx.save(model, str(tmp_path / "e.onnx"))
+    refused(tmp_path / "e.onnx", "not a YOLO detection model")
+
+
+def test_inputs_of_another_kind(tmp_path):
+    model = onnx.load(str(detector(tmp_path / "d.onnx")))
+    for shape, kind in (([1, 1, 32, 32], TensorProto.FLOAT), ([1, 3, 32], TensorProto.FLOAT),
+                        ([1, 3, 32, 32], TensorProto.INT64)):  # fmt: skip
+        model.graph.input[0].CopyFrom(helper.make_tensor_value_info("images", kind, shape))
+        onnx.save(model, str(tmp_path / "i.onnx"))
+        refused(tmp_path / "i.onnx", "input images is not")
+    model.graph.input.append(helper.make_tensor_value_info("text", TensorProto.FLOAT, [1]))
+    onnx.save(model, str(tmp_path / "i.onnx"))
+    refused(tmp_path / "i.onnx", "expected one input, the images; it has 2: images, text")
+
+
+def test_weights_in_a_second_file(tmp_path):
+    model = onnx.load(str(detector(tmp_path / "d.onnx")))
+    onnx.save(model, str(tmp_path / "x.onnx"), save_as_external_data=True, location="d.bin", size_threshold=0)
+    refused(tmp_path / "x.onnx", "weights lie in a second file")
+
+
+def test_an_image_larger_than_any(tmp_path):
+    refused(detector(tmp_path / "d.onnx", size=1_000_000), "1000000 x 1000000 are not within")
+
+
+def test_a_bomb_of_operators_that_make_memory_from_nothing(tmp_path):
+    huge = numpy_helper.from_array(np.array([1, 1, 200_000, 200_000], np.int64), "huge")
+    for kind, read in (("Expand", ["end", "huge"]), ("Tile", ["end", "huge"])):
+        path = detector(tmp_path / "b.onnx", extra=(node(kind, read, "big"),), weights=(huge,))
+        refused(path, f"backbone holds {kind}, which no YOLO backbone does")
+
+
+def test_a_bomb_of_maps_that_are_joined_with_themselves(tmp_path):
+    nodes = tuple(node("Concat", [f"t{k}" if k else "end"] * 2, f"t{k + 1}", axis=1) for k in range(40))
+    refused(detector(tmp_path / "b.onnx", extra=nodes), "larger than any backbone's")
+
+
+def test_a_bomb_of_padding(tmp_path):
+    kernel = numpy_helper.from_array(np.ones((1, 6, 1, 1), np.float32), "k")
+    pad = node("Conv", ["end", "k"], "big", pads=[100_000] * 4)
+    refused(detector(tmp_path / "b.onnx", extra=(pad,), weights=(kernel,)), "larger than any backbone's")
+
+
+def test_a_weight_that_claims_more_than_it_holds(tmp_path):
+    claims = TensorProto(name="k", data_type=TensorProto.FLOAT, dims=[2**20, 2**20], raw_data=b"\0" * 8)
+    path = detector(tmp_path / "b.onnx", extra=(node("Mul", ["end", "k"], "big"),), weights=(claims,))
+    refused(path, "larger than any backbone's")
+    claims.dims[:] = [1, 6, 8, 8]
+    path = detector(tmp_path / "b.onnx", extra=(node("Mul", ["end", "k"], "big"),), weights=(claims,))
+    refused(path, "cannot load it")
+
+
+def test_a_damaged_projection(tmp_path):
+    for text in ("!", "AAAA", "AAAAAAAA" * 11):
+        path = detector(tmp_path / "p.onnx", meta={"freshfield.projection": text})
+        refused(path, "projection is damaged")
