@@ -43,4 +43,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     "ch6-low": _ch6_one_state(120.0, 30.0),
     # As ch6, but a state lasts 3 s: its memory outlives a decision, so there is something to learn.
     "ch6-slow": _ch6(3000.0),
+    # In both states of ch6 a buffer fills about equally fast (few frames and short delays, many and
+    # long ones), so that the best wait is the same. Here only delays differ, tenfold, and a state lasts 3 s:
+    # what is best depends on the state, which the ages tell.
+    "swing": {
+        "arrivals": {"process": "periodic", "period_ms": 30.0},
+        "chain": {"mu1_per_ms": 1 / 3000, "mu2_per_ms": 1 / 3000, "states": _STATES},
+        "service": {"law": "exponential", "mean_ms": [15.0, 150.0]},
+        "service_state": "at-start",
+        "discipline": "newest-waits",
+    },
 }

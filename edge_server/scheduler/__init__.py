@@ -6,30 +6,45 @@ they are given (and of the policy's own seeded stream), so that live and virtual
 
 Adding a policy is one file here and a line in ``POLICIES``. A name may go on with a treatment of the views
 that are selected: ``threshold+freshen`` (``edge_server.treatments``, a line in ``TREATMENTS``); a treatment's
-name alone treats all views.
+name alone treats all views. ``bandit:FILE`` is a policy that was learnt (``edge_server.scheduler.learned``).
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:  # nothing of it is loaded where no policy asks for it
+    from edge_server.scheduler.learned.bandit import Decided
+    from edge_server.scheduler.learned.state import State
     from edge_server.treatments import Treatment
+
+
+STATE_PARTS = ("semantics", "age", "pose")
+"""Parts of the state that a learnt policy may look at, in the order of (6.33)."""
+
+
+class Observe(Protocol):
+    """What else there is to see. Computed when it is called, and only the ``parts`` asked for."""
+
+    def __call__(self, parts: Sequence[str] = STATE_PARTS) -> State: ...
 
 
 @dataclass(frozen=True)
 class Epoch:
     """What a policy may look at: the time, the epoch's number and the generation time in ns of the newest
-    frame of every camera that has reported (others are missing), on the edge's clock."""
+    frame of every camera that has reported (others are missing), on the edge's clock. state: of all cameras,
+    with poses and embeddings, for policies that look at more than ages; None where nobody offers it."""
 
     now_ns: int
     number: int
     generated_ns: Mapping[str, int]
+    state: Observe | None = None
 
     def age_ms(self, camera: str) -> float:
         return (self.now_ns - self.generated_ns[camera]) / 1e6
@@ -86,6 +101,9 @@ TREATMENTS: dict[str, tuple[str, str, str]] = {
     "freshen": ("freshen", "Freshen", "stale views are carried forward to now by their optical flow"),
 }
 
+# Prefix of a policy that was learnt: the path of a learner's checkpoint follows.
+BANDIT = "bandit:"
+
 # A live edge cannot take back what the network carries; virtual time can, to show what the thesis assumes.
 VIRTUAL_ONLY = ("wait-flush",)
 # What is offered where people choose; any other combination may be typed.
@@ -100,12 +118,18 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
 
     Raises ValueError for an unknown name or a value out of range, saying what is possible.
     """
+    if name.startswith(BANDIT):
+        if value is not None:
+            raise ValueError(f"policy {name!r}: what was learnt has no value to set")
+        from edge_server.scheduler.learned.bandit import Bandit
+
+        return Bandit.from_file(name.removeprefix(BANDIT), rng)
     chooses, treats = _parts(name)
     if chooses not in POLICIES or name.endswith("+"):
         wrong = name if chooses in POLICIES else chooses
         raise ValueError(
             f"policy {wrong!r} is not known; choose one of {', '.join((*POLICIES, *TREATMENTS))}, "
-            "or join a policy and a treatment, as in threshold+freshen"
+            "or join a policy and a treatment, as in threshold+freshen; a learnt one is bandit:FILE"
         )
     module, cls, _ = POLICIES[chooses]
     policy: Policy = getattr(importlib.import_module(f"{__name__}.{module}"), cls)(value, rng)
@@ -120,6 +144,25 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
 
     module, cls, _ = TREATMENTS[treats]
     return Treated(name, policy, getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)())
+
+
+def read_policy(text: str) -> tuple[str, float | None]:
+    """Name and value of a policy as people type it: ``threshold:120``, ``all``, ``bandit:FILE``, where FILE
+    is relative to where they are. ValueError where the value is no number."""
+    if text.startswith(BANDIT):
+        return learnt_policy(text, Path()), None
+    name, _, value = text.partition(":")
+    try:
+        return name, float(value) if value else None
+    except ValueError:
+        raise ValueError(f"{text}: {value!r} is not a number") from None
+
+
+def learnt_policy(name: str, folder: Path) -> str:
+    """``bandit:FILE`` with a FILE relative to ``folder`` made absolute; another policy's name as it is."""
+    if not name.startswith(BANDIT):
+        return name
+    return BANDIT + str((folder / Path(name.removeprefix(BANDIT)).expanduser()).absolute())
 
 
 def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
@@ -137,8 +180,21 @@ def treatment_of(policy: Policy) -> Treatment | None:
     return getattr(policy, "treatment", None)
 
 
+def embedding_of(policy: Policy) -> tuple[int, str]:
+    """Width of the embeddings that ``policy`` decides by, 0: it needs none, as most; and the name of the
+    embedder whose they are, empty where the policy does not say."""
+    return getattr(policy, "embedding", (0, ""))
+
+
+def decision_of(policy: Policy) -> Decided | None:
+    """The newest decision of a learnt policy, with what it saw; None of others, and before the first."""
+    return getattr(policy, "last", None)
+
+
 def help_of(name: str) -> str:
     """One line on a policy; empty for one that is not known."""
+    if name.startswith(BANDIT):
+        return "a policy that was learnt (edge-server train-scheduler)"
     chooses, treats = _parts(name)
     if chooses not in POLICIES or (treats and treats not in TREATMENTS):
         return ""

@@ -34,13 +34,14 @@ Curve = dict[float, dict[int, float | None]]
 @dataclass(frozen=True)
 class Ask:
     """What was asked for. seeds: repetitions of every point; None takes the study's own. scenes: None takes
-    the study's own, those whose data are here."""
+    the study's own, those whose data are here. jobs: processes, for studies that train."""
 
     quick: bool
     out: Path
     folders: Folders
     seeds: int | None = None
     scenes: tuple[str, ...] | None = None
+    jobs: int = 1
 
     def repeats(self, quick: int, full: int) -> range:
         return range(self.seeds or (quick if self.quick else full))

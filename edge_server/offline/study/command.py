@@ -16,6 +16,7 @@ from edge_server.fidelity.lpips_weights import weights_folder
 from edge_server.offline.study.base import Ask, Verdict, run_study
 from edge_server.offline.study.engine import Engine, StudyError
 from edge_server.offline.study.trial import SCENARIOS, Folders
+from edge_server.offline.training.trainer import TrainingError
 from freshfield.files import write_json
 from freshfield.scenario import ScenarioError
 
@@ -29,7 +30,19 @@ STUDIES = {
     "images": ("images", "Images"),
     "representations": ("representations", "Representations"),
     "phase": ("phase", "Phase"),
+    "ppo-select": ("ppo_select", "PpoSelect"),
+    "ppo-wait": ("ppo_wait", "PpoWait"),
+    "ablation": ("ablation", "Ablation"),
+    "weights": ("weights", "Weights"),
+    "drift": ("drift", "Drift"),
+    "transfer": ("transfer", "Transfer"),
+    "semantics": ("semantics", "Semantics"),
+    "reward-cost": ("reward_cost", "RewardCost"),
 }
+# Trainings, which go through no heap of trials: they take long, and are not part of "all".
+LEARNING = (
+    "ppo-select", "ppo-wait", "ablation", "weights", "drift", "transfer", "semantics", "reward-cost"
+)  # fmt: skip
 DESCRIPTION = """\
 The thesis's figures, each with a table (CSV), a figure (PNG) and a verdict: the claim, what was found here
 with 95 % intervals over seeds, and whether it holds.
@@ -48,6 +61,15 @@ with 95 % intervals over seeds, and whether it holds.
   representations   figure 6.7: the same trade with other representations
   phase             where the trade exists: speed x delay x memory x compute, and what mask and freshen gain
 
+  ppo-select        figure 5.9: a scheduler that learns which views to use, against everything else
+  ppo-wait          figure 6.8: one that learns how long to wait, or how old is too old, by traffic
+  ablation          what ages, poses and semantics in the state are worth to what is learnt
+  weights           what is learnt by other weights of the reward, judged by all of them
+  drift             the channel changes during use: fixed, learnt, and still learning
+  transfer          learnt on one scene and channel, used on another
+  semantics         where it helps to look at the pictures, and what it costs where it does not
+  reward-cost       what is learnt against the time it takes, by the effort of a fit and the embedding
+
 Everything runs in virtual time from seeds: a trial gives the same figures bit for bit wherever it runs.
 Results are kept in OUT/trials by content; after Ctrl-C the same command goes on with what is missing.
 """
@@ -58,14 +80,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
     folders = Folders(base, weights_folder(args.lpips, base))
-    ask = Ask(args.quick, args.out, folders, args.seeds, tuple(args.scene.split(",")) if args.scene else None)
-    names = list(STUDIES) if args.study == "all" else [args.study]
+    scenes = tuple(args.scene.split(",")) if args.scene else None
+    ask = Ask(args.quick, args.out, folders, args.seeds, scenes, args.jobs)
+    names = [n for n in STUDIES if n not in LEARNING] if args.study == "all" else [args.study]
+    if args.study == "learning":
+        names = list(LEARNING)
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
     try:
         _check(ask, args.jobs)
         for name in names:
             _run(name, ask, engine)
-    except (ScenarioError, DatasetError, StudyError) as error:
+    except (ScenarioError, DatasetError, StudyError, TrainingError) as error:
         print(f"edge-server study: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -112,7 +137,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("edge-server study", description=DESCRIPTION, formatter_class=raw)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     add = parser.add_argument
-    add("study", choices=[*STUDIES, "all"], metavar="NAME", help=f"{', '.join(STUDIES)} or all")
+    add("study", choices=[*STUDIES, "all", "learning"], metavar="NAME",
+        help=f"{', '.join(STUDIES)}; all: those before ppo-select; learning: those from it on")  # fmt: skip
     add(
         "--quick",
         action="store_true",

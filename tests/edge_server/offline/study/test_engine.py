@@ -86,6 +86,7 @@ def test_processes_give_what_one_process_gives(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_ray_gives_what_one_process_gives(tmp_path: Path):
     ray = pytest.importorskip("ray", reason="Ray is not installed (pip install 'freshfield[cluster]')")
     alone = Engine(tmp_path / "a", jobs=1, say=quiet).run(trials())

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from edge_server.offline.study.base import Ask, Point, Table, objective, run_study
-from edge_server.offline.study.command import STUDIES, main, make_study
+from edge_server.offline.study.command import LEARNING, STUDIES, main, make_study
 from edge_server.offline.study.engine import Engine
 from edge_server.offline.study.trial import Folders
 from edge_server.scheduler import make_policy
 
-NAMES = [n for n in STUDIES if n != "metrics"]
+NAMES = [n for n in STUDIES if n not in ("metrics", *LEARNING)]
 
 
 def ask(tmp_path: Path, **more: Any) -> Ask:

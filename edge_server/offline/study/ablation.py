@@ -1,0 +1,70 @@
+"""What each part of the state is worth (6.33): age; + pose; + semantics; all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from edge_server.offline.study.base import Ask, Point, Table, Verdict
+from edge_server.offline.study.learning import (
+    FOUR_VIEWPOINTS,
+    Lesson,
+    School,
+    better,
+    embeddings_missing,
+    fixed_of,
+    room,
+)
+from edge_server.offline.train_scheduler import OMEGAS_MS, layout_of
+from edge_server.offline.training.contest import rivals, rows, write_rows
+from edge_server.offline.training.trainer import Course
+from edge_server.scheduler.learned.spec import Spec
+
+EPISODES = {True: 100, False: 600}
+# name -> parts of the state
+VARIANTS = {
+    "age": ("age",), "age+pose": ("age", "pose"), "age+semantics": ("semantics", "age"),
+    "all": ("semantics", "age", "pose"),
+}  # fmt: skip
+
+
+class Ablation:
+    name = "ablation"
+    title = "What each part of the state is worth: age, pose, semantics (6.33)"
+
+    def points(self, ask: Ask) -> list[Point]:
+        return []
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        del table
+        variants = dict(VARIANTS)
+        if missing := embeddings_missing():
+            print(f"  semantics are left out: {missing}")
+            variants = {name: parts for name, parts in variants.items() if "semantics" not in parts}
+        # All see the same decisions, drawn with all that any of them looks at.
+        parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
+        setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
+        with School(ask) as school:
+            reward, mine = school.reward("set", "moving"), {}
+            for name, used in variants.items():
+                spec = Spec("select", layout_of(setting, used))
+                lesson = Lesson(f"{self.name}-{name}", setting, Course(spec, reward, EPISODES[ask.quick]))
+                mine[f"learnt {name}"] = school.teach(lesson).actor
+            everybody: dict[str, Any] = {
+                **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
+            }  # fmt: skip
+            contest = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
+        write_rows(ask.out / f"{self.name}.csv", rows(contest))
+        about, base = "room, ch5, moving, four viewpoints", contest.rewards("learnt age")
+        best, told = contest.best_fixed("threshold")[0], fixed_of(contest, "threshold")
+        found = [better(f"{about}, {name}", "better than the best fixed threshold.",
+                        contest.rewards(f"learnt {name}"), best, f"against {told}; ")
+                 for name in variants]  # fmt: skip
+        found += [better(f"{about}, {name}", "better than age alone.",
+                         contest.rewards(f"learnt {name}"), base)
+                  for name in variants if name != "age"]  # fmt: skip
+        if "all" in variants:
+            found.append(
+                better(about, "semantics add to age and pose.", contest.rewards("learnt all"),
+                       contest.rewards("learnt age+pose"))
+            )  # fmt: skip
+        return found

@@ -1,0 +1,219 @@
+"""What studies of schedulers that learn share: settings of the room, trainings that are kept, contests.
+
+A training is a chain, not a heap of trials, so it does not go through the engine: it is kept with its
+checkpoints below OUT/training, evaluations in OUT/training/evaluations.jsonl by content, and the same command
+goes on with either.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from camera_node.config import WorldConfig, source_config
+from edge_server.offline.deployment import exact_scene
+from edge_server.offline.study.base import Ask, Verdict, by_bool
+from edge_server.offline.study.statistics import interval, paired
+from edge_server.offline.study.trial import Trial
+from edge_server.offline.train_scheduler import reward_of
+from edge_server.offline.training.choosing import Maker
+from edge_server.offline.training.contest import Contest, PerSeed, hold
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.report import draw_curve, span
+from edge_server.offline.training.setting import Setting, seeds
+from edge_server.offline.training.trainer import Course, Row, read_log, train
+from edge_server.scheduler import Epoch, Plan
+from edge_server.scheduler.learned.decide import Actor
+from edge_server.scheduler.learned.rewards import Reward
+from freshfield.files import write_json
+
+FIELD = "splat"
+FIELD_OPTIONS = {"effort": "low"}
+SIZE = 64
+FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """One training of a study. name: of its folder and in its tables."""
+
+    name: str
+    setting: Setting
+    course: Course
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """actor: what was learnt. rows: of its log. seconds: of training, wall clock, when it was trained, by
+    ``jobs`` processes. folder: with its policy.npz."""
+
+    lesson: Lesson
+    actor: Actor
+    rows: list[Row]
+    seconds: float
+    jobs: int
+    folder: Path
+
+
+def room(
+    channel: Mapping[str, Any] | str = "ch5",
+    *,
+    scene: str = "room",
+    speed_m_per_s: float = 1.0,
+    held_out: tuple[str, ...] = ("cam00",),
+    embedding: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> Setting:
+    """The usual setting: a world at 64 x 64, nineteen cameras of which one is held out, a splat field. more:
+    of ``Setting``. channel: a preset or a section. embedding: the section ``edge.embedding``."""
+    section = {"preset": channel} if isinstance(channel, str) else dict(channel)
+    trial = Trial(
+        scene, 0, section, size=SIZE, field=FIELD, field_options=FIELD_OPTIONS, speed_m_per_s=speed_m_per_s
+    )
+    scenario = dataclasses.replace(trial.scenario(), held_out=held_out)
+    if embedding is not None:
+        scenario = dataclasses.replace(scenario, edge={**scenario.edge, "embedding": dict(embedding)})
+    return Setting(scenario, **{"steps": 50, **more})
+
+
+class Nearest:
+    """The k cameras that stand nearest to the held-out one, whatever their age: what can be won by knowing
+    from where the field will be looked at, without looking at the state."""
+
+    name = "nearest"
+    parameter = "k"
+
+    def __init__(self, setting: Setting, k: int) -> None:
+        self.value: float | None = float(k)
+        source = cast(WorldConfig, source_config(setting.scenario))
+        scene, _ = exact_scene(setting.scenario, source)
+        stand = {camera: pose[:3, 3] for camera, (_, pose) in scene.cameras.items()}
+        watched = [stand[camera] for camera in setting.scenario.held_out]
+        far = {
+            c: min(float(np.linalg.norm(stand[c] - w)) for w in watched) for c in setting.scenario.training
+        }
+        self._order = sorted(far, key=lambda c: far[c])
+        self._k = k
+
+    def plan(self, epoch: Epoch) -> Plan:
+        return Plan(epoch.now_ns)
+
+    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
+        near = set([c for c in self._order if c in epoch.generated_ns][: self._k])
+        return tuple(c for c in epoch.generated_ns if c in near)
+
+
+@dataclass
+class School:
+    """Trains and compares for one study; use as a context."""
+
+    ask: Ask
+    crew: Crew = field(init=False)
+    _told: bool = False
+
+    def __post_init__(self) -> None:
+        self.folder = self.ask.out / "training"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.crew = Crew(self.ask.folders, self.ask.jobs, self.folder / "evaluations.jsonl")
+
+    def __enter__(self) -> School:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.crew.__exit__(*error)
+
+    def reward(self, name: str, on: str = "whole") -> Reward:
+        """A reward of the presets; said once where its LPIPS term has to be left out."""
+        reward, missing = reward_of(name, on, self.ask.folders.lpips)
+        if missing and not self._told:
+            print(f"  {missing}")
+            self._told = True
+        return reward
+
+    def teach(self, lesson: Lesson) -> Learnt:
+        """The lesson's learner, trained now or kept; its curve is drawn to OUT/LESSON.png."""
+        folder = self.folder / f"{lesson.name}-{_digest(lesson)}"
+        by = folder / "jobs.json"
+        learner = train(
+            lesson.setting, lesson.course, self.crew, folder,
+            lambda line: print(f"  {lesson.name}: {line}", flush=True),
+        )  # fmt: skip
+        rows = read_log(folder)
+        draw_curve(self.ask.out / f"{lesson.name}.png", rows)
+        if not by.exists():
+            write_json(by, self.ask.jobs)
+        seconds = sum(row["seconds"] for row in rows)
+        return Learnt(lesson, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
+
+    def contest(
+        self,
+        setting: Setting,
+        everybody: Mapping[str, Maker | Actor],
+        reward: Reward,
+        count: int,
+        seed: int = 0,
+    ) -> Contest:
+        """All of ``everybody`` on ``count`` seeds that nobody trained on."""
+        return hold(
+            setting, self.crew, seeds(seed, "test", count), everybody, reward,
+            lambda line: print(f"  contest: {line}", flush=True),
+        )  # fmt: skip
+
+
+def embeddings_missing() -> str | None:
+    """Why no policy can look at pictures here, in one line; None: it can."""
+    from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+
+    try:
+        make_embedder(EmbeddingConfig())
+    except EmbeddingError as error:
+        return str(error)
+    return None
+
+
+def fixed_of(contest: Contest, kind: str) -> str:
+    """The best fixed policy of a kind, in words."""
+    values, name = contest.best_fixed(kind)
+    return f"{name} {span(interval(list(values.values())))}"
+
+
+def mean_of(contest: Contest, names: Sequence[str]) -> PerSeed:
+    """Mean reward over several trainings of the same lesson, by seed of testing."""
+    each = [contest.rewards(name) for name in names]
+    found: PerSeed = {}
+    for s in each[0]:
+        values = [e[s] for e in each]
+        found[s] = (
+            None if any(v is None for v in values) else sum(v for v in values if v is not None) / len(each)
+        )
+    return found
+
+
+def better(about: str, claim: str, mine: PerSeed, other: PerSeed, found: str = "") -> Verdict:
+    """Whether ``mine`` is better than ``other``: the paired interval says."""
+    over = paired(mine, other)
+    return Verdict(about, claim, f"{found}difference {span(over)} over {over.count} seeds.",
+                   by_bool(over.above(0.0)))  # fmt: skip
+
+
+def no_worse(about: str, claim: str, mine: PerSeed, other: PerSeed, share: float = 0.01) -> Verdict:
+    """Whether ``mine`` loses no more than ``share`` of the size of ``other``'s mean reward."""
+    over, base = paired(mine, other), interval(list(other.values())).mean
+    return Verdict(
+        about, claim,
+        f"difference {span(over)} at {base:.4f}, that is {100 * over.mean / abs(base):+.2f} %.",
+        by_bool(over.above(-share * abs(base))),
+    )  # fmt: skip
+
+
+def _digest(lesson: Lesson) -> str:
+    """Lessons of one name and other settings stand beside each other."""
+    text = lesson.setting.key + repr(dataclasses.asdict(lesson.course))
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -1,0 +1,66 @@
+"""Trained on one scene and channel, used on another."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from edge_server.offline.study.base import Ask, Point, Table, Verdict
+from edge_server.offline.study.learning import Lesson, School, better, fixed_of, no_worse, room
+from edge_server.offline.train_scheduler import OMEGAS_MS
+from edge_server.offline.training.contest import rivals, rows, write_rows
+from edge_server.offline.training.setting import Setting
+from edge_server.offline.training.trainer import Course
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
+
+EPISODES = {True: 40, False: 600}
+HOME = "room, swing"
+AGE = -0.003
+
+
+def settings(quick: bool) -> dict[str, Setting]:
+    """Where policies are used; they are trained in each, and that of ``HOME`` is used in all."""
+    found = {HOME: room("swing"), "tower, swing": room("swing", scene="tower")}
+    more = {"room at 3 m/s, swing": room("swing", speed_m_per_s=3.0), "room, ch6-slow": room("ch6-slow")}
+    return found if quick else found | more
+
+
+class Transfer:
+    name = "transfer"
+    title = "Trained on one scene and channel, used on another"
+
+    def points(self, ask: Ask) -> list[Point]:
+        return []
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        del table
+        found: list[Verdict] = []
+        written: list[dict[str, Any]] = []
+        spec = Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
+        with School(ask) as school:
+            reward = dataclasses.replace(school.reward("corrected"), age=AGE)
+            places = settings(ask.quick)
+            learnt = {
+                place: school.teach(
+                    Lesson(f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",
+                           setting, Course(spec, reward, EPISODES[ask.quick], tries=3))
+                ).actor
+                for place, setting in places.items()
+            }  # fmt: skip
+            for place, setting in places.items():
+                everybody: dict[str, Any] = {
+                    **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
+                    "learnt at home": learnt[HOME], "learnt here": learnt[place],
+                }  # fmt: skip
+                contest = school.contest(setting, everybody, reward, len(ask.repeats(8, 100)))
+                written += rows(contest, place=place)
+                home, here = contest.rewards("learnt at home"), contest.rewards("learnt here")
+                best = contest.best_fixed("wait")[0]
+                found.append(better(place, f"learnt in {HOME}, better than the best fixed wait here.", home,
+                                    best, f"against {fixed_of(contest, 'wait')}; "))  # fmt: skip
+                if place != HOME:
+                    found.append(no_worse(place, f"learnt in {HOME}, it loses no more than 5 % to what is "
+                                          "learnt here.", home, here, 0.05))  # fmt: skip
+        write_rows(ask.out / f"{self.name}.csv", written)
+        return found

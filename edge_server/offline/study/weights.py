@@ -1,0 +1,75 @@
+"""How much the weights of a reward matter (6.36-6.38): policies learnt by each, judged by every one."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
+from edge_server.offline.study.learning import Lesson, School, better, room
+from edge_server.offline.study.statistics import paired
+from edge_server.offline.train_scheduler import OMEGAS_MS
+from edge_server.offline.training.contest import rivals, rows, write_rows
+from edge_server.offline.training.report import span
+from edge_server.offline.training.trainer import Course
+from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
+
+EPISODES = {True: 40, False: 600}
+
+
+class Weights:
+    name = "weights"
+    title = "Sensitivity to the weights of the reward (6.36-6.38)"
+
+    def points(self, ask: Ask) -> list[Point]:
+        return []
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        del table
+        setting, spec = room("swing"), Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
+        with School(ask) as school:
+            rewards = variants(school)
+            learnt = {
+                name: school.teach(
+                    Lesson(f"{self.name}-{name}", setting,
+                           Course(spec, reward, EPISODES[ask.quick], tries=3))
+                ).actor
+                for name, reward in rewards.items()
+            }  # fmt: skip
+            everybody: dict[str, Any] = {
+                **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
+                **{f"learnt {name}": actor for name, actor in learnt.items()},
+            }
+            contest = school.contest(setting, everybody, rewards["corrected"], len(ask.repeats(8, 100)))
+        found, written = [], []
+        for name, reward in rewards.items():
+            contest.reward = reward
+            written += rows(contest, judged_by=name)
+            mine, about = contest.rewards(f"learnt {name}"), f"room, swing, {name}"
+            best, fixed = contest.best_fixed("wait")
+            claim = "what was learnt by it is better than the best fixed wait."
+            found.append(better(about, claim, mine, best, f"the best is {fixed}; "))
+            losses = {o: paired(mine, contest.rewards(f"learnt {o}")) for o in rewards if o != name}
+            worst = max(losses, key=lambda o: losses[o].mean)
+            answers = [loss.above(0.0) for loss in losses.values()]
+            found.append(
+                Verdict(about, "it matters: what was learnt by other weights is worse by these.",
+                        "; ".join(f"{o} {span(loss)}" for o, loss in losses.items()) + f"; most: {worst}.",
+                        by_bool(None if None in answers and True not in answers else True in answers))
+            )  # fmt: skip
+        write_rows(ask.out / f"{self.name}.csv", written)
+        return found
+
+
+def variants(school: School) -> dict[str, Reward]:
+    """Rewards by name: the thesis's, ours with the sign put right, and ages that count less."""
+    corrected = school.reward("corrected")
+    return {
+        "thesis": school.reward("thesis"),
+        "corrected": corrected,
+        "age a fifth": dataclasses.replace(corrected, age=corrected.age / 5),
+        "age a fiftieth": dataclasses.replace(corrected, age=corrected.age / 50),
+        "moving": dataclasses.replace(corrected, fidelity="moving", age=corrected.age / 5),
+    }

@@ -1,0 +1,232 @@
+"""``edge-server train-scheduler``: a scheduler learns in virtual time, with real field fits as reward."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from camera_node.sources.records import DatasetError
+from edge_server.config import open_embedder, read_config
+from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
+from edge_server.offline.study.trial import Folders
+from edge_server.offline.training.choosing import Maker
+from edge_server.offline.training.contest import Contest, hold, rivals, write_rows
+from edge_server.offline.training.contest import rows as rows_of
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.report import draw_curve, lines, summary
+from edge_server.offline.training.setting import Setting, seeds
+from edge_server.offline.training.trainer import Course, TrainingError, read_log, train
+from edge_server.scheduler.learned.decide import Actor
+from edge_server.scheduler.learned.rewards import REWARDS, Reward, available, make_reward
+from edge_server.scheduler.learned.spec import ACTIONS, Spec
+from edge_server.scheduler.learned.state import PARTS, StateLayout
+from freshfield.files import write_json
+from freshfield.scenario import Scenario, ScenarioError, load
+
+DESCRIPTION = """\
+Learns when and of which views to update the field: decisions are drawn from the scenario in virtual time,
+each action is carried out by a real field fit and rewarded on the held-out camera at the instant of
+publication.
+
+  edge-server train-scheduler room19 --out runs/select
+  edge-server train-scheduler room19 --kind wait --reward corrected --episodes 200 --out runs/wait
+  edge-server run room --policy bandit:runs/select/policy.npz
+
+  --kind select      a set of cameras, Bernoulli each (thesis 5.4, algorithm 1)
+  --kind threshold   how old a view may be (6.3)
+  --kind wait        how long to wait for younger ones (6.3, algorithm 2)
+
+  --reward set        0.02 PSNR + 0.5 SSIM - LPIPS (5.19); usual for select
+  --reward corrected  -F_w (6.36-6.38), a better SSIM rewarded; usual for threshold and wait
+  --reward thesis     -F_w as printed, which rewards a worse SSIM
+
+An episode is --decisions decisions at random instants. Of each, --tries actions are carried out from the same
+field, so that they can be compared; --warm starts them from a field that remembers, else from nothing.
+Pictures are small (--size) and the field is quick (--field), so that there are many decisions.
+
+OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
+apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. After Ctrl-C the same
+command goes on, bit for bit; so it does whatever --jobs is.
+"""
+OMEGAS_MS = {
+    "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
+    "wait": (0.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 160.0, 200.0, 300.0),
+}
+LEARNT = "learnt"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
+    folders = Folders(base, weights_folder(args.lpips, base))
+    try:
+        setting = setting_of(args, load(args.scenario))
+        course = _course(args, setting, folders)
+        _check(args, course)
+    except (ScenarioError, DatasetError, ValueError) as error:
+        print(f"edge-server train-scheduler: {error}", file=sys.stderr)
+        return 2
+    try:
+        with Crew(folders, args.jobs, _made(args.out) / "evaluations.jsonl") as crew:
+            _go(args, setting, course, crew)
+    except (ScenarioError, DatasetError, TrainingError) as error:
+        print(f"edge-server train-scheduler: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nstopped; what is finished is in {args.out}: the same command goes on", flush=True)
+        return 130
+    return 0
+
+
+def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) -> None:
+    began = time.monotonic()
+    learner = train(setting, course, crew, args.out, lambda line: print(f"  {line}", flush=True))
+    spent = time.monotonic() - began
+    rows = read_log(args.out)
+    write_rows(args.out / "training.csv", rows)
+    if spent > 1.0:
+        print(f"  {course.episodes} episodes; trained for {spent:.0f} s", flush=True)
+    if not args.test:
+        draw_curve(args.out / "training.png", rows)
+        return
+    kinds = ["threshold"] if course.spec.action == "select" else [course.spec.action]
+    omegas = course.spec.omegas_ms or OMEGAS_MS["threshold"]
+    everybody: dict[str, Maker | Actor] = {**rivals(omegas, kinds), LEARNT: learner.actor}
+    contest = hold(
+        setting, crew, seeds(course.seed, "test", args.test), everybody, course.reward,
+        lambda line: print(f"  on unseen seeds: {line}", flush=True),
+    )  # fmt: skip
+    _report(args.out, contest, kinds[0], rows, spent)
+
+
+def _report(out: Path, contest: Contest, fixed: str, rows: list[dict[str, Any]], spent: float) -> None:
+    write_rows(out / "contest.csv", rows_of(contest))
+    found = summary(contest, LEARNT, fixed)
+    levels = {"random": found["rewards"]["random"][0], f"best fixed ({found['best_fixed']})":
+              found["rewards"][found["best_fixed"]][0], LEARNT: found["reward"][0]}  # fmt: skip
+    draw_curve(out / "training.png", rows, {k: v for k, v in levels.items() if v is not None})
+    reward = contest.reward
+    about = {"reward_name": reward.name, "on": reward.fidelity, "seconds": round(spent, 1)}
+    write_json(out / "summary.json", {**found, **about}, indent=1)
+    for line in lines(contest, LEARNT, fixed):
+        print(f"  {line}")
+    print(f"  {out / 'policy.npz'}: edge-server run SCENARIO --policy bandit:{out / 'policy.npz'}")
+
+
+def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
+    """Where decisions come from: the scenario with small pictures and a quick field."""
+    source, edge = dict(scenario.source), dict(scenario.edge)
+    if source.get("kind") == "world" and args.size:
+        source |= {"width": args.size, "height": args.size}
+    if args.field:
+        edge["field"] = args.field
+        edge["field_options"] = {"effort": "low"} if args.field in ("splat", "voxel", "ngp") else {}
+    edge["policy"] = {"name": "all"}
+    given = dataclasses.replace(scenario, source=source, edge=edge)
+    return Setting(
+        given,
+        steps=args.fit_steps or (20 if args.warm else 50),
+        scratch=not args.warm,
+        decisions=args.decisions,
+        compute=read_config(given).compute,
+        parts=_parts(args.parts),
+    )
+
+
+def reward_of(name: str, on: str, lpips_folder: Path | None) -> tuple[Reward, str | None]:
+    """The reward of a name, on the whole image or its moving pixels. Where LPIPS has no weights its term is
+    left out, and the second value says so."""
+    reward = make_reward(name, fidelity=on)  # type: ignore[arg-type]
+    _, missing = open_lpips(lpips_folder)
+    found = available(reward, missing)
+    return found, None if found == reward else f"the reward has no term of distance: {missing}"
+
+
+def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
+    """What a network sees of the state: ``parts``, embedded as the setting's scenario says. ValueError where
+    nothing can embed here."""
+    if "semantics" not in parts:
+        return StateLayout(parts)
+    from edge_server.embed import EmbeddingConfig
+
+    embedder = open_embedder(read_config(setting.scenario).embedding or EmbeddingConfig())
+    assert embedder is not None
+    return StateLayout(parts, embedder.dim, embedding=embedder.name)
+
+
+def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Course:
+    name = args.reward or ("set" if args.kind == "select" else "corrected")
+    reward, missing = reward_of(name, args.on, folders.lpips)
+    if missing:
+        print(f"  {missing}")
+    given = tuple(float(v) for v in args.omegas.split(",")) if args.omegas else None
+    spec = Spec(
+        args.kind,
+        layout_of(setting, setting.parts),
+        () if args.kind == "select" else given or OMEGAS_MS[args.kind],
+        network=args.network,
+        cameras=len(setting.scenario.training) if args.network == "flat" else None,
+    )
+    return Course(spec, reward, args.episodes, args.batch, args.tries, args.seed)
+
+
+def _parts(text: str) -> tuple[str, ...]:
+    asked = set(text.split(","))
+    if unknown := asked - set(PARTS):
+        raise ValueError(f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(PARTS)}")
+    return tuple(part for part in PARTS if part in asked)
+
+
+def _check(args: argparse.Namespace, course: Course) -> None:
+    if args.jobs < 1:
+        raise TrainingError(f"--jobs: expected at least 1, got {args.jobs}")
+    if not 0 <= args.test <= 10_000:
+        raise TrainingError(f"--test: expected 0 to 10000 seeds, got {args.test}")
+    seeds(course.seed, "train", course.episodes)
+
+
+def _made(out: Path) -> Path:
+    out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+    return out
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        "edge-server train-scheduler", description=DESCRIPTION, formatter_class=raw
+    )
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    add = parser.add_argument
+    add("scenario", help="scenario file, or the name of a shipped one; it must hold a camera out")
+    add("--kind", choices=ACTIONS, default="select", help="what is decided [%(default)s]")
+    add("--episodes", type=int, default=600, metavar="N", help="[%(default)s]")
+    add("--decisions", type=int, default=4, metavar="N", help="of an episode [%(default)s]")
+    add("--batch", type=int, default=10, metavar="N", help="episodes of one update [%(default)s]")
+    add("--tries", type=int, default=2, metavar="N", help="actions tried at a decision [%(default)s]")
+    add("--reward", choices=tuple(REWARDS), help="[set for select, else corrected]")
+    add("--on", choices=("whole", "moving"), default="whole", help="pixels of the PSNR [%(default)s]")
+    add(
+        "--parts", default="age,pose", metavar="P,...", help=f"of the state: {', '.join(PARTS)} [%(default)s]"
+    )
+    add("--omegas", metavar="MS,...", help="what threshold and wait choose from")
+    add("--network", choices=("pooled", "flat"), default="pooled",
+        help="pooled takes any number of cameras, flat is the thesis's [%(default)s]")  # fmt: skip
+    add("--warm", action="store_true", help="updates go on with a field that knows the scene")
+    add("--fit-steps", type=int, metavar="N", help="of an update [50; 20 with --warm]")
+    add("--size", type=int, default=64, metavar="PX", help="of a world's pictures, 0: its own [%(default)s]")
+    add("--field", default="splat", metavar="NAME", help="representation, '': the scenario's [%(default)s]")
+    add("--seed", type=int, default=0, metavar="K", help="[%(default)s]")
+    add("--test", type=int, default=20, metavar="N", help="unseen seeds at the end [%(default)s]")
+    add("--jobs", type=int, default=cores, metavar="J", help="processes [%(default)s]")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--lpips", type=Path, metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
+    add("--out", type=Path, required=True, metavar="DIR", help="where everything is written")
+    return parser

@@ -1,0 +1,178 @@
+"""Carries out episodes in processes of one thread each. What comes back depends on what was asked for and on
+nothing else: neither on how many processes there are nor on who was first.
+
+An episode belongs to one process, which keeps its pictures and its warm field, so that all actions of its
+decisions are evaluated there. What is known is not evaluated again; with a file, not even by the next run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from edge_server.fields.kernels.pool import THREADS_VARIABLE
+from edge_server.offline.study.engine import source_digest
+from edge_server.offline.study.trial import Folders
+from edge_server.offline.training.episode import Choice, Ground, Moment, Outcome
+from edge_server.offline.training.setting import Setting
+from freshfield.files import Lines
+
+Asked = tuple[int, int, Choice]
+"""Seed of an episode, number of a decision, what was chosen."""
+
+# Evaluations of one task: few enough that little is lost by Ctrl-C.
+_ASKED_A_TASK = 48
+# Settings whose pictures a process keeps.
+_GROUNDS_KEPT = 3
+_GROUNDS: dict[tuple[str, Folders], Ground] = {}
+
+
+def _ground(setting: Setting, folders: Folders) -> Ground:
+    at = (setting.key, folders)
+    if at not in _GROUNDS:
+        while len(_GROUNDS) >= _GROUNDS_KEPT:
+            _GROUNDS.pop(next(iter(_GROUNDS)))
+        _GROUNDS[at] = Ground(setting, folders)
+    return _GROUNDS[at]
+
+
+def _draw(setting: Setting, folders: Folders, seeds: Sequence[int]) -> list[tuple[Moment, ...]]:
+    ground = _ground(setting, folders)
+    return [ground.episode(seed).moments for seed in seeds]
+
+
+def _evaluate(setting: Setting, folders: Folders, asked: Sequence[Asked]) -> list[Outcome]:
+    ground = _ground(setting, folders)
+    return [ground.episode(seed).evaluate(number, choice) for seed, number, choice in asked]
+
+
+def _begin() -> None:
+    """In a process of the crew: one thread; Ctrl-C is the parent's business."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ[THREADS_VARIABLE] = "1"
+    cv2.setNumThreads(1)
+    import torch
+
+    # How many threads share a convolution decides its last bits.
+    torch.set_num_threads(1)
+
+
+class Crew:
+    """jobs: processes; 1 does everything in this one. known: file of evaluations that is read and added to;
+    None keeps them in memory only. Use as a context, or ``close`` at the end."""
+
+    def __init__(self, folders: Folders, jobs: int = 1, known: Path | None = None) -> None:
+        self.folders, self.jobs = folders, max(1, jobs)
+        self.evaluated = 0
+        """Evaluations that were carried out, not found."""
+        self._pools: list[ProcessPoolExecutor] = []
+        self._moments: dict[tuple[str, int], tuple[Moment, ...]] = {}
+        self._known: dict[str, Outcome] = {}
+        self._lines: Lines | None = None
+        if known is not None:
+            self._read(known)
+            self._lines = Lines(known)
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close(at_once=error[0] is not None)
+
+    def close(self, at_once: bool = False) -> None:
+        """End the processes; at_once: without waiting for what they are doing."""
+        pools, self._pools = self._pools, []
+        for pool in pools:
+            if at_once:
+                for process in list((pool._processes or {}).values()):
+                    process.terminate()
+            pool.shutdown(wait=not at_once, cancel_futures=at_once)
+        if self._lines is not None:
+            self._lines.close()
+            self._lines = None
+
+    def draw(self, setting: Setting, seeds: Sequence[int]) -> list[tuple[Moment, ...]]:
+        """The decisions of each episode, in the order of the seeds."""
+        found = [self._moments.get((setting.key, seed)) for seed in seeds]
+        for seed, moments in zip(*self._drawn(setting, [s for s, m in zip(seeds, found) if m is None])):
+            self._moments[setting.key, seed] = moments
+        return [self._moments[setting.key, seed] for seed in seeds]
+
+    def forget(self, setting: Setting, seeds: Sequence[int]) -> None:
+        """Give back the memory of episodes that are not needed any more."""
+        for seed in seeds:
+            self._moments.pop((setting.key, seed), None)
+
+    def evaluate(self, setting: Setting, asked: Sequence[Asked]) -> list[Outcome]:
+        """What each choice came to, in the order asked. After Ctrl-C the file has what was finished."""
+        keys = [self._key(setting, a) for a in asked]
+        wanted = {key: a for key, a in zip(keys, asked) if key not in self._known}
+        tasks: list[tuple[list[str], list[Asked]]] = []
+        for place in range(self.jobs):
+            mine = [(key, a) for key, a in wanted.items() if a[0] % self.jobs == place]
+            for i in range(0, len(mine), _ASKED_A_TASK):
+                part = mine[i : i + _ASKED_A_TASK]
+                tasks.append(([key for key, _ in part], [a for _, a in part]))
+        sent = [(task, self._send(task[1][0][0], _evaluate, setting, task[1])) for task in tasks]
+        for (names, _), result in sent:
+            for name, outcome in zip(names, result.result()):
+                self._known[name] = outcome
+                self.evaluated += 1
+                if self._lines is not None:
+                    self._lines.write(json.dumps({"key": name, **asdict(outcome)}))
+        return [self._known[key] for key in keys]
+
+    def _drawn(self, setting: Setting, seeds: Sequence[int]) -> tuple[list[int], list[tuple[Moment, ...]]]:
+        parts = [[s for s in seeds if s % self.jobs == place] for place in range(self.jobs)]
+        sent = [(part, self._send(part[0], _draw, setting, part)) for part in parts if part]
+        order = [seed for part, _ in sent for seed in part]
+        return order, [moments for _, result in sent for moments in result.result()]
+
+    def _send(
+        self, seed: int, work: Callable[..., list[Any]], setting: Setting, what: Sequence[Any]
+    ) -> Future[list[Any]]:
+        """Have the process that an episode belongs to do something."""
+        if self.jobs == 1:
+            done: Future[list[Any]] = Future()
+            done.set_result(work(setting, self.folders, what))
+            return done
+        if not self._pools:
+            # Fresh processes: forking one that has threads of kernels in it would hang.
+            context = get_context("spawn")
+            self._pools = [ProcessPoolExecutor(1, context, _begin) for _ in range(self.jobs)]
+        return self._pools[seed % self.jobs].submit(work, setting, self.folders, what)
+
+    def _key(self, setting: Setting, asked: Asked) -> str:
+        seed, number, choice = asked
+        parts = [source_digest(), setting.key, self._weights, seed, number, asdict(choice)]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+
+    @property
+    def _weights(self) -> str:
+        return (
+            ""
+            if self.folders.lpips is None
+            else str(sorted(p.name for p in self.folders.lpips.glob("*.npz")))
+        )
+
+    def _read(self, path: Path) -> None:
+        """Take what an earlier run knew; a torn line counts as none."""
+        if not path.exists():
+            return
+        for line in path.read_text().splitlines():
+            try:
+                found = json.loads(line)
+                key = str(found.pop("key"))
+                self._known[key] = Outcome(**found)
+            except (ValueError, KeyError, TypeError):
+                continue

@@ -1,0 +1,56 @@
+"""Decisions with real field fits as a ``Problem``, for learners that are not ours.
+
+with Crew(folders) as crew:
+    problem = FitProblem(setting, Spec("select"), make_reward("set"), crew)
+    environment = ...                      # scheduler.learned.environment, with gymnasium's interface
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from edge_server.offline.training.choosing import of_action
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.episode import Moment
+from edge_server.offline.training.setting import Setting
+from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import State
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """``scheduler.learned.problem.Problem``: seed s is decision s mod D of episode s div D, D being the
+    setting's decisions in an episode. spec: what an action means."""
+
+    setting: Setting
+    spec: Spec
+    reward: Reward
+    crew: Crew
+
+    def draw(self, seed: int) -> FitDecision:
+        episode, number = divmod(seed, self.setting.decisions)
+        return FitDecision(self, self.crew.draw(self.setting, [episode])[0][number])
+
+
+@dataclass(frozen=True)
+class FitDecision:
+    """``scheduler.learned.problem.Decision``."""
+
+    problem: FitProblem
+    moment: Moment
+
+    @property
+    def state(self) -> State:
+        return self.moment.state
+
+    def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
+        """The reward of a real fit, NaN where a term of it is missing, and its terms."""
+        of, moment = self.problem, self.moment
+        choice = of_action(of.spec, action, moment)
+        (outcome,) = of.crew.evaluate(of.setting, [(moment.seed, moment.number, choice)])
+        found = of.reward.of(outcome)
+        total = found.total if found.complete else None
+        return (math.nan if total is None else total), found.terms

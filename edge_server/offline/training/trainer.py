@@ -1,0 +1,206 @@
+"""A learner learns from decisions that are drawn, acted on, carried out and rewarded, batch by batch.
+
+Everything follows from the seed: episodes from their numbers, actions from the learner's own stream, rewards
+from the field fits, whoever makes them. Between two batches the learner is all there is, so that a run that
+was stopped goes on bit for bit from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.offline.training.choosing import of_action
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.episode import Moment, Outcome
+from edge_server.offline.training.setting import Setting, seeds
+from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.spec import Spec
+from freshfield.files import write_json, write_text
+
+if TYPE_CHECKING:
+    from edge_server.scheduler.learned.ppo import Learner
+
+Row = dict[str, Any]
+
+
+class TrainingError(ValueError):
+    """A training that cannot be run as asked; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a learner is taught. episodes: in all; batch: of one update of the weights. tries: actions drawn
+    and carried out at every decision. Of more than one, each is rewarded by how much better it did than the
+    others of the same decision: their mean is an estimate of V(s) (5.24) that knows this very scene and
+    channel, which no function of the state does. seed: of episodes and of the learner. checkpoint_every:
+    batches.
+    """
+
+    spec: Spec
+    reward: Reward
+    episodes: int = 600
+    batch: int = 10
+    tries: int = 2
+    seed: int = 0
+    checkpoint_every: int = 5
+
+    def __post_init__(self) -> None:
+        if min(self.episodes, self.batch, self.tries, self.checkpoint_every) < 1:
+            raise TrainingError("episodes, batch, tries and checkpoint_every: expected at least 1")
+
+    @property
+    def batches(self) -> int:
+        return -(-self.episodes // self.batch)
+
+    def seeds(self, number: int) -> range:
+        """Of the episodes of a batch."""
+        first = number * self.batch
+        return seeds(self.seed, "train", min(self.batch, self.episodes - first), first)
+
+
+def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable[[str], None]) -> Learner:
+    """Teach until the course is over; what is in ``out`` of the same course is gone on with. Writes
+    OUT/training.jsonl (a line a batch), OUT/training.json and, at its end, OUT/policy.npz. TrainingError
+    where ``out`` holds another course; KeyboardInterrupt leaves the last checkpoint there."""
+    out.mkdir(parents=True, exist_ok=True)
+    kept = _Kept(out, _key(setting, course))
+    learner, rows = kept.load()
+    began, first = time.monotonic(), len(rows)
+    if first and first < course.batches:
+        say(f"going on after {first} of {course.batches} batches")
+    if learner is None:
+        learner = _new_learner(setting, course, crew)
+    for number in range(first, course.batches):
+        at = time.monotonic()
+        row = _one_batch(setting, course, crew, learner, number)
+        rows.append({**row, "seconds": round(time.monotonic() - at, 3)})
+        if (number + 1) % course.checkpoint_every == 0 or number + 1 == course.batches:
+            kept.save(learner, rows)
+        spent = time.monotonic() - began
+        left = spent / (number + 1 - first) * (course.batches - number - 1)
+        say(f"{_told(course, row)}; {left:.0f} s left")
+    if not (out / "policy.npz").exists():
+        learner.save(out / "policy.npz")
+    return learner
+
+
+def read_log(out: Path) -> list[Row]:
+    """The lines of a training so far, one a batch."""
+    return [json.loads(line) for line in (out / "training.jsonl").read_text().splitlines()]
+
+
+def _one_batch(setting: Setting, course: Course, crew: Crew, learner: Learner, number: int) -> Row:
+    """Draw, act, carry out, learn."""
+    chosen = course.seeds(number)
+    moments = [m for episode in crew.draw(setting, chosen) for m in episode]
+    crew.forget(setting, chosen)
+    # The tries of one decision stand together.
+    each = [m for m in moments for _ in range(course.tries)]
+    states = [m.state for m in each]
+    actions, logps = learner.act(states)
+    asked = [(m.seed, m.number, of_action(course.spec, a, m)) for m, a in zip(each, actions)]
+    before = crew.evaluated
+    outcomes = crew.evaluate(setting, asked)
+    found = [course.reward.of(outcome) for outcome in outcomes]
+    # A reward that lacks a term is not comparable with one that does not.
+    rewards = np.array([r.total if r.complete and r.total is not None else np.nan for r in found])
+    told = learner.update(learner.batch(states, actions, logps, compared(rewards, course.tries)))
+    row: Row = {
+        "batch": number, "episodes": chosen[-1] + 1 - course.seeds(0)[0], "reward": _mean(rewards),
+        "decisions": len(moments), "fits": len(each), "carried_out": crew.evaluated - before,
+    }  # fmt: skip
+    row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
+    row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
+    if course.spec.action != "select":
+        row["omega_ms"] = _mean([course.spec.omegas_ms[int(a)] for a in actions])
+    return row | {k: v for k, v in dataclasses.asdict(told).items() if k != "reward"}
+
+
+def compared(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
+    """Rewards (B,) as they are learnt from, ``tries`` of every decision together: each less the mean of the
+    others of its decision, so that it does not count itself; of a single try, as it is. NaN where it, or
+    all others, are NaN."""
+    if tries == 1:
+        return rewards
+    table = rewards.reshape(-1, tries)
+    known = np.isfinite(table)
+    filled = np.where(known, table, 0.0)
+    count = known.sum(axis=1, keepdims=True) - known
+    with np.errstate(divide="ignore", invalid="ignore"):
+        others = (filled.sum(axis=1, keepdims=True) - filled) / count
+    return np.where(known, table - others, np.nan).reshape(-1)
+
+
+def _new_learner(setting: Setting, course: Course, crew: Crew) -> Learner:
+    from edge_server.scheduler.learned.ppo import Learner
+
+    spec = course.spec
+    if "semantics" in spec.layout.parts and not spec.layout.centre:
+        first: list[Moment] = [m for e in crew.draw(setting, course.seeds(0)) for m in e]
+        spec = dataclasses.replace(spec, layout=spec.layout.standardised([m.state for m in first]))
+    return Learner(spec, course.seed)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A course's checkpoint: weights under a name of their own, then the file that names them, so that
+    what stands there is whole whenever it is stopped."""
+
+    out: Path
+    key: str
+
+    def load(self) -> tuple[Learner | None, list[Row]]:
+        """The learner and the rows of its log, if a course was begun here."""
+        from edge_server.scheduler.learned.ppo import Learner
+
+        path = self.out / "training.json"
+        if not path.exists():
+            return None, []
+        try:
+            found = json.loads(path.read_text())
+            key, name, done = found["key"], str(found["weights"]), int(found["batches"])
+        except (ValueError, KeyError, TypeError):
+            raise TrainingError(f"{path}: damaged: choose another --out, or delete it") from None
+        if key != self.key:
+            raise TrainingError(
+                f"{self.out} holds a training with other settings: choose another --out, or delete it"
+            )
+        lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
+        return Learner.load(self.out / name), [json.loads(line) for line in lines]
+
+    def save(self, learner: Learner, rows: list[Row]) -> None:
+        name = f"weights-{len(rows):05d}.npz"
+        learner.save(self.out / name)
+        write_text(self.out / "training.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+        write_json(self.out / "training.json", {"key": self.key, "batches": len(rows), "weights": name})
+        for old in self.out.glob("weights-*.npz"):
+            if old.name != name:
+                old.unlink(missing_ok=True)
+
+
+def _key(setting: Setting, course: Course) -> str:
+    taught = dataclasses.asdict(course)
+    taught.pop("checkpoint_every")  # decides when the disk is written, not what is learnt
+    text = json.dumps([setting.key, taught], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _told(course: Course, row: Row) -> str:
+    omega = f", omega {row['omega_ms']:.0f} ms" if row.get("omega_ms") is not None else ""
+    reward = "-" if row["reward"] is None else f"{row['reward']:.4f}"
+    return f"{row['episodes']}/{course.episodes} episodes: reward {reward}, {row['views']:.1f} views{omega}"
+
+
+def _mean(values: Any) -> float | None:
+    known = [float(v) for v in values if v is not None and np.isfinite(v)]
+    return float(np.mean(known)) if known else None

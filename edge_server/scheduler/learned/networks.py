@@ -1,0 +1,109 @@
+"""Actors and values as functions of weights, written once for numpy (deciding) and torch (learning).
+
+``pooled``: one encoder for every camera, and the mean and the maximum over the cameras that have reported as
+context: any number of cameras with one set of weights, and no order among them. ``flat``: the thesis's layer
+over all cameras in their order (5.5). The first argument ``xp`` is the module, numpy or torch; all arrays
+are float64: the networks are tiny, and probabilities at the edges are not lost.
+
+Activations are tanh, so that no feature whatever makes a logit overflow.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.scheduler.learned.spec import Spec
+
+Weights = dict[str, Any]
+"""Name -> array of numpy or tensor of torch."""
+
+# So many cameras count as many: the scale of how many have reported.
+_MANY = np.log1p(200.0)
+
+
+def new_actor(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+    """Weights of an actor that prefers nothing yet: its last layer is small (as PPO is commonly started)."""
+    weights = _new_trunk(spec, rng)
+    outputs = len(spec.omegas_ms) or (spec.cameras if spec.network == "flat" else 1)
+    if spec.action == "select" and spec.network == "pooled":
+        weights["own"] = _orthogonal(rng, spec.hidden, spec.hidden, 1.0)
+    weights["out"] = _orthogonal(rng, spec.hidden, outputs or 1, 0.01)
+    bias = np.log(spec.start / (1.0 - spec.start)) if spec.action == "select" else 0.0
+    weights["out_b"] = np.full(outputs or 1, bias)
+    return weights
+
+
+def new_value(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+    """Weights of a state value V (5.24); an encoder of its own, so that neither disturbs the other."""
+    return {**_new_trunk(spec, rng), "out": _orthogonal(rng, spec.hidden, 1, 0.1), "out_b": np.zeros(1)}
+
+
+def logits(xp: Any, spec: Spec, weights: Weights, features: Any) -> Any:
+    """Features (B, N, width) to logits: (B, N) of Bernoullis for ``select``, else (B, K) over the omegas."""
+    if spec.action != "select" or spec.network == "flat":
+        return _hidden(xp, spec, weights, features)[0] @ weights["out"] + weights["out_b"]
+    context, own = _hidden(xp, spec, weights, features, activated=False)
+    each = xp.tanh(own @ weights["own"] + context[:, None, :])
+    return (each @ weights["out"] + weights["out_b"])[..., 0]
+
+
+def value(xp: Any, spec: Spec, weights: Weights, features: Any) -> Any:
+    """Features (B, N, width) to state values (B,), in units of the rewards' spread."""
+    return (_hidden(xp, spec, weights, features)[0] @ weights["out"] + weights["out_b"])[..., 0]
+
+
+def _hidden(xp: Any, spec: Spec, weights: Weights, features: Any, activated: bool = True) -> tuple[Any, Any]:
+    """The last hidden layer (B, hidden), and what the encoder makes of each camera (B, N, hidden)."""
+    if spec.network == "flat":
+        batch, cameras, width = features.shape
+        if cameras != spec.cameras:
+            raise ValueError(
+                f"the policy was trained for {spec.cameras} cameras and sees {cameras}: train one with "
+                "network: pooled, which takes any number"
+            )
+        own = xp.tanh(features.reshape(batch, cameras * width) @ weights["in"] + weights["in_b"])
+        return xp.tanh(own @ weights["mid"] + weights["mid_b"]), own
+    own = xp.tanh(features @ weights["in"] + weights["in_b"])
+    own = xp.tanh(own @ weights["enc"] + weights["enc_b"])
+    pooled = _pooled(xp, own, features[..., -1:])
+    context = pooled @ weights["mid"] + weights["mid_b"]
+    return (xp.tanh(context) if activated else context), own
+
+
+def _pooled(xp: Any, own: Any, mask: Any) -> Any:
+    """(B, 2 hidden + 1): mean and maximum over the cameras that have reported, and how many those are. Zeros
+    where none has."""
+    count = mask.sum(axis=1)
+    mean = (own * mask).sum(axis=1) / xp.clip(count, 1.0, None)
+    # A tanh is above -1, so that one who has not reported is never the maximum.
+    highest = xp.amax(xp.where(mask > 0, own, -1.0 + 0.0 * own), axis=1)
+    highest = xp.where(count > 0, highest, 0.0 * highest)
+    return xp.concatenate((mean, highest, xp.log1p(count) / _MANY), axis=1)
+
+
+def _new_trunk(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+    hidden, width = spec.hidden, spec.layout.width
+    gain = 5.0 / 3.0  # of tanh
+    zeros = np.zeros(hidden)
+    if spec.network == "flat":
+        assert spec.cameras is not None  # Spec has seen to it
+        return {
+            "in": _orthogonal(rng, spec.cameras * width, hidden, gain), "in_b": zeros.copy(),
+            "mid": _orthogonal(rng, hidden, hidden, gain), "mid_b": zeros.copy(),
+        }  # fmt: skip
+    return {
+        "in": _orthogonal(rng, width, hidden, gain), "in_b": zeros.copy(),
+        "enc": _orthogonal(rng, hidden, hidden, gain), "enc_b": zeros.copy(),
+        "mid": _orthogonal(rng, 2 * hidden + 1, hidden, 1.0), "mid_b": zeros.copy(),
+    }  # fmt: skip
+
+
+def _orthogonal(rng: np.random.Generator, rows: int, columns: int, gain: float) -> NDArray[np.float64]:
+    """(rows, columns) with orthonormal rows or columns, whichever are fewer, times ``gain``."""
+    tall = rng.standard_normal((max(rows, columns), min(rows, columns)))
+    q, r = np.linalg.qr(tall)
+    q *= np.sign(np.diag(r))  # else the signs would be the decomposition's choice
+    return np.ascontiguousarray(gain * (q if rows >= columns else q.T))

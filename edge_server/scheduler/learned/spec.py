@@ -1,0 +1,81 @@
+"""Everything that defines a learner, as data: a checkpoint carries it, a study varies it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from edge_server.scheduler.learned.state import StateLayout
+
+Action = Literal["select", "wait", "threshold"]
+ACTIONS: tuple[Action, ...] = ("select", "wait", "threshold")
+
+
+@dataclass(frozen=True)
+class Spec:
+    """action: ``select`` chooses a set of cameras, Bernoulli each (5.18-5.20); ``wait`` and ``threshold``
+    choose one of ``omegas_ms`` (6.34, 6.39). network: ``pooled`` is one encoder for every camera and takes
+    any number of them; ``flat`` is the thesis's, one layer over ``cameras`` cameras in their order.
+
+    hidden: width of all layers. start: probability of every camera before anything is learnt. The rest is
+    PPO's: clip is epsilon of (5.23); entropy and value weigh their terms; passes over a batch end early when
+    the policy has moved by ``target_kl``.
+    """
+
+    action: Action
+    layout: StateLayout = field(default_factory=lambda: StateLayout(("age",)))
+    omegas_ms: tuple[float, ...] = ()
+    network: Literal["pooled", "flat"] = "pooled"
+    cameras: int | None = None
+    hidden: int = 64
+    start: float = 0.5
+    learning_rate: float = 3e-3
+    clip: float = 0.2
+    passes: int = 10
+    minibatch: int = 64
+    entropy: float = 0.003
+    value: float = 0.5
+    max_gradient: float = 0.5
+    target_kl: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.action not in ACTIONS:
+            raise ValueError(f"action {self.action!r} is not known; choose one of {', '.join(ACTIONS)}")
+        if (self.action == "select") != (not self.omegas_ms):
+            raise ValueError(f"action {self.action}: omegas_ms belong to wait and threshold, and only there")
+        rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))
+        if not rising or not all(math.isfinite(o) and o >= 0 for o in self.omegas_ms):
+            raise ValueError(f"omegas_ms: expected finite values from 0, rising, got {self.omegas_ms}")
+        if self.network not in ("pooled", "flat"):
+            raise ValueError(f"network {self.network!r} is not known; choose pooled or flat")
+        if (self.network == "flat") != (self.cameras is not None):
+            raise ValueError("cameras: a flat network has a fixed number of them, a pooled one takes any")
+        if self.cameras is not None and self.cameras < 1:
+            raise ValueError(f"cameras: expected a whole number from 1, got {self.cameras}")
+        if min(self.hidden, self.passes, self.minibatch) < 1:
+            raise ValueError("hidden, passes and minibatch: expected whole numbers from 1")
+        if not 0.0 < self.start < 1.0:
+            raise ValueError(f"start: expected a probability between 0 and 1, got {self.start:g}")
+        positive = (self.learning_rate, self.clip, self.max_gradient, self.target_kl)
+        if not all(0.0 < p < math.inf for p in positive):
+            raise ValueError("learning_rate, clip, max_gradient and target_kl must be positive and finite")
+        if not all(0.0 <= p < math.inf for p in (self.entropy, self.value)):
+            raise ValueError("entropy and value must be finite and not negative")
+
+    def as_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> Spec:
+        """ValueError for what ``as_json`` cannot have written."""
+        try:
+            values = dict(data)
+            layout = dict(values.pop("layout"))
+            for name in ("parts", "centre", "spread"):
+                layout[name] = tuple(layout[name])
+            values["omegas_ms"] = tuple(values["omegas_ms"])
+            return Spec(layout=StateLayout(**layout), **values)
+        except (TypeError, KeyError) as error:
+            raise ValueError(f"not a learner's specification ({error})") from None

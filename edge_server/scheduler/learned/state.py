@@ -1,0 +1,168 @@
+"""What a decision is made from: semantics, ages and poses of all cameras, s_t = [Z Delta P] (6.33).
+
+``State`` is as measured; ``StateLayout`` makes it numbers for a network: finite whatever is measured, the
+same scale for every part, and zeros with a cleared bit for a camera that never reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.scheduler import STATE_PARTS
+
+if TYPE_CHECKING:
+    from freshfield.frame import Frame
+
+PARTS = STATE_PARTS
+POSE_WIDTH = 6
+# Features stay within this many of their usual spread: what lies beyond is a broken value, not information.
+_FEATURE_LIMIT = 8.0
+# A feature that hardly varies where it was standardised says nothing; it must not be blown up to noise.
+_SMALLEST_SPREAD = 1e-3
+
+
+@dataclass(frozen=True)
+class State:
+    """The cameras at one instant, one row each, whether they have reported or not.
+
+    ages_ms (N,): age of the newest frame (5.5), any value where nothing was reported. poses (N, 6):
+    translation from the rig's centre in units of its size, then the rotation vector in radians. embeddings
+    (N, d): of the newest frames (6.31), rows that are not finite count as unknown; None: nobody computed
+    them. reported (N,): whether there is a newest frame. cameras: names of the rows, where they have some.
+    frames: those frames themselves, still encoded, by camera, for who explains a decision; none unless asked
+    for.
+    """
+
+    ages_ms: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    embeddings: NDArray[np.float32] | None
+    reported: NDArray[np.bool_]
+    cameras: tuple[str, ...] = ()
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.ages_ms)
+        shapes = {"ages_ms": (n,), "poses": (n, POSE_WIDTH), "reported": (n,)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"state: {name} has shape {getattr(self, name).shape}, expected {shape}")
+        if self.embeddings is not None and (self.embeddings.ndim != 2 or len(self.embeddings) != n):
+            raise ValueError(f"state: embeddings of shape {self.embeddings.shape} for {n} cameras")
+        if self.cameras and len(self.cameras) != n:
+            raise ValueError(f"state: {len(self.cameras)} names for {n} cameras")
+
+    def __len__(self) -> int:
+        return len(self.ages_ms)
+
+
+@dataclass(frozen=True)
+class StateLayout:
+    """Which parts a network sees, and their scales.
+
+    parts: any of ``PARTS``. dim: width d of an embedding, 0 without semantics. age_scale_ms: ages enter as
+    log(1 + age / scale), fine where ages differ by a frame, coarse where they are hopeless; oldest_ms: where
+    that ends. centre, spread (d,): of embeddings, from ``standardised``; empty: they are used as they are.
+    embedding: name of the embedder whose they are, for who installs a policy; empty: not said.
+    """
+
+    parts: tuple[str, ...] = ("age", "pose", "semantics")
+    dim: int = 0
+    age_scale_ms: float = 100.0
+    oldest_ms: float = 60_000.0
+    centre: tuple[float, ...] = ()
+    spread: tuple[float, ...] = ()
+    embedding: str = ""
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.parts) - set(PARTS):
+            raise ValueError(f"state: no part is called {', '.join(unknown)}; there are {', '.join(PARTS)}")
+        if not self.parts:
+            raise ValueError(f"state: no parts; choose some of {', '.join(PARTS)}")
+        if ("semantics" in self.parts) != (self.dim > 0):
+            raise ValueError(f"state: dim {self.dim} with parts {', '.join(self.parts)}: semantics has a dim")
+        if not (0 < self.age_scale_ms < np.inf and 0 < self.oldest_ms < np.inf):
+            raise ValueError("state: age_scale_ms and oldest_ms must be positive and finite")
+        if not len(self.centre) == len(self.spread) in (0, self.dim):
+            raise ValueError(f"state: centre and spread of embeddings must have {self.dim} values, or none")
+
+    @property
+    def columns(self) -> dict[str, slice]:
+        """Columns of every part that there is; the last column of all is the mask bit."""
+        widths = {"semantics": self.dim, "age": 1, "pose": POSE_WIDTH}
+        out, at = {}, 0
+        for part in PARTS:
+            if part in self.parts:
+                out[part] = slice(at, at + widths[part])
+                at += widths[part]
+        return out
+
+    @property
+    def width(self) -> int:
+        """Columns in all: of the parts, and one that is 1 for a camera that has reported."""
+        return max(columns.stop for columns in self.columns.values()) + 1
+
+    @property
+    def limit(self) -> float:
+        """No feature is further from zero."""
+        return max(_FEATURE_LIMIT, float(np.log1p(self.oldest_ms / self.age_scale_ms)))
+
+    def features(self, state: State) -> NDArray[np.float64]:
+        """(N, width), finite for any state. A camera whose age is no number counts as one that never
+        reported. ValueError where semantics are wanted and the state has none, or of another width."""
+        known = state.reported & ~np.isnan(state.ages_ms)
+        out = np.zeros((len(state), self.width))
+        for part, columns in self.columns.items():
+            out[:, columns] = getattr(self, f"_{part}")(state)
+        out[:, -1] = 1.0
+        out[~known] = 0.0
+        return out
+
+    def batch(self, states: Sequence[State]) -> NDArray[np.float64]:
+        """(B, N, width) of states with up to N cameras; those with fewer end in cameras that never
+        reported."""
+        n = max((len(state) for state in states), default=0)
+        out = np.zeros((len(states), n, self.width))
+        for row, state in zip(out, states):
+            row[: len(state)] = self.features(state)
+        return out
+
+    def standardised(self, states: Sequence[State]) -> StateLayout:
+        """The layout whose embeddings have mean 0 and spread 1 over the cameras of ``states``: what all
+        frames have in common says nothing about a decision. Itself without semantics or embeddings."""
+        if "semantics" not in self.parts:
+            return self
+        found = [s.embeddings[s.reported] for s in states if s.embeddings is not None]
+        rows = np.concatenate(found).astype(np.float64) if found else np.zeros((0, self.dim))
+        rows = rows[np.isfinite(rows).all(axis=1)]
+        if len(rows) < 2:
+            return self
+        spread = np.maximum(rows.std(axis=0), _SMALLEST_SPREAD * max(1.0, float(np.abs(rows).max())))
+        return replace(self, centre=tuple(rows.mean(axis=0).tolist()), spread=tuple(spread.tolist()))
+
+    def _age(self, state: State) -> NDArray[np.float64]:
+        # A camera whose clock is ahead is as fresh as can be. NaN rows are masked by the caller.
+        ages = np.clip(np.nan_to_num(state.ages_ms, nan=0.0, posinf=self.oldest_ms), 0.0, self.oldest_ms)
+        return np.log1p(ages / self.age_scale_ms)[:, None]
+
+    def _pose(self, state: State) -> NDArray[np.float64]:
+        poses = np.nan_to_num(state.poses, nan=0.0, posinf=_FEATURE_LIMIT, neginf=-_FEATURE_LIMIT)
+        return np.clip(poses, -_FEATURE_LIMIT, _FEATURE_LIMIT)
+
+    def _semantics(self, state: State) -> NDArray[np.float64]:
+        if state.embeddings is None:
+            raise ValueError("state: semantics are wanted, but nothing computes embeddings here")
+        if state.embeddings.shape[1] != self.dim:
+            raise ValueError(f"state: embeddings of width {state.embeddings.shape[1]}, expected {self.dim}")
+        z = state.embeddings.astype(np.float64)
+        unknown = ~np.isfinite(z).all(axis=1)
+        z[unknown] = 0.0
+        if self.centre:
+            z = (z - np.array(self.centre)) / np.array(self.spread)
+            z[unknown] = 0.0
+        # All of an embedding weighs at the start as much as one other feature, or d of them drown the age.
+        return np.clip(z, -_FEATURE_LIMIT, _FEATURE_LIMIT) / np.sqrt(self.dim)

@@ -1,0 +1,202 @@
+"""Training: who evaluates does not matter, a stopped course goes on bit for bit, and it learns."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from edge_server.offline.train_scheduler import main
+from edge_server.offline.training.choosing import choices, named
+from edge_server.offline.training.contest import HINDSIGHT, hold, rivals, rows, write_rows
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.problem import FitProblem
+from edge_server.offline.training.report import draw_curve, lines, summary
+from edge_server.offline.training.setting import seeds
+from edge_server.offline.training.trainer import Course, TrainingError, compared, read_log, train
+from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.problem import collect
+from edge_server.scheduler.learned.rewards import Reward, make_reward
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
+from tests.edge_server.offline.training.small import NOTHING, RAW, setting
+
+REWARD = make_reward("set", distance=0.0)
+COURSE = Course(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2,
+                checkpoint_every=1)  # fmt: skip
+
+
+def weights(learner: Learner) -> dict[str, np.ndarray]:
+    return learner.actor.weights
+
+
+def same(a: Learner, b: Learner) -> bool:
+    return all(np.array_equal(w, weights(b)[name]) for name, w in weights(a).items())
+
+
+def quiet(line: str) -> None:
+    del line
+
+
+def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path):
+    with Crew(NOTHING) as one, Crew(NOTHING, jobs=2) as two:
+        alone = train(setting(), COURSE, one, tmp_path / "one", quiet)
+        both = train(setting(), COURSE, two, tmp_path / "two", quiet)
+    assert same(alone, both) and not same(alone, Learner(COURSE.spec, COURSE.seed))
+    timeless = [[{k: v for k, v in row.items() if k != "seconds"} for row in read_log(tmp_path / name)]
+                for name in ("one", "two")]  # fmt: skip
+    assert timeless[0] == timeless[1]
+    with Crew(NOTHING) as crew:
+        other = train(setting(), dataclasses.replace(COURSE, seed=1), crew, tmp_path / "other", quiet)
+    assert not same(alone, other)
+
+
+def test_a_stopped_course_goes_on_bit_for_bit(tmp_path: Path):
+    def stop(line: str) -> None:
+        if line.startswith("4/6"):
+            raise KeyboardInterrupt
+
+    with Crew(NOTHING) as crew:
+        whole = train(setting(), COURSE, crew, tmp_path / "whole", quiet)
+    with Crew(NOTHING) as crew, pytest.raises(KeyboardInterrupt):
+        train(setting(), COURSE, crew, tmp_path / "parts", stop)
+    assert len(read_log(tmp_path / "parts")) == 2 and not (tmp_path / "parts/policy.npz").exists()
+    with Crew(NOTHING) as crew:
+        parts = train(setting(), COURSE, crew, tmp_path / "parts", quiet)
+    assert same(whole, parts) and (tmp_path / "parts/policy.npz").exists()
+    assert len(list((tmp_path / "parts").glob("weights-*.npz"))) == 1
+    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match="other settings"):
+        train(setting(steps=5), COURSE, crew, tmp_path / "parts", quiet)
+
+
+def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
+    omegas = (30.0, 100.0, 400.0)
+    spec = Spec("threshold", StateLayout(("age",)), omegas, hidden=16, learning_rate=1e-2)
+    course = Course(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
+    with Crew(NOTHING) as crew:
+        learner = train(setting(steps=1), course, crew, tmp_path, quiet)
+        everybody = {**rivals(omegas, ["threshold"]), "learnt": learner.actor}
+        contest = hold(setting(steps=1), crew, seeds(0, "test", 6), everybody, course.reward)
+    assert contest.term("learnt", "aaoi_ms").mean < contest.term("threshold:100", "aaoi_ms").mean
+    assert contest.against("learnt", contest.rewards("random")).low > 0.0
+    found = read_log(tmp_path)
+    assert found[-1]["omega_ms"] < 60.0 < found[0]["omega_ms"]
+
+
+def test_evaluations_are_kept_in_a_file_and_a_torn_line_costs_only_itself(tmp_path: Path):
+    known = tmp_path / "known.jsonl"
+    with Crew(NOTHING, known=known) as crew:
+        moments = crew.draw(setting(), [7])[0]
+        asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
+        first = crew.evaluate(setting(), asked * 2)
+        assert crew.evaluated == len(asked) and first[: len(asked)] == first[len(asked) :]
+        assert crew.evaluate(setting(steps=5), asked) != first[: len(asked)]
+    text = known.read_text()
+    known.write_text(text + text.splitlines()[0][:20])
+    with Crew(NOTHING, known=known) as crew:
+        assert crew.evaluate(setting(), asked) == first[: len(asked)] and crew.evaluated == 0
+
+
+def test_tries_are_compared_with_the_others_of_their_decision():
+    found = compared(np.array([1.0, 2.0, 6.0, 5.0, np.nan, 1.0]), 3)
+    assert np.allclose(found, [1 - 4, 2 - 3.5, 6 - 1.5, 4.0, np.nan, -4.0], equal_nan=True)
+    alone = compared(np.array([3.0, np.nan]), 2)
+    assert np.isnan(alone).all()  # nothing to compare with
+    assert compared(np.array([3.0, 4.0]), 1).tolist() == [3.0, 4.0]
+
+
+@pytest.fixture(scope="module")
+def contest(tmp_path_factory):
+    names = rivals((40.0, 120.0), ["threshold"], ("random", "all", "freshen"))
+    with Crew(NOTHING) as crew:
+        actor = Learner(COURSE.spec, 0).actor
+        return hold(setting(), crew, seeds(0, "test", 6), {**names, "learnt": actor}, REWARD)
+
+
+def test_nobody_beats_hindsight_and_the_best_fixed_is_measured_where_it_was_not_chosen(contest):
+    best = contest.rewards(HINDSIGHT)
+    for name in contest.outcomes:
+        assert all(best[s] >= r - 1e-12 for s, r in contest.rewards(name).items())
+    values, name = contest.best_fixed("threshold")
+    assert name in contest.outcomes
+    for seed, value in values.items():
+        assert value in (contest.rewards("threshold:40")[seed], contest.rewards("threshold:120")[seed])
+    assert contest.share(contest.rewards("random")).mean == 0.0
+    assert contest.share(best).mean == 1.0
+    assert contest.varies("threshold")["gain"].mean >= 0.0
+
+
+def test_a_contest_is_told_in_a_table_and_in_words(contest, tmp_path: Path):
+    write_rows(tmp_path / "contest.csv", rows(contest))
+    found = {row["policy"]: row for row in csv.DictReader((tmp_path / "contest.csv").open())}
+    assert found.keys() == {*contest.outcomes, HINDSIGHT}
+    assert float(found["all"]["views"]) >= 3.0 and float(found["random"]["share"]) == 0.0
+    told = " ".join(lines(contest, "learnt", "threshold"))
+    assert "over random" in told and "threshold:" in told
+    kept = json.loads(json.dumps(summary(contest, "learnt", "threshold")))
+    assert kept["seeds"] == 6 and len(kept["over_best_fixed"]) == 3
+
+
+def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
+    course = [{"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
+            for k in range(5)]  # fmt: skip
+    draw_curve(tmp_path / "curve.png", course, {"random": 0.1})
+    assert (tmp_path / "curve.png").stat().st_size > 5_000
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nowhere"], "shipped scenarios"),
+        (["room", "--parts", "age,smell"], "no smell"),
+        (["room", "--jobs", "0"], "--jobs"),
+        (["room", "--episodes", "0"], "episodes"),
+        (["lego", "--jobs", "1"], "lego"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys):
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert said in told and told.count("\n") == 1
+
+
+def test_other_learners_see_the_same_decisions_as_a_problem():
+    with Crew(NOTHING) as crew:
+        problem = FitProblem(setting(), COURSE.spec, REWARD, crew)
+        moments = crew.draw(setting(), [4])[0]
+        decision = problem.draw(4 * setting().decisions + 1)
+        assert decision.moment == moments[1] and decision.state is moments[1].state
+        action = np.array([True, False, True, True])
+        reward, terms = decision.reward(action)
+        assert decision.reward(action) == (reward, terms) and set(terms) == {"psnr", "ssim"}
+        assert reward == pytest.approx(sum(terms.values()))
+        batch = collect(Learner(COURSE.spec, 0), problem, range(6))
+        assert len(batch) == 6 and np.isfinite(batch.rewards).all()
+
+
+def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
+    file, out = tmp_path / "small.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump(RAW))
+    words = [str(file), "--kind", "threshold", "--omegas", "50,200", "--episodes", "2", "--batch", "1",
+             "--decisions", "1", "--fit-steps", "2", "--size", "24", "--test", "2", "--jobs", "1",
+             "--out", str(out)]  # fmt: skip
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "2/2 episodes" in told and "over random" in told and "bandit:" in told
+    kept = json.loads((out / "summary.json").read_text())
+    assert kept["reward_name"] == "corrected" and kept["best_fixed"].startswith("threshold:")
+    for name in ("training.csv", "training.png", "contest.csv", "policy.npz"):
+        assert (out / name).stat().st_size > 0
+    policy = make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))
+    with Crew(NOTHING) as crew:
+        chosen = choices(lambda rng: policy, crew.draw(setting(), [1])[0])
+    assert all(choice.cameras for choice in chosen)
+    lines_before = (out / "evaluations.jsonl").read_text()
+    assert main(words) == 0  # finished: nothing is left to be evaluated
+    assert (out / "evaluations.jsonl").read_text() == lines_before

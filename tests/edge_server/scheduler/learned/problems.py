@@ -1,0 +1,93 @@
+"""Bandits whose best actions are known in closed form, and states as a rig would give them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edge_server.scheduler.learned.problem import collect
+from edge_server.scheduler.learned.state import State, StateLayout
+
+OMEGAS_MS = (0.0, 50.0, 100.0, 150.0)
+WORTH_MS = 100.0
+
+
+def state(n: int, rng: np.random.Generator, d: int = 0, silent: int = 0) -> State:
+    """``n`` cameras with exponential ages, the last ``silent`` of which never reported."""
+    reported = np.arange(n) < n - silent
+    z = rng.standard_normal((n, d)).astype(np.float32) if d else None
+    ages = np.where(reported, rng.exponential(80.0, n), np.nan)
+    return State(ages, rng.standard_normal((n, 6)), z, reported, tuple(f"cam{i:02d}" for i in range(n)))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    state: State
+    best: Any
+    gain: Any
+    noise: float
+
+    def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
+        value = float(self.gain(action)) + self.noise
+        return value, {"value": value}
+
+    def regret(self, action: Any) -> float:
+        return float(self.gain(self.best)) - float(self.gain(action))
+
+
+@dataclass(frozen=True)
+class FreshOnes:
+    """Sets: a frame is worth (1 - age / 100 ms) / N: the best set is every frame younger than that, or the
+    youngest one where none is."""
+
+    cameras: int = 6
+    silent: int = 0
+    layout = StateLayout(("age",))
+
+    def draw(self, seed: int) -> Drawn:
+        rng = np.random.default_rng([1, seed])
+        s = state(self.cameras, rng, silent=self.silent)
+        worth = np.where(s.reported, 1.0 - np.nan_to_num(s.ages_ms) / WORTH_MS, 0.0) / self.cameras
+        best = (worth > 0) & s.reported
+        if not best.any():
+            best[np.argmax(np.where(s.reported, worth, -np.inf))] = True
+        return Drawn(s, best, lambda a: (worth * a).sum(), 0.1 * rng.standard_normal())
+
+
+@dataclass(frozen=True)
+class Waits:
+    """Omegas: the older the cameras are on average, the longer it pays to wait; the best is in a closed
+    form of the mean age. semantic: the first number of an embedding decides instead, ages say nothing."""
+
+    cameras: int = 6
+    semantic: bool = False
+
+    @property
+    def layout(self) -> StateLayout:
+        return StateLayout(("age", "semantics"), dim=4) if self.semantic else StateLayout(("age",))
+
+    def draw(self, seed: int) -> Drawn:
+        rng = np.random.default_rng([2, seed])
+        s = state(self.cameras, rng, d=4 if self.semantic else 0)
+        if self.semantic:
+            assert s.embeddings is not None
+            s.embeddings[:, 0] += (wanted := float(rng.integers(0, 2)) * 2.0 - 1.0) * 2.0
+            target = 3.0 if wanted > 0 else 0.0
+        else:
+            s.ages_ms[:] *= rng.uniform(0.2, 2.0)
+            target = float(np.clip(s.ages_ms.mean() / 40.0, 0.0, 3.0))
+        return Drawn(s, round(target), lambda k: -0.1 * abs(target - k), 0.1 * rng.standard_normal())
+
+
+def teach(learner: Any, problem: Any, updates: int, batch: int = 64) -> None:
+    for number in range(updates):
+        learner.update(collect(learner, problem, range(number * batch, (number + 1) * batch)))
+
+
+def regret(learner: Any, problem: Any, decisions: int = 300) -> float:
+    """Mean regret of the likeliest actions at instants that were never trained on."""
+    drawn = [problem.draw(10**6 + i) for i in range(decisions)]
+    actions, _ = learner.act([d.state for d in drawn], explore=False)
+    return float(np.mean([d.regret(a) for d, a in zip(drawn, actions)]))

@@ -1,0 +1,184 @@
+"""A checkpoint as a policy: what it decides is carried out as by the policies it stands beside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.buffer import FrameBuffer
+from edge_server.config import read_config
+from edge_server.loop import Updates
+from edge_server.scheduler import Epoch, help_of, make_live_policy, make_policy, read_policy
+from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import State, StateLayout
+from freshfield import scenario
+from tests.edge_server.fields_for_tests import tiny_field
+from tests.edge_server.frames import frame
+
+MS = 1_000_000
+OMEGAS_MS = (0.0, 40.0, 80.0)
+
+
+def policy(action, favourite=None, **layout):
+    """A policy that prefers one omega, by the bias of its last layer."""
+    omegas = () if action == "select" else OMEGAS_MS
+    learner = Learner(Spec(action, StateLayout(**(layout or {"parts": ("age",)})), omegas), 1)
+    actor = learner.actor
+    if favourite is not None:
+        actor = replace(actor, weights={**actor.weights, "out_b": 9.0 * np.eye(len(OMEGAS_MS))[favourite]})
+    return Bandit(actor, "bandit:test", np.random.default_rng(0))
+
+
+def epoch(now_ms, **generated_ms):
+    """An epoch whose state has the cameras a, b and c."""
+    names = ("a", "b", "c")
+    ages = np.array([now_ms - generated_ms.get(c, np.nan) for c in names])
+    s = State(ages, np.zeros((3, 6)), None, np.isfinite(ages), names)
+    return Epoch(now_ms * MS, 7, {c: g * MS for c, g in generated_ms.items()}, lambda parts=(): s)
+
+
+AT = epoch(200, a=190, b=80, c=150)
+
+
+def test_waiting_is_carried_out_as_by_omega_wait():
+    p = policy("wait", favourite=1)
+    plan = p.plan(AT)
+    fixed = make_policy("wait", 40.0, np.random.default_rng(0))
+    assert plan == fixed.plan(AT)
+    later = epoch(240, a=190, b=220, c=150)
+    assert p.select(later, plan) == fixed.select(later, plan) == ("b",)
+
+
+def test_not_waiting_uses_the_buffer_as_it_is():
+    p = policy("wait", favourite=0)
+    assert p.select(AT, p.plan(AT)) == ("a", "b", "c")
+
+
+def test_a_threshold_is_carried_out_as_by_omega_threshold():
+    p = policy("threshold", favourite=2)
+    plan = p.plan(AT)
+    assert plan.omega_ms == 80.0 and plan.wait_until_ns == 0
+    assert p.select(AT, plan) == ("a", "c")
+    p = policy("threshold", favourite=0)
+    assert p.select(AT, p.plan(AT)) == ("a",)  # none is that young: the freshest
+
+
+def test_a_set_is_chosen_when_views_are_selected_and_is_never_empty():
+    p = policy("select")
+    actor = p.actor
+    for bias, expected in ((9.0, {"a", "b"}), (-9.0, None)):
+        p.actor = replace(actor, weights={**actor.weights, "out_b": np.array([bias])})
+        chosen = p.select(epoch(100, a=50, b=0), p.plan(AT))
+        assert set(chosen) == expected if expected else len(chosen) == 1
+    assert p.last is not None and p.last.now_ns == 100 * MS and p.last.number == 7
+
+
+def test_nothing_is_selected_while_nothing_is_there():
+    for action in ("select", "wait", "threshold"):
+        p = policy(action)
+        assert p.select(epoch(100), p.plan(epoch(100))) == ()
+
+
+def test_exploring_draws_and_repeats_with_its_seed():
+    def drawn(seed):
+        p = policy("select")
+        p = Bandit(p.actor, p.name, np.random.default_rng(seed), explore=True)
+        return [p.select(AT, p.plan(AT)) for _ in range(20)]
+
+    assert drawn(1) == drawn(1) != drawn(2)
+    assert len(set(drawn(1))) > 2
+
+
+def test_it_is_made_by_name(tmp_path):
+    Learner(Spec("select", StateLayout(("age",))), 1).save(tmp_path / "p.npz")
+    name = f"bandit:{tmp_path / 'p.npz'}"
+    for make in (make_policy, make_live_policy):
+        assert make(name, None, np.random.default_rng(0)).name == name
+    assert "learnt" in help_of(name)
+    with pytest.raises(ValueError, match="no value"):
+        make_policy(name, 3.0, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="no such"):
+        make_policy("bandit:nowhere.npz", None, np.random.default_rng(0))
+
+
+def test_a_file_is_relative_to_where_it_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert read_policy("bandit:runs/p.npz") == (f"bandit:{tmp_path}/runs/p.npz", None)
+    assert read_policy("bandit:/a:b.npz") == ("bandit:/a:b.npz", None)
+    assert read_policy("threshold:120") == ("threshold", 120.0)
+    data = {"name": "tiny", "seed": 3, "cameras": {"count": 3}, "edge": {"policy": {"name": "bandit:p.npz"}}}
+    made = scenario.parse(data, tmp_path / "there" / "tiny.yaml")
+    assert read_config(made).policy.name == f"bandit:{tmp_path}/there/p.npz"
+
+
+# --- in the loop ------------------------------------------------------------------------------------
+
+
+class Brightness:
+    """Embeds a picture by its mean; counts."""
+
+    name, dim = "brightness", 1
+
+    def __init__(self):
+        self.asked = 0
+
+    def embed(self, images):
+        self.asked += len(images)
+        return np.array([[image.mean()] for image in images], np.float32)
+
+
+def updates(p, embedder=None):
+    made = Updates(FrameBuffer(("a", "b", "c")), p, tiny_field(), start_ns=0, embedder=embedder)
+    for i, camera in enumerate("ac"):
+        made.buffer.put(frame(camera, i, generated_ns=10 * i * MS), 20 * MS)
+    return made
+
+
+def test_the_loop_shows_a_policy_the_state_of_its_buffer():
+    p = policy("select", parts=("age", "semantics"), dim=1)
+    u = updates(p, Brightness())
+    selection = u.select(u.plan(60 * MS), 60 * MS)
+    assert selection is not None and p.last is not None
+    s = p.last.state
+    np.testing.assert_array_equal(s.ages_ms, [60, np.nan, 50])
+    assert s.embeddings is not None and np.isnan(s.embeddings[1]).all()
+    assert 40 < s.embeddings[0, 0] < s.embeddings[2, 0] < 100  # frames grow brighter with their number
+    assert list(s.frames) == ["a", "c"]
+    assert s.cameras == ("a", "b", "c")
+
+
+def test_nothing_is_embedded_where_no_decision_needs_it():
+    embedder = Brightness()
+    for p in (policy("select", parts=("age", "pose")), make_policy("all", None, np.random.default_rng(0))):
+        u = updates(p, embedder)
+        u.select(u.plan(60 * MS), 60 * MS)
+    assert embedder.asked == 0
+
+
+def test_a_policy_that_needs_embeddings_is_refused_where_there_are_none():
+    p = policy("select", parts=("semantics",), dim=1)
+    with pytest.raises(ValueError, match=r"edge\.embedding"):
+        updates(p)
+    u = updates(make_policy("all", None, np.random.default_rng(0)))
+    with pytest.raises(ValueError, match=r"edge\.embedding"):
+        u.policy = p
+    assert u.policy.name == "all"
+
+
+def test_a_policy_that_was_taught_with_other_embeddings_is_refused():
+    with pytest.raises(ValueError, match=r"embeddings of 2 numbers, .* brightness of 1"):
+        updates(policy("select", parts=("semantics",), dim=2), Brightness())
+    other = policy("select", parts=("semantics",), dim=1, embedding="colour")
+    with pytest.raises(ValueError, match="taught with colour"):
+        updates(other, Brightness())
+    updates(policy("select", parts=("semantics",), dim=1, embedding="brightness"), Brightness())
+
+
+def test_a_policy_says_where_it_is_not_shown_a_state():
+    p = policy("threshold")
+    with pytest.raises(ValueError, match="more than ages"):
+        p.plan(replace(AT, state=None))

@@ -1,0 +1,127 @@
+"""Explanations: shares sum to the whole, and what is known to have decided is what is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.scheduler.learned.explain import explain, firmness, occlusion
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
+from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, state, teach
+
+LAYOUT = StateLayout(("age", "pose", "semantics"), dim=3)
+
+
+def untaught(action, seed=0):
+    """An actor with an opinion, though a random one."""
+    actor = Learner(Spec(action, LAYOUT, () if action == "select" else OMEGAS_MS), seed).actor
+    rng = np.random.default_rng(seed)
+    return replace(
+        actor,
+        weights={**actor.weights, "out": 50.0 * actor.weights["out"]},
+        usual=rng.standard_normal(LAYOUT.width),
+    )
+
+
+@pytest.mark.parametrize("action", ["select", "wait", "threshold"])
+@pytest.mark.parametrize(("n", "silent"), [(1, 0), (2, 0), (7, 2), (30, 0)])
+def test_shares_sum_to_the_whole(action, n, silent):
+    actor, s = untaught(action), state(n, np.random.default_rng(n), d=3, silent=silent)
+    chosen = actor.act([s])[0][0]
+    found = explain(actor, s, chosen, pairs=4)
+    assert sum(found.parts.values()) == pytest.approx(found.firmness - found.usual, abs=1e-9)
+    assert found.cameras.sum() == pytest.approx(found.firmness - found.usual, abs=1e-9)
+    assert set(found.parts) == {"age", "pose", "semantics"}
+    assert not found.cameras[n - silent :].any()
+    assert abs(found.firmness - found.usual) > 1e-3
+
+
+def test_the_logit_explained_is_that_of_the_action():
+    actor, s = untaught("wait"), state(5, np.random.default_rng(0), d=3)
+    x = LAYOUT.features(s)[None]
+    (best,), (logp,) = actor.act([s])
+    assert firmness(actor, x, best)[0] == pytest.approx(np.log(np.exp(logp) / (1 - np.exp(logp))))
+    chooser = untaught("select")
+    own = chooser.logits(x)
+    assert firmness(chooser, x, own[0] > 0)[0] == pytest.approx(np.abs(own).sum())
+    assert firmness(chooser, x, own[0] < 0)[0] == pytest.approx(-np.abs(own).sum())
+
+
+def test_cameras_of_two_are_exact():
+    """With two cameras a pair of permutations is all there are."""
+    actor, s = untaught("wait"), state(2, np.random.default_rng(1), d=3)
+    chosen = actor.act([s])[0][0]
+    found = explain(actor, s, chosen, pairs=3)
+    np.testing.assert_allclose(found.cameras_error, 0.0, atol=1e-12)
+    x, usual = LAYOUT.features(s), np.tile(actor.usual, (2, 1))
+    usual[:, -1] = 1.0
+    only = np.stack([np.stack([x[0], usual[1]]), np.stack([usual[0], x[1]]), usual, x])
+    a, b, none, both = firmness(actor, only, chosen)
+    np.testing.assert_allclose(found.cameras, [0.5 * (a - none + both - b), 0.5 * (b - none + both - a)])
+
+
+def test_where_only_ages_decide_the_age_is_named():
+    layout = StateLayout(("age", "pose"))
+    learner = Learner(Spec("wait", layout, OMEGAS_MS), 0)
+    teach(learner, Waits(), 16)
+    shares = {"age": 0.0, "pose": 0.0}
+    for i in range(20):
+        s = Waits().draw(10**6 + i).state
+        found = explain(learner.actor, s, learner.greedy(s), pairs=1)
+        for part, share in found.parts.items():
+            shares[part] += abs(share)
+    assert shares["age"] > shares["pose"]
+
+
+def test_a_camera_that_is_much_older_is_the_one_that_spoke_against_itself():
+    learner = Learner(Spec("select", FreshOnes.layout), 0)
+    teach(learner, FreshOnes(), 8)
+    s = state(6, np.random.default_rng(0))
+    s.ages_ms[:] = [60.0, 60.0, 60.0, 2000.0, 60.0, 60.0]
+    found = explain(learner.actor, s, learner.greedy(s))
+    assert found.strongest() == 3
+    assert found.action == "5 of 6 views"
+
+
+def test_the_same_state_has_the_same_explanation():
+    actor, s = untaught("select"), state(9, np.random.default_rng(2), d=3)
+    a, b = (explain(actor, s, actor.act([s])[0][0]) for _ in range(2))
+    np.testing.assert_array_equal(a.cameras, b.cameras)
+    assert a.parts == b.parts
+
+
+# --- regions ----------------------------------------------------------------------------------------
+
+
+def brightness(images):
+    """Embeds a picture by how bright each colour is on the whole: what a region adds is known."""
+    return np.array([image.mean(axis=(0, 1)) / 64.0 for image in images], np.float32)
+
+
+def test_the_region_that_differs_is_the_one_that_moved_it():
+    actor, s = untaught("wait"), state(4, np.random.default_rng(3), d=3)
+    image = np.full((48, 64, 3), 114, np.uint8)
+    image[30:36, 16:24] = 255  # row 5, column 2 of eight by eight
+    z = s.embeddings.copy()
+    z[1] = brightness([image])[0]
+    s = replace(s, embeddings=z)
+    found = occlusion(actor, s, actor.act([s])[0][0], 1, image, brightness)
+    assert np.unravel_index(np.abs(found).argmax(), found.shape) == (5, 2)
+    assert np.abs(np.delete(found.ravel(), 5 * 8 + 2)).max() == 0.0
+
+
+def test_a_picture_smaller_than_the_grid_is_no_problem():
+    actor, s = untaught("wait"), state(2, np.random.default_rng(4), d=3)
+    tiny = np.zeros((3, 5, 3), np.uint8)
+    assert np.isfinite(occlusion(actor, s, 0, 0, tiny, brightness)).all()
+
+
+def test_a_policy_that_looks_at_no_pictures_says_so():
+    learner = Learner(Spec("select", FreshOnes.layout), 0)
+    s = state(3, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="no pictures"):
+        occlusion(learner.actor, s, learner.greedy(s), 0, np.zeros((8, 8, 3), np.uint8), brightness)

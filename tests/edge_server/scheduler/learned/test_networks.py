@@ -1,0 +1,121 @@
+"""One set of weights for any number of cameras, in any order; the same function in numpy and torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from edge_server.scheduler.learned import networks
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
+from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
+
+LAYOUT = StateLayout(("age", "pose", "semantics"), dim=3)
+SELECT = Spec("select", LAYOUT)
+WAIT = Spec("wait", LAYOUT, OMEGAS_MS)
+
+
+def actor(spec, seed=0):
+    """Weights with a last layer large enough that outputs differ."""
+    weights = networks.new_actor(spec, np.random.default_rng(seed))
+    return {**weights, "out": 100.0 * weights["out"]}
+
+
+def features(n, silent=0, seed=0, batch=5):
+    rng = np.random.default_rng(seed)
+    return LAYOUT.batch([state(n, rng, d=3, silent=silent) for _ in range(batch)])
+
+
+@pytest.mark.parametrize("spec", [SELECT, WAIT], ids=lambda s: s.action)
+@pytest.mark.parametrize("n", [1, 2, 18, 200])
+def test_one_set_of_weights_takes_any_number_of_cameras(spec, n):
+    found = networks.logits(np, spec, actor(spec), features(n))
+    assert found.shape == ((5, n) if spec.action == "select" else (5, len(OMEGAS_MS)))
+    assert np.isfinite(found).all()
+    assert networks.value(
+        np, spec, networks.new_value(spec, np.random.default_rng(0)), features(n)
+    ).shape == (5,)
+
+
+def test_cameras_have_no_order():
+    x, order = features(7), np.random.default_rng(1).permutation(7)
+    each = networks.logits(np, SELECT, actor(SELECT), x)
+    np.testing.assert_allclose(
+        networks.logits(np, SELECT, actor(SELECT), x[:, order]), each[:, order], rtol=1e-9, atol=1e-12
+    )
+    whole = networks.logits(np, WAIT, actor(WAIT), x)
+    np.testing.assert_allclose(
+        networks.logits(np, WAIT, actor(WAIT), x[:, order]), whole, rtol=1e-9, atol=1e-12
+    )
+
+
+def test_what_never_reported_changes_nothing_for_the_others():
+    x = features(6, silent=2)
+    for spec, keep in ((SELECT, np.s_[:, :4]), (WAIT, np.s_[:])):
+        all_rows = networks.logits(np, spec, actor(spec), x)[keep]
+        np.testing.assert_allclose(
+            all_rows, networks.logits(np, spec, actor(spec), x[:, :4])[keep], rtol=1e-9
+        )
+
+
+def test_each_camera_sees_what_the_others_are_like():
+    x = features(4)
+    other = x.copy()
+    other[:, 3, 3] += 1.0  # the age of another camera
+    a, b = (networks.logits(np, SELECT, actor(SELECT), f) for f in (x, other))
+    assert (np.abs(a - b)[:, 0] > 1e-3).all()
+
+
+@pytest.mark.parametrize("spec", [SELECT, WAIT, Spec("select", LAYOUT, network="flat", cameras=4)])
+def test_numpy_and_torch_compute_the_same(spec):
+    x, weights = features(4, silent=1), actor(spec)
+    tensors = {name: torch.tensor(w) for name, w in weights.items()}
+    found = networks.logits(torch, spec, tensors, torch.tensor(x)).numpy()
+    np.testing.assert_allclose(networks.logits(np, spec, weights, x), found, rtol=1e-12, atol=1e-12)
+
+
+def test_a_flat_network_says_that_it_has_another_number_of_cameras():
+    spec = Spec("wait", LAYOUT, OMEGAS_MS, network="flat", cameras=4)
+    with pytest.raises(ValueError, match="trained for 4 cameras and sees 5"):
+        networks.logits(np, spec, actor(spec), features(5))
+
+
+@pytest.mark.parametrize("start", [0.1, 0.5, 0.9])
+def test_before_anything_is_learnt_every_camera_has_the_probability_asked_for(start):
+    spec = Spec("select", LAYOUT, start=start)
+    weights = networks.new_actor(spec, np.random.default_rng(0))
+    p = 1.0 / (1.0 + np.exp(-networks.logits(np, spec, weights, features(18))))
+    assert np.abs(p - start).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ({"action": "skip"}, "choose one of select"),
+        ({"action": "select", "omegas_ms": (0.0,)}, "belong to wait"),
+        ({"action": "wait"}, "belong to wait"),
+        ({"action": "wait", "omegas_ms": (50.0, 0.0)}, "rising"),
+        ({"action": "wait", "omegas_ms": (0.0, float("inf"))}, "finite"),
+        ({"action": "select", "network": "deep"}, "pooled or flat"),
+        ({"action": "select", "network": "flat"}, "fixed number"),
+        ({"action": "select", "cameras": 4}, "fixed number"),
+        ({"action": "select", "start": 1.0}, "between 0 and 1"),
+        ({"action": "select", "passes": 0}, "whole numbers"),
+        ({"action": "select", "learning_rate": float("nan")}, "positive"),
+        ({"action": "select", "entropy": -1.0}, "not negative"),
+    ],
+)
+def test_what_cannot_be_learnt_is_refused(words, says):
+    with pytest.raises(ValueError, match=says):
+        Spec(**words)
+
+
+def test_a_specification_survives_json():
+    import json
+
+    layout = StateLayout(("age", "semantics"), dim=2, centre=(0.1, 0.2), spread=(1.0, 3.0))
+    spec = Spec("threshold", layout, OMEGAS_MS, learning_rate=1e-4)
+    assert Spec.from_json(json.loads(json.dumps(spec.as_json()))) == spec
+    with pytest.raises(ValueError, match="specification"):
+        Spec.from_json({"action": "select"})

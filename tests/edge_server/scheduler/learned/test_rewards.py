@@ -1,0 +1,92 @@
+"""Rewards as printed, as corrected, term by term; a missing metric is never a silent zero."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from edge_server.fidelity.scorer import Score
+from edge_server.scheduler.learned.rewards import REWARDS, make_reward
+
+
+def score(psnr_db=25.0, psnr_moving_db=20.0, ssim=0.9, lpips=0.2):
+    return Score("cam00", 0, psnr_db, psnr_moving_db, ssim, lpips, 0.0)
+
+
+def test_the_reward_of_sets_is_519():
+    found = make_reward("set").of(score())
+    assert found.terms == {"psnr": 0.5, "ssim": 0.45, "lpips": -0.2}
+    assert found.total == pytest.approx(0.02 * 25 + 0.5 * 0.9 - 0.2)
+    assert found.complete
+
+
+def test_the_reward_of_waiting_is_minus_f_w():
+    f_w = 0.015 * 60 - 0.02 * 25 + 0.2 * 0.9 + 0.3 * 0.2  # (6.36), (6.37) as printed
+    assert make_reward("thesis").of(score(), aaoi_ms=60.0).total == pytest.approx(-f_w)
+    corrected = make_reward().of(score(), aaoi_ms=60.0)
+    assert corrected.total == pytest.approx(-f_w + 2 * 0.2 * 0.9)
+    assert corrected.terms["age"] == pytest.approx(-0.9)
+
+
+def test_a_better_ssim_is_worth_more_but_in_the_thesis_preset():
+    gains = {
+        name: reward.of(score(ssim=0.95), 60.0).total - reward.of(score(ssim=0.9), 60.0).total
+        for name, reward in REWARDS.items()
+    }
+    assert gains["set"] > 0 and gains["corrected"] > 0
+    assert gains["thesis"] < 0
+
+
+def test_fidelity_may_be_that_of_moving_pixels():
+    found = make_reward("set", fidelity="moving").of(score())
+    assert found.terms["psnr_moving"] == pytest.approx(0.4)
+    assert "psnr" not in found.terms
+
+
+@pytest.mark.parametrize("value", [None, math.nan, math.inf])
+def test_a_missing_metric_is_reported_and_the_rest_stays_finite(value):
+    found = make_reward("set").of(score(lpips=value))
+    assert found.terms["lpips"] is None
+    assert found.missing == ("lpips",)
+    assert not found.complete
+    assert found.total == pytest.approx(0.95)
+
+
+def test_nothing_known_is_no_reward():
+    found = make_reward("set", fidelity="moving").of(score(25.0, None, None, None))
+    assert found.total is None
+    assert found.missing == ("psnr_moving", "ssim", "lpips")
+
+
+def test_the_age_is_asked_for_only_where_it_counts():
+    assert make_reward("set").of(score()).complete
+    assert make_reward("corrected").of(score()).missing == ("age",)
+
+
+def test_the_stand_in_for_lpips_carries_its_own_name():
+    found = make_reward("set", distance_is="perceptual").of(score(), perceptual=0.3)
+    assert found.terms["perceptual"] == pytest.approx(-0.3)
+    assert "lpips" not in found.terms
+    assert make_reward("set", distance_is="perceptual").of(score()).missing == ("perceptual",)
+
+
+def test_weights_can_be_replaced_and_a_weight_of_zero_is_no_term():
+    found = make_reward("corrected", distance=0.0, age=-0.001).of(score(), aaoi_ms=100.0)
+    assert found.terms.keys() == {"psnr", "ssim", "age"}
+    assert found.terms["age"] == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ({"name": "best"}, "corrected"),
+        ({"name": "set", "lpips": 1.0}, "distance"),
+        ({"name": "set", "fidelity": "all"}, "whole or moving"),
+        ({"name": "set", "distance_is": "ssim"}, "lpips or perceptual"),
+        ({"name": "set", "age": math.nan}, "finite"),
+    ],
+)
+def test_what_cannot_be_a_reward_is_refused(words, says):
+    with pytest.raises(ValueError, match=says):
+        make_reward(**words)

@@ -1,0 +1,165 @@
+"""A state as numbers: the parts in their columns, the same scale for all, cameras that are silent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.buffer import Buffered
+from edge_server.scheduler.learned.observe import observe
+from edge_server.scheduler.learned.state import State, StateLayout
+from freshfield.geometry import Pose, look_at, so3_exp
+from tests.edge_server.frames import frame
+from tests.edge_server.scheduler.learned.problems import state
+
+MS = 1_000_000
+
+
+def test_the_columns_are_semantics_age_pose_and_the_bit_of_who_reported():
+    s = state(3, np.random.default_rng(0), d=4, silent=1)
+    layout = StateLayout(("pose", "semantics", "age"), dim=4)
+    found = layout.features(s)
+    assert found.shape == (3, layout.width) == (3, 4 + 1 + 6 + 1)
+    assert list(layout.columns) == ["semantics", "age", "pose"]
+    assert s.embeddings is not None
+    np.testing.assert_allclose(found[:2, :4], s.embeddings[:2] / 2.0)
+    np.testing.assert_allclose(found[:2, 4], np.log1p(s.ages_ms[:2] / 100.0))
+    np.testing.assert_allclose(found[:2, 5:11], s.poses[:2])
+    np.testing.assert_array_equal(found[:, -1], [1, 1, 0])
+    assert not found[2].any()
+
+
+def test_what_is_not_a_part_has_no_columns():
+    s = state(2, np.random.default_rng(0))
+    assert StateLayout(("age",)).features(s).shape == (2, 2)
+    assert StateLayout(("pose",)).features(s).shape == (2, 7)
+
+
+def test_standardised_embeddings_have_mean_zero_and_spread_one_over_the_cameras_that_reported():
+    rng = np.random.default_rng(1)
+    states = []
+    for _ in range(200):
+        s = state(5, rng, d=3, silent=1)
+        assert s.embeddings is not None
+        z = 50.0 + s.embeddings * np.float32([1.0, 2.0, 4.0])
+        z[4] = 1e6  # of a camera that is silent: nobody's
+        z[0] = np.nan
+        states.append(replace(s, embeddings=z))
+    layout = StateLayout(("semantics",), dim=3).standardised(states)
+    z = np.sqrt(3) * np.concatenate([layout.features(s)[1:4, :3] for s in states])
+    np.testing.assert_allclose(z.mean(axis=0), 0.0, atol=1e-3)
+    np.testing.assert_allclose(z.std(axis=0), 1.0, atol=1e-3)
+    assert not layout.features(states[0])[0, :3].any()
+
+
+def test_an_embedding_that_hardly_varies_is_not_blown_up_to_noise():
+    s = state(4, np.random.default_rng(2), d=2)
+    still = np.full((4, 2), 3.0, np.float32) + np.float32([[0, 0], [1e-6, 0], [0, 0], [0, 0]])
+    layout = StateLayout(("semantics",), dim=2).standardised([replace(s, embeddings=still)])
+    assert np.abs(layout.features(replace(s, embeddings=still))[:, :2]).max() < 1e-2
+
+
+def test_a_batch_pads_with_cameras_that_never_reported():
+    rng = np.random.default_rng(3)
+    few, many = state(2, rng), state(4, rng)
+    found = StateLayout(("age",)).batch([few, many])
+    assert found.shape == (2, 4, 2)
+    np.testing.assert_array_equal(found[0, :, -1], [1, 1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"parts": ("colour",)}, "colour"),
+        ({"parts": ()}, "no parts"),
+        ({"parts": ("age",), "dim": 4}, "dim 4"),
+        ({"parts": ("semantics",)}, "dim 0"),
+        ({"parts": ("age",), "age_scale_ms": 0.0}, "positive"),
+        ({"parts": ("semantics",), "dim": 2, "centre": (0.0,), "spread": (1.0,)}, "2 values"),
+    ],
+)
+def test_a_wrong_layout_is_refused_by_name(values, says):
+    with pytest.raises(ValueError, match=says):
+        StateLayout(**values)
+
+
+def test_a_state_of_the_wrong_shape_is_refused():
+    s = state(3, np.random.default_rng(0), d=4)
+    for wrong in ({"poses": s.poses[:2]}, {"reported": s.reported[:1]}, {"cameras": ("a",)}):
+        with pytest.raises(ValueError, match="state"):
+            replace(s, **wrong)
+    layout = StateLayout(("semantics",), dim=5)
+    with pytest.raises(ValueError, match="width 4, expected 5"):
+        layout.features(s)
+    with pytest.raises(ValueError, match="nothing computes embeddings"):
+        layout.features(replace(s, embeddings=None))
+
+
+# --- observe ----------------------------------------------------------------------------------------
+
+
+class Colours:
+    """Embeds a frame by its number; the third frame asked for has none. Counts."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def of(self, items):
+        self.asked += len(items)
+        rows = np.array([[i.frame.sequence, 1.0] for i in items], np.float32).reshape(-1, 2)
+        return rows, np.arange(len(items)) != 2
+
+
+def rig(scale=1.0, shift=(0.0, 0.0, 0.0)):
+    out = {}
+    for i, angle in enumerate((0.0, 1.5, 3.0, 4.5)):
+        eye = scale * np.array([np.cos(angle), np.sin(angle), 0.5])
+        matrix = look_at(eye, [0.0, 0.0, 0.0])
+        matrix[:3, 3] += shift
+        made = frame(f"c{i}", sequence=i, generated_ns=10 * i * MS, pose=Pose.from_matrix(matrix))
+        out[f"c{i}"] = Buffered(made, made.generated_ns, 50 * MS)
+    return out
+
+
+def test_observing_gives_ages_poses_and_embeddings_in_the_cameras_order():
+    newest = rig()
+    del newest["c1"]
+    s = observe(("c3", "c2", "c1", "c0"), newest, 100 * MS, Colours())
+    np.testing.assert_array_equal(s.ages_ms, [70, 80, np.nan, 100])
+    np.testing.assert_array_equal(s.reported, [True, True, False, True])
+    assert s.cameras == ("c3", "c2", "c1", "c0")
+    np.testing.assert_array_equal(s.embeddings, [[3, 1], [2, 1], [np.nan] * 2, [np.nan] * 2])
+    turn = newest["c3"].frame.pose.matrix()[:3, :3]
+    np.testing.assert_allclose(so3_exp(s.poses[0, 3:]), turn, atol=1e-12)
+
+
+def test_poses_do_not_depend_on_where_a_rig_stands_nor_on_its_size():
+    names = ("c0", "c1", "c2", "c3")
+    here = observe(names, rig(), 0).poses
+    there = observe(names, rig(scale=20.0, shift=(100.0, -7.0, 3.0)), 0).poses
+    np.testing.assert_allclose(here, there, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(here[:, :3], axis=1).mean(), 1.0)
+
+
+def test_only_what_is_asked_for_is_computed():
+    colours = Colours()
+    s = observe(("c0", "c1"), rig(), 0, colours, parts=("age",))
+    assert colours.asked == 0
+    assert s.embeddings is None
+    assert not s.poses.any()
+
+
+def test_nobody_has_reported_and_one_camera_alone():
+    s = observe(("c0", "c1"), {}, 0, Colours())
+    layout = StateLayout(("age", "pose", "semantics"), dim=2)
+    assert not layout.features(s).any()
+    alone = {"c0": rig()["c0"]}
+    assert np.isfinite(layout.features(observe(("c0", "c1"), alone, 0, Colours()))).all()
+
+
+def test_a_state_is_plain_data():
+    s = state(2, np.random.default_rng(0))
+    assert isinstance(s, State)
+    assert len(s) == 2
