@@ -16,7 +16,7 @@ COPY proto proto
 COPY camera_node camera_node
 COPY channel_emu channel_emu
 COPY edge_server edge_server
-RUN /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[edge]'
+RUN /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[edge,embed]'
 
 FROM docker.io/library/python:3.11-slim-bookworm
 RUN useradd --system --create-home --uid 10001 freshfield \

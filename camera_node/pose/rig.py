@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +16,8 @@ from typing import Protocol
 import numpy as np
 
 from freshfield.geometry import GeometryError, Pose, quaternion_normalise
+
+_COLUMN_NAMES = ("t", "time", "timestamp")
 
 
 class TrajectoryError(ValueError):
@@ -70,27 +73,56 @@ class Trajectory:
         self._max_gap_ns = max_gap_ns
 
     def at(self, t_ns: int) -> Paired:
-        after = bisect.bisect_left(self._times, t_ns)
-        before = after - 1
-        if after == len(self._times) or (
-            before >= 0 and t_ns - self._times[before] <= self._times[after] - t_ns
-        ):
-            nearest = before
-        else:
-            nearest = after
-        gap = abs(self._times[nearest] - t_ns)
-        if gap > self._max_gap_ns:
-            raise PoseGapError(
-                f"the nearest pose is {gap / 1e6:.1f} ms away, more than {self._max_gap_ns / 1e6:g} ms"
-            )
-        if not self._interpolate or gap == 0 or before < 0 or after == len(self._times):
-            return Paired(self._poses[nearest], gap)
-        fraction = (t_ns - self._times[before]) / (self._times[after] - self._times[before])
-        return Paired(self._poses[before].interpolate(self._poses[after], fraction), gap)
+        place = find(self._times, t_ns, self._max_gap_ns)
+        if not self._interpolate or place.fraction is None:
+            return Paired(self._poses[place.nearest], place.gap_ns)
+        before, after = self._poses[place.before], self._poses[place.before + 1]
+        return Paired(before.interpolate(after, place.fraction), place.gap_ns)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an instant lies among sample times: the nearest one, and the share ``fraction`` of the way from
+    ``before`` to the next; None on a sample, before the first and after the last."""
+
+    nearest: int
+    gap_ns: int
+    before: int
+    fraction: float | None
+
+
+def find(times_ns: Sequence[int], t_ns: int, max_gap_ns: int) -> Place:
+    """Place of an instant among increasing times. Raises PoseGapError where none is within the bound."""
+    if not times_ns:
+        raise PoseGapError("there is no pose yet")
+    after = bisect.bisect_left(times_ns, t_ns)
+    before = after - 1
+    last = after == len(times_ns)
+    if last or (before >= 0 and t_ns - times_ns[before] <= times_ns[after] - t_ns):
+        nearest = before
+    else:
+        nearest = after
+    gap = abs(times_ns[nearest] - t_ns)
+    if gap > max_gap_ns:
+        raise PoseGapError(f"the nearest pose is {gap / 1e6:.1f} ms away, more than {max_gap_ns / 1e6:g} ms")
+    if gap == 0 or before < 0 or last:
+        return Place(nearest, gap, before, None)
+    return Place(nearest, gap, before, (t_ns - times_ns[before]) / (times_ns[after] - times_ns[before]))
 
 
 def read_tum(path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000) -> Trajectory:
-    """Read a trajectory file; lines that are empty or start with # are skipped. Raises TrajectoryError."""
+    """Read a trajectory file. Raises TrajectoryError."""
+    times, poses = read_samples(path)
+    try:
+        return Trajectory(times, poses, interpolate, max_gap_ns)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+
+
+def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
+    """Times (ns) and poses of a file as they stand in it, in whatever order; fields are separated by spaces
+    or commas. Lines that are empty, start with # or name the columns (``t,x,...``) are skipped. Raises
+    TrajectoryError naming file and line."""
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -99,7 +131,7 @@ def read_tum(path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000)
     poses: list[Pose] = []
     for number, line in enumerate(lines, 1):
         fields = line.replace(",", " ").split()
-        if not fields or fields[0].startswith("#"):
+        if not fields or fields[0].startswith("#") or (not times and fields[0] in _COLUMN_NAMES):
             continue
         try:
             t, x, y, z, qx, qy, qz, qw = map(float, fields)
@@ -112,10 +144,7 @@ def read_tum(path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000)
             raise TrajectoryError(f"{path}:{number}: expected t tx ty tz qx qy qz qw") from None
         times.append(_nanoseconds(fields[0]))
         poses.append(Pose(tuple(map(float, q)), (x, y, z)))  # type: ignore[arg-type]
-    try:
-        return Trajectory(times, poses, interpolate, max_gap_ns)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {error}") from None
+    return times, poses
 
 
 def _nanoseconds(seconds: str) -> int:

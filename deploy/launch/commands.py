@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from freshfield.scenario import Scenario
@@ -25,6 +25,7 @@ _ONE_THREAD = (
     "NUMBA_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
+_ARM_PORT = 30004  # of every controller's state (RTDE); clients know it by heart
 _EDGE_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -34,18 +35,27 @@ class MissingCommand(RuntimeError):
 
 @dataclass(frozen=True)
 class Plan:
-    """The processes of one scenario. ``nodes`` is never empty."""
+    """The processes of one scenario. ``nodes`` is never empty; ``arms`` and ``drivers`` hold one each where
+    the scenario has a simulated arm and a path for it."""
 
     edge: Child
     emulator: Child
     nodes: list[Child]
     edge_address: str
     emulator_address: str
+    arms: list[Child] = field(default_factory=list)
+    arm_address: str = ""
+    drivers: list[Child] = field(default_factory=list)
 
     @property
     def children(self) -> list[Child]:
         """All of them in the order in which they stop: nobody sends to what is gone."""
-        return [*self.nodes, self.emulator, self.edge]
+        return [child for group in self.groups for child in group]
+
+    @property
+    def groups(self) -> list[list[Child]]:
+        """Those of ``children`` that may stop together."""
+        return [self.drivers, self.nodes, self.arms, [self.emulator], [self.edge]]
 
 
 def plan(
@@ -61,6 +71,7 @@ def plan(
     edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
     file = str(scenario.path)
     common = ["--out", str(out), *(["--seed", str(seed)] if seed is not None else [])]
+    one = _threads(_ONE_THREAD, 1)
     recorded = ["--data", str(data)] if data is not None else []
     edge = Child(
         "edge",
@@ -81,7 +92,7 @@ def plan(
             *("--listen", emulator_address, "--to", edge_address, *common),
         ],
         out / "log-emulator.txt",
-        _threads(_ONE_THREAD, 1),
+        one,
     )
     groups = [[camera] for camera in scenario.cameras] if process_per_camera else [[]]
     nodes = []
@@ -90,8 +101,21 @@ def plan(
         name = f"node-{cameras[0]}" if cameras else "node"
         role = f"the camera node of {', '.join(cameras)}" if cameras else "the camera node"
         command = [program("camera-node"), "run", file, *which, "--to", emulator_address, *common, *recorded]
-        nodes.append(Child(name, role, command, out / f"log-{name}.txt", _threads(_ONE_THREAD, 1)))
-    return Plan(edge, emulator, nodes, edge_address, emulator_address)
+        nodes.append(Child(name, role, command, out / f"log-{name}.txt", one))
+    arm = scenario.source.get("arm")
+    if not isinstance(arm, dict) or not arm.get("simulated"):
+        return Plan(edge, emulator, nodes, edge_address, emulator_address)
+    arms, drivers = [
+        [Child(name, role, [program("camera-node"), command, file], out / f"log-{name}.txt", one)]
+        for name, role, command in (
+            ("arm", "the simulated arm", "simulate-arm"),
+            ("driver", "the arm's driver", "drive-arm"),
+        )
+    ]
+    arm_address = f"{arm.get('host')}:{_ARM_PORT}"
+    if not arm.get("path"):
+        drivers = []
+    return Plan(edge, emulator, nodes, edge_address, emulator_address, arms, arm_address, drivers)
 
 
 def program(name: str) -> str:
@@ -101,7 +125,7 @@ def program(name: str) -> str:
     if found is None:
         raise MissingCommand(
             f"{name} is not installed beside {sys.executable}; use `make demo`, or install the project "
-            "there with: pip install -e '.[edge,up]'"
+            "there with: pip install -e '.[edge,embed,up]'"
         )
     return found
 

@@ -47,6 +47,16 @@ def is_serving(address: str, timeout_s: float = 0.5) -> bool:
         return bool(reply.status == health_pb2.HealthCheckResponse.SERVING)
 
 
+def accepts(address: str, timeout_s: float = 0.5) -> bool:
+    """Whether anybody takes a connection at ``host:port``."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout_s).close()
+    except OSError:
+        return False
+    return True
+
+
 def page_answers(port: int, timeout_s: float = 1.0) -> bool:
     """Whether the page on the loopback port answers with a document."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)

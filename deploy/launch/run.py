@@ -99,8 +99,10 @@ class Run:
         # The nodes render ahead while the edge loads its libraries. The emulator opens its door last: no
         # frame is offered before there is somebody to take it, and none is lost to the start.
         self.plan.edge.start()
-        for node in self.plan.nodes:
-            node.start()
+        for arm in self.plan.arms:
+            arm.start()
+        if not self.plan.arms:
+            self._start_nodes()
         resources = Resources(self.options.out / "processes.jsonl")
         while not self._asked.wait(TICK_S):
             now_s = time.monotonic()
@@ -117,9 +119,16 @@ class Run:
             if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
                 return
 
+    def _start_nodes(self) -> None:
+        for child in (*self.plan.nodes, *self.plan.drivers):
+            child.start()
+
     def _get_ready(self, now_s: float) -> None:
-        """One step of the start: emulator once the edge serves, and the address once the page answers."""
+        """One step of the start: nodes once an arm they need is there, emulator once the edge serves, and the
+        address once the page answers."""
         emulator = self.plan.emulator
+        if self.plan.nodes[0].process is None and net.accepts(self.plan.arm_address):
+            self._start_nodes()
         if emulator.process is None and net.is_serving(self.plan.edge_address):
             emulator.start()
         if not self._page_told and net.page_answers(self.options.port):
@@ -188,7 +197,7 @@ class Run:
         why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
         self._display.say(f"stopping{reason}: cameras, channel, edge")
-        for group in (self.plan.nodes, [self.plan.emulator], [self.plan.edge]):
+        for group in self.plan.groups:
             processes.stop(group, 0.0 if len(self._signals) > 1 else processes.GRACE_S)
             for child in group:
                 if child.killed:

@@ -70,7 +70,7 @@ def dry_run(*arguments: str, **variables: str) -> str:
 def test_a_fresh_clone_installs_torch_first_and_the_demo_without_test_tools() -> None:
     plan = dry_run("demo")
     (torch,) = re.finditer(r"install .*--no-deps +(torch==\S+)", plan)
-    rest = plan.index("-e '.[edge,up]'")
+    rest = plan.index("-e '.[edge,embed,up]'")
     assert plan.index("-m venv .venv") < torch.start() < rest < plan.index("deploy/up.py")
     assert "deploy/up.py deploy/scenarios/room.yaml --for 60s" in plan
     assert requirement("torch").specifier == Requirement(torch[1]).specifier

@@ -1,0 +1,160 @@
+"""``camera-node calibrate hand-eye --live``: a scenario's camera and a session, at the camera's pace."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import secrets
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.calibrate import CalibrationError
+from camera_node.calibrate.folder import pairs_json, read_pairs
+from camera_node.calibrate.handeye import Calibration, calibrate
+from camera_node.calibrate.motions import Array, Samples
+from camera_node.calibrate.session import KEPT, MOVING, Session, Step, preview
+from camera_node.calibrate.targets import Target
+from camera_node.config import source_config
+from camera_node.pose.pairing import tidy
+from camera_node.pose.rig import PoseProvider, Trajectory, TrajectoryError, read_samples
+from camera_node.sources import Source, open_sources
+from freshfield import files, payload, scenario
+from freshfield.geometry import Pinhole
+
+Image = NDArray[np.uint8]
+
+
+def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None, setup: str) -> Calibration:
+    """Run a session with a scenario's camera. Ctrl-C ends it with what there is. Raises CalibrationError,
+    ScenarioError."""
+    if not args.want_mm > 0 or (args.seconds is not None and not args.seconds > 0):
+        raise CalibrationError("--want-mm, --seconds: expected positive numbers")
+    plan = scenario.load(args.live)
+    if args.camera not in plan.cameras:
+        raise CalibrationError(f"--camera: {plan.path} has {', '.join(plan.cameras)}, got {args.camera}")
+    config = source_config(plan)
+    try:
+        source = open_sources(plan, config, [args.camera], args.data)[args.camera]
+    except (ValueError, OSError) as error:
+        raise CalibrationError(str(error)) from None
+    before = None
+    if args.samples is not None and args.samples.exists():
+        before = read_pairs(args.samples, setup)
+        print(f"{args.samples}: going on with its {len(before)} samples", file=sys.stderr)
+
+    def keep(samples: Samples) -> None:
+        if args.samples is not None:
+            files.write_json(args.samples, pairs_json(samples))
+
+    def show(image: Image, step: Step, session: Session) -> None:
+        _say(step)
+        if args.preview is not None:
+            _write_picture(args.preview, preview(image, session.corners, step))
+
+    hands = None
+    if args.hand is not None:
+        try:
+            times, poses, _ = tidy(*read_samples(args.hand))
+            hands = Trajectory(times, poses, max_gap_ns=round(args.max_gap_ms * 1e6))
+        except TrajectoryError as error:
+            raise CalibrationError(str(error)) from None
+    session = Session(board, setup, args.want_mm, args.moving, before, keep)
+    pace = _Pace(float(source.fps), args.seconds)
+    try:
+        guide(source, config.codec, lens, session, pace, show, hands)
+    except KeyboardInterrupt:
+        print("\nstopped; what there is:", file=sys.stderr)
+    except OSError as error:
+        raise CalibrationError(f"--samples or --preview cannot be written: {error}") from None
+    finally:
+        source.release()
+    return calibrate(session.samples(), args.method)
+
+
+def guide(
+    source: Source,
+    codec: str,
+    lens: Pinhole | None,
+    session: Session,
+    pace: Callable[[int], bool],
+    show: Callable[[Image, Step, Session], None],
+    hands: PoseProvider | None = None,
+    move: Callable[[Array], None] | None = None,
+) -> Step | None:
+    """Offer the source's shots to the session until there is enough, ``pace`` says that time is over, or a
+    recording has been seen once. lens: instead of the source's own. hands: poses of the hand by time since
+    tick 0; None: the shots' own poses are the hand's. move: brings the hand to a pose (4, 4), or refuses by
+    ValueError; None: an operator does. Returns the last step."""
+    step = None
+    for tick in itertools.count():
+        if (source.contents is not None and tick >= source.contents) or not pace(tick):
+            return step
+        try:
+            shot = source.read(source.content(tick))
+            hand = shot.pose if hands is None else hands.at(round(tick * 10**9 / source.fps)).pose
+        except ValueError as error:  # one shot that cannot be had; later ones may
+            print(f"\n{error}", file=sys.stderr)
+            continue
+        image = shot.image
+        if isinstance(image, bytes):
+            image = payload.decode(image, codec, shot.intrinsics.width, shot.intrinsics.height)
+        step = session.offer(image, lens or shot.intrinsics, hand.matrix())
+        show(image, step, session)
+        if step.enough:
+            return step
+        if move is not None and step.outcome != MOVING:
+            _go_on(session, step, move)
+    return step
+
+
+def _go_on(session: Session, step: Step, move: Callable[[Array], None]) -> None:
+    if step.outcome != KEPT:
+        session.turn_down()
+    wanted = session.wanted()
+    if wanted is None:
+        return
+    try:
+        move(wanted)
+    except ValueError as error:  # the next picture is like this one, and another pose will be wanted
+        print(f"\n{error}", file=sys.stderr)
+
+
+class _Pace:
+    """Waits for a tick's instant; ticks that are late are not waited for."""
+
+    def __init__(self, fps: float, seconds: float | None) -> None:
+        self._fps, self._seconds = fps, seconds
+        self._start = time.monotonic()
+
+    def __call__(self, tick: int) -> bool:
+        at_s = tick / self._fps
+        if self._seconds is not None and at_s > self._seconds:
+            return False
+        time.sleep(max(0.0, self._start + at_s - time.monotonic()))
+        return True
+
+
+def _say(step: Step) -> None:
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns - 1
+        print(f"\r{step.line[:width]:{width}}", end="\n" if step.outcome == KEPT else "", file=sys.stderr)
+    elif step.outcome == KEPT:
+        print(step.line, file=sys.stderr)
+
+
+def _write_picture(path: Path, picture: Image) -> None:
+    """Whole whenever somebody looks. Raises OSError."""
+    done, data = cv2.imencode(path.suffix or ".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise OSError(f"{path}: not a kind of picture")
+    part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
+    part.write_bytes(data.tobytes())
+    os.replace(part, path)

@@ -1,0 +1,219 @@
+"""Pairing frames with what an arm reports (thesis 4.3.3), while both still arrive, each at its own rate.
+
+The thesis takes the sample nearest to the frame. Here a sample may also be made between the two around it: by
+a straight line and slerp, along the screw from one to the other (constant twist), or linearly in joint space.
+``camera-node calibrate accuracy`` measures what each is worth. Either way the distance to the nearest sample
+goes with the frame, and beyond a bound there is no pair.
+"""
+
+from __future__ import annotations
+
+import bisect
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.pose.rig import Paired, PoseGapError, find
+from freshfield.geometry import Pose, se3_inverse, so3_exp, so3_log
+
+T = TypeVar("T")
+Mix = Callable[[T, T, float], T]
+Joints = NDArray[np.float64]
+
+_SMALL_ANGLE = 1e-4
+
+
+def along_line(a: Pose, b: Pose, fraction: float) -> Pose:
+    """Slerp and a straight line between the two origins."""
+    return a.interpolate(b, fraction)
+
+
+def along_screw(a: Pose, b: Pose, fraction: float) -> Pose:
+    """The SE(3) geodesic a exp(f log(a^-1 b)): a body that turns and moves at constant rates about its own
+    axes, so that the origin of anything mounted on it runs along the same screw."""
+    start = a.matrix()
+    step = se3_inverse(start) @ b.matrix()
+    omega = so3_log(step[:3, :3])
+    out = np.eye(4)
+    out[:3, :3] = so3_exp(fraction * omega)
+    velocity = np.linalg.solve(_left_jacobian(omega), step[:3, 3])
+    out[:3, 3] = fraction * _left_jacobian(fraction * omega) @ velocity
+    return Pose.from_matrix(start @ out)
+
+
+def _left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3): translation of exp((omega, v)) over v; Barfoot, State Estimation for Robotics, (7.37)."""
+    angle = float(np.linalg.norm(omega))
+    if angle < _SMALL_ANGLE:
+        a, b = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
+    else:
+        a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    k = np.array([[0.0, -omega[2], omega[1]], [omega[2], 0.0, -omega[0]], [-omega[1], omega[0], 0.0]])
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def between_joints(a: Joints, b: Joints, fraction: float) -> Joints:
+    """Joint angles (J,) in radians, linearly; not across a turn: a controller reports turns unwrapped."""
+    return (1.0 - fraction) * a + fraction * b
+
+
+@dataclass
+class Counts:
+    """What a buffer was given and asked. duplicates: the same stamp again (the first is kept). conflicting:
+    those of them with another sample. reordered: older than the newest but put in its place. stale: too old
+    to be of use. restarts: times the sender's clock was seen to begin anew. paired, refused: instants asked
+    for."""
+
+    samples: int = 0
+    duplicates: int = 0
+    conflicting: int = 0
+    reordered: int = 0
+    stale: int = 0
+    restarts: int = 0
+    paired: int = 0
+    refused: int = 0
+
+
+@dataclass(frozen=True)
+class Match(Generic[T]):
+    """A sample for an instant, and how far (ns) the nearest one it rests on is from that instant."""
+
+    sample: T
+    gap_ns: int
+
+
+class SampleBuffer(Generic[T]):
+    """The last ``keep_ns`` of a stream of samples, in the order of their stamps whatever order they came in.
+    Thread-safe: one thread adds, others ask.
+
+    mix: makes a sample between two; None takes the nearest. An instant further than ``max_gap_ns`` from every
+    sample is refused and counted. A stamp older than everything kept is dropped; ``restart_after`` of them in
+    a row, each newer than the one before, mean that the sender's clock was set back or that a wild stamp had
+    emptied the buffer, and the buffer begins anew with them.
+    """
+
+    def __init__(
+        self,
+        mix: Mix[T] | None,
+        max_gap_ns: int = 50_000_000,
+        keep_ns: int = 2_000_000_000,
+        restart_after: int = 8,
+    ) -> None:
+        if max_gap_ns < 0 or keep_ns <= 0 or restart_after < 1:
+            raise ValueError("max_gap_ns cannot be negative, keep_ns and restart_after must be positive")
+        self.counts = Counts()
+        self._mix = mix
+        self._max_gap_ns, self._keep_ns, self._restart_after = max_gap_ns, keep_ns, restart_after
+        self._times: list[int] = []
+        self._samples: list[T] = []
+        self._old: list[tuple[int, T]] = []
+        self._lock = threading.Lock()
+
+    def add(self, t_ns: int, sample: T) -> bool:
+        """Take a sample; False if it was a duplicate or too old."""
+        with self._lock:
+            self.counts.samples += 1
+            if self._times and t_ns < self._times[-1] - self._keep_ns:
+                return self._add_stale(t_ns, sample)
+            at = bisect.bisect_left(self._times, t_ns)
+            if at < len(self._times) and self._times[at] == t_ns:
+                self.counts.duplicates += 1
+                self.counts.conflicting += not np.array_equal(_plain(self._samples[at]), _plain(sample))
+                return False
+            self.counts.reordered += at < len(self._times)
+            self._old.clear()
+            self._times.insert(at, t_ns)
+            self._samples.insert(at, sample)
+            self._prune()
+            return True
+
+    def at(self, t_ns: int) -> Match[T]:
+        """The sample for an instant. Raises PoseGapError where none is near enough."""
+        with self._lock:
+            try:
+                place = find(self._times, t_ns, self._max_gap_ns)
+            except PoseGapError:
+                self.counts.refused += 1
+                raise
+            self.counts.paired += 1
+            if self._mix is None or place.fraction is None:
+                return Match(self._samples[place.nearest], place.gap_ns)
+            a, b = self._samples[place.before], self._samples[place.before + 1]
+        return Match(self._mix(a, b, place.fraction), place.gap_ns)
+
+    def ready(self, t_ns: int) -> bool:
+        """Whether a sample as new as the instant has come: before that, interpolation would only repeat the
+        newest one."""
+        with self._lock:
+            return bool(self._times) and self._times[-1] >= t_ns
+
+    def _add_stale(self, t_ns: int, sample: T) -> bool:
+        self.counts.stale += 1
+        if self._old and t_ns <= self._old[-1][0]:
+            self._old.clear()
+        self._old.append((t_ns, sample))
+        if len(self._old) < self._restart_after:
+            return False
+        self.counts.restarts += 1
+        self._times, self._samples = [t for t, _ in self._old], [s for _, s in self._old]
+        self._old.clear()
+        self._prune()
+        return True
+
+    def _prune(self) -> None:
+        # An eighth more than is kept, so that a full list is not moved at every sample.
+        if self._times[0] < self._times[-1] - self._keep_ns * 9 // 8:
+            first = bisect.bisect_left(self._times, self._times[-1] - self._keep_ns)
+            del self._times[:first], self._samples[:first]
+
+
+class PoseBuffer:
+    """Poses of an arm as they come in, asked as any ``PoseProvider``."""
+
+    def __init__(
+        self, mix: Mix[Pose] | None = along_screw, max_gap_ns: int = 50_000_000, keep_ns: int = 2_000_000_000
+    ) -> None:
+        self._buffer = SampleBuffer[Pose](mix, max_gap_ns, keep_ns)
+
+    @property
+    def counts(self) -> Counts:
+        return self._buffer.counts
+
+    def add(self, t_ns: int, pose: Pose) -> bool:
+        """See ``SampleBuffer.add``."""
+        return self._buffer.add(t_ns, pose)
+
+    def ready(self, t_ns: int) -> bool:
+        """See ``SampleBuffer.ready``."""
+        return self._buffer.ready(t_ns)
+
+    def at(self, t_ns: int) -> Paired:
+        match = self._buffer.at(t_ns)
+        return Paired(match.sample, match.gap_ns)
+
+
+def tidy(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list[T], Counts]:
+    """A recording in the order of its stamps, each once (the first that came), and what was put right."""
+    counts = Counts(samples=len(times_ns))
+    newest = None
+    kept: dict[int, T] = {}
+    for t_ns, sample in zip(times_ns, samples):
+        if t_ns in kept:
+            counts.duplicates += 1
+            counts.conflicting += not np.array_equal(_plain(kept[t_ns]), _plain(sample))
+            continue
+        counts.reordered += newest is not None and t_ns < newest
+        newest = t_ns if newest is None else max(newest, t_ns)
+        kept[t_ns] = sample
+    order = sorted(kept)
+    return order, [kept[t] for t in order], counts
+
+
+def _plain(sample: object) -> NDArray[np.float64]:
+    if isinstance(sample, Pose):
+        return np.array([*sample.quaternion, *sample.translation_m])
+    return np.asarray(sample, dtype=np.float64)

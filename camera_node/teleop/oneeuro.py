@@ -1,0 +1,52 @@
+"""The one-euro filter (Casiez, Roussel and Vogel, CHI 2012): smooth when slow, quick when fast."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from freshfield.geometry import quaternion_multiply, quaternion_to_matrix, slerp, so3_log
+
+Array = NDArray[np.float64]
+
+_SPEED_HZ = 2.0  # cutoff of the speed that the cutoff follows
+# Stamps nearer or farther than these say more about a clock than about a hand.
+_LEAST_S, _MOST_S = 1e-4, 0.5
+
+
+class OneEuro:
+    """Position (3,) and orientation (4,), w first, low-passed with a cutoff of ``hz + hz_per_speed * speed``,
+    each by its own speed (m/s, rad/s). ``reset`` makes the next sample pass as it is."""
+
+    def __init__(self, hz: float, hz_per_speed: float) -> None:
+        self._hz, self._slope = hz, hz_per_speed
+        self.reset()
+
+    def reset(self) -> None:
+        self._position: Array | None = None
+        self._quaternion = np.array([1.0, 0.0, 0.0, 0.0])
+        self._speeds = np.zeros(2)
+
+    def __call__(self, position: Array, quaternion: Array, dt_s: float) -> tuple[Array, Array]:
+        """The filtered pose ``dt_s`` after the last one."""
+        if self._position is None:
+            self._position, self._quaternion, self._speeds = position.copy(), quaternion.copy(), np.zeros(2)
+            return self._position, self._quaternion
+        dt = min(max(dt_s, _LEAST_S), _MOST_S)
+        step = position - self._position
+        inverse = self._quaternion * np.array([1.0, -1.0, -1.0, -1.0])
+        turn = so3_log(quaternion_to_matrix(quaternion_multiply(quaternion, inverse)))
+        now = np.array([np.linalg.norm(step), np.linalg.norm(turn)]) / dt
+        self._speeds = self._speeds + _share(_SPEED_HZ, dt) * (now - self._speeds)
+        shares = [_share(self._hz + self._slope * speed, dt) for speed in self._speeds]
+        self._position = self._position + shares[0] * step
+        self._quaternion = slerp(self._quaternion, quaternion, shares[1])
+        return self._position, self._quaternion
+
+
+def _share(cutoff_hz: float, dt_s: float) -> float:
+    """How much of the way to a new value a first-order low-pass makes in ``dt_s``."""
+    rate = 2.0 * math.pi * cutoff_hz * dt_s
+    return rate / (rate + 1.0)

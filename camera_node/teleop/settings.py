@@ -1,0 +1,75 @@
+"""The section ``source.arm.teleop`` of a scenario."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+Three = tuple[float, float, float]
+
+SOLVERS = ("auto", "pink", "dls")
+
+
+@dataclass(frozen=True)
+class TeleopConfig:
+    """How a stylus moves the arm. Positions are of the flange, in the axes of the arm's base.
+
+    scale: metres of the arm for a metre of the stylus, along each axis of the base: S of (4.1). yaw_deg: the
+    stylus's axes are turned by this about the vertical. orientation: whether the arm turns with the stylus.
+    rate_hz: joint targets a second, 20 to 500. gain_per_s: share of the way to its target that the arm sets
+    out to make in a second. filter_hz, filter_hz_s_m: of the one-euro filter: its cutoff at rest, and what a
+    speed of 1 m/s (or rad/s) adds. watchdog_ms: with no message for so long, the arm comes to rest. jump_m,
+    jump_rad: a stylus that moves farther between two messages is taken to have been put elsewhere.
+
+    Limits, which hold at every tick whatever the stylus does. workspace_low_m, workspace_high_m: the box that
+    the flange stays in. joint_margin_rad: distance kept from the joints' limits. speed_rad_s,
+    acceleration_rad_s2: of every joint. speed_m_s: of the flange. margin_m: kept between parts of the arm
+    that are no neighbours. floor_m: nothing of the arm beyond the shoulder comes lower. tool_m and
+    tool_radius_m: the camera and what holds it, as a capsule along the flange's axis.
+
+    solver: pink (extra ``teleop``), dls (damped least squares, no extra), auto: pink where it is installed.
+    """
+
+    scale: Three = (1.0, 1.0, 1.0)
+    yaw_deg: float = 0.0
+    orientation: bool = True
+    rate_hz: float = 125.0
+    gain_per_s: float = 5.0
+    filter_hz: float = 2.0
+    filter_hz_s_m: float = 20.0
+    watchdog_ms: float = 200.0
+    jump_m: float = 0.05
+    jump_rad: float = 0.5
+    workspace_low_m: Three = (-0.45, -0.45, 0.05)
+    workspace_high_m: Three = (0.45, 0.45, 0.60)
+    joint_margin_rad: float = 0.05
+    speed_rad_s: float = 0.8
+    acceleration_rad_s2: float = 2.0
+    speed_m_s: float = 0.25
+    margin_m: float = 0.02
+    floor_m: float = 0.0
+    tool_m: float = 0.08
+    tool_radius_m: float = 0.04
+    solver: str = "auto"
+
+    def __post_init__(self) -> None:
+        if not all(0.0 < abs(s) <= 100.0 for s in self.scale):
+            raise ValueError("scale: expected three numbers within 100 that are not 0")
+        if not 20.0 <= self.rate_hz <= 500.0:
+            raise ValueError(f"rate_hz: expected 20 to 500, got {self.rate_hz:g}")
+        if not all(low < high for low, high in zip(self.workspace_low_m, self.workspace_high_m)):
+            raise ValueError("workspace_low_m must be below workspace_high_m along every axis")
+        ranges = {
+            "gain_per_s": (0.1, 20.0), "filter_hz": (0.01, 1000.0), "filter_hz_s_m": (0.0, 1e4),
+            "watchdog_ms": (10.0, 5000.0), "jump_m": (1e-3, 1.0), "jump_rad": (1e-2, 3.14),
+            "joint_margin_rad": (0.0, 3.0), "speed_rad_s": (1e-3, 6.28), "acceleration_rad_s2": (0.05, 40.0),
+            "speed_m_s": (1e-3, 1.5), "margin_m": (0.0, 0.2), "floor_m": (-2.0, 1.0), "tool_m": (0.0, 0.5),
+            "tool_radius_m": (1e-3, 0.2),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name}: expected {low:g} to {high:g}, got {getattr(self, name):g}")
+        # Every tick of a stop is examined before a tick is let through.
+        if self.speed_rad_s / self.acceleration_rad_s2 > 2.0:
+            raise ValueError("acceleration_rad_s2: too low to come to rest from speed_rad_s within 2 s")
+        if self.solver not in SOLVERS:
+            raise ValueError(f"solver: expected one of {', '.join(SOLVERS)}, got {self.solver!r}")

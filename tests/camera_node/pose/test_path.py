@@ -1,0 +1,114 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from camera_node.config import PathConfig, source_config
+from camera_node.pose.kinematics import UR3E
+from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
+from camera_node.pose.path import PathError, tour, viewpoints
+from freshfield.scenario import ScenarioError, load, parse
+
+CELL = load("cell")
+ARM = source_config(CELL).arm
+BASE = base_matrix(ARM)
+MOUNT = hand_eyes(CELL, ARM, ["hand"])["hand"].transform
+
+
+def test_viewpoints_look_at_their_target_from_their_radius():
+    path = PathConfig(target_m=(0.1, 0.2, 0.3), radius_m=0.5, elevations_deg=(20.0, 70.0), step_deg=30.0)
+    poses = viewpoints(path)
+    assert len(poses) == 14
+    for pose in poses:
+        to = np.array(path.target_m) - pose[:3, 3]
+        assert np.isclose(np.linalg.norm(to), 0.5) and np.allclose(pose[:3, 2], to / 0.5)
+    azimuths = [np.arctan2(pose[0, 3] - 0.1, 0.2 - pose[1, 3]) for pose in poses]
+    assert np.isclose(azimuths[6], azimuths[7])  # there and back: no leap from ring to ring
+
+
+def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
+    stops = tour(UR3E, BASE, MOUNT, ARM.path)
+    assert len(stops) >= 20
+    eyes = []
+    for before, joints in zip([stops[0], *stops], stops):
+        camera = BASE @ UR3E.forward(joints) @ MOUNT
+        to = np.array(ARM.path.target_m) - camera[:3, 3]
+        assert np.isclose(np.linalg.norm(to), ARM.path.radius_m) and camera[:3, 2] @ to > 0
+        assert not UR3E.singularities(joints)
+        assert np.abs(joints - before).max() <= 2.0
+        for part in np.linspace(0, 1, 5):
+            on_the_way = UR3E.links((1 - part) * before + part * joints)
+            assert min((BASE @ link)[2, 3] for link in on_the_way[2:]) > 0.04
+        eyes.append(camera[:3, 3] - ARM.path.target_m)
+    azimuths = np.rad2deg(np.arctan2([e[0] for e in eyes], [-e[1] for e in eyes]))
+    assert azimuths.min() < -80 and azimuths.max() > 80
+
+
+def test_the_tour_begins_where_it_can_be_begun():
+    free = tour(UR3E, BASE, MOUNT, ARM.path)
+    again = tour(UR3E, BASE, MOUNT, ARM.path, start=free[0])
+    assert np.allclose(again[0], free[0], atol=1e-9)
+
+
+def test_a_tour_out_of_reach_says_what_to_change():
+    with pytest.raises(PathError, match=r"reaches 0 of .* viewpoints: change radius_m"):
+        tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, radius_m=2.0))
+
+
+def cell(**changed):
+    arm = {"host": "127.0.0.2", "cameras": {"hand": None}, **changed}
+    data = {
+        "cameras": {"ids": ["hand", "still"]},
+        "source": {"kind": "world", "scene": "tile", "arm": arm},
+    }
+    return parse(data, CELL.path)
+
+
+def test_a_camera_that_is_not_calibrated_yet_has_the_hands_poses():
+    scenario = cell()
+    mounts = hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+    assert list(mounts) == ["hand"] and np.array_equal(mounts["hand"].transform, np.eye(4))
+
+
+def test_where_the_base_stands():
+    base = base_matrix(source_config(cell(base_m=[1.0, 2.0, 3.0], base_yaw_deg=90.0)).arm)
+    assert np.allclose(base @ [1, 0, 0, 1], [1, 3, 3, 1])
+
+
+@pytest.mark.parametrize(
+    "changed, says",
+    [
+        ({"robot": "ur99"}, "arm: robot is 'ur99', expected one of ur3e"),
+        ({"frequency_hz": 1000}, "frequency_hz is 1000, expected 10 to 500"),
+        ({"host": "192.168.56.101", "simulated": True}, "simulated: host is 192.168.56.101"),
+        ({"cameras": {}}, "cameras: expected at least one camera"),
+        ({"pairing": "guessed"}, "pairing is 'guessed'"),
+        ({"path": {"radius_m": -1}}, "radius_m above 0"),
+        ({"hosts": "x"}, "arm.hosts: unknown key"),
+    ],
+)
+def test_a_wrong_arm_is_refused_by_key(changed, says):
+    with pytest.raises(ScenarioError, match=says):
+        source_config(cell(**changed))
+
+
+@pytest.mark.parametrize(
+    "changed, says",
+    [
+        ({"cameras": {"nobody": None}}, "arm.cameras: 'nobody' is not one of the scenario's cameras"),
+        (
+            {"cameras": {"hand": "no-such-file.yaml"}},
+            r"arm.cameras.hand: .*no-such-file.yaml: cannot be read",
+        ),
+    ],
+)
+def test_a_wrong_mount_is_refused_by_camera(changed, says):
+    scenario = cell(**changed)
+    with pytest.raises(ScenarioError, match=says):
+        hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+
+
+def test_a_wrong_calibration_of_the_robot_is_refused():
+    scenario = cell(calibration="no-such.conf")
+    with pytest.raises(ScenarioError, match=r"source.arm.calibration: .*no-such.conf: cannot be read"):
+        arm_model(scenario, source_config(scenario).arm)

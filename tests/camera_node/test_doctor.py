@@ -1,0 +1,110 @@
+"""The doctor finds what is wrong, names what to do, and moves nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from camera_node import doctor
+from camera_node.cli import main
+from freshfield.clock import WallClock
+from freshfield.scenario import load
+from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.sources.mjpeg import NetworkCamera
+from tests.camera_node.sources.test_live import CALIBRATION
+
+
+def examined(capsys, *arguments):
+    """Exit code, and part -> (ok, said)."""
+    code = main(["doctor", "--json", *arguments])
+    found = json.loads(capsys.readouterr().out)
+    assert found["ok"] == (code == 0)
+    return code, {part["part"]: (part["ok"], part["said"]) for part in found["parts"]}
+
+
+def cell_at(folder: Path, host: str, **arm) -> str:
+    data = yaml.safe_load(load("cell").path.read_text())
+    mount = load("cell").path.parent / data["source"]["arm"]["cameras"]["hand"]
+    data["source"]["arm"].update({"host": host, "cameras": {"hand": str(mount)}, **arm})
+    file = folder / "cell.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return str(file)
+
+
+def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
+    _, parts = examined(capsys, "--out", str(tmp_path / "not" / "there" / "yet"))
+    assert parts["python"][0] and parts["disk"][0] and "GB free" in parts["disk"][1]
+    assert parts["clock"][0] is not None and "synchronised" in parts["clock"][1]
+    assert parts["network"][0] is None and parts["scenario"][0] is None
+
+
+def test_an_arm_that_is_well(capsys, tmp_path):
+    require_ur_rtde()
+    host = own_address()
+    with simulated_arm(host):
+        _, parts = examined(capsys, cell_at(tmp_path, host, frequency_hz=10))
+    assert parts["arm"] == (True, parts["arm"][1]) and "running" in parts["arm"][1]
+    assert parts["package ur"][0] and parts["hand-eye"][1].endswith("hand eye-in-hand, 65 mm away")
+    assert parts["arm's path"][0] and "of 45 viewpoints" in parts["arm's path"][1]
+
+
+def test_every_fault_is_named_in_one_call(capsys, tmp_path):
+    require_ur_rtde()
+    code, parts = examined(
+        capsys, cell_at(tmp_path, own_address(), cameras={"hand": "none.yaml"}), "--to", "127.0.0.1:9"
+    )
+    assert code == 1
+    assert parts["network"][0] is False and "does a firewall stand between" in parts["network"][1]
+    assert parts["hand-eye"][0] is False and "none.yaml" in parts["hand-eye"][1]
+    assert parts["arm"][0] is False and "simulate-arm" in parts["arm"][1]
+    assert parts["arm's path"][0] is False
+
+
+def test_a_scenario_that_is_wrong_is_said_like_everything_else(capsys, tmp_path):
+    file = tmp_path / "bad.yaml"
+    file.write_text("cameras: {count: 2}\nsource: {kind: oak, sockets: CAM_A}\n")
+    code, parts = examined(capsys, str(file))
+    assert code == 1 and parts["scenario"][0] is False and "did you mean 'socket'" in parts["scenario"][1]
+
+
+def test_a_camera_is_opened_and_watched(capsys, tmp_path):
+    camera = NetworkCamera(WallClock())
+    (tmp_path / "calibration.json").write_text(json.dumps(CALIBRATION))
+    source = {
+        "kind": "camera",
+        "devices": {"eye": camera.address},
+        "calibration": "calibration.json",
+        "first_frame_s": 10,
+    }
+    file = tmp_path / "bench.yaml"
+    file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
+    _, parts = examined(capsys, str(file))
+    camera.close()
+    assert parts["camera eye"][0] and parts["camera eye"][1].startswith("64 x 48, ")
+    assert parts["calibration"] == (True, "calibration.json: 1 cameras")
+    assert "network" in parts
+    (tmp_path / "calibration.json").write_text(json.dumps({"other": CALIBRATION["eye"]}))
+    _, parts = examined(capsys, str(file))
+    assert parts["calibration"] == (False, "calibration.json: it lacks eye")
+    assert parts["camera eye"][0] is False and "no camera at http" in parts["camera eye"][1]
+
+
+def test_a_missing_package_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(doctor.Wrong, match=r"ur-rtde is not installed: pip install 'freshfield\[ur\]'"):
+        doctor._package("ur")
+
+
+def test_a_full_disk_is_wrong(monkeypatch, tmp_path):
+    monkeypatch.setattr(doctor, "LEAST_FREE_GB", 1e9)
+    with pytest.raises(doctor.Wrong, match="make room"):
+        doctor._disk(tmp_path)
+
+
+def test_people_read_lines_with_marks(capsys):
+    main(["doctor"])
+    said = capsys.readouterr().out
+    assert "ok     python" in said and "-      scenario" in said

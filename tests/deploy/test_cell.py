@@ -1,0 +1,65 @@
+"""A scenario with a simulated arm: who is started, in which order, and a field that sees the tile."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from freshfield.scenario import load
+from tests.camera_node.pose.simulated import own_address, require_ur_rtde
+from tests.deploy.test_up import Up
+
+CELL = load("cell")
+
+
+@pytest.fixture
+def plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    from launch import commands
+
+    monkeypatch.setattr(commands, "program", lambda name: name)
+    return lambda scenario: commands.plan(scenario, tmp_path, 8080)
+
+
+def test_a_simulated_arm_and_its_driver_belong_to_the_run(plan) -> None:
+    found = plan(CELL)
+    assert [child.command[1] for child in found.arms + found.drivers] == ["simulate-arm", "drive-arm"]
+    assert found.arm_address == "127.0.0.2:30004"
+    # Nobody sends to what is gone: driver, cameras, arm, channel, edge.
+    assert [child.name for child in found.children] == ["driver", "node", "arm", "emulator", "edge"]
+
+
+def test_a_real_arm_is_neither_simulated_nor_driven(plan) -> None:
+    arm = {**CELL.source["arm"], "simulated": False}
+    real = dataclasses.replace(CELL, source={**CELL.source, "arm": arm})
+    assert [child.name for child in plan(real).children] == ["node", "emulator", "edge"]
+    assert [child.name for child in plan(load("tile")).children] == ["node", "emulator", "edge"]
+
+
+def test_a_simulated_arm_without_a_path_stands_still(plan) -> None:
+    arm = {key: value for key, value in CELL.source["arm"].items() if key != "path"}
+    still = dataclasses.replace(CELL, source={**CELL.source, "arm": arm})
+    assert plan(still).arms and not plan(still).drivers
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
+    require_ur_rtde()
+    mount = CELL.path.parent / CELL.source["arm"]["cameras"]["hand"]
+    text = CELL.path.read_text().replace("../lab/hand-eye-example.yaml", str(mount))
+    text = re.sub(r"host: \S+", f"host: {own_address()}", text)
+    text = text.replace("width: 128", "width: 48").replace("height: 128", "height: 48")
+    run = Up(tmp_path, scenario=text)
+    try:
+        run.wait_for_updates(8)
+        run.process.terminate()
+        assert run.end() == 0
+    finally:
+        run.process.kill()
+    frames = run.report()["frames"]
+    assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
+    views = {tuple(line.split()) for line in (run.out / "log-driver.txt").read_text().splitlines()}
+    assert ("29", "viewpoints") in views
