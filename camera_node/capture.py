@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from camera_node.clocks import Drifting, NodeClock
 from camera_node.config import SourceConfig
+from camera_node.pace import Pace, Paced, Ticks
 from camera_node.sources import Source
 from freshfield import payload
 from freshfield.clock import Clock
@@ -15,12 +16,13 @@ from freshfield.geometry import Pinhole, Pose
 
 @dataclass(frozen=True)
 class Encoded:
-    """A compressed shot: everything of a frame that does not depend on when it was taken."""
+    """A compressed shot: everything of a frame but when it was due. captured_ns: see ``Shot``."""
 
     payload: bytes
     pose: Pose
     intrinsics: Pinhole
     pose_gap_ns: int
+    captured_ns: int | None = None
 
 
 class EncodedCache:
@@ -64,13 +66,20 @@ class Camera:
         self.name = source.camera
         self.fps = source.fps
         self.source = source
-        self._codec, self._quality = config.codec, config.quality
+        # What is replayed has been compressed already.
+        self._codec = source.codec if isinstance(source, Paced) else config.codec
+        self._quality = config.quality
         self._cache = cache
         self._drift = drift
 
     def clock(self, true: Clock) -> NodeClock:
         """The clock this camera stamps with, given the true time."""
         return NodeClock(true, self._drift)
+
+    def pace(self, start_ns: int) -> Pace:
+        """When it captures; a recording begins at ``start_ns``."""
+        source = self.source
+        return source.pace(start_ns) if isinstance(source, Paced) else Ticks(self.fps)
 
     @property
     def codec(self) -> str:
@@ -119,4 +128,4 @@ class Camera:
         if not isinstance(data, bytes):
             data = payload.encode(data, self._codec, self._quality)
         payload.check(data, self._codec, shot.intrinsics.width, shot.intrinsics.height)
-        return Encoded(data, shot.pose, shot.intrinsics, shot.pose_gap_ns)
+        return Encoded(data, shot.pose, shot.intrinsics, shot.pose_gap_ns, shot.captured_ns)

@@ -10,6 +10,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from camera_node import lab
+from camera_node.calibrate import CalibrationError
+from camera_node.calibrate import command as calibrate
 from freshfield import scenario, transport
 
 if TYPE_CHECKING:
@@ -20,8 +23,13 @@ EXAMPLES = """examples:
   camera-node run room.yaml --camera cam03 --to emu:7001     one camera, as on a machine of its own
   camera-node run fox --all --to :7001 --data ~/data         recorded data: where the data sets lie
   camera-node prepare room --all                             render ahead, for a quick start later
+  camera-node calibrate hand-eye --help                      where a camera sits on an arm, and its lens
   camera-node sources                                        what a scenario's source section can say
   camera-node effects                                        what it can list under effects
+  camera-node simulate-arm cell                              an arm for the scenario "cell" on this machine
+  camera-node drive-arm cell                                 take its camera round the target
+  camera-node teleop cell --stylus keyboard                  or gamepad, network:PORT: an operator moves it
+  camera-node doctor cell                                    what is missing here, and what to do about it
 
 exit codes: 0 stopped as asked, 1 failed while running, 2 wrong scenario, option or data
 """
@@ -47,19 +55,27 @@ def main(arguments: list[str] | None = None) -> int:
     )
     _add_cameras(prepare)
     prepare.add_argument("-q", "--quiet", action="store_true", help="only warnings")
+    calibrate.add_arguments(
+        commands.add_parser("calibrate", help="hand-eye, intrinsics, and what they are worth")
+    )
     commands.add_parser("sources", help="list kinds of sources and the keys they take")
     commands.add_parser("effects", help="list effects and their parameters")
+    lab.add_commands(commands)
     args = parser.parse_args(arguments)
     try:
         if args.command == "run":
             return _run(args)
         if args.command == "prepare":
             return _prepare(args)
+        if args.command in lab.COMMANDS:
+            return lab.run(args)
+        if args.command == "calibrate":
+            return calibrate.run(args)
         from camera_node import listing
 
         print(listing.sources() if args.command == "sources" else listing.effects())
         return 0
-    except (UsageError, scenario.ScenarioError, transport.TransportError) as error:
+    except (UsageError, CalibrationError, scenario.ScenarioError, transport.TransportError) as error:
         print(f"camera-node: {error}", file=sys.stderr)
         return 2
 

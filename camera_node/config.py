@@ -11,13 +11,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from freshfield.payload import CODECS
+from freshfield.payload import CODECS, MAX_IMAGE_SIDE
 from freshfield.scenario import Scenario, ScenarioError, read_section
 
-KINDS = ("world", "transforms", "video")
+KINDS = (
+    "world", "transforms", "video", "dynerf", "zju", "eyeful", "colmap", "mcap", "camera", "oak", "realsense",
+)  # fmt: skip
 LOOPS = ("back-and-forth", "restart")
+REPLAYS = ("once", "restart")
 PAIRINGS = ("nearest", "interpolated")
 BACKGROUNDS = ("white", "black", "keep")
+ROBOTS = ("ur3e",)
 
 
 @dataclass(frozen=True)
@@ -50,9 +54,83 @@ class SourceConfig:
 
 
 @dataclass(frozen=True)
+class PathConfig:
+    """The tour that ``camera-node drive-arm`` makes: viewpoints on rings around a target, looking at it.
+
+    target_m: in the world. radius_m: camera to target. elevations_deg: of the rings, in the order of the
+    tour. azimuths_deg: first and last of each ring (0 is on the target's -y side, 90 on its +x side).
+    step_deg: between viewpoints of a ring. speed_rad_s, acceleration_rad_s2: of the fastest joint. floor_m:
+    nothing of the arm beyond the upper arm comes lower, in the world's z.
+    """
+
+    target_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius_m: float = 0.35
+    elevations_deg: tuple[float, ...] = (45.0, 65.0)
+    azimuths_deg: tuple[float, float] = (-90.0, 90.0)
+    step_deg: float = 15.0
+    speed_rad_s: float = 0.5
+    acceleration_rad_s2: float = 1.0
+    floor_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not self.elevations_deg or not all(-89.0 <= e <= 89.0 for e in self.elevations_deg):
+            raise ValueError("elevations_deg: expected one or more from -89 to 89")
+        if not self.radius_m > 0 or not 1.0 <= self.step_deg <= 120.0:
+            raise ValueError("expected radius_m above 0 and step_deg from 1 to 120")
+        if not 0 < self.speed_rad_s <= 3.14 or not 0 < self.acceleration_rad_s2 <= 40.0:
+            raise ValueError("expected speed_rad_s from 0 to 3.14 and acceleration_rad_s2 from 0 to 40")
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """An arm whose joint states give cameras their poses (extra ``ur``).
+
+    host: the controller's address. robot: ur3e. cameras: camera -> its hand-eye calibration, a file of
+    ``camera-node calibrate hand-eye``, relative to the scenario, or null as long as there is none (its poses
+    are then the hand's own, as that command needs them). calibration: the robot's own
+    ``calibration.conf``, likewise. base_m, base_yaw_deg: where its base stands in the world. frequency_hz:
+    joint states a second, 10 to 500. pairing: nearest or interpolated. max_gap_ms: a frame farther than this
+    from a joint state is not sent. path: the tour of ``camera-node drive-arm``. simulated: deploy/up.py
+    starts ``camera-node simulate-arm`` at ``host`` (an address of this machine, 127.0.0.2 and up) and drives
+    it. teleop: keys of ``camera_node.teleop.settings.TeleopConfig``, for ``camera-node teleop``.
+    """
+
+    host: str
+    cameras: dict[str, str | None]
+    robot: str = "ur3e"
+    calibration: str | None = None
+    base_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    base_yaw_deg: float = 0.0
+    frequency_hz: float = 125.0
+    pairing: str = "interpolated"
+    max_gap_ms: float = 20.0
+    path: PathConfig | None = None
+    simulated: bool = False
+    teleop: dict[str, Any] | None = None  # read by the command alone: a node that streams needs none of it
+
+    def __post_init__(self) -> None:
+        if self.robot not in ROBOTS:
+            raise ValueError(f"robot is {self.robot!r}, expected one of {', '.join(ROBOTS)}")
+        if not self.cameras:
+            raise ValueError("cameras: expected at least one camera with its hand-eye calibration")
+        # drive-arm does not ask before it moves a simulated arm: a real one must not pass for one.
+        if self.simulated and not self.host.startswith("127."):
+            raise ValueError(
+                f"simulated: host is {self.host}, expected one of this machine's, such as 127.0.0.2"
+            )
+        if not 10.0 <= self.frequency_hz <= 500.0:
+            raise ValueError(f"frequency_hz is {self.frequency_hz:g}, expected 10 to 500")
+        if self.pairing not in PAIRINGS:
+            raise ValueError(f"pairing is {self.pairing!r}, expected one of {', '.join(PAIRINGS)}")
+        if self.max_gap_ms < 0:
+            raise ValueError("max_gap_ms cannot be negative")
+
+
+@dataclass(frozen=True)
 class WorldConfig(SourceConfig):
     """A synthetic world. scene: ``room``, ``tile`` or ``tower``; size and lens of its cameras; how fast it
-    moves. params: further parameters of the scene by name."""
+    moves. params: further parameters of the scene by name. arm: carries those of the cameras that it lists;
+    what they see is rendered from where a simulated arm really is."""
 
     scene: str = "room"
     width: int | None = None
@@ -60,6 +138,7 @@ class WorldConfig(SourceConfig):
     horizontal_fov_deg: float | None = None
     speed_m_per_s: float | None = None
     params: dict[str, Any] = field(default_factory=dict)
+    arm: ArmConfig | None = None
 
     def scene_parameters(self) -> dict[str, Any]:
         """What the scene is made with: the keys above that were given, and ``params``."""
@@ -73,13 +152,15 @@ class TrajectoryConfig:
     """Poses from TUM files (``t tx ty tz qx qy qz qw``), one a camera, instead of the calibration's.
 
     files: camera -> file. pairing: nearest or interpolated. max_gap_ms: a frame further than this from its
-    pose sample is not sent. start_s: the trajectory's time at the clip's first frame.
+    pose sample is not sent. start_s: the trajectory's time at the clip's first frame. hand_eye: the files are
+    of the hand that holds the camera, and this one, of ``camera-node calibrate hand-eye --out``, says where.
     """
 
     files: dict[str, str]
     pairing: str = "interpolated"
     max_gap_ms: float = 50.0
     start_s: float = 0.0
+    hand_eye: str = ""
 
     def __post_init__(self) -> None:
         if self.pairing not in PAIRINGS:
@@ -118,10 +199,7 @@ class TransformsConfig(RecordedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.background not in BACKGROUNDS:
-            raise ValueError(f"background is {self.background!r}, expected {', '.join(BACKGROUNDS)}")
-        if self.background == "keep" and self.codec != "png":
-            raise ValueError(f"background 'keep' sends alpha, which codec {self.codec!r} cannot; use png")
+        _check_background(self.background, self.codec)
 
 
 @dataclass(frozen=True)
@@ -133,11 +211,148 @@ class VideoConfig(RecordedConfig):
     trajectory: TrajectoryConfig | None = None
 
 
+@dataclass(frozen=True)
+class LiveConfig(SourceConfig):
+    """Keys of every kind with a camera behind it. devices: camera -> which one it is (its serial number; a
+    number, path or address for kind ``camera``); needed where there is more than one. width, height: pixels
+    asked for. exposure_us: fixed; not given, the camera chooses. calibration: JSON of intrinsics and poses by
+    camera (as ``camera-node sources`` says for videos), relative to the scenario; without it intrinsics are
+    the device's own, where it has any, and poses come from ``arm``. first_frame_s: how long a camera may take
+    until its first frame."""
+
+    devices: dict[str, str] = field(default_factory=dict)
+    width: int = 640
+    height: int = 400
+    exposure_us: int | None = None
+    calibration: str | None = None
+    arm: ArmConfig | None = None
+    first_frame_s: float = 3.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (8 <= self.width <= MAX_IMAGE_SIDE and 8 <= self.height <= MAX_IMAGE_SIDE):
+            raise ValueError(f"width and height: expected 8 to {MAX_IMAGE_SIDE}")
+        if self.exposure_us is not None and not 1 <= self.exposure_us <= 1_000_000:
+            raise ValueError("exposure_us: expected 1 to 1000000")
+        if not 0.1 <= self.first_frame_s <= 60.0:
+            raise ValueError("first_frame_s: expected 0.1 to 60")
+
+
+@dataclass(frozen=True)
+class CameraConfig(LiveConfig):
+    """Any camera or stream that OpenCV opens: a USB camera by number or path (/dev/v4l/by-id/...), a network
+    camera by address (rtsp://...). It knows no intrinsics: ``calibration`` gives them. latency_ms: from
+    exposure to the host, for drivers that stamp nothing themselves; subtracted from the time of arrival."""
+
+    latency_ms: float = 0.0
+
+
+@dataclass(frozen=True)
+class OakConfig(LiveConfig):
+    """Luxonis OAK cameras through depthai 3 (extra ``oak``). socket: which of the device's cameras. iso: with
+    exposure_us. rectify: straighten the picture on the device; otherwise its lens goes with the frame, as
+    well as four coefficients describe it."""
+
+    socket: str = "CAM_A"
+    iso: int = 400
+    rectify: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 100 <= self.iso <= 1600:
+            raise ValueError("iso: expected 100 to 1600")
+
+
+@dataclass(frozen=True)
+class RealsenseConfig(LiveConfig):
+    """Intel RealSense D400 cameras, their colour stream (extra ``realsense``)."""
+
+
+@dataclass(frozen=True)
+class DynerfConfig(RecordedConfig):
+    """DyNeRF (Neural 3D Video). data: the folder with ``cam*.mp4`` and ``poses_bounds.npy``."""
+
+
+@dataclass(frozen=True)
+class ZjuConfig(RecordedConfig):
+    """ZJU-MoCap. data: the folder with ``annots.npy`` and the cameras' folders of images. recorded_fps: of
+    the recording, whose files do not tell. masks: a folder of masks (``mask_cihp``) that cut the person out;
+    background: what the person is then laid on."""
+
+    recorded_fps: float = 50.0
+    masks: str | None = None
+    background: str = "black"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.01 <= self.recorded_fps <= 1000:
+            raise ValueError(f"recorded_fps is {self.recorded_fps:g}, expected 0.01 to 1000")
+        _check_background(self.background, self.codec)
+
+
+@dataclass(frozen=True)
+class EyefulConfig(RecordedConfig):
+    """Eyeful Tower. data: a scene's folder with ``cameras.json`` or ``cameras.xml``. images: folder of
+    images in it (default: the smallest of ``images-jpeg-1k``, ``-2k``, ``-4k``, ``images-jpeg``). Cameras
+    are called as their folders: name them in cameras.ids, or in assignment."""
+
+    images: str | None = None
+
+
+@dataclass(frozen=True)
+class ColmapConfig(RecordedConfig):
+    """A COLMAP model, text or binary. data: the folder that holds it, itself or in ``sparse/0``. images:
+    folder of images (default ``images``). background: what transparent ones are laid on."""
+
+    images: str | None = None
+    background: str = "white"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_background(self.background, self.codec)
+
+
+@dataclass(frozen=True)
+class McapConfig(SourceConfig):
+    """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
+    poses, stamps shifted to now. file: the recording. loop: ``once`` from first to last, after which the
+    node ends, or ``restart`` over and over, in step with nodes elsewhere. assignment: scenario camera -> the
+    recording's, where the names differ. fps, codec and quality are the recording's own."""
+
+    file: str = ""
+    loop: str = "once"
+    assignment: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.file:
+            raise ValueError("file: missing: the recording")
+        if self.loop not in REPLAYS:
+            raise ValueError(f"loop is {self.loop!r}, expected one of {', '.join(REPLAYS)}")
+        if self.effects:
+            raise ValueError("effects: a recording is replayed as it was; leave them out")
+
+
 MODELS: dict[str, type[SourceConfig]] = {
     "world": WorldConfig,
     "transforms": TransformsConfig,
     "video": VideoConfig,
+    "camera": CameraConfig,
+    "oak": OakConfig,
+    "realsense": RealsenseConfig,
+    "dynerf": DynerfConfig,
+    "zju": ZjuConfig,
+    "eyeful": EyefulConfig,
+    "colmap": ColmapConfig,
+    "mcap": McapConfig,
 }
+
+
+def _check_background(background: str, codec: str) -> None:
+    if background not in BACKGROUNDS:
+        raise ValueError(f"background is {background!r}, expected {', '.join(BACKGROUNDS)}")
+    if background == "keep" and codec != "png":
+        raise ValueError(f"background 'keep' sends alpha, which codec {codec!r} cannot; use png")
 
 
 def source_config(scenario: Scenario) -> SourceConfig:
@@ -149,10 +364,10 @@ def source_config(scenario: Scenario) -> SourceConfig:
     return read_section(MODELS[kind], scenario.source, where)
 
 
-def find_data(name: str, scenario: Scenario, base: Path | None) -> Path:
-    """The file or folder ``name`` of the ``data`` key: absolute, or below ``base`` (--data), else below
+def find_data(name: str, scenario: Scenario, base: Path | None, key: str = "data") -> Path:
+    """The file or folder ``name`` of ``key``: absolute, or below ``base`` (--data), else below
     $FRESHFIELD_DATA. Raises ScenarioError saying what to set."""
-    where = f"{scenario.path}: source.data"
+    where = f"{scenario.path}: source.{key}"
     path = Path(name).expanduser()
     if not path.is_absolute():
         folder = base or (Path(os.environ["FRESHFIELD_DATA"]) if os.environ.get("FRESHFIELD_DATA") else None)

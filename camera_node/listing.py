@@ -7,7 +7,7 @@ import importlib
 import inspect
 from typing import Any
 
-from camera_node.config import MODELS, SourceConfig
+from camera_node.config import MODELS, ArmConfig, PathConfig, SourceConfig
 
 
 def sources() -> str:
@@ -20,6 +20,8 @@ def sources() -> str:
             if issubclass(part, SourceConfig) and part is not SourceConfig:
                 lines += [_doc(part), ""]
         lines += _keys(model, leave_out=common)
+    for name, part in (("arm: {...}", ArmConfig), ("arm: {path: {...}}", PathConfig)):
+        lines += ["", f"source: {{{name}}}", "", _doc(part), "", *_keys(part)]
     return "\n".join(lines)
 
 

@@ -33,6 +33,7 @@ log = logging.getLogger("camera-node")
 STATUS_PERIOD_S = 1.0
 # How long a clean exit waits for the answers to frames already sent.
 _LAST_ANSWERS_S = 1.0
+_READY_POLL_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -132,8 +133,14 @@ class Node:
         self._enter("preparing")
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
+        if any(camera.pace(0).whole for camera in self._cameras):
+            # A recording that began before there is somebody to send it to would lose its beginning.
+            self._enter("connecting")
+            while not all(sender.ready for sender in self.senders.values()):
+                await asyncio.sleep(_READY_POLL_S)
         self._enter("streaming")
-        tasks = [asyncio.ensure_future(self._capture(c)) for c in self._cameras]
+        start_ns = self._clock.now_ns()
+        tasks = [asyncio.ensure_future(self._capture(c, start_ns)) for c in self._cameras]
         try:
             await asyncio.wait(
                 tasks, timeout=self._options.seconds or None, return_when=asyncio.FIRST_EXCEPTION
@@ -145,16 +152,15 @@ class Node:
             if isinstance(result, Exception):
                 raise result
 
-    async def _capture(self, camera: Camera) -> None:
-        """One camera's captures, at the ticks of true time."""
+    async def _capture(self, camera: Camera, start_ns: int) -> None:
+        """One camera's captures, as its pace has them due in true time."""
         loop = asyncio.get_running_loop()
         outbox, trouble = self.outboxes[camera.name], self._trouble[camera.name]
-        fps = camera.fps
-        per_tick = fps.denominator * 1_000_000_000  # tick k is due at k * per_tick / fps.numerator ns
-        tick = self._clock.now_ns() * fps.numerator // per_tick + 1
+        pace = camera.pace(start_ns)
+        tick: int | None = pace.first(self._clock.now_ns())
         sequence = 0
-        while True:
-            due_ns = tick * per_tick // fps.numerator
+        while tick is not None:
+            due_ns = pace.due_ns(tick)
             await asyncio.sleep((due_ns - self._clock.now_ns()) * 1e-9)
             try:
                 shot = camera.cached(tick)
@@ -163,13 +169,16 @@ class Node:
             except (ValueError, OSError) as error:  # OSError: a photo that is gone
                 self._failed(camera.name, error)
             else:
-                # The shot shows the instant the tick was due, however late the loop woke for it.
-                generated_ns = self._clocks[camera.name].stamp_ns(due_ns)
+                # What is rendered or read shows the instant the tick was due, however late the loop woke for
+                # it; a real camera says itself when it exposed.
+                shown_ns = due_ns if shot.captured_ns is None else shot.captured_ns
+                generated_ns = self._clocks[camera.name].stamp_ns(shown_ns)
+                if pace.whole:
+                    await outbox.room()
                 outbox.put(self._frame(camera, shot, sequence, generated_ns))
                 sequence += 1
-            latest = self._clock.now_ns() * fps.numerator // per_tick
-            trouble["missed"] += max(0, latest - tick - 1)
-            tick = max(tick + 1, latest)
+            tick, missed = pace.after(tick, self._clock.now_ns())
+            trouble["missed"] += missed
 
     def _frame(self, camera: Camera, shot: Encoded, sequence: int, generated_ns: int) -> Frame:
         return Frame(
@@ -194,7 +203,7 @@ class Node:
     async def _last_answers(self) -> None:
         try:
             async with asyncio.timeout(_LAST_ANSWERS_S):
-                while any(sender.busy for sender in self.senders.values()):
+                while any(s.busy or (s.connected and s.outbox.waiting) for s in self.senders.values()):
                     await asyncio.sleep(0.01)
         except TimeoutError:
             pass  # those frames are written down as broken

@@ -24,6 +24,8 @@ class Outbox:
         self._clock = clock
         self._frame: Frame | None = None
         self._filled = asyncio.Event()
+        self._emptied = asyncio.Event()
+        self._emptied.set()
 
     @property
     def waiting(self) -> int:
@@ -37,6 +39,11 @@ class Outbox:
         self._frame = frame
         self.note(frame.sequence, "captured")
         self._filled.set()
+        self._emptied.clear()
+
+    async def room(self) -> None:
+        """Until no frame waits, so that ``put`` replaces none."""
+        await self._emptied.wait()
 
     async def wait(self) -> None:
         """Until a frame waits."""
@@ -49,6 +56,7 @@ class Outbox:
         if frame is None:
             raise LookupError("no frame is waiting")
         self._filled.clear()
+        self._emptied.set()
         self.note(frame.sequence, "sent")
         return frame
 

@@ -73,6 +73,11 @@ class Sender:
         self._reasons: dict[str, int] = {}
         self._offset_awaited = False
 
+    @property
+    def ready(self) -> bool:
+        """Whether a frame put into the outbox now would leave at once, dated."""
+        return self.connected and self._offset_awaited
+
     async def run(self) -> None:
         """Until cancelled."""
         backoff = FIRST_BACKOFF_S

@@ -26,12 +26,14 @@ class Shot:
 
     image: uint8 (H, W, 3) RGB or (H, W, 4) RGBA, or bytes already in the scenario's codec; matches
     ``intrinsics``. pose_gap_ns: time between the exposure and the pose sample it was paired with.
+    captured_ns: when a real camera exposed it, on the node's clock; None: at the tick it was asked for.
     """
 
     image: NDArray[np.uint8] | bytes
     pose: Pose
     intrinsics: Pinhole
     pose_gap_ns: int = 0
+    captured_ns: int | None = None
 
 
 class Source(Protocol):

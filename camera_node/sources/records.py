@@ -40,11 +40,13 @@ class Record:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Records in the data set's own order; ``missing`` counts entries that have no file."""
+    """Records in the data set's own order; ``missing`` counts entries that have no file. held_out: names of
+    the records that the data set itself keeps for testing, where it says so."""
 
     records: tuple[Record, ...]
     missing: int = 0
     fps: float | None = None
+    held_out: frozenset[str] = frozenset()
 
     def __len__(self) -> int:
         return len(self.records)

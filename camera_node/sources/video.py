@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 
-from camera_node.config import SourceConfig, TrajectoryConfig, VideoConfig, find_data
+from camera_node.config import RecordedConfig, SourceConfig, TrajectoryConfig, VideoConfig, find_data
 from camera_node.pose.rig import FixedPose, PoseProvider, TrajectoryError, read_tum
 from camera_node.sources import Shot, Source
 from camera_node.sources.assign import assigned
@@ -81,6 +81,22 @@ def open_sources(
     config = cast(VideoConfig, config)
     folder = find_data(config.data, scenario, data)
     rig = load_rig(folder, config.files)
+    return rig_sources(
+        scenario, config, cameras, rig, folder,
+        lambda camera, name: _poses(scenario, config, folder, rig, camera, name),
+    )  # fmt: skip
+
+
+def rig_sources(
+    scenario: Scenario,
+    config: RecordedConfig,
+    cameras: Sequence[str],
+    rig: VideoRig,
+    folder: Path,
+    poses: Callable[[str, str], PoseProvider],
+) -> dict[str, Source]:
+    """Live ``cameras`` that show a rig's videos. poses: of a scenario's camera, played by a rig's. Raises
+    ScenarioError or DatasetError."""
     names = assigned(scenario, config.assignment, cameras, list(rig.cameras))
     clips = {name: open_clip(rig, name) for name in rig.cameras}
     # All cameras turn round at the same frame, or they would drift apart at every turn.
@@ -94,9 +110,7 @@ def open_sources(
     fps = rate(config.fps) if config.fps else recorded
     playback = Playback(count, fps, recorded, config.loop == "back-and-forth")
     return {
-        camera: VideoSource(
-            camera, rig, name, config.scale, playback, _poses(scenario, config, folder, rig, camera, name)
-        )
+        camera: VideoSource(camera, rig, name, config.scale, playback, poses(camera, name))
         for camera, name in names.items()
     }
 
@@ -113,11 +127,21 @@ def _poses(
             track = read_tum(base / wanted.files[camera], wanted.pairing == "interpolated", gap_ns)
         except TrajectoryError as error:
             raise ScenarioError(f"{where}.files.{camera}: {error}") from None
-        return _Shifted(track, round(wanted.start_s * 1e9))
+        shifted = _Shifted(track, round(wanted.start_s * 1e9))
+        return _mounted(shifted, base / wanted.hand_eye, where) if wanted.hand_eye else shifted
     pose = rig.cameras[name].pose
     if pose is None:
         raise ScenarioError(f"{where}.files.{camera}: missing, and the calibration has no pose for {name}")
     return FixedPose(pose)
+
+
+def _mounted(hand: PoseProvider, file: Path, where: str) -> PoseProvider:
+    from camera_node.pose.mount import HandEyeError, read_hand_eye
+
+    try:
+        return read_hand_eye(file).camera_poses(hand)
+    except HandEyeError as error:
+        raise ScenarioError(f"{where}.hand_eye: {error}") from None
 
 
 class _Shifted:

@@ -52,7 +52,11 @@ def load_dataset(path: str | Path, scale: float = 1.0, files: Mapping[str, str] 
 
     Poses are the calibration's. Videos of different lengths are cut to the shortest. Raises DatasetError.
     """
-    rig = load_rig(Path(path), files)
+    return rig_dataset(load_rig(Path(path), files), Path(path), scale)
+
+
+def rig_dataset(rig: VideoRig, path: Path, scale: float = 1.0) -> Dataset:
+    """``load_dataset`` of a rig that is known already. path: for messages."""
     clips = {name: open_clip(rig, name) for name in rig.cameras}
     count = min(clip.count for clip in clips.values())
     records: list[Record] = []

@@ -74,14 +74,21 @@ def open_sources(
 ) -> dict[str, Source]:
     """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
     config = cast(WorldConfig, config)
-    return {
+    frames = frame_caches(scenario, config, cameras, effects)
+    carried: dict[str, Source] = {}
+    if config.arm is not None and any(camera in config.arm.cameras for camera in cameras):
+        from camera_node.sources.on_arm import open_hand_cameras
+
+        on_hand = {camera: frames.pop(camera) for camera in cameras if camera in config.arm.cameras}
+        carried = open_hand_cameras(scenario, config.arm, on_hand, effects)
+    return carried | {
         camera: WorldSource(
             camera,
-            frames,
+            each,
             effects.get(camera) or NO_EFFECTS,
             partial(fill_in_child, scenario, config, camera),
         )
-        for camera, frames in frame_caches(scenario, config, cameras, effects).items()
+        for camera, each in frames.items()
     }
 
 

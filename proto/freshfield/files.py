@@ -27,6 +27,11 @@ def write_json(path: Path, data: Any, indent: int | None = None) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
+    """Replace ``path`` by ``text``; see ``write_bytes``."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
     """Replace ``path`` at once: a reader sees the old file or the new one, never half of one.
 
     Any number of threads, processes and machines sharing the folder may do so. OSError where it cannot be
@@ -35,7 +40,7 @@ def write_text(path: Path, text: str) -> None:
     # The process id is not enough: threads share it, and containers that share a folder often do.
     part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
     try:
-        part.write_text(text)
+        part.write_bytes(data)
         os.replace(part, path)
     except BaseException:
         part.unlink(missing_ok=True)

@@ -98,6 +98,13 @@ def to_request(frame: Frame) -> pb.PushRequest:
     return pb.PushRequest(header=header, payload=frame.payload, crc32c=checksum(header, frame.payload))
 
 
+def pose_and_lens(h: pb.FrameHeader) -> tuple[Pose, Pinhole]:
+    """Pose and lens of a header as they stand in it, to the bit and unchecked: to send them again."""
+    p, k = h.pose, h.intrinsics
+    lens = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
+    return Pose((p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)), lens
+
+
 def from_request(request: pb.PushRequest) -> Frame:
     """Check everything that needs no memory and return the frame; the payload stays encoded.
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from camera_node.sources.playback import Playback, rate
 from camera_node.sources.records import DatasetError
-from camera_node.sources.transforms import deal
+from camera_node.sources.streamed import deal
 
 
 def test_back_and_forth_and_restart():

@@ -115,6 +115,13 @@ def test_a_trajectory_gives_the_poses(tmp_path):
     assert shot.pose.translation_m == pytest.approx((4.5, 0, 0)) and shot.pose_gap_ns == 50_000_000
     with pytest.raises(ValueError, match="nearest pose"):
         sources["cam01"].read(30)  # 1.5 s: half a second after the last sample
+    # The same as poses of a hand that holds the camera (4.7), whose clock is 50 ms ahead.
+    mount = {"transform": [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "time_offset_s": 0.05}
+    (tmp_path / "hand.yaml").write_text(json.dumps(mount))
+    held = opened(video_scenario(file, trajectory={**trajectory, "hand_eye": "hand.yaml"}))["cam01"].read(9)
+    assert held.pose.translation_m == pytest.approx((5.5, 0, 0)) and held.pose_gap_ns == 0
+    with pytest.raises(ScenarioError, match=r"trajectory.hand_eye.*none.yaml"):
+        opened(video_scenario(file, trajectory={**trajectory, "hand_eye": "none.yaml"}))
     with pytest.raises(ScenarioError, match=r"trajectory.files.cam01.*none.txt"):
         opened(video_scenario(file, trajectory={"files": {"cam01": "none.txt"}}))
 

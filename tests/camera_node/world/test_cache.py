@@ -213,6 +213,7 @@ def test_render_ahead_fills_all_and_counts(tmp_path):
     assert calls[-1] == (18, 18) and [d for d, _ in calls] == list(range(1, 19))
 
 
+@pytest.mark.alone
 def test_streaming_from_the_cache_costs_next_to_nothing(tmp_path):
     """Nine cameras of 128 x 128 at 15 frames a second: the source's part of their 15 % of a core."""
     scene = make_scene("room", {"width": 128, "height": 128, "supersample": 1, "speed_m_per_s": 8.0})

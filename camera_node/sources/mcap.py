@@ -1,0 +1,131 @@
+"""A recorded session, replayed message by message: the bytes, poses and lenses that once arrived at an edge.
+
+Frames are captured at the intervals at which they were, to the nanosecond. Where clocks differed, each
+session of a node is shifted as a whole, by the offset it knew best."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from camera_node.config import McapConfig, SourceConfig, find_data
+from camera_node.pace import Once, Pace, Round
+from camera_node.sources import Shot, Source
+from camera_node.sources.assign import assigned
+from camera_node.sources.records import DatasetError
+from freshfield.frame import pose_and_lens
+from freshfield.geometry import Pinhole
+from freshfield.scenario import Scenario, ScenarioError
+from freshfield.session import CODEC_NAMES, SessionError
+
+if TYPE_CHECKING:
+    from freshfield.session.reader import Session, SessionFrame
+
+log = logging.getLogger("camera-node")
+
+
+class ReplaySource:
+    """One camera of a session. times_ns: of its frames since the session's first, strictly increasing."""
+
+    def __init__(
+        self,
+        camera: str,
+        session: Session,
+        frames: Sequence[SessionFrame],
+        times_ns: Sequence[int],
+        period_ns: int | None,
+    ) -> None:
+        self.camera = camera
+        self.contents: int | None = len(frames)
+        self.codec = CODEC_NAMES[frames[0].header.codec]
+        self.intrinsics: Pinhole = pose_and_lens(frames[0].header)[1]
+        usual_ns = float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 1e9
+        self.fps = Fraction(1e9 / usual_ns).limit_denominator(1001)
+        self._session, self._frames = session, frames
+        self._times, self._period = times_ns, period_ns
+
+    def pace(self, start_ns: int) -> Pace:
+        """Once from ``start_ns`` on, or over and over in step with the epoch."""
+        return Once(self._times, start_ns) if self._period is None else Round(self._times, self._period)
+
+    def content(self, tick: int) -> int:
+        return tick % len(self._frames)
+
+    def read(self, content: int) -> Shot:
+        frame = self._frames[content]
+        pose, lens = pose_and_lens(frame.header)
+        return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns)
+
+    def prepare(self, stopped: Callable[[], bool]) -> None:
+        """Nothing beyond the shots themselves can be made ahead."""
+
+    def release(self) -> None:
+        """Nothing is held between reads."""
+
+
+def open_sources(
+    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
+) -> dict[str, Source]:
+    """See ``camera_node.sources.open_sources``."""
+    config = cast(McapConfig, config)
+    path = Path(config.file).expanduser()
+    if not path.is_file():
+        path = find_data(config.file, scenario, data, key="file")
+    try:
+        from freshfield.session.reader import Session
+
+        session = Session(path)
+    except SessionError as error:
+        raise ScenarioError(f"{scenario.path}: source.file: {error}") from None
+    if session.cut is not None:
+        log.warning("%s", session.cut)
+    if not session.frames:
+        raise DatasetError(f"{path}: holds no frames of any camera")
+    times = {name: _times(frames) for name, frames in session.frames.items()}
+    first = min(t[0] for t in times.values())
+    last = max(t[-1] for t in times.values())
+    # From the last frame to the first of the next round: a usual interval.
+    gaps = [b - a for t in times.values() for a, b in pairwise(t)]
+    period = last - first + (round(float(np.median(gaps))) if gaps else 10**9)
+    names = assigned(scenario, config.assignment, cameras, list(session.frames))
+    sources: dict[str, Source] = {}
+    for camera, name in names.items():
+        frames, kept = _in_order(name, session.frames[name], times[name])
+        if len({frame.header.codec for frame in frames}) != 1 or frames[0].header.codec not in CODEC_NAMES:
+            raise DatasetError(f"{path}: {name}: its frames are not all of one known codec")
+        turn = period if config.loop == "restart" else None
+        sources[camera] = ReplaySource(camera, session, frames, [t - first for t in kept], turn)
+    return sources
+
+
+def _times(frames: Sequence[SessionFrame]) -> list[int]:
+    """When frames were captured, in ns on the edge's clock; intervals are those of the node's clock."""
+    best: dict[str, tuple[int, int]] = {}
+    for frame in frames:
+        h = frame.header
+        known = (h.clock_uncertainty_ns, h.clock_offset_ns)
+        best[h.session_id] = min(best.get(h.session_id, known), known, key=lambda pair: pair[0])
+    return [f.header.generated_ns + best[f.header.session_id][1] for f in frames]
+
+
+def _in_order(
+    name: str, frames: Sequence[SessionFrame], times_ns: Sequence[int]
+) -> tuple[list[SessionFrame], list[int]]:
+    """Frames without those that do not follow the one before: an edge would refuse them."""
+    kept: list[int] = []
+    out: list[SessionFrame] = []
+    for frame, t_ns in zip(frames, times_ns):
+        if not kept or t_ns > kept[-1]:
+            kept.append(t_ns)
+            out.append(frame)
+    if len(out) < len(frames):
+        log.warning(
+            "%s: %d frames do not follow the one before in time: left out", name, len(frames) - len(out)
+        )
+    return out, kept

@@ -1,0 +1,39 @@
+"""A session as one MCAP file: exactly what arrived at the edge, and what was decided.
+
+Topics, CAMERA being a camera's id:
+
+    /CAMERA/header       freshfield.v1.FrameHeader    the frame's header as it came over the wire
+    /CAMERA/image        foxglove.CompressedImage     its payload; jpeg, png, or zstd, which viewers lack
+    /CAMERA/pose         foxglove.PoseInFrame         camera-to-world; frame ``world``
+    /CAMERA/calibration  foxglove.CameraCalibration   when it changes; OpenCV's pixel origin
+    /tf                  foxglove.FrameTransform      the same pose: ``world`` -> CAMERA, axes as OpenCV's
+    /decisions           freshfield.Decision          JSON: an update of the field, when published
+    /scores              freshfield.Decision          JSON: the same with its fidelity, when that is known
+
+A message's log time is when it arrived at the edge, its publish time when it was captured, by the edge's
+clock. Header and image hold everything that was sent; the others say the same in terms that viewers know.
+Chunks are not compressed: payloads are already, and what was written before a cut can be had.
+
+Needs the packages mcap, mcap-protobuf-support and foxglove-schemas-protobuf (extra ``mcap``), which only
+``writer`` and ``reader`` import.
+"""
+
+from __future__ import annotations
+
+from freshfield.v1 import frames_pb2 as pb
+
+WORLD = "world"
+HEADER, IMAGE, POSE, CALIBRATION = "header", "image", "pose", "calibration"
+TRANSFORMS, DECISIONS, SCORES = "/tf", "/decisions", "/scores"
+INSTALL = "recordings need MCAP: pip install 'freshfield[mcap]'"
+
+CODEC_NAMES = {pb.CODEC_JPEG: "jpeg", pb.CODEC_PNG: "png", pb.CODEC_ZSTD: "zstd"}
+
+
+class SessionError(ValueError):
+    """A recording that cannot be written or read; the message says why and what to do."""
+
+
+def topic(camera: str, kind: str) -> str:
+    """Where a camera's messages of a kind stand."""
+    return f"/{camera}/{kind}"

@@ -1,0 +1,198 @@
+"""Reads the frames of a session, also of one that was cut short: an index first, payloads when asked for."""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+from freshfield.session import HEADER, IMAGE, INSTALL, SessionError
+from freshfield.v1 import frames_pb2 as pb
+
+try:
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from google.protobuf.message import DecodeError
+    from mcap.data_stream import ReadDataStream
+    from mcap.opcode import Opcode
+    from mcap.records import Channel, Chunk, Message
+    from mcap.stream_reader import get_chunk_data_stream
+    from mcap.writer import MCAP0_MAGIC
+except ImportError:
+    raise SessionError(INSTALL) from None
+
+_HEAD = struct.Struct("<BQ")
+# Of a chunk: times, size, checksum, and the length of the compression's name.
+_CHUNK = struct.Struct("<QQQII")
+_KEPT_CHUNKS = 4
+
+
+class _Place(NamedTuple):
+    """Where a message's record lies: in the file, or in the records of a compressed chunk at ``chunk``."""
+
+    chunk: int | None
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True)
+class SessionFrame:
+    """A frame as it came over the wire, its payload still in the file. arrived_ns: on the edge's clock."""
+
+    header: pb.FrameHeader
+    arrived_ns: int
+    place: _Place
+
+
+class Session:
+    """The frames of a recording, by camera, in the order of their arrival. Thread-safe.
+
+    messages: complete ones of all topics, counted by topic. cut: what is missing, in one line, or None: for
+    a file that was not closed, or of which chunks are damaged. Raises SessionError, OSError."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.frames: dict[str, list[SessionFrame]] = {}
+        self.messages: Counter[str] = Counter()
+        self.cut: str | None = None
+        self._channels: dict[int, str] = {}
+        self._headers: dict[str, tuple[int, int, pb.FrameHeader]] = {}
+        self._damaged = 0
+        self._file = path.open("rb")
+        self._lock = threading.Lock()
+        self._size = os.fstat(self._file.fileno()).st_size
+        self._records = lru_cache(maxsize=_KEPT_CHUNKS)(self._decompressed)
+        if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise SessionError(f"{path}: is no MCAP file")
+        end = self._read_all()
+        said = []
+        if end is not None:
+            where = f"cut short at byte {end} of {self._size}"
+            said.append(where if end < self._size else f"never closed, ends at byte {end}")
+        if self._damaged:
+            said.append(f"{self._damaged} damaged chunks left out")
+        if said:
+            self.cut = f"{path}: {', '.join(said)}: {sum(self.messages.values())} complete messages are used"
+
+    def payload(self, frame: SessionFrame) -> bytes:
+        """The payload of one of ``frames``, byte for byte. SessionError where the file has changed."""
+        body = self._body(frame.place)
+        try:
+            return bytes(CompressedImage.FromString(_message(body).data).data)
+        except (DecodeError, struct.error, EOFError) as error:
+            raise SessionError(f"{self.path}: a message cannot be read again: {error}") from None
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _body(self, place: _Place) -> bytes:
+        if place.chunk is not None:
+            return self._records(place.chunk)[place.offset : place.offset + place.size]
+        return self._at(place.offset, place.size)
+
+    def _at(self, offset: int, size: int) -> bytes:
+        with self._lock:
+            self._file.seek(offset)
+            return self._file.read(size)
+
+    # --- the index --------------------------------------------------------------------------------
+
+    def _read_all(self) -> int | None:
+        """Note every complete message; where what is complete ends, or None for a file that was closed."""
+        heads, end = self._heads()
+        # A closed file repeats its channels at the end: a damaged chunk takes only its own messages with it.
+        for wanted in (Opcode.CHANNEL, None):
+            for opcode, at, size in heads:
+                whole = at + size <= self._size
+                if opcode == Opcode.CHUNK and wanted is None:
+                    self._chunk(at, min(size, self._size - at), whole)
+                elif whole and opcode == (wanted or Opcode.MESSAGE):
+                    self._record(opcode, self._at(at, size), _Place(None, at, size))
+        return end
+
+    def _heads(self) -> tuple[list[tuple[int, int, int]], int | None]:
+        """(opcode, offset, size) of the file's records, the last of which may be cut; and where."""
+        heads: list[tuple[int, int, int]] = []
+        at = len(MCAP0_MAGIC)
+        while at + _HEAD.size <= self._size:
+            opcode, size = _HEAD.unpack(self._at(at, _HEAD.size))
+            heads.append((opcode, at + _HEAD.size, size))
+            if at + _HEAD.size + size > self._size:
+                break
+            if opcode == Opcode.FOOTER:
+                return heads, None
+            at += _HEAD.size + size
+        return heads, at
+
+    def _chunk(self, at: int, size: int, whole: bool) -> None:
+        if size < _CHUNK.size:
+            return
+        data = self._at(at, size)
+        *_, crc, name = _CHUNK.unpack_from(data)
+        compressed, begin = bool(name), _CHUNK.size + name + 8
+        if compressed and not whole:
+            return  # half of a compressed chunk is nothing
+        if not compressed and whole and crc and zlib.crc32(data[begin:]) != crc:
+            self._damaged += 1
+            return
+        if compressed:
+            try:
+                data, begin = self._records(at), 0
+            except (ValueError, RuntimeError, EOFError, struct.error, MemoryError):
+                self._damaged += 1
+                return
+        for opcode, offset, length in _framed(data, begin):
+            place = _Place(at, offset, length) if compressed else _Place(None, at + offset, length)
+            self._record(opcode, data[offset : offset + length], place)
+
+    def _decompressed(self, at: int) -> bytes:
+        """Records of the compressed chunk whose body is at ``at``."""
+        _, size = _HEAD.unpack(self._at(at - _HEAD.size, _HEAD.size))
+        chunk = Chunk.read(ReadDataStream(BytesIO(self._at(at, size))))
+        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+        return stream.read(length)
+
+    def _record(self, opcode: int, body: bytes, place: _Place) -> None:
+        if opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(body)))
+            self._channels[channel.id] = channel.topic
+        elif opcode == Opcode.MESSAGE:
+            message = _message(body)
+            name = self._channels.get(message.channel_id)
+            if name is None:
+                return
+            self.messages[name] += 1
+            camera, _, kind = name[1:].rpartition("/")
+            if kind == HEADER and camera:
+                try:
+                    header = pb.FrameHeader.FromString(message.data)
+                except DecodeError:
+                    return
+                self._headers[camera] = (message.log_time, message.publish_time, header)
+            elif kind == IMAGE and camera:
+                # The image follows its header: one whose header is missing is no frame.
+                before = self._headers.pop(camera, None)
+                if before is not None and before[:2] == (message.log_time, message.publish_time):
+                    self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], place))
+
+
+def _framed(data: bytes, at: int) -> Iterator[tuple[int, int, int]]:
+    """(opcode, offset, size) of the complete records of a chunk from ``at`` on."""
+    while at + _HEAD.size <= len(data):
+        opcode, size = _HEAD.unpack_from(data, at)
+        at += _HEAD.size
+        if at + size > len(data):
+            return
+        yield opcode, at, size
+        at += size
+
+
+def _message(body: bytes) -> Message:
+    return Message.read(ReadDataStream(BytesIO(body)), len(body))
