@@ -11,17 +11,21 @@ from pathlib import Path
 
 from freshfield import transport
 from freshfield.scenario import ScenarioError, load
+from freshfield.session import SessionError
 from freshfield.transport import TransportError
 
 DESCRIPTION = """\
 The edge of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
 
   edge-server run room --listen 127.0.0.1:7000 --page-port 8080 --out runs/room
+  edge-server run room --out runs/room --record runs/room/session.mcap
   edge-server fit ~/data/lego --field ngp --seconds 60 --holdout 8 --scale 2 --out runs/lego
   edge-server frontier --quick --out runs/frontier
   edge-server simulate room --seconds 10
   edge-server study mat --quick --out runs/study
   edge-server report runs/room
+  edge-server explain runs/room --decision 12
+  edge-server export runs/room --mesh room.ply
 """
 
 
@@ -57,16 +61,29 @@ def main(argv: Sequence[str] | None = None) -> int:
 _OFFLINE = {
     "fit": "fit a recorded data set without a network and report fidelity over time",
     "frontier": "what accuracy costs in time: sweep effort, plot fidelity against seconds",
+    "train-scheduler": "learn when and of which views to update, with real field fits as reward",
     "simulate": "a scenario's whole deployment in virtual time, repeatable bit for bit",
     "study": "the thesis's figures as commands, each with a verdict",
-    "bench": "measure this machine: field, track, options, limits, ingest, fidelity, peer",
+    "bench": "measure this machine: field, track, limits, ingest and more (bench --help)",
+    "explain": "what moved a decision of a run: part of the state, camera, region of its picture",
+    "export": "a run's mesh, splats, points, cameras and poses as files for other programs",
+    "train-detector": "train the small detector whose backbone makes the default embeddings",
+    "train-perceptual": "fit the stand-in for LPIPS to real LPIPS on our own distorted renderings",
+    "fetch-lpips": "fetch LPIPS weights with the public package and convert them to our weights folder",
+}
+# Of a command whose module is not called as it is.
+_PLACES = {
+    "fetch-lpips": "fetch_lpips",
+    "train-detector": "detector.command",
+    "train-perceptual": "detector.perceptual",
+    "train-scheduler": "train_scheduler",
 }
 
 
 def _offline(name: str, words: list[str]) -> int:
     import importlib
 
-    return importlib.import_module(f"edge_server.offline.{name}").main(words)
+    return importlib.import_module(f"edge_server.offline.{_PLACES.get(name, name)}").main(words)
 
 
 def _add_run(commands: argparse._SubParsersAction) -> None:
@@ -84,11 +101,22 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--metrics-port", type=int, metavar="PORT", help="serve Prometheus metrics on this port")
     run.add_argument("--out", type=Path, default=Path("runs/edge"), metavar="DIR", help="[%(default)s]")
     run.add_argument("--seed", type=int, help="instead of the scenario's")
-    run.add_argument("--policy", metavar="NAME[:VALUE]", help="instead of the scenario's, e.g. threshold:120")
+    run.add_argument(
+        "--policy", metavar="NAME[:VALUE]", help="not the scenario's: threshold:120, bandit:FILE"
+    )
+    run.add_argument(
+        "--learn", nargs="?", const="", metavar="REWARD[:moving]",
+        help="bandit:FILE goes on learning, by this reward [the one it was trained with]",
+    )  # fmt: skip
+    run.add_argument(
+        "--fallback", metavar="NAME[:VALUE]", help="beside what learns [the best of its training]"
+    )
     run.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (its lpips/ is found)")
     run.add_argument("--resume", type=Path, metavar="FILE", help="start from a checkpoint of an earlier run")
     run.add_argument("--checkpoint-every", type=float, metavar="S", help="write OUT/field.npz this often")
+    run.add_argument("--record", type=Path, metavar="FILE", help="write the session as MCAP, to look at or "
+                     "replay (source kind mcap)")  # fmt: skip
     run.add_argument("--seconds", type=float, metavar="S", help="end by itself after this long")
     transport.add_arguments(run)
     run.set_defaults(go=_run)
@@ -99,16 +127,16 @@ def _run(args: argparse.Namespace) -> int:
 
     from edge_server.config import PolicyConfig, read_config
     from edge_server.fidelity.lpips_weights import weights_folder
+    from edge_server.scheduler import read_policy
     from edge_server.server import EdgeServer, Options
 
     scenario = load(args.scenario, args.seed)
     config = read_config(scenario)
     if args.policy:
-        name, _, value = args.policy.partition(":")
         try:
-            config = replace(config, policy=PolicyConfig(name, float(value) if value else None))
-        except ValueError:
-            raise ScenarioError(f"--policy {args.policy}: {value!r} is not a number") from None
+            config = replace(config, policy=PolicyConfig(*read_policy(args.policy)))
+        except ValueError as error:
+            raise ScenarioError(f"--policy {error}") from None
     options = Options(
         listen=args.listen,
         out=args.out,
@@ -119,9 +147,14 @@ def _run(args: argparse.Namespace) -> int:
         lpips_folder=weights_folder(args.lpips, args.data),
         resume=args.resume,
         checkpoint_s=args.checkpoint_every,
+        learn=args.learn,
+        fallback=args.fallback,
+        record=args.record,
     )
     try:
         server = EdgeServer(scenario, config, options)
+    except SessionError as error:
+        raise ScenarioError(f"--record: {error}") from None
     except ValueError as error:  # field options, a checkpoint that does not fit: the message says what
         raise ScenarioError(f"{scenario.path}: {error}") from None
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from edge_server.scheduler import Policy, embedding_of, learnt_policy
 from freshfield.scenario import Scenario, read_section
+
+if TYPE_CHECKING:
+    from edge_server.embed import EmbeddingConfig
+    from edge_server.embed.embedder import Embedder
 
 
 @dataclass(frozen=True)
 class PolicyConfig:
     """Which views an update uses. value: the policy's one parameter (omega_ms, k, period_ms), see
-    edge_server.scheduler; None takes the policy's default."""
+    edge_server.scheduler; None takes the policy's default. name: also bandit:FILE, relative to the
+    scenario."""
 
     name: str = "all"
     value: float | None = None
@@ -39,6 +45,22 @@ class ComputeConfig:
 
 
 @dataclass(frozen=True)
+class KeyframesConfig:
+    """Earlier viewpoints of cameras that move, for ``edge_server.keyframes``. most: of each camera. apart_m,
+    apart_deg: a viewpoint is another one if it lies so far from all that are kept, or is turned so far."""
+
+    most: int = 32
+    apart_m: float = 0.03
+    apart_deg: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.most <= 1000:
+            raise ValueError(f"most: expected 1 to 1000, got {self.most}")
+        if self.apart_m < 0 or self.apart_deg < 0:
+            raise ValueError("apart_m and apart_deg cannot be negative")
+
+
+@dataclass(frozen=True)
 class EdgeConfig:
     """The edge section of a scenario.
 
@@ -51,7 +73,11 @@ class EdgeConfig:
     grace_ms: how long the first update waits for cameras that have not reported. lpips: network scored
     with, where its weights are installed; none turns it off.
     noisy_truth: held-out frames are real or noisy video, so that the bound of moving pixels follows
-    their noise.
+    their noise. metrics: further ones to score with: perceptual, the stand-in where there is no LPIPS
+    (fidelity.perceptual). embedding: an edge_server.embed.EmbeddingConfig for policies that look at what
+    cameras see; None: nothing is embedded. keyframes: earlier viewpoints of cameras that move go on
+    supervising; not given, nothing of the kind is loaded or kept. foreground: an
+    edge_server.foreground.ForegroundConfig, cuts the background out of every view; None: views stay whole.
     """
 
     field: str = "ngp"
@@ -65,6 +91,10 @@ class EdgeConfig:
     grace_ms: float = 3000.0
     lpips: str = "alex"
     noisy_truth: bool = False
+    metrics: tuple[str, ...] = ()
+    embedding: Any = None  # named here, its module would be imported whether a scenario asks for it or not
+    keyframes: KeyframesConfig | None = None
+    foreground: Any = None  # as embedding
 
     def __post_init__(self) -> None:
         if not 10.0 <= self.update_ms <= 3_600_000.0:
@@ -79,6 +109,27 @@ class EdgeConfig:
             raise ValueError("grace_ms: expected zero or more")
         if self.lpips not in ("alex", "squeeze", "none"):
             raise ValueError(f"lpips: expected alex, squeeze or none, got {self.lpips!r}")
+        if unknown := set(self.metrics) - {"perceptual"}:
+            raise ValueError(f"metrics: expected perceptual, got {', '.join(sorted(unknown))}")
+
+
+def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
+    """How frames are embedded, where the scenario or the policy asks for it: as the scenario says, else as
+    policies are taught where it says nothing. None: nobody asks, and nothing of it is imported."""
+    if config.embedding is not None or not embedding_of(policy)[0]:
+        return config.embedding
+    from edge_server.embed import EmbeddingConfig
+
+    return EmbeddingConfig()
+
+
+def open_embedder(embedding: EmbeddingConfig | None) -> Embedder | None:
+    """What embeds frames; None for None. ValueError where the model cannot be used."""
+    if embedding is None:
+        return None
+    from edge_server.embed import make_embedder
+
+    return make_embedder(embedding)
 
 
 def read_config(scenario: Scenario) -> EdgeConfig:
@@ -86,4 +137,14 @@ def read_config(scenario: Scenario) -> EdgeConfig:
     section = dict(scenario.edge)
     if section.get("compute") == "zero":
         section["compute"] = {}
-    return read_section(EdgeConfig, section, f"{scenario.path}: edge")
+    if section.get("embedding") is not None:
+        from edge_server.embed import read_embedding
+
+        section["embedding"] = read_embedding(section["embedding"], scenario.path)
+    if section.get("foreground") is not None:
+        from edge_server.foreground import read_foreground
+
+        section["foreground"] = read_foreground(section["foreground"], scenario.path)
+    config = read_section(EdgeConfig, section, f"{scenario.path}: edge")
+    name = learnt_policy(config.policy.name, scenario.path.parent)
+    return dataclasses.replace(config, policy=dataclasses.replace(config.policy, name=name))

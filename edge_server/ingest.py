@@ -72,8 +72,9 @@ class Gate:
 
 
 class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
-    """FrameStreamService of the edge. ``on_held_out`` takes held-out frames (called on the event loop: it
-    must not block). Counts are plain numbers; readers see them without a lock."""
+    """FrameStreamService of the edge. ``on_held_out`` takes held-out frames, ``on_accepted`` what was
+    accepted (called on the event loop: they must not block). Counts are plain numbers; readers see them
+    without a lock."""
 
     def __init__(
         self,
@@ -82,12 +83,14 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         held_out: Collection[str],
         ledger: Ledger,
         on_held_out: Callable[[Frame, int], None],
+        on_accepted: Callable[[pb.PushRequest, int], None] | None = None,
     ) -> None:
         self._clock = clock
         self._buffer = buffer
         self._gate = Gate(buffer.cameras, held_out)
         self._ledger = ledger
         self._on_held_out = on_held_out
+        self._on_accepted = on_accepted
         self.delivered: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()
         self.rejected_by_camera: Counter[str] = Counter()
@@ -132,6 +135,8 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
             self._buffer.put(frame, now_ns)
         self.delivered[frame.camera] += 1
         self._ledger.write(now_ns, frame.camera, frame.session, frame.sequence, "delivered")
+        if self._on_accepted is not None:
+            self._on_accepted(request, now_ns)
         self.check_ms.add((time.perf_counter() - begun) * 1e3)
         return pb.PushResponse(sequence=frame.sequence, outcome=pb.OUTCOME_ACCEPTED)
 

@@ -1,8 +1,9 @@
-"""What a run leaves behind, written as it goes: edge.json, series.jsonl, ages.jsonl.
+"""What a run leaves behind, written as it goes: edge.json, series.jsonl, ages.jsonl, poses.jsonl.
 
 edge.json is replaced atomically about twice a second (live tables read it); series.jsonl gets one line per
 publication once its scores are final; ages.jsonl samples every camera's age at a fixed rate, so that its
-mean is a time average.
+mean is a time average. poses.jsonl has a line for every view that the field learnt from and that stands
+elsewhere than its camera's last one: a rig that stands still leaves one line a camera.
 """
 
 from __future__ import annotations
@@ -12,17 +13,21 @@ import json
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from edge_server.fields import View
 from edge_server.state import Publication
 from freshfield.files import Lines, write_json
+from freshfield.geometry import Pose
 
 log = logging.getLogger(__name__)
 
 # A publication whose scores have not come after this many younger ones will not get any.
 _FINAL_AFTER = 8
+# Some 100 MB: days of an arm that never rests.
+_MOST_POSES = 500_000
 
 
 class Journal:
@@ -40,12 +45,15 @@ class Journal:
         self._lock = threading.Lock()
         self._series = Lines(out / "series.jsonl")
         self._ages = Lines(out / "ages.jsonl")
+        self._poses = Lines(out / "poses.jsonl")
+        self._posed: dict[str, Pose] = {}
+        self._poses_left = _MOST_POSES
         self._status_failed = False
 
     @property
     def lines_lost(self) -> int:
         """Lines that could not be written so far."""
-        return self._series.lost + self._ages.lost
+        return self._series.lost + self._ages.lost + self._poses.lost
 
     def published(self, publication: Publication) -> None:
         with self._lock:
@@ -70,6 +78,18 @@ class Journal:
         }
         self._ages.write(json.dumps(line))
 
+    def poses(self, views: Sequence[View]) -> None:
+        """Where the views of an update were taken from, of those cameras that have moved."""
+        for view in views:
+            pose = Pose.from_matrix(view.camera_to_world)
+            if self._posed.get(view.camera) == pose or not self._poses_left:
+                continue
+            self._posed[view.camera] = pose
+            self._poses_left -= 1
+            q, t_m = pose.quaternion, pose.translation_m
+            line = {"camera": view.camera, "ns": view.generated_ns, "q": q, "t_m": t_m}
+            self._poses.write(json.dumps(line))
+
     def write_status(self) -> None:
         """Replace edge.json; where that fails, the old one stays."""
         status = self._status()
@@ -86,6 +106,7 @@ class Journal:
                 self._write_oldest()
             self._series.close()
             self._ages.close()
+            self._poses.close()
         self.write_status()
 
     def _write_oldest(self) -> None:

@@ -12,19 +12,29 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, Queue
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from edge_server.buffer import Buffered, FrameBuffer
+from edge_server.config import KeyframesConfig
 from edge_server.fields import Budget, Field, FitReport, Renderer, View
 from edge_server.pacing import Pacing
-from edge_server.scheduler import Epoch, Plan, Policy, treatment_of
+from edge_server.scheduler import STATE_PARTS, Epoch, Plan, Policy, embedding_of, treatment_of
 from edge_server.state import Publication
 from edge_server.views import Decoder
 from freshfield.clock import Clock
+from freshfield.scenario import Scenario, ScenarioError
+
+if TYPE_CHECKING:  # loaded only where a policy was learnt, or a scenario asks for it
+    from edge_server.embed.cache import EmbeddingCache, Embeds
+    from edge_server.foreground import ForegroundConfig
+    from edge_server.foreground.foreground import Foreground
+    from edge_server.keyframes import Keyframes
+    from edge_server.scheduler.learned.state import State
 
 log = logging.getLogger(__name__)
 
@@ -57,13 +67,34 @@ class TreatmentCost:
 
 
 class Updates:
-    """Decisions and updates of one field from one buffer. Owns no thread and reads no clock."""
+    """Decisions and updates of one field from one buffer. Owns no thread and reads no clock. embedder: for
+    policies that look at what the cameras see; keyframes: earlier viewpoints of cameras that move;
+    foreground: cuts out the object. None: there are none."""
 
-    def __init__(self, buffer: FrameBuffer, policy: Policy, field: Field, start_ns: int) -> None:
+    def __init__(
+        self,
+        buffer: FrameBuffer,
+        policy: Policy,
+        field: Field,
+        start_ns: int,
+        embedder: Embeds | None = None,
+        keyframes: Keyframes | None = None,
+        foreground: Foreground | None = None,
+    ) -> None:
         self.buffer = buffer
-        self.decoder = Decoder()
+        self.decoder = Decoder(foreground)
+        self._embedder = embedder
+        self.embeddings: EmbeddingCache | None = None
+        if embedder is not None:
+            from edge_server.embed.cache import EmbeddingCache
+
+            # What is embedded and trained on is decoded once.
+            self.embeddings = EmbeddingCache(embedder, self.decoder)
+        self.expose: Callable[[Sequence[Buffered]], Sequence[Buffered]] | None = None
+        """Gives frames of the buffer their pictures and poses, where these are made late (virtual time)."""
         self.policy = policy
         self.field = field
+        self.keyframes = keyframes
         self.treatment_cost = TreatmentCost()
         self.start_ns = start_ns
         self.number = 0
@@ -74,16 +105,43 @@ class Updates:
 
     @policy.setter
     def policy(self, policy: Policy) -> None:
-        """From the next decision on. Only a policy that compares a camera's frames has the older one kept."""
+        """From the next decision on. Only a policy that compares a camera's frames has the older one kept.
+        ValueError for a policy that needs embeddings where there are none."""
+        self.check(policy)
         self._policy = policy
         treats = treatment_of(policy) is not None
         self.buffer.keep_earlier(treats)
         if not treats:
             self.decoder.forget_earlier()
 
+    def check(self, policy: Policy) -> None:
+        """ValueError where ``policy`` needs embeddings that are not computed here: there are none, or
+        another embedder's than it was taught with."""
+        wanted, whose = embedding_of(policy)
+        if not wanted:
+            return
+        if self._embedder is None:
+            raise ValueError(f"{policy.name} decides by what cameras see: it needs an edge.embedding section")
+        if wanted != self._embedder.dim or (whose and whose != self._embedder.name):
+            raise ValueError(
+                f"{policy.name} was taught with {whose or 'embeddings'} of {wanted} numbers, edge.embedding "
+                f"is {self._embedder.name} of {self._embedder.dim}"
+            )
+
     def epoch(self, now_ns: int) -> Epoch:
-        generated = {c: item.generated_ns for c, item in self.buffer.newest().items()}
-        return Epoch(now_ns, self.number, generated)
+        return self._epoch(self.buffer.newest(), now_ns)
+
+    def _epoch(self, newest: Mapping[str, Buffered], now_ns: int) -> Epoch:
+        def state(parts: Sequence[str] = STATE_PARTS) -> State:
+            from edge_server.scheduler.learned.observe import observe
+
+            seen = newest
+            if self.expose is not None:
+                seen = {item.frame.camera: item for item in self.expose(tuple(newest.values()))}
+            return observe(self.buffer.cameras, seen, now_ns, self.embeddings, parts, keep_frames=True)
+
+        generated = {c: item.generated_ns for c, item in newest.items()}
+        return Epoch(now_ns, self.number, generated, state)
 
     def plan(self, now_ns: int) -> Plan:
         return self.policy.plan(self.epoch(now_ns))
@@ -93,8 +151,7 @@ class Updates:
         if now_ns < plan.wait_until_ns:
             return None
         newest, earlier = self.buffer.newest_and_earlier()
-        epoch = Epoch(now_ns, self.number, {c: item.generated_ns for c, item in newest.items()})
-        cameras = self.policy.select(epoch, plan)
+        cameras = self.policy.select(self._epoch(newest, now_ns), plan)
         if not cameras:
             return None
         before = tuple(earlier[c] for c in cameras if c in earlier)
@@ -110,7 +167,18 @@ class Updates:
         views = self.decoder.views(selection.items)
         if not views:
             return None
-        return views, self.field.fit(self._treated(views, earlier, publishes_ns or selection.now_ns), budget)
+        treated = self._treated(views, earlier, publishes_ns or selection.now_ns)
+        if self.keyframes is None:
+            return views, self.field.fit(treated, budget)
+        report = self.field.fit(self.keyframes.with_earlier(treated), budget)
+        own = {view.camera for view in views}  # what is refused of an earlier viewpoint is no frame's matter
+        return views, replace(report, refused=tuple(c for c in report.refused if c in own))
+
+    def reset(self) -> None:
+        """Forget the scene."""
+        self.field.reset()
+        if self.keyframes is not None:
+            self.keyframes.forget()
 
     def _treated(self, views: list[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
         treatment = treatment_of(self.policy)
@@ -142,6 +210,28 @@ class Updates:
         )
         self.number += 1
         return publication
+
+
+def open_keyframes(config: KeyframesConfig | None) -> Keyframes | None:
+    """What keeps earlier viewpoints, where a scenario asks for it."""
+    if config is None:
+        return None
+    from edge_server.keyframes import Keyframes
+
+    return Keyframes(config)
+
+
+def open_foreground(config: ForegroundConfig | None, scenario: Scenario) -> Foreground | None:
+    """What cuts the background out of views, where a scenario asks for it. Raises ScenarioError."""
+    if config is None:
+        return None
+    from edge_server.foreground import ForegroundError
+    from edge_server.foreground.foreground import make_foreground
+
+    try:
+        return make_foreground(config)
+    except ForegroundError as error:
+        raise ScenarioError(f"{scenario.path}: edge.foreground: {error}") from None
 
 
 class Loop:
@@ -237,7 +327,7 @@ class Loop:
         if policy is not None:
             self._updates.policy = policy
         if reset:
-            self._updates.field.reset()
+            self._updates.reset()
             log.info("the field was reset")
         self._write_checkpoints()
         if self.paused:

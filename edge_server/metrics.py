@@ -55,6 +55,7 @@ class EdgeCollector:
             ("psnr_moving_db", scored.psnr_moving_db),
             ("ssim", scored.ssim),
             ("lpips", scored.lpips),
+            ("perceptual", scored.perceptual),
         )
         for name, value in named:
             if value is not None:

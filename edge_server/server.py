@@ -7,12 +7,13 @@ lower priority), and observers (scoring, page, metrics), which only read what wa
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import logging
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -20,16 +21,16 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from edge_server.buffer import FrameBuffer
-from edge_server.config import EdgeConfig
+from edge_server.config import EdgeConfig, embedding_for, open_embedder
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Scorer
+from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.fields import View, checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.ingest import Ingest, Recent
 from edge_server.journal import Journal
-from edge_server.loop import Loop, Updates
+from edge_server.loop import Loop, Updates, open_foreground, open_keyframes
 from edge_server.pacing import Deadline, Fixed, Pacing, choose, read_points
-from edge_server.scheduler import OFFERED, make_live_policy
+from edge_server.scheduler import BANDIT, OFFERED, Policy, decision_of, make_live_policy
 from edge_server.scoring import Scoring
 from edge_server.service import ClockService, EdgeService
 from edge_server.state import CameraView, Comparison, Controls, EdgeState, Publication, Renderer
@@ -38,6 +39,11 @@ from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
+
+if TYPE_CHECKING:  # loaded only where a policy was learnt, or a run is recorded
+    from edge_server.recorder import Recorder
+    from edge_server.scheduler.learned.lessons import Lessons
+    from edge_server.scheduler.learned.record import DecisionRecord
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +68,12 @@ class Options:
     lpips_folder: Path | None = None
     resume: Path | None = None
     checkpoint_s: float | None = None
+    learn: str | None = None
+    """A learnt policy goes on learning, by this reward (NAME or NAME:moving; empty: by the one it was trained
+    with)."""
+    fallback: str | None = None
+    """The fixed policy beside one that learns; None takes the best of its training."""
+    record: Path | None = None
 
 
 class EdgeServer:
@@ -95,15 +107,33 @@ class EdgeServer:
             if config.lpips == "none"
             else open_lpips(options.lpips_folder, config.lpips)  # type: ignore[arg-type]
         )
-        self.scoring = Scoring(scenario.held_out, Scorer(lpips, config.noisy_truth), self._scored)
-        self.ingest = Ingest(
-            self.clock, self.buffer, scenario.held_out, self.ledger, self.scoring.held_out_frame
-        )
+        scorer = Scorer(lpips, config.noisy_truth, perceptual=listed_metric(config.metrics))
+        self.scoring = Scoring(scenario.held_out, scorer, self._scored)
         try:
             policy = self._policy(config.policy.name, config.policy.value)
+            self.lessons = self._lessons(policy)
+            if self.lessons is not None:
+                policy = self.lessons.apprentice
+            self._embedding = embedding_for(config, policy)
+            embedder = open_embedder(self._embedding)
+            keyframes = open_keyframes(config.keyframes)
+            foreground = open_foreground(config.foreground, scenario)
+            self.updates = Updates(
+                self.buffer, policy, self.field, self.start_ns, embedder, keyframes, foreground
+            )
         except ValueError as error:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
-        self.updates = Updates(self.buffer, policy, self.field, self.start_ns)
+        self.recorder: Recorder | None = None
+        if options.record is not None:
+            from edge_server.recorder import Recorder  # MCAP is loaded only where something is recorded
+
+            self.recorder = Recorder(options.record, scenario.name)
+            log.info("recording to %s", self.recorder.file)
+        self.ingest = Ingest(
+            self.clock, self.buffer, scenario.held_out, self.ledger, self.scoring.held_out_frame,
+            None if self.recorder is None else self.recorder.frame,
+        )  # fmt: skip
+        self._decisions: DecisionRecord | None = None
         self.updates.number = updates
         self.loop = Loop(
             self.updates,
@@ -116,7 +146,8 @@ class EdgeServer:
         )
         self.state = EdgeState(
             scenario=scenario.name,
-            policies=OFFERED,
+            # Of what was learnt, only what the server was started with: nobody outside names files to open.
+            policies=OFFERED if policy.name in OFFERED else (policy.name, *OFFERED),
             controls=Controls(policy.name, policy.value),
             cameras=self._cameras,
             now_s=lambda: (self.clock.now_ns() - self.start_ns) / 1e9,
@@ -124,6 +155,9 @@ class EdgeServer:
             save_snapshot=self._save_snapshot,
             channel=_JsonFile(options.out / "channel.json"),
             field_name=config.field,
+            decision=lambda: decision_of(self.updates.policy),
+            embed=None if embedder is None else embedder.embed,
+            learning=self._learning,
         )
         self.journal = Journal(options.out, self.status)
 
@@ -156,12 +190,16 @@ class EdgeServer:
 
                 serve_metrics(self.state, self.ingest, self.options.page_host, self.options.metrics_port)
             self.scoring.start()
+            if self.lessons is not None:
+                self.lessons.start()
             self.loop.start()
             self._watch()
         finally:
             self._stopping.set()
             self.loop.stop()
             self.scoring.stop()
+            if self.lessons is not None:
+                self.lessons.stop()
             if page is not None:
                 page.stop()
             grpc_thread.join(5.0)
@@ -237,11 +275,33 @@ class EdgeServer:
             self.state.bounds = getattr(self.field, "bounds", None)
         self.state.publish(publication, renderer)
         self.journal.published(publication)
+        self._record_decision(publication)
+        self.journal.poses(views)
+        if self.recorder is not None:
+            self.recorder.published(publication)
         self.scoring.published(publication, renderer, views)
 
     def _scored(self, publication: Publication, comparison: Comparison | None, final: bool) -> None:
         self.state.scored(publication, comparison)
         self.journal.scored(publication, final)
+        if self.lessons is not None and final:
+            self.lessons.scored(publication.number, publication)
+        if final and self.recorder is not None:
+            self.recorder.scored(publication, self.clock.now_ns())
+
+    def _record_decision(self, publication: Publication) -> None:
+        """Keep what a learnt policy saw, so that it can be explained (edge-server explain)."""
+        decided = decision_of(self.updates.policy)
+        if decided is None or decided.number != publication.number:
+            return
+        if self._decisions is None:
+            from edge_server.scheduler.learned.record import DecisionRecord
+
+            embedding = self._embedding
+            self._decisions = DecisionRecord(
+                self.options.out, None if embedding is None else dataclasses.asdict(embedding)
+            )
+        self._decisions.write(decided)
 
     def _say(self, line: str) -> None:
         self.state.last_decision = line
@@ -249,8 +309,34 @@ class EdgeServer:
     def _policy(self, name: str, value: float | None):
         return make_live_policy(name, value, self.scenario.rng("policy", name))
 
+    def _lessons(self, policy: Policy) -> Lessons | None:
+        """What lets ``policy`` go on learning, where that was asked for. ValueError where it cannot."""
+        if self.options.learn is None:
+            return None
+        if not policy.name.startswith(BANDIT):
+            raise ValueError(f"{policy.name} cannot learn: --learn needs --policy bandit:FILE")
+        if not self.scenario.held_out:
+            raise ValueError("nothing is held out (cameras.held_out), so that there is no reward to learn by")
+        from edge_server.scheduler.learned.lessons import open_lessons
+
+        return open_lessons(
+            Path(policy.name.removeprefix(BANDIT)), self.options.learn, self.options.fallback,
+            self.scenario.rng("lessons"), self.lpips_missing, self.options.out,
+        )  # fmt: skip
+
+    def _learning(self) -> str:
+        """How learning goes, for people; empty where nobody learns, or another policy was chosen."""
+        if self.lessons is None or self.state.controls.policy != self.lessons.apprentice.name:
+            return ""
+        return self.lessons.apprentice.told()
+
     def _set_policy(self, name: str, value: float | None) -> None:
+        if name.startswith(BANDIT) and name not in self.state.policies:
+            raise ValueError(f"policy {name!r}: what was learnt is chosen at the start (--policy {name})")
         policy = self._policy(name, value)
+        if self.lessons is not None and policy.name == self.lessons.apprentice.name:
+            policy = self.lessons.apprentice  # the one that learns goes on
+        self.updates.check(policy)
         self.state.controls.policy, self.state.controls.value = policy.name, policy.value
         self.loop.use_policy(policy)
 
@@ -295,7 +381,9 @@ class EdgeServer:
             values = [v for b in list(baselines) if (v := getattr(b, name)) is not None]
             return float(np.mean(values)) if values else None
 
+        recorded = {} if self.recorder is None else {"recording": self.recorder.status()}
         return {
+            **recorded,
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "started_ns": self.start_ns,
@@ -317,6 +405,7 @@ class EdgeServer:
             ],
             "rejected": dict(self.ingest.rejected),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
+            "decisions_lost": 0 if self._decisions is None else self._decisions.lost,
             "stale_on_arrival": self.buffer.stale_on_arrival,
             "check_ms": {f"p{p}": self.ingest.check_ms.percentile(p) for p in (50, 99)},
             "updates": {
@@ -331,10 +420,12 @@ class EdgeServer:
                 "views": self.updates.treatment_cost.views,
                 "ms_per_view": self.updates.treatment_cost.ms_per_view,
             },
+            "foreground": None if (cut := self.updates.decoder.foreground) is None else cut.status(),
             "baseline": {
                 "mean_colour_db": mean("mean_colour_db"),
                 "nearest_view_db": mean("nearest_view_db"),
             },
+            "learning": None if self.lessons is None else self.lessons.apprentice.status(),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),
@@ -343,7 +434,8 @@ class EdgeServer:
                                                "omega_ms": last.omega_ms, "steps": last.steps},
             "scores": None if scored is None else {"psnr_db": scored.psnr_db, "ssim": scored.ssim,
                                                    "psnr_moving_db": scored.psnr_moving_db,
-                                                   "lpips": scored.lpips, "on": scored.scored_on},
+                                                   "lpips": scored.lpips,
+                                                   "perceptual": scored.perceptual, "on": scored.scored_on},
         }  # fmt: skip
 
     def _write_final(self) -> None:
@@ -355,6 +447,8 @@ class EdgeServer:
                     cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
             if self.state.started and not self.loop.alive:
                 self._checkpoint(self.options.out / "field.npz")
+            if self.lessons is not None:
+                self.lessons.close()
         except OSError as error:
             log.error("not everything was written at the end: %s", error)
         finally:
@@ -362,6 +456,8 @@ class EdgeServer:
             try:
                 self.ledger.close(self.clock.now_ns())
             finally:
+                if self.recorder is not None:
+                    self.recorder.close()
                 self.journal.close()
 
     def _about(self) -> dict[str, Any]:

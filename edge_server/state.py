@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from numpy.typing import NDArray
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Renderer
 from freshfield.frame import Frame
+
+if TYPE_CHECKING:  # loaded only where a policy was learnt
+    from edge_server.scheduler.learned.bandit import Decided
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class Publication:
     truth_gap_ms: float | None = None
     scored_on: str | None = None
     """Held-out camera id, or "selected" where nothing is held out (6.21-6.22)."""
+    perceptual: float | None = None
+    """The stand-in for LPIPS, where the scenario lists it (edge.metrics)."""
 
     def scored(self, score: Score) -> Publication:
         """The same publication with its fidelity."""
@@ -57,6 +63,7 @@ class Publication:
             psnr_moving_db=score.psnr_moving_db,
             ssim=score.ssim,
             lpips=score.lpips,
+            perceptual=score.perceptual,
             truth_gap_ms=score.truth_gap_ms,
             scored_on=score.camera if score.on == "held-out" else "selected",
         )
@@ -107,7 +114,13 @@ class EdgeState:
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
     """The emulator's status (channel.json) where it runs on the same machine, else None."""
+    decision: Callable[[], Decided | None] = lambda: None
+    """The newest decision of a policy that was learnt, with what it saw; None of any other policy."""
+    embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
+    """Embeds pictures as that policy does, on any thread; None where nothing is embedded."""
     field_name: str = ""
+    learning: Callable[[], str] = lambda: ""
+    """One line on a policy that learns while it is used; empty where none does."""
     started: bool = False
     bounds: NDArray[np.float64] | None = None
     """World box (2, 3) in metres of what the field represents, once known."""

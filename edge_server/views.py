@@ -7,18 +7,24 @@ camera, because a policy may well select the same frame twice.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from edge_server.buffer import Buffered
 from edge_server.fields import View
 from freshfield import payload
 from freshfield.frame import Frame
 
+if TYPE_CHECKING:
+    from edge_server.foreground.foreground import Foreground
+
 
 class Decoder:
     """Decodes buffered frames. ``undecodable`` counts damaged payloads; one that failed is remembered, so
-    that a frame that stays newest for long is counted once."""
+    that a frame that stays newest for long is counted once. foreground: cuts the background out of every
+    picture, or None."""
 
-    def __init__(self) -> None:
+    def __init__(self, foreground: Foreground | None = None) -> None:
+        self.foreground = foreground
         self._views: dict[str, tuple[Frame, View | None]] = {}
         self._earlier: dict[str, tuple[Frame, View | None]] = {}
         self.undecodable = 0
@@ -62,7 +68,10 @@ class Decoder:
         try:
             k = frame.intrinsics
             image = payload.decode(frame.payload, frame.codec, k.width, k.height)
-            view = View(frame.camera, image, frame.pose.matrix(), k, item.generated_ns)
+            weight = None
+            if self.foreground is not None:
+                image, weight = self.foreground.apply(frame.camera, image)
+            view = View(frame.camera, image, frame.pose.matrix(), k, item.generated_ns, weight)
         except payload.PayloadError:
             self.undecodable += 1
         return view

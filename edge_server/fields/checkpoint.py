@@ -1,4 +1,4 @@
-"""Fields on disk: arrays in one npz without pickle, facts in JSON inside it; written all or nothing."""
+"""Fields and schedulers on disk: arrays in one npz, no pickle, facts in JSON inside it; all or nothing."""
 
 from __future__ import annotations
 
@@ -13,37 +13,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_FORMAT = "freshfield-field-1"
+_FORMAT = "freshfield-{kind}-1"
 
 
 class CheckpointError(ValueError):
     """A checkpoint that cannot be used; the message says which file and why."""
 
 
-def save(path: Path | str, state: Mapping[str, NDArray[Any]], about: Mapping[str, Any] | None = None) -> None:
-    """Write ``Field.state()`` and a few facts about it (JSON) to ``path``.
+def save(
+    path: Path | str,
+    state: Mapping[str, NDArray[Any]],
+    about: Mapping[str, Any] | None = None,
+    kind: str = "field",
+    durable: bool = True,
+) -> None:
+    """Write ``Field.state()``, or the state of another ``kind``, and a few facts about it (JSON) to ``path``.
 
     A temporary file beside it is renamed into place, so that a crash leaves the old checkpoint or the new
-    one, never half of one. OSError where the folder cannot be written.
+    one, never half of one. durable: also a crash of the machine, which takes waiting for the disk.
+    OSError where the folder cannot be written.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    facts = json.dumps({"format": _FORMAT, "about": dict(about or {})})
+    facts = json.dumps({"format": _FORMAT.format(kind=kind), "about": dict(about or {})})
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
             np.savez(file, allow_pickle=False, __facts__=np.array(facts), **state)
-            file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
 
 
-def load(path: Path | str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def load(path: Path | str, kind: str = "field") -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """The state and the facts of a checkpoint. CheckpointError: not there, damaged, or something else."""
-    path = Path(path)
+    path, expected = Path(path), _FORMAT.format(kind=kind)
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
@@ -51,9 +59,9 @@ def load(path: Path | str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such checkpoint") from None
     except KeyError:
-        raise CheckpointError(f"{path}: an npz file, but not a field's checkpoint") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path}: an npz file, but not a {kind}'s checkpoint") from None
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"{path}: damaged or not a checkpoint ({error})") from None
-    if not isinstance(facts, dict) or facts.get("format") != _FORMAT:
-        raise CheckpointError(f"{path}: written in another format than {_FORMAT}")
+    if not isinstance(facts, dict) or facts.get("format") != expected:
+        raise CheckpointError(f"{path}: written in another format than {expected}")
     return arrays, facts["about"]

@@ -145,6 +145,7 @@ class SplatField:
             pool=self.pool,
             step=self.step,
             passes=self._looker,
+            planar=self.settings.planar,
         )
 
     def warm_up(self) -> float:
@@ -344,6 +345,8 @@ class SplatField:
             update, cams, gaussians, len(cloud), passes.projected, passes.lists.own_first,
             passes.lists.own_count, passes.sums, cloud.moments(), self._rule(progress), dropped,
         )  # fmt: skip
+        if s.planar:
+            self._lay_flat(int(picked[0]))
         lost = int(losses[:, 2].sum() + dropped.sum())
         if losses[:, 2].any():
             self._repair()
@@ -351,6 +354,17 @@ class SplatField:
         pixels = TILE * TILE * len(tasks)
         pairs = int(np.minimum(passes.lists.needed, passes.lists.pair.shape[1])[: len(picked)].sum())
         return float(losses[:, 1].sum()) / (3 * pixels), pixels, pairs, lost
+
+    def _lay_flat(self, view: int) -> None:
+        """The part of a step that is for surfaces; view: which to take normals from."""
+        from edge_server.fields.splat_planar import align, flatten
+
+        s = self.settings
+        flatten(self.cloud, s)
+        if s.align and self.step % s.align_every == 0:
+            camera = np.ascontiguousarray(self._cams[[view]])
+            self._looker.look(camera, self.cloud.gaussians(s.harmonics), [None], differentiate=False)
+            align(self.cloud, s, self._looker, self.pool, camera[0], self._views[view].intrinsics)
 
     def _count_step(self) -> None:
         """A step is made: grow and prune when it is time, after a look at every view at least."""

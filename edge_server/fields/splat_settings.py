@@ -50,6 +50,13 @@ class SplatSettings:
     changed_share: float = _option(0.25, "steps that look only at tiles that changed since the last view")
     follow: int = _option(8, "steps at the start of an update that carry along what moves; 0: none")
     reseed: float = _option(0.25, "of ``gaussians``, how many are made anew where something moved, at most")
+    flatten: float = _option(
+        0.0, "pull on each Gaussian's smallest size, in its logarithm a step, for surfaces (.02); 0: none"
+    )
+    align: float = _option(
+        0.0, "share by which Gaussians turn to the normals of the depth they show, for surfaces (.3); 0: none"
+    )
+    align_every: int = _option(5, "steps between two turns of ``align``")
     age_tau_ms: float = shared_option("age_tau_ms")
     mask_stale_ms: float = shared_option("mask_stale_ms")
     mask_grow_px_s: float = shared_option("mask_grow_px_s")
@@ -69,7 +76,8 @@ class SplatSettings:
             ("grow", 0.0, 1.0), ("prune", 0.0, 0.9), ("largest", 1e-3, 50.0), ("widest", 1e-3, 1e3),
             ("aspect", 1.0, 1e4), ("changed_share", 0.0, 1.0), ("reseed", 0.0, 1.0),
             ("rate_position", 0.0, 100.0), ("rate_scale", 0.0, 10.0), ("rate_rotation", 0.0, 10.0),
-            ("rate_opacity", 0.0, 10.0), ("rate_color", 0.0, 10.0), *TRUST_BOUNDS,
+            ("rate_opacity", 0.0, 10.0), ("rate_color", 0.0, 10.0), ("flatten", 0.0, 1.0),
+            ("align", 0.0, 1.0), ("align_every", 1, 1 << 30), *TRUST_BOUNDS,
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"splat: {name} must be in {low}..{high}, not {getattr(self, name)}")
@@ -90,6 +98,11 @@ class SplatSettings:
         for name in ("radius_m", "near_m"):
             if getattr(self, name) is not None and not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"splat: {name} must be positive, not {getattr(self, name)}")
+
+    @property
+    def planar(self) -> bool:
+        """Whether Gaussians are made to lie on surfaces, so that their planes tell the depth."""
+        return self.flatten > 0.0 or self.align > 0.0
 
 
 EFFORTS: dict[str, dict[str, Any]] = {

@@ -23,7 +23,7 @@ SOLID = 0.5  # opacity from which on a pixel shows a surface
 class SplatSnapshot:
     """Gaussians and cameras of one instant. Nothing in it is written after it is made. ahead_s: by how much
     that instant is later than the newest view. passes: buffers to render pixels with, if one thread alone
-    uses this."""
+    uses this. planar: the Gaussians are flat, so that planes tell their depth (``render_surface``)."""
 
     box: SceneBox
     gaussians: Gaussians
@@ -33,6 +33,17 @@ class SplatSnapshot:
     step: int
     ahead_s: float = 0.0
     passes: Passes | None = None
+    planar: bool = False
+
+    def render_surface(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """The picture, with the depth at which rays meet the Gaussians' planes (``splat_planar``)."""
+        from edge_server.fields.splat_planar import plane_depth  # numba compiles it where it is asked for
+
+        picture, passes = self.render(camera_to_world, intrinsics), Passes(self.pool)
+        cams = camera_rows([camera_to_world], [intrinsics], self.box)
+        passes.look(cams, self.gaussians, [None], differentiate=False)
+        depth, opacity = plane_depth(passes, self.pool, self.gaussians, cams[0], intrinsics)
+        return Rendering(picture.color, depth * np.float32(self.box.radius_m), opacity)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture a camera at this pose would take."""

@@ -35,23 +35,30 @@ options    what each optional part of a representation costs in time and gains i
 limits     what this machine allows (random reads and additions, multiply-adds), and how near each kernel gets
 ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
 fidelity   what scoring one image costs
+decide     what a decision of a learnt policy takes, embeddings aside, with 18 and with 200 cameras
+embed      ms to embed a frame, beside ONNX Runtime alone, by the shipped detectors or --model FILE; needs
+           the extra embed; not part of all
+foreground masks of lego against its alpha: IoU and ms by options, what detectors find (--model FILE: another
+           one), and dB that a field gains; needs FRESHFIELD_DATA; not part of all
 peer       seconds to 20 and 25 dB on lego and kitchen, beside nerfstudio's nerfacto where it is installed and
            the same field in plain torch; needs FRESHFIELD_DATA; not part of all
+surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
+           each stage; needs the extra surface; not part of all
 
 With --json FILE figures are written scene by scene as they are measured; at the end of a part also FILE
 with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on where it stopped.
 """
 
-PARTS = ("field", "track", "options", "limits", "ingest", "fidelity")
-# Not part of "all": needs recorded data, and patience.
-MORE = ("peer",)
+PARTS = ("field", "track", "options", "limits", "ingest", "fidelity", "decide")
+# Not part of "all": they need an extra, or recorded data and patience.
+MORE = ("embed", "foreground", "peer", "surface")
 # Parts that write each figure as it comes, and can skip what is known.
-_KEEPING = ("field", "track", "options")
+_KEEPING = ("field", "track", "options", "surface")
 # Flags that mean something to some parts only.
 _ONLY_OF = {
     "field": _KEEPING, "resume": (*PARTS, *MORE), "only": ("options",), "scene": ("track",),
     "updates": ("track",), "update_s": ("track",), "steps": ("track",), "samples": ("track",),
-    "option": ("track",),
+    "option": ("track",), "model": ("embed", "foreground"),
 }  # fmt: skip
 
 
@@ -111,11 +118,12 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME",
-        help="of field, track, options [all there are]",
+        help="of field, track, options, surface [all there are]",
     )
     add("--quick", action="store_true", help="fewer repetitions, cached kernels only")
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     add("--only", action="append", default=[], metavar="NAME", help="of options: 'exposure', ... [all]")
+    add("--model", type=Path, metavar="FILE", help="of embed, foreground: a YOLO ONNX [the shipped ones]")
     track = parser.add_argument_group("of track")
     add = track.add_argument
     add("--scene", action="append", default=[], choices=("room", "kitchen"), help="[both]")
@@ -180,6 +188,8 @@ def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: d
         }  # fmt: skip
     elif part == "options":
         more["only"] = args.only
+    elif part in ("embed", "foreground"):
+        more["model"] = args.model
     with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
         figures[part] = module.measure(args.quick, Path(folder), args.lpips, **more)
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 from camera_node.build import build_cameras, load
 from camera_node.capture import Camera
-from camera_node.config import SourceConfig, WorldConfig, source_config
+from camera_node.config import LiveConfig, SourceConfig, WorldConfig, source_config
 from camera_node.world import Scene, make_scene
 from camera_node.world.effects import NO_EFFECTS, Effects
 from channel_emu.config import channel_from_mapping
 from edge_server.buffer import FrameBuffer
-from edge_server.config import EdgeConfig, read_config
+from edge_server.config import EdgeConfig, embedding_for, open_embedder, read_config
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
-from edge_server.loop import Updates
+from edge_server.loop import Updates, open_foreground, open_keyframes
 from edge_server.offline.truth import CapturedTruth, ExactTruth
 from edge_server.offline.virtual import Terms, Truth, VirtualDeployment
 from edge_server.scheduler import make_policy
@@ -52,7 +52,13 @@ def deploy(
         field = field or _field(edge, scenario.seed)
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: edge: {error}") from None
-    updates = Updates(FrameBuffer(scenario.training), policy, field, start_ns=0)
+    try:
+        embedder = open_embedder(embedding_for(edge, policy))
+        keyframes = open_keyframes(edge.keyframes)
+        foreground = open_foreground(edge.foreground, scenario)
+        updates = Updates(FrameBuffer(scenario.training), policy, field, 0, embedder, keyframes, foreground)
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: edge: {error}") from None
     return VirtualDeployment(
         cameras or training_cameras(scenario, data),
         channel,
@@ -65,8 +71,15 @@ def deploy(
 
 
 def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camera]:
-    """The training cameras as a node would host them."""
-    return build_cameras(scenario, source_config(scenario), scenario.training, data, _CACHE_BYTES)
+    """The training cameras as a node would host them. Raises ScenarioError for real cameras, and for ones
+    that an arm carries: those keep real time."""
+    source = source_config(scenario)
+    if isinstance(source, LiveConfig) or getattr(source, "arm", None) is not None:
+        raise ScenarioError(
+            f"{scenario.path}: source: its cameras or its arm keep real time and cannot be run in virtual "
+            "time: use deploy/up.py, or camera-node and edge-server run"
+        )
+    return build_cameras(scenario, source, scenario.training, data, _CACHE_BYTES)
 
 
 def truth_of(

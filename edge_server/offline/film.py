@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.sources.formats import open_dataset
 from camera_node.sources.records import DatasetError
 from camera_node.world import make_scene
 from camera_node.world.scene import HELD_OUT
 from edge_server.fidelity.moving import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Renderer, View
-from edge_server.offline.recorded import open_dataset, split
+from edge_server.offline.recorded import split
 from freshfield.geometry import Pinhole
 
 Image = NDArray[np.uint8]

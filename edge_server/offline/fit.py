@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from camera_node.sources.formats import FORMATS
 from camera_node.sources.records import DatasetError
 from camera_node.sources.world import WORLD_FPS
 from camera_node.world import SCENES
@@ -40,12 +41,14 @@ Fit a recorded data set as fast as this machine can, and measure fidelity on vie
   edge-server fit tower --field splat --seconds 10
   edge-server fit --field splat --list-options
   edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --option samples=256
+  edge-server fit ~/data/apartment --format eyeful --holdout split
 
-DATA is a transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), the calibration JSON of a rig's videos,
-a folder with either, or one of our own scenes: room, tile, tower. What moves is fitted at one instant
-(--frame, 15 a second in a scene). Time spent on evaluation is not
-counted as fitting. Ctrl-C ends it early; report, pictures and checkpoint are written all the same, and
---resume goes on from there.
+DATA is the folder of a data set, or one of our own scenes: room, tile, tower. Its files say what it is:
+transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), videos with a calibration JSON, DyNeRF (videos
+with poses_bounds.npy), ZJU-MoCap (annots.npy), Eyeful Tower (cameras.json or .xml), a COLMAP model (text or
+binary). Name the describing file itself, or give --format, where several lie there. What moves is fitted at
+one instant (--frame, 15 a second in a scene). Time spent on evaluation is not counted as fitting. Ctrl-C
+ends it early; report, pictures and checkpoint are written all the same, and --resume goes on from there.
 """
 
 BACKGROUNDS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -70,6 +73,7 @@ class Job:
     frame: int = 0
     background: str = "white"
     seed: int = 0
+    format: str | None = None
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -78,7 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="edge-server fit", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or JSON file")
+    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
+    parser.add_argument("--format", choices=list(FORMATS), help="of the data set [what its files say]")
     parser.add_argument(
         "--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]"
     )
@@ -86,7 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
     parser.add_argument(
         "--holdout", default="8", metavar="K|NAME,...",
-        help="every K-th view, or these images or cameras; 0: none [%(default)s]",
+        help="every K-th view, or these images or cameras; split: what the data set keeps for testing; "
+        "0: none [%(default)s]",
     )  # fmt: skip
     parser.add_argument(
         "--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]"
@@ -115,13 +121,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("\n".join(f"{name:18} {text}" for name, text in known.items()))
         return 0
     if args.data is None:
-        parser.error("name a data set: a folder, or a JSON file")
+        parser.error("name a data set: a folder, or the file that describes it")
     job = Job(args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background,
-              args.seed)  # fmt: skip
-    name = str(args.data)
-    if not _is_scene(args.data):
-        name = (args.data if args.data.is_dir() else args.data.parent).resolve().name
-    out = args.out or Path("runs") / f"fit-{name}"
+              args.seed, args.format)  # fmt: skip
+    out = args.out or Path("runs") / f"fit-{_called(args.data)}"
     try:
         job.options.update(parse_options(args.option))
         run(job, out, args.lpips, args.resume)
@@ -176,9 +179,14 @@ def _is_scene(data: Path) -> bool:
     return str(data) in SCENES and not data.exists()
 
 
+def _called(data: Path) -> str:
+    """What a scene or data set is called in names of folders and reports."""
+    return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
+
+
 def _open(job: Job) -> Recorded:
     if not _is_scene(job.data):
-        return load_recorded(job.data, job.holdout, job.scale, job.frame)
+        return load_recorded(job.data, job.holdout, job.scale, job.frame, job.format)
     t_s = job.frame / WORLD_FPS
     still = synthetic(str(job.data), size=max(8, round(_SCENE_SIZE / job.scale)), t_s=t_s)
     return Recorded(job.data, still.training, still.held_out, f"at {t_s:g} s")
@@ -327,8 +335,7 @@ class _Run:
         return baseline(self.data.training, view.image, view.camera_to_world, self.background)
 
     def _name(self) -> str:
-        file = self.data.file
-        return f"fit {file if _is_scene(file) else file.resolve().parent.name}"
+        return f"fit {_called(self.job.data)}"
 
 
 def progress(at: Scored, outside: float | None) -> str:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from camera_node.sources import transforms_file, video_files
+from camera_node.sources.formats import open_dataset
 from camera_node.sources.records import Dataset, DatasetError
 from edge_server.fields import View
 
-# What nerfstudio and NeRF-synthetic call the file that a training run starts from.
-_PREFERRED = ("transforms.json", "transforms_train.json")
+# For --holdout: what the data set itself keeps for testing.
+OWN_SPLIT = "split"
 
 
 @dataclass(frozen=True)
@@ -27,45 +26,36 @@ class Recorded:
     missing: int = 0
 
 
-def load_recorded(path: Path, holdout: str = "8", scale: float = 1.0, frame: int = 0) -> Recorded:
+def load_recorded(
+    path: Path, holdout: str = "8", scale: float = 1.0, frame: int = 0, name: str | None = None
+) -> Recorded:
     """The views of a data set, images decoded, alpha kept.
 
-    path: a transforms JSON, a calibration JSON beside its videos, or a folder with either. holdout: ``8``
-    holds out every 8th view (the first, the ninth, ...), ``0`` none, else names of images or cameras with
-    commas between. scale: images are divided by it. frame: which instant of a set that moves, from 0.
+    path: the folder of a data set, or the file that describes it. holdout: ``8`` holds out every 8th view
+    (the first, the ninth, ...), ``0`` none, ``split`` those that the data set itself keeps for testing, else
+    names of images or cameras with commas between. scale: images are divided by it. frame: which instant of
+    a set that moves, from 0. name: of the format (``camera_node.sources.formats``), instead of recognising
+    it.
 
     Raises camera_node's DatasetError.
     """
-    file, dataset = open_dataset(path, scale)
+    file, dataset = open_dataset(path, scale, name)
     views, instant = _views(dataset, frame)
-    training, held_out = split(views, holdout)
+    training, held_out = split(views, holdout, dataset.held_out)
     return Recorded(file, training, held_out, instant, dataset.missing)
 
 
-def open_dataset(path: Path, scale: float) -> tuple[Path, Dataset]:
-    """The file that describes a data set, and its records. Of several in a folder, the first whose images
-    exist. Raises DatasetError."""
-    if path.is_file():
-        return path, _load(path, scale)
-    if not path.is_dir():
-        raise DatasetError(f"{path}: no such file or folder")
-    tried: list[str] = []
-    for file in _candidates(path):
-        try:
-            return file, _load(file, scale)
-        except DatasetError as error:
-            tried.append(str(error))
-    raise DatasetError(
-        tried[0]
-        if tried
-        else f"{path}: expected transforms.json, transforms_*.json or the calibration JSON of videos in it"
-    )
-
-
-def split(views: Sequence[View], holdout: str) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """(training, held out) by ``holdout`` as in ``load_recorded``. Raises DatasetError."""
+def split(
+    views: Sequence[View], holdout: str, own: Collection[str] = ()
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """(training, held out) by ``holdout`` as in ``load_recorded``. own: names of the views that the data set
+    itself holds out. Raises DatasetError."""
     every = _whole_number(holdout)
-    if every is None:
+    if holdout.strip() == OWN_SPLIT:
+        if not own:
+            raise DatasetError(f"--holdout {OWN_SPLIT}: this data set does not say what it keeps for testing")
+        out = [view.camera in own for view in views]
+    elif every is None:
         wanted = [name.strip() for name in holdout.split(",") if name.strip()]
         for name in wanted:
             if not any(_is_called(view, name) for view in views):
@@ -89,22 +79,6 @@ def _whole_number(text: str) -> int | None:
 def _is_called(view: View, name: str) -> bool:
     path = Path(view.camera)
     return name in (view.camera, path.name, path.stem)
-
-
-def _candidates(folder: Path) -> list[Path]:
-    named = [folder / name for name in _PREFERRED if (folder / name).is_file()]
-    patterns = ("transforms*.json", "calib*.json")
-    return list(dict.fromkeys([*named, *(f for p in patterns for f in sorted(folder.glob(p)))]))
-
-
-def _load(file: Path, scale: float) -> Dataset:
-    try:
-        described = json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
-    if isinstance(described, dict) and "frames" not in described:
-        return video_files.load_dataset(file, scale)
-    return transforms_file.load_dataset(file, scale, "keep")
 
 
 def _views(dataset: Dataset, frame: int) -> tuple[list[View], str]:

@@ -18,10 +18,11 @@ import numpy as np
 from camera_node.sources.records import DatasetError
 from edge_server.config import ComputeConfig, PolicyConfig, read_config
 from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
-from edge_server.fidelity.scorer import Scorer
+from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.offline.deployment import deploy
 from edge_server.offline.virtual import Terms, VirtualDeployment
 from edge_server.report.machine import versions
+from edge_server.scheduler import read_policy
 from edge_server.state import Publication
 from freshfield.files import write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
@@ -38,7 +39,7 @@ steps, and virtual time is charged for them: zero, as the thesis does, or ms a s
 (edge.compute of the scenario, or --compute; edge-server frontier measures what a machine takes). One seed,
 one result: the digest that is printed is of every publication and of the field's parameters.
 """
-_METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "aaoi_ms")
+_METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
 # Seconds of virtual time between two lines of progress.
 _TOLD_EVERY_S = 1.0
 
@@ -62,7 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         metric, missing = None, None
         if config.lpips != "none":
             metric, missing = open_lpips(lpips, cast(Network, config.lpips))
-        deployment = deploy(scenario, terms, scorer=Scorer(metric, config.noisy_truth), data=base)
+        scorer = Scorer(metric, config.noisy_truth, perceptual=listed_metric(config.metrics))
+        deployment = deploy(scenario, terms, scorer=scorer, data=base)
         _run(deployment, args.seconds, quiet=args.json)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
@@ -130,7 +132,10 @@ def show(found: dict[str, Any]) -> str:
         f"{found['policy']}{value}",
         f"  updates     {found['updates']} of {found['steps']} steps, {told}",
         f"  views       {_n(found['views'], 1)} an update",
-        "  last fifth  " + ", ".join(f"{k} {_n(v, 3)}" for k, v in found["last_fifth"].items()),
+        "  last fifth  "
+        + ", ".join(
+            f"{k} {_n(v, 3)}" for k, v in found["last_fifth"].items() if k != "perceptual" or v is not None
+        ),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]}",
     ]
@@ -155,11 +160,10 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     scenario = load(args.scenario, args.seed)
     edge = dict(scenario.edge)
     if args.policy:
-        name, _, value = args.policy.partition(":")
         try:
-            edge["policy"] = dataclasses.asdict(PolicyConfig(name, float(value) if value else None))
-        except ValueError:
-            raise ScenarioError(f"--policy {args.policy}: {value!r} is not a number") from None
+            edge["policy"] = dataclasses.asdict(PolicyConfig(*read_policy(args.policy)))
+        except ValueError as error:
+            raise ScenarioError(f"--policy {error}") from None
     if args.compute:
         edge["compute"] = dataclasses.asdict(_compute(args.compute))
     if args.out is not None:

@@ -120,6 +120,7 @@ class VirtualDeployment:
     ) -> None:
         self.clock = VirtualClock(updates.start_ns)
         self.updates = updates
+        updates.expose = self.exposed
         self.terms = terms
         self.truth = truth
         self.publications: list[Publication] = []
@@ -171,6 +172,11 @@ class VirtualDeployment:
                 self._wake = next(self._edge)
         self.clock.advance_to(end_ns)
         return self.publications[known:]
+
+    def exposed(self, items: Sequence[Buffered]) -> tuple[Buffered, ...]:
+        """Frames of the buffer with their images and poses, made now; without those that a source cannot
+        give. For who decides in the place of this deployment's own edge."""
+        return self._exposed_once(items)
 
     def frames(self) -> dict[str, Any]:
         """The books, with the terms of report.json; every captured frame is offered at once here."""

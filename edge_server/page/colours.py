@@ -22,6 +22,9 @@ UNKNOWN: RGB = (125, 131, 143)
 HELD_OUT: RGB = (158, 128, 255)
 """The truth is not part of the age scale: it is never trained on. Violet, because sky blue is the same as the
 fresh green to a tritanope."""
+FOR: RGB = (0, 114, 178)
+AGAINST: RGB = (213, 94, 0)
+"""What spoke for a decision and what against it: blue and vermillion, as in the figures."""
 # Frustums change colour in steps, so that a page at rest sends next to nothing.
 STEPS = 24
 

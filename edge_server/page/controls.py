@@ -66,7 +66,8 @@ class ControlPanel:
             self.value.label = _label(parameter)
             if self.value.value != _shown(controls.value):
                 self.value.value = _shown(controls.value)
-            self.help.content = _help(controls.policy)
+            learning = self._state.learning()
+            self.help.content = _help(controls.policy) + (note(learning) if learning else "")
             if self._paused != controls.paused:
                 self._paused = controls.paused
                 self.buttons.options = ("resume" if controls.paused else "pause", "reset", "snapshot")

@@ -5,11 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from edge_server.page.colours import FRESH_MS, HELD_OUT, RGB, STALE_MS, age_colour, css, scale_colour
+from edge_server.page.colours import (
+    AGAINST,
+    FOR,
+    FRESH_MS,
+    HELD_OUT,
+    RGB,
+    STALE_MS,
+    age_colour,
+    css,
+    scale_colour,
+)
 from edge_server.state import CameraView
 
+if TYPE_CHECKING:  # loaded only where a policy was learnt
+    from edge_server.scheduler.learned.explain import Explanation
+
+# Cameras that the explanation of a decision shows.
+CAMERAS_WHY = 6
 _DIM = "color:var(--mantine-color-dimmed)"
 _CARD = "background:rgba(128,140,160,.10);border-radius:6px"
 
@@ -142,6 +157,33 @@ def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], note_: str = "")
     return (
         '<div style="padding:.35em .9em .1em;font-size:.78em;display:flex;justify-content:space-between">'
         f"<span>{escape(title)}</span><span>{right}</span></div>"
+    )
+
+
+def why(e: Explanation) -> str:
+    """Why a learnt policy decided as it did: bars of the parts of the state and of the strongest cameras."""
+    largest = sorted(zip(e.names, e.cameras.tolist()), key=lambda pair: -abs(pair[1]))[:CAMERAS_WHY]
+    widest = max((abs(share) for share in (*e.parts.values(), *(s for _, s in largest))), default=0.0)
+    bars = "".join(_share(name, share, widest) for name, share in e.parts.items())
+    bars += f'<div style="height:.4em"></div>{"".join(_share(n, s, widest) for n, s in largest)}'
+    return (
+        f'<div style="padding:.3em .9em;font-size:.78em"><div><b>{escape(e.action)}</b> '
+        f'<span style="{_DIM}">logit {e.firmness:+.2f}, of average cameras {e.usual:+.2f}</span></div>{bars}'
+        f'<div style="{_DIM}"><span style="color:{css(FOR)}">&#9632;</span> for it '
+        f'<span style="color:{css(AGAINST)}">&#9632;</span> against it</div></div>'
+    )
+
+
+def _share(name: str, share: float, widest: float) -> str:
+    percent = 100.0 * abs(share) / widest if widest > 0 else 0.0
+    bar = (
+        f"width:{percent:.0f}%;height:.7em;border-radius:2px;background:{css(FOR if share >= 0 else AGAINST)}"
+    )
+    grid = "display:grid;grid-template-columns:6.5em 1fr 3.5em;gap:.4em;align-items:center"
+    return (
+        f'<div style="{grid}"><span style="overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
+        f'<div style="{bar}"></div>'
+        f'<span style="text-align:right;font-variant-numeric:tabular-nums">{share:+.2f}</span></div>'
     )
 
 

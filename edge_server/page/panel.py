@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
+from edge_server.page.surface import SurfaceLayer
 from edge_server.page.timelines import History, Timelines
+from edge_server.page.why import Why
 from edge_server.state import CameraView, Comparison, EdgeState, Publication
 
 MAIN_WIDTH = 372
@@ -40,6 +42,8 @@ class Panel:
         self._folder = gui.add_folder("Controls")
         with self._folder:
             self.controls = ControlPanel(server, state)
+            self.surface = SurfaceLayer(server, state)
+        self._why = Why(gui, state)
         side = gui.add_panel()
         with side.add_tab("Time lines"):
             self._timelines = Timelines(gui)
@@ -70,6 +74,7 @@ class Panel:
         if self._turn % 2:  # curves need no more than one new point a second
             self._timelines.refresh(history, publications)
         self.controls.refresh()
+        self._why.refresh()
         comparison = self._state.comparison
         if comparison is not None and comparison.number != self._pair_of:
             self._compare(comparison, publications)

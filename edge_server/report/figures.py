@@ -64,6 +64,9 @@ def draw_fidelity(report: Report, records: Records, path: Path) -> bool:
         if len(lpips[0]):
             network = found.get("lpips_network") or "network unknown"
             bottom.plot(*lpips, color=ORANGE, label=f"LPIPS-{network} (lower is better)")
+        stand_in = _points(series, "perceptual")
+        if len(stand_in[0]):
+            bottom.plot(*stand_in, color=GREY, label="perceptual, not LPIPS (lower is better)")
         bottom.set_ylim(0.0, 1.02)
         label_lines(bottom, "score", "seconds of fitting" if fit else "seconds since the edge started")
     return True

@@ -82,6 +82,8 @@ def _tiles(report: Report) -> str:
         (_n(final["ssim"], 3), "SSIM"),
         (_n(final["lpips"], 3), f"LPIPS-{network}" if network else "LPIPS"),
     ]
+    if final["perceptual"] is not None:
+        similarity.append((_n(final["perceptual"], 3), "perceptual (not LPIPS)"))
     if report["kind"] == "fit":
         return _tile_row([(_n(final["psnr_db"], 1, " dB"), "PSNR at the end"), *similarity])
     return _tile_row([
@@ -102,17 +104,18 @@ def _tile_row(tiles: list[tuple[str, str]]) -> str:
 def _fidelity_table(report: Report) -> str:
     found = report["fidelity"]
     network = f"LPIPS-{found['lpips_network']}" if found["lpips_network"] else "LPIPS"
+    metrics = {"psnr_db": 2, "psnr_moving_db": 2, "ssim": 4, "lpips": 4}
     rows = [["", "PSNR (dB)", "PSNR, moving (dB)", "SSIM", network]]
+    if found["mean"]["perceptual"] is not None:
+        metrics["perceptual"] = 4
+        rows[0].append("perceptual (not LPIPS)")
     fit = report["kind"] == "fit"
     for name, label in (("final", "at the end" if fit else "last fifth of the run"), ("mean", "whole run")):
         if fit and name == "mean":
             continue  # the mean of a learning curve says nothing
-        s = found[name]
-        rows.append(
-            [label, _n(s["psnr_db"], 2), _n(s["psnr_moving_db"], 2), _n(s["ssim"], 4), _n(s["lpips"], 4)]
-        )
+        rows.append([label, *(_n(found[name][metric], digits) for metric, digits in metrics.items())])
     for name, label in (("nearest_view_db", "nearest training view"), ("mean_colour_db", "mean colour")):
-        rows.append([label, _n(found["baseline"][name], 2), "", "", ""])
+        rows.append([label, _n(found["baseline"][name], 2), *[""] * (len(metrics) - 1)])
     said = []
     if found["scored_on"] == ["selected"]:
         said.append("No camera is held out: scored on the selected views themselves (6.21-6.22).")

@@ -15,7 +15,7 @@ from edge_server.report.machine import machine, outside_load, versions
 from edge_server.report.records import Records, Row, read_records
 from freshfield.files import write_json, write_text
 
-METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
+METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
 SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")
 # ``final`` is the mean of this last share of the run.
 FINAL_SHARE = 0.2

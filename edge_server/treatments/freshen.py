@@ -69,6 +69,8 @@ class Freshen:
         weight: NDArray[np.float32] = np.ones(unsure.shape, np.float32)
         weight[unsure] = trust
         weight[motion.moving & ~landed] *= np.float32(self.uncovered)
+        if view.weight is not None:
+            weight *= view.weight  # of where things were; what has moved since has little weight already
         return dataclasses.replace(view, image=image, weight=weight, carried_to_ns=carried_to_ns)
 
 

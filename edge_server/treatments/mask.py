@@ -48,7 +48,7 @@ class Mask:
         reach_px = min(speed_px_per_ms(before, view, changes) * age_ms, longest)
         weight: NDArray[np.float32] = np.ones(changes.changed.shape, np.float32)
         weight[dilated(changes.changed, reach_px)] = left
-        return dataclasses.replace(view, weight=weight)
+        return dataclasses.replace(view, weight=weight if view.weight is None else weight * view.weight)
 
 
 def speed_px_per_ms(before: View, view: View, changes: Changes) -> float:

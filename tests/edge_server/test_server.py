@@ -110,6 +110,7 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
     feed.start()
     until(lambda: any(p.psnr_db is not None for p in server.state.publications()))
+    until(lambda: server.scoring.baselines)  # they come after the first score
     with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics") as page:
         text = page.read().decode()
     assert 'freshfield_camera_age_seconds{camera="cam01"}' in text

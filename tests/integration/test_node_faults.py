@@ -155,7 +155,12 @@ def test_a_node_needs_no_torch_and_imports_no_effect_that_is_not_listed(tmp_path
 import sys
 from camera_node.cli import main
 code = main(["run", sys.argv[1], "--all", "--to", sys.argv[2], "--seconds", "0.5", "-q"])
-heavy = {"torch", "numba", "scipy", "edge_server", "channel_emu", "matplotlib"} & set(sys.modules)
+heavy = {
+    "torch", "numba", "scipy", "edge_server", "channel_emu", "matplotlib", "depthai", "pyrealsense2",
+    "rtde_receive", "rtde_control", "camera_node.pose.kinematics", "camera_node.pose.arm",
+    "camera_node.pose.pairing", "camera_node.pose.controller", "camera_node.sources.live",
+    "camera_node.doctor",
+} & set(sys.modules)
 world = [m for m in sys.modules if m.startswith("camera_node.world")]
 print(code, sorted(heavy), sorted(world))
 """

@@ -151,6 +151,7 @@ def test_reset_forgets_everything() -> None:
     assert before.keys() == after.keys() and all((before[k] == after[k]).all() for k in before)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("seconds", [0.3, 1.0])
 def test_a_budget_in_seconds_is_kept(trained: SplatField, seconds: float) -> None:
     report = trained.fit(SEEN, Budget(seconds=seconds))
@@ -158,6 +159,7 @@ def test_a_budget_in_seconds_is_kept(trained: SplatField, seconds: float) -> Non
     assert 0.85 * seconds <= report.seconds <= 1.1 * seconds + 0.15 and report.steps > 3
 
 
+@pytest.mark.alone
 def test_a_budget_in_seconds_is_kept_while_things_move() -> None:
     """New pictures at every update: they are taken in, judged, followed and seeded within the budget."""
     field = SplatField(SMALL)

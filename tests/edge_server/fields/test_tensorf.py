@@ -123,6 +123,7 @@ def test_reset_forgets_everything() -> None:
     assert before.keys() == after.keys() and all((before[k] == after[k]).all() for k in before)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("seconds", [0.3, 1.0])
 def test_a_budget_in_seconds_is_kept(trained: TensorfField, seconds: float) -> None:
     report = trained.fit(SEEN, Budget(seconds=seconds))

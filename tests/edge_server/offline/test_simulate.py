@@ -10,8 +10,9 @@ import pytest
 import yaml
 
 from edge_server.config import ComputeConfig, read_config
+from edge_server.offline.deployment import training_cameras
 from edge_server.offline.simulate import main
-from freshfield.scenario import ScenarioError, parse
+from freshfield.scenario import ScenarioError, load, parse
 from tests.edge_server.offline.sets import SMALL
 
 
@@ -85,3 +86,8 @@ def test_the_scenario_says_zero_or_milliseconds():
     for wrong in ("free", {"ms_per_step": -1.0}, {"seconds": 1}):
         with pytest.raises(ScenarioError, match="compute"):
             config(wrong)
+
+
+def test_an_arm_keeps_real_time():
+    with pytest.raises(ScenarioError, match=r"cell.yaml: source: .* cannot be run in virtual time"):
+        training_cameras(load("cell"))

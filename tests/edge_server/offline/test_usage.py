@@ -6,10 +6,12 @@ import os
 import time
 
 import numpy as np
+import pytest
 
 from edge_server.offline.usage import Usage, cpu_s, peak_rss_mb, rss_mb
 
 
+@pytest.mark.alone
 def test_a_busy_loop_is_counted_as_ours_and_not_as_others():
     usage = Usage("me")
     before, until = time.process_time(), time.perf_counter() + 0.5

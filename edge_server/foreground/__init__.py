@@ -1,0 +1,91 @@
+"""What the scene is about, cut out before the field sees it (thesis 4.4.3).
+
+detector -> box -> segmentation -> alpha. A detector finds the object's box, a segmentation decides within
+it, and what is background becomes transparent: the view's RGBA then asks the field for empty space there.
+Poses are untouched. A scenario asks for it with ``edge.foreground``; without that key nothing here is
+imported.
+Held-out frames are not cut: fidelity goes on being taken on whole pictures, background included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from freshfield.scenario import read_section
+
+DEFAULT, GRABCUT, BOX = "default", "grabcut", "box"
+CHOICES = ("surest", "largest")
+PROVIDERS = ("auto", "cpu", "cuda")
+Four = tuple[float, float, float, float]
+
+
+class ForegroundError(ValueError):
+    """A model or setting that cannot be used: one line saying what, where and what to do."""
+
+
+@dataclass(frozen=True)
+class ForegroundConfig:
+    """The section ``edge.foreground`` of a scenario.
+
+    detector: a YOLO detection ONNX (v8, v11), relative to the scenario, or ``default``, the small one that is
+    shipped and knows our own scenes. box: instead of a detector, [left, top, right, bottom] as shares of the
+    image; boxes: the same camera by camera. kinds: names of what may be detected; none: anything. confidence:
+    the least score. choose: of several detections the surest or the largest one. margin: added to each side
+    of a detected box, as a share of it. segment: ``grabcut``, ``box`` (all of the box), or an ONNX that gives
+    one map (n, 1, h, w) of the foreground. iterations: of grabcut. side: longest side in pixels that the
+    segmentation works at; the mask is then enlarged. threshold: of an ONNX's map. normalise: of what an ONNX
+    is given: imagenet (most of them) or unit (0 to 1). doubt: how much a pixel that is cut out within the box
+    supervises, 0 to 1, against 1 outside of it: a hole that segmentation leaves in the object contradicts all
+    other views, what it leaves unsaid does not. provider, threads: where models run.
+    """
+
+    detector: str | None = None
+    box: Four | None = None
+    boxes: dict[str, Four] = field(default_factory=dict)
+    kinds: list[str] = field(default_factory=list)
+    confidence: float = 0.25
+    choose: str = "surest"
+    margin: float = 0.05
+    segment: str = GRABCUT
+    iterations: int = 3
+    side: int = 160
+    threshold: float = 0.5
+    normalise: str = "imagenet"
+    doubt: float = 0.0
+    provider: str = "auto"
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        fixed = bool(self.boxes) or self.box is not None
+        if fixed == (self.detector is not None):
+            raise ValueError("expected either detector or box (or boxes)")
+        for name, box in {**({"box": self.box} if self.box else {}), **self.boxes}.items():
+            if not all(0.0 <= v <= 1.0 for v in box):
+                raise ValueError(f"{name}: expected left, top, right, bottom within 0 to 1, got {list(box)}")
+        ranges = {
+            "confidence": (0.0, 1.0), "margin": (0.0, 1.0), "iterations": (1, 50), "side": (16, 4096),
+            "threshold": (0.0, 1.0), "doubt": (0.0, 1.0), "threads": (1, 256),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"{name}: expected {low:g} to {high:g}, got {getattr(self, name)}")
+        for name, known in {
+            "choose": CHOICES, "provider": PROVIDERS, "normalise": ("imagenet", "unit"),
+        }.items():  # fmt: skip
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: expected {' or '.join(known)}, got {getattr(self, name)!r}")
+
+
+def read_foreground(mapping: Mapping[str, Any], scenario: Path) -> ForegroundConfig:
+    """The section ``edge.foreground`` of the file ``scenario``; raises freshfield.scenario.ScenarioError."""
+    values = dict(mapping) if isinstance(mapping, Mapping) else mapping
+    config = read_section(ForegroundConfig, values, f"{scenario}: edge.foreground")
+    beside: dict[str, Any] = {}
+    if config.detector not in (None, DEFAULT):
+        beside["detector"] = str(scenario.parent / str(config.detector))
+    if config.segment not in (GRABCUT, BOX):
+        beside["segment"] = str(scenario.parent / config.segment)
+    return ForegroundConfig(**{**vars(config), **beside})

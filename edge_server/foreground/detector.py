@@ -1,0 +1,138 @@
+"""Boxes from any YOLO detection model in ONNX (v8 and v11 heads): letterbox, run, decode, suppress."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.embed import EmbeddingError, model_path
+from edge_server.embed.backbone import MAX_FILE_BYTES, MAX_SIDE, USUAL_SIDE
+from edge_server.embed.embedder import open_session
+from edge_server.embed.letterbox import blob, checked
+from edge_server.foreground import ForegroundError
+
+Array = NDArray[np.float64]
+
+NMS_IOU = 0.6
+_TYPES: dict[str, type[np.floating]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+# Boxes that reach the suppression: what is below is no object of interest.
+_MOST = 300
+
+
+@dataclass(frozen=True)
+class Detection:
+    """box: left, top, right, bottom in pixels of the image, not clipped to it; kind: the model's name."""
+
+    box: tuple[float, float, float, float]
+    score: float
+    kind: str
+
+
+class Detector:
+    """A YOLO model at ``path`` (``default``: the one shipped). Raises ForegroundError."""
+
+    def __init__(self, path: str, provider: str = "auto", threads: int = 1) -> None:
+        file = model_path(path)
+        self.name = file.name
+        self._session = open_model(file, provider, threads)
+        image = self._session.get_inputs()[0]
+        if len(self._session.get_inputs()) != 1 or len(image.shape) != 4 or image.type not in _TYPES:
+            raise ForegroundError(f"{file}: expected a model of images (n, 3, height, width)")
+        self._input, self._dtype = image.name, _TYPES[image.type]
+        meta = self._session.get_modelmeta().custom_metadata_map
+        self.height, self.width = _size(image.shape, meta, file)
+        self.kinds = _kinds(meta)
+        self.detect(np.zeros((8, 8, 3), np.uint8), 1.0)  # what cannot run fails here, with the file's name
+
+    def detect(self, image: NDArray[np.uint8], confidence: float) -> list[Detection]:
+        """Detections in ``image`` (H, W, 3 or 4) from ``confidence`` up, the surest first, overlapping ones
+        of a kind left out. Raises ForegroundError where the model gives what no YOLO head does."""
+        whole = checked(image, 0)
+        try:
+            out = self._session.run(None, {self._input: blob([whole], self.height, self.width, self._dtype)})[
+                0
+            ]
+        except Exception as error:  # ONNX Runtime's exceptions share no base class
+            reason = " ".join(str(error).split())[:160]
+            raise ForegroundError(f"{self.name}: ONNX Runtime cannot run it: {reason}") from None
+        rows = decode(np.asarray(out), confidence, self.name)
+        h, w = whole.shape[:2]
+        # The letterbox, undone.
+        scale = min(self.height / h, self.width / w)
+        left, top = (
+            (side - max(1, round(n * scale))) // 2 for side, n in ((self.width, w), (self.height, h))
+        )
+        found = []
+        for x0, y0, x1, y1, score, kind in rows:
+            box = ((x0 - left) / scale, (y0 - top) / scale, (x1 - left) / scale, (y1 - top) / scale)
+            found.append(Detection(box, score, self.kinds.get(int(kind), str(int(kind)))))
+        return found
+
+
+def decode(output: NDArray[np.floating], confidence: float, name: str) -> list[tuple[float, ...]]:
+    """Rows (left, top, right, bottom, score, kind), the surest first, of a head's output (1, 4 + kinds,
+    cells) or (1, cells, 4 + kinds): centre, size and a score a kind, in pixels of the model. What is
+    not finite, and boxes without area, are left out."""
+    if output.ndim != 3 or len(output) != 1 or min(output.shape[1:]) < 5:
+        raise ForegroundError(
+            f"{name}: gives {output.shape}, not the boxes and scores (1, 4 + kinds, cells) of a YOLO v8 or "
+            "v11 head; export it with format=onnx and nms=False"
+        )
+    # There are more cells than numbers a cell, unless the model is tiny: our smallest gives 8 x 64.
+    table = output[0].T if output.shape[1] < output.shape[2] else output[0]
+    table = table.astype(np.float64)
+    scores, kinds = table[:, 4:].max(axis=1), table[:, 4:].argmax(axis=1)
+    sound = np.isfinite(table).all(axis=1) & (scores >= confidence) & (table[:, 2:4] > 0).all(axis=1)
+    best = np.flatnonzero(sound)
+    best = best[np.argsort(-scores[best], kind="stable")][:_MOST]
+    if not len(best):
+        return []
+    centre, size = table[best, :2], table[best, 2:4]
+    low = centre - size / 2
+    rectangles = np.concatenate([low, size], axis=1)
+    kept = cv2.dnn.NMSBoxesBatched(
+        rectangles.tolist(), scores[best].tolist(), kinds[best].tolist(), 0.0, NMS_IOU
+    )
+    rows = np.concatenate([low, low + size, scores[best, None], kinds[best, None]], axis=1)
+    return [tuple(float(v) for v in rows[k]) for k in sorted(int(i) for i in kept)]
+
+
+def open_model(file: Path, provider: str, threads: int) -> Any:
+    """A session of the ONNX model in ``file``. Raises ForegroundError."""
+    try:
+        if file.stat().st_size > MAX_FILE_BYTES:
+            raise ForegroundError(f"{file}: larger than {MAX_FILE_BYTES >> 20} MB")
+        return open_session(file.read_bytes(), provider, threads, str(file))[0]
+    except OSError as error:
+        raise ForegroundError(
+            f"{file}: cannot be read: {error.strerror}; name a model in ONNX format"
+        ) from None
+    except EmbeddingError as error:
+        raise ForegroundError(str(error)) from None
+
+
+def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]:
+    """(height, width) to feed: the input's own, else what the exporter noted, else the usual."""
+    sides = [side if isinstance(side, int) else 0 for side in shape[2:]]
+    if not all(sides):
+        try:
+            sides = [int(side) for side in ast.literal_eval(meta["imgsz"])]
+        except (KeyError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+            sides = [USUAL_SIDE, USUAL_SIDE]
+    if len(sides) != 2 or not all(1 <= side <= MAX_SIDE for side in sides):
+        raise ForegroundError(f"{file}: images of {sides} pixels are not within 1 to {MAX_SIDE} a side")
+    return sides[0], sides[1]
+
+
+def _kinds(meta: dict[str, str]) -> dict[int, str]:
+    """Names of what the model knows, as the exporter noted them; without a note there are only numbers."""
+    try:
+        return {int(k): str(v) for k, v in ast.literal_eval(meta["names"]).items()}
+    except (KeyError, ValueError, TypeError, AttributeError, SyntaxError, MemoryError, RecursionError):
+        return {}

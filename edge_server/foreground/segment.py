@@ -1,0 +1,144 @@
+"""What of a box is the object: GrabCut (Rother, Kolmogorov and Blake 2004), a given ONNX, or all of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.foreground import BOX, GRABCUT, ForegroundConfig, ForegroundError
+
+Mask = NDArray[np.bool_]
+Box = tuple[int, int, int, int]
+
+_SEED = 4403
+# Around the box, as a share of it: background for GrabCut to learn from, and context for a model.
+_AROUND = 0.15
+_USUAL_SIDE = 320
+_MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+
+
+class Segmenter(Protocol):
+    """Decides pixel by pixel within a box."""
+
+    def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
+        """(H, W) of ``image`` (H, W, 3): True is the object. box: left, top, right, bottom, whole pixels
+        within the image and with area."""
+        ...
+
+
+def make_segmenter(config: ForegroundConfig) -> Segmenter:
+    """Raises ForegroundError."""
+    if config.segment == BOX:
+        return WholeBox()
+    if config.segment == GRABCUT:
+        return GrabCut(config.iterations, config.side)
+    return SegmentModel(config)
+
+
+class WholeBox:
+    """No segmentation: what a box alone is worth."""
+
+    def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
+        """See ``Segmenter``."""
+        out = np.zeros(image.shape[:2], np.bool_)
+        out[box[1] : box[3], box[0] : box[2]] = True
+        return out
+
+
+class GrabCut:
+    """Colours inside and outside of the box as two mixtures, and the cut between them. side: of the part that
+    is looked at, the longest in pixels; what is larger is shrunk, and the mask enlarged."""
+
+    def __init__(self, iterations: int, side: int) -> None:
+        self._iterations, self._side = iterations, side
+
+    def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
+        """See ``Segmenter``. Where the box leaves no background to learn from, all of it."""
+        part, (left, top, right, bottom) = _surroundings(image.shape, box)
+        crop = image[part[1] : part[3], part[0] : part[2]]
+        h, w = crop.shape[:2]
+        scale = min(1.0, self._side / max(h, w))
+        size = (max(1, round(w * scale)), max(1, round(h * scale)))
+        small = cv2.resize(crop, size, interpolation=cv2.INTER_AREA) if scale < 1.0 else crop
+        labels = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)
+        rows = slice(int(top * scale), max(int(top * scale) + 1, int(np.ceil(bottom * scale))))
+        columns = slice(int(left * scale), max(int(left * scale) + 1, int(np.ceil(right * scale))))
+        labels[rows, columns] = cv2.GC_PR_FGD
+        out = np.zeros(image.shape[:2], np.bool_)
+        within = out[part[1] : part[3], part[0] : part[2]]
+        if (labels == cv2.GC_PR_FGD).all():
+            within[:] = True
+            return out
+        # Its mixtures begin with k-means, which draws from a generator that all of OpenCV shares.
+        cv2.setRNGSeed(_SEED)
+        inside, outside = np.zeros((1, 65)), np.zeros((1, 65))
+        picture, nowhere = np.ascontiguousarray(small), (0, 0, 1, 1)  # the labels say where, not a rectangle
+        mode = cv2.GC_INIT_WITH_MASK
+        cv2.grabCut(picture, labels, nowhere, outside, inside, self._iterations, mode)
+        found = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+        if scale < 1.0:
+            soft = cv2.resize(found.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
+            found = soft > 0.5
+        within[:] = found
+        return out
+
+
+class SegmentModel:
+    """An ONNX that is given the box with what surrounds it and gives one map of the foreground: shares, or
+    logits where values lie outside of 0 to 1 (U2-Net, IS-Net and their like). Raises ForegroundError."""
+
+    def __init__(self, config: ForegroundConfig) -> None:
+        from edge_server.foreground.detector import open_model
+
+        file = Path(config.segment)
+        self._name = file.name
+        self._session: Any = open_model(file, config.provider, config.threads)
+        image = self._session.get_inputs()[0]
+        if len(image.shape) != 4 or image.type != "tensor(float)":
+            raise ForegroundError(f"{file}: expected a model of images (1, 3, height, width), float32")
+        self._input = image.name
+        self._height, self._width = (
+            side if isinstance(side, int) else _USUAL_SIDE for side in image.shape[2:]
+        )
+        self._threshold = config.threshold
+        unit = config.normalise == "unit"
+        self._mean = np.zeros(3) if unit else _MEAN
+        self._spread = np.ones(3) if unit else _SPREAD
+        self.mask(np.zeros((8, 8, 3), np.uint8), (1, 1, 7, 7))  # what cannot run fails here
+
+    def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
+        """See ``Segmenter``; what the model finds outside of the box is not the object."""
+        part, _ = _surroundings(image.shape, box)
+        crop = image[part[1] : part[3], part[0] : part[2]]
+        fitted = cv2.resize(crop, (self._width, self._height), interpolation=cv2.INTER_LINEAR) / 255.0
+        given = ((fitted - self._mean) / self._spread).transpose(2, 0, 1)[None].astype(np.float32)
+        try:
+            found = np.asarray(self._session.run(None, {self._input: given})[0], dtype=np.float32)
+        except Exception as error:  # ONNX Runtime's exceptions share no base class
+            reason = " ".join(str(error).split())[:160]
+            raise ForegroundError(f"{self._name}: ONNX Runtime cannot run it: {reason}") from None
+        if found.size != found.shape[-1] * found.shape[-2] or found.ndim < 2:
+            raise ForegroundError(
+                f"{self._name}: gives {found.shape}, not one map (1, 1, height, width) of the foreground"
+            )
+        share: NDArray[np.floating] = found.reshape(found.shape[-2:])
+        share = np.nan_to_num(share, nan=0.0, posinf=50.0, neginf=-50.0)
+        if share.min() < 0.0 or share.max() > 1.0:
+            share = 1.0 / (1.0 + np.exp(-np.clip(share, -50.0, 50.0)))
+        out = np.zeros(image.shape[:2], np.bool_)
+        size = (crop.shape[1], crop.shape[0])
+        wanted = cv2.resize(share, size, interpolation=cv2.INTER_LINEAR) > self._threshold
+        out[part[1] : part[3], part[0] : part[2]] = wanted
+        return out & WholeBox().mask(image, box)
+
+
+def _surroundings(shape: tuple[int, ...], box: Box) -> tuple[Box, Box]:
+    """(the box with what surrounds it, in the image; the box within that)."""
+    left, top, right, bottom = box
+    dx, dy = (max(2, round(_AROUND * side)) for side in (right - left, bottom - top))
+    part = max(0, left - dx), max(0, top - dy), min(shape[1], right + dx), min(shape[0], bottom + dy)
+    return part, (left - part[0], top - part[1], right - part[0], bottom - part[1])

@@ -1,0 +1,90 @@
+"""The mesh on the page: made of what was published last when somebody asks, beside everything else."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any
+
+import viser
+
+from edge_server.state import EdgeState
+
+log = logging.getLogger(__name__)
+
+NODE = "/field/mesh"
+VOXELS = 160  # along the longest side: a browser takes the triangles in a second or two
+MEMORY_MB = 512.0
+NOTICE_S = 10.0
+
+
+class SurfaceLayer:
+    """A button in the present GUI container that shows a mesh of the field, and hides it again.
+
+    The work is done by a thread of its own, one mesh at a time, from an immutable snapshot: neither the loop
+    nor other visitors wait for it. Nothing of it is imported before the first press.
+    """
+
+    def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
+        self._server, self._state = server, state
+        self._lock = threading.Lock()
+        self._node: Any = None
+        self._thread: threading.Thread | None = None
+        self.button: Any = server.gui.add_button(
+            "show mesh", hint="The surface of the field as it is now, from the depth that its cameras see."
+        )
+        self.button.on_click(self._pressed)
+
+    def _pressed(self, event: Any) -> None:
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                return  # it is being made
+            if self._node is not None:
+                self._node.remove()
+                self._node = None
+                self.button.label = "show mesh"
+                return
+            self.button.label, self.button.disabled = "making the mesh ...", True
+            self._thread = threading.Thread(
+                target=self._make, args=(event.client,), name="page-mesh", daemon=True
+            )
+            self._thread.start()
+
+    def _make(self, client: Any) -> None:
+        label = "show mesh"
+        try:
+            self._node = self._shown()
+            label = "hide mesh"
+        except Exception as error:  # whatever goes wrong is the visitor's to know, never the page's end
+            log.info("page: no mesh: %s", error)
+            if client is not None:
+                client.add_notification(
+                    "No mesh", str(error) or type(error).__name__, auto_close_seconds=NOTICE_S, color="red"
+                )
+        finally:
+            self.button.label, self.button.disabled = label, False
+
+    def _shown(self) -> Any:
+        import numpy as np
+        import trimesh
+
+        from edge_server.surface import SurfaceError
+        from edge_server.surface.reconstruct import MeshSettings, grid_for, maps_of, mesh_of_maps
+
+        renderer = self._state.renderer
+        views = getattr(renderer, "cameras", ())
+        if renderer is None or not views:
+            raise SurfaceError("the field has not been trained yet")
+        # The depth as the field has it: what moves is in no two pictures alike.
+        settings = MeshSettings(sharpen=False, memory_mb=MEMORY_MB)
+        maps = maps_of(renderer, views, settings)
+        grid = grid_for(maps, settings)
+        span = float(np.subtract(grid.upper, grid.lower).max())
+        settings = MeshSettings(
+            sharpen=False, memory_mb=MEMORY_MB, voxel_m=max(grid.voxel_m, span / VOXELS),
+            bounds=(grid.lower, grid.upper),
+        )  # fmt: skip
+        mesh = mesh_of_maps(maps, settings)
+        return self._server.scene.add_mesh_trimesh(
+            NODE, trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.color, process=False)
+        )

@@ -1,0 +1,101 @@
+"""Pictures whose foreground is known, and small ONNX models made for the test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def disc(
+    height: int = 96, width: int = 128, centre: tuple[int, int] = (50, 70), radius: int = 22, seed: int = 0
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """(picture (H, W, 3), truth (H, W)): an orange disc on a noisy blue ground; centre is (row, column)."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    truth = (y - centre[0]) ** 2 + (x - centre[1]) ** 2 <= radius**2
+    picture = np.where(truth[..., None], (230, 120, 20), (40, 70, 160)) + rng.normal(0, 8, (height, width, 3))
+    return picture.clip(0, 255).astype(np.uint8), truth
+
+
+def iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def box_of(truth: NDArray[np.bool_], margin: int = 3) -> tuple[float, float, float, float]:
+    """Left, top, right, bottom as shares of the picture, ``margin`` pixels around what is true."""
+    h, w = truth.shape
+    rows, columns = np.flatnonzero(truth.any(1)), np.flatnonzero(truth.any(0))
+    left, top = columns[0] - margin, rows[0] - margin
+    right, bottom = columns[-1] + 1 + margin, rows[-1] + 1 + margin
+    return max(left / w, 0.0), max(top / h, 0.0), min(right / w, 1.0), min(bottom / h, 1.0)
+
+
+def save_orange_detector(path: Path, kinds: int = 3, side: int = 64, transposed: bool = False) -> Path:
+    """An ONNX with a YOLO head's output: one cell a pixel of an 8 x 8 grid, of which those on orange score,
+    with boxes of 40 pixels around them."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    grid = 8
+    step = side // grid
+    centres = (np.arange(grid) + 0.5) * step
+    x, y = np.meshgrid(centres, centres)
+    boxes = np.stack([x.ravel(), y.ravel(), np.full(grid * grid, 40.0), np.full(grid * grid, 40.0)])
+    # Orange: much red, little blue. Score of kind 1; the others get none.
+    weight = np.array([1.0, 0.0, -1.0], np.float32).reshape(1, 3, 1, 1)
+    nodes = [
+        helper.make_node("AveragePool", ["images"], ["pooled"], kernel_shape=[step] * 2, strides=[step] * 2),
+        helper.make_node("Conv", ["pooled", "weight"], ["orange"]),
+        helper.make_node("Relu", ["orange"], ["score"]),
+        helper.make_node("Reshape", ["score", "flat"], ["row"]),
+        helper.make_node("Mul", ["row", "spread"], ["scores"]),
+        helper.make_node("Concat", ["boxes", "scores"], ["table"], axis=1),
+        helper.make_node("Transpose", ["table"], ["output0"], perm=[0, 2, 1])
+        if transposed
+        else helper.make_node("Identity", ["table"], ["output0"]),
+    ]
+    spread = np.zeros((1, kinds, 1), np.float32)
+    spread[0, 1] = 1.0
+    constants = {
+        "weight": weight,
+        "flat": np.array([1, 1, grid * grid], np.int64),
+        "spread": spread,
+        "boxes": boxes[None].astype(np.float32),
+    }
+    shape = [1, grid * grid, 4 + kinds] if transposed else [1, 4 + kinds, grid * grid]
+    graph = helper.make_graph(
+        nodes,
+        "orange",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, side, side])],
+        [helper.make_tensor_value_info("output0", TensorProto.FLOAT, shape)],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    names = {k: name for k, name in enumerate(["apple", "orange", "pear"][:kinds])}
+    helper.set_model_props(model, {"names": str(names)})
+    onnx.save(model, str(path))
+    return path
+
+
+def save_orange_segmenter(path: Path, logits: bool = False) -> Path:
+    """An ONNX that maps red minus blue to a share of foreground, or to logits."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    gain = 20.0 if logits else 1.0
+    weight = (gain * np.array([1.0, 0.0, -1.0], np.float32)).reshape(1, 3, 1, 1)
+    nodes = [helper.make_node("Conv", ["images", "weight"], ["map" if logits else "raw"])]
+    if not logits:
+        nodes.append(helper.make_node("Sigmoid", ["raw"], ["map"]))
+    graph = helper.make_graph(
+        nodes,
+        "segment",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 64, 64])],
+        [helper.make_tensor_value_info("map", TensorProto.FLOAT, [1, 1, 64, 64])],
+        [numpy_helper.from_array(weight, "weight")],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    onnx.save(model, str(path))
+    return path

@@ -1,0 +1,74 @@
+"""The mesh on the page: made when asked for, hidden again, and a reason where there is none."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import viser
+
+from edge_server.fields import View
+from edge_server.page.surface import NODE, SurfaceLayer
+from tests.edge_server.page.test_page import bare_state, publication
+from tests.edge_server.surface.shapes import LENS, BallRenderer, around
+
+
+class Client:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, str]] = []
+
+    def add_notification(self, title: str, body: str, **more) -> None:
+        self.told.append((title, body))
+
+
+@pytest.fixture
+def server():
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    yield server
+    server.stop()
+
+
+def press(layer: SurfaceLayer, client: Client) -> None:
+    layer._pressed(SimpleNamespace(client=client))
+    end = time.monotonic() + 60
+    while layer.button.disabled:
+        assert time.monotonic() < end, "the mesh was not finished"
+        time.sleep(0.02)
+
+
+def test_a_mesh_comes_and_goes(server):
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    state, client = bare_state(), Client()
+    picture = np.zeros((64, 64, 3), np.uint8)
+    cameras = tuple(View(f"cam{k}", picture, pose, LENS) for k, pose in enumerate(around(10)))
+    state.publish(publication(0), BallRenderer(cameras))
+    layer = SurfaceLayer(server, state)
+    press(layer, client)
+    assert client.told == [] and layer.button.label == "hide mesh"
+    assert layer._node is not None and layer._node.name == NODE
+    press(layer, client)
+    assert layer._node is None and layer.button.label == "show mesh"
+
+
+def test_a_field_that_has_seen_nothing_has_no_mesh(server):
+    client = Client()
+    layer = SurfaceLayer(server, bare_state())
+    press(layer, client)
+    assert client.told == [("No mesh", "the field has not been trained yet")]
+    assert layer.button.label == "show mesh" and layer._node is None
+
+
+def test_nothing_of_it_is_loaded_before_it_is_asked_for():
+    code = (
+        "import sys, edge_server.page, edge_server.server\n"
+        "loaded = [m for m in sys.modules if m.startswith(('edge_server.surface', 'skimage'))"
+        " or m == 'edge_server.fields.splat_planar']\n"
+        "assert not loaded, loaded"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -1,0 +1,118 @@
+"""Earlier viewpoints of cameras that move."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from edge_server.buffer import FrameBuffer
+from edge_server.config import EdgeConfig, KeyframesConfig
+from edge_server.fields import Budget, View
+from edge_server.keyframes import Keyframes
+from edge_server.loop import Updates, open_keyframes
+from edge_server.scheduler import make_policy
+from freshfield.geometry import Pinhole, Pose, look_at
+from tests.edge_server.fields_for_tests import tiny_field
+from tests.edge_server.frames import frame
+
+LENS = Pinhole.from_fov(8, 8, 60.0)
+
+
+def view(camera, degrees, t_ms, radius_m=1.0, value=0):
+    a = np.deg2rad(degrees)
+    pose = look_at([radius_m * np.sin(a), -radius_m * np.cos(a), 0.5], [0, 0, 0])
+    return View(camera, np.full((8, 8, 3), value, np.uint8), pose, LENS, t_ms * 1_000_000)
+
+
+def names(views):
+    return [v.camera for v in views]
+
+
+def test_a_camera_that_stands_still_has_no_earlier_viewpoints():
+    kept = Keyframes(KeyframesConfig())
+    for t_ms in range(5):
+        assert names(kept.with_earlier([view("still", 0, t_ms)])) == ["still"]
+
+
+def test_earlier_viewpoints_follow_the_newest_view_and_are_as_they_were():
+    kept = Keyframes(KeyframesConfig(apart_m=0.1))
+    first, second = view("hand", 0, 0, value=1), view("hand", 20, 1, value=2)
+    kept.with_earlier([first])
+    given = kept.with_earlier([second, view("still", 0, 1)])
+    assert given[0] is second and names(given) == ["hand", "still", "hand#0"]
+    earlier = given[2]
+    assert earlier.image is first.image and earlier.generated_ns == 0
+    assert np.array_equal(earlier.camera_to_world, first.camera_to_world)
+    # The same objects come again, so that a field need not look at them again.
+    assert kept.with_earlier([second])[1] is earlier
+
+
+def test_a_place_seen_again_is_seen_anew():
+    kept = Keyframes(KeyframesConfig(apart_m=0.1, apart_deg=8.0))
+    for t_ms, degrees in enumerate((0, 20, 2)):  # the third is where the first was
+        given = kept.with_earlier([view("hand", degrees, t_ms, value=t_ms)])
+    assert names(given) == ["hand", "hand#1"] and len(kept) == 2
+    given = kept.with_earlier([view("hand", 40, 3)])
+    assert [v.image[0, 0, 0] for v in given[1:]] == [2, 1]
+
+
+def test_turning_and_another_lens_make_another_viewpoint():
+    kept = Keyframes(KeyframesConfig(apart_m=10.0, apart_deg=5.0))
+    kept.with_earlier([view("hand", 0, 0)])
+    assert len(kept.with_earlier([view("hand", 30, 1)])) == 2
+    zoomed = View("hand", np.zeros((8, 8, 3), np.uint8), view("", 30, 0).camera_to_world,
+                  Pinhole.from_fov(8, 8, 30.0), 2_000_000)  # fmt: skip
+    assert len(kept.with_earlier([zoomed])) == 3
+
+
+def test_the_oldest_gives_way():
+    kept = Keyframes(KeyframesConfig(most=3, apart_m=0.01))
+    for t_ms in range(10):
+        given = kept.with_earlier([view("hand", 15 * t_ms, t_ms)])
+        assert len(kept) == min(3, t_ms + 1)
+    assert sorted(v.generated_ns for v in given) == [7_000_000, 8_000_000, 9_000_000]
+    kept.forget()
+    assert len(kept.with_earlier([view("hand", 0, 11)])) == 1
+
+
+def test_updates_hand_them_to_the_field_and_report_frames_only():
+    policy = make_policy("all", None, np.random.default_rng(0))
+    u = Updates(FrameBuffer(["hand"]), policy, tiny_field(), 0, Keyframes(KeyframesConfig()))
+    given, fit, reset = [], u.field.fit, u.field.reset
+
+    def watched(views, budget):
+        given.append(names(views))
+        return dataclasses.replace(fit(views, budget), refused=("hand#0", "hand"))
+
+    u.field.fit = watched
+    u.field.reset = lambda: given.append("reset") or reset()
+    for k in range(3):
+        assert names(_update(u, k)) == ["hand"]
+    assert given == [["hand"], ["hand", "hand#0"], ["hand", "hand#0", "hand#1"]]
+    u.reset()
+    _update(u, 3)
+    assert given[-2:] == ["reset", ["hand"]]
+
+
+def _update(u, k):
+    pose = Pose.from_matrix(view("", 30 * k, 0, radius_m=2.0).camera_to_world)
+    u.buffer.put(frame("hand", sequence=k, generated_ns=k * 10**9, pose=pose), k * 10**9)
+    views, report = u.fit(u.select(u.plan(k * 10**9), k * 10**9), Budget(steps=1))
+    assert report.refused == ("hand",)  # what is refused of an earlier viewpoint is no frame's matter
+    return views
+
+
+def test_without_the_key_nothing_of_it_is_loaded():
+    assert open_keyframes(EdgeConfig().keyframes) is None
+    code = "import sys, edge_server.loop, edge_server.server; print('edge_server.keyframes' in sys.modules)"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
+
+
+@pytest.mark.parametrize("wrong", [{"most": 0}, {"apart_m": -1.0}, {"apart_deg": -1.0}])
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"most|negative"):
+        KeyframesConfig(**wrong)

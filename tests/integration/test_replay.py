@@ -1,0 +1,251 @@
+"""From a node to an edge that records, and from the recording through a node: the same, each message."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import sys
+import threading
+from itertools import pairwise
+from pathlib import Path
+from subprocess import run
+
+import numpy as np
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.config import source_config
+from camera_node.node import Node, NodeOptions
+from edge_server.buffer import FrameBuffer
+from edge_server.config import read_config
+from edge_server.ingest import Ingest
+from edge_server.recorder import Recorder
+from edge_server.server import EdgeServer, Options
+from freshfield import payload
+from freshfield.clock import WallClock
+from freshfield.frame import Frame, to_request
+from freshfield.geometry import Pinhole, Pose
+from freshfield.ledger import Ledger
+from freshfield.scenario import ScenarioError, parse
+from freshfield.transport import Transport
+from freshfield.v1 import frames_pb2 as pb
+from tests.camera_node.photos import photo_scenario, write_photos
+from tests.edge_server.fields_for_tests import TINY
+from tests.integration.peer import Peer
+from tests.ports import free_port
+
+pytest.importorskip("mcap", reason="MCAP is not installed (extra mcap)")
+
+from freshfield.session.reader import Session
+from freshfield.session.writer import SessionWriter
+
+EDGE = {"field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"}
+
+
+CAMERAS = {"count": 3, "held_out": ["cam00"]}
+
+
+def replay_scenario(file: Path, **source):
+    section = {"kind": "mcap", "file": str(file), **source}
+    return parse({"name": "replay", "seed": 3, "cameras": CAMERAS, "source": section}, file.parent / "r.yaml")
+
+
+def node_of(scenario, to: str, cameras=None, seconds: float | None = None) -> Node:
+    built = build_cameras(scenario, source_config(scenario), cameras or scenario.cameras)
+    return Node(scenario, built, NodeOptions(to=to, transport=Transport(), seconds=seconds))
+
+
+def sent_by(
+    scenario, cameras=None, seconds: float | None = None, take=None, after_s: float = 0.0
+) -> list[pb.PushRequest]:
+    """What a node sends until it ends by itself (or after some seconds); ``take`` answers, after a while."""
+    got: list[pb.PushRequest] = []
+
+    async def respond(request: pb.PushRequest) -> pb.PushResponse:
+        got.append(request)
+        await asyncio.sleep(after_s)
+        if take is not None:
+            return take(request)
+        return pb.PushResponse(sequence=request.header.sequence, outcome=pb.OUTCOME_ACCEPTED)
+
+    async def scene() -> None:
+        peer = await Peer(respond=respond).start()
+        await asyncio.wait_for(node_of(scenario, peer.address, cameras, seconds).run(), 20)
+        await peer.stop()
+
+    asyncio.run(scene())
+    return got
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A node's session, recorded at the edge's door: the file, and what was sent."""
+    folder = tmp_path_factory.mktemp("session")
+    recorder = Recorder(folder / "a.mcap", "test")
+    ingest = Ingest(
+        WallClock(), FrameBuffer(("cam01", "cam02")), ["cam00"], Ledger(folder, "edge", "edge", 1),
+        lambda frame, now_ns: None, recorder.frame,
+    )  # fmt: skip
+    scenario = photo_scenario(write_photos(folder / "data", 24), 3, fps=25)
+    sent = sent_by(scenario, seconds=1.5, take=ingest.take)
+    recorder.close()
+    assert not ingest.rejected and recorder.dropped == 0
+    return folder / "a.mcap", sent
+
+
+def said(request: pb.PushRequest) -> tuple:
+    """Everything of a message that a replay repeats: pose and lens to the bit."""
+    h = request.header
+    parts = [part.SerializeToString(deterministic=True) for part in (h.pose, h.intrinsics)]
+    return (*parts, h.codec, h.width, h.height, h.role, h.pose_gap_ns, request.payload)
+
+
+def test_everything_that_was_accepted_is_recorded(session):
+    file, sent = session
+    found = Session(file)
+    assert found.cut is None and len(sent) > 60
+    for camera in ("cam00", "cam01", "cam02"):
+        mine = [r for r in sent if r.header.camera_id == camera]
+        assert [f.header for f in found.frames[camera]] == [r.header for r in mine]
+        assert [found.payload(f) for f in found.frames[camera]] == [r.payload for r in mine]
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.05], ids=["quick answers", "answers slower than frames"])
+def test_replay_is_exact_to_the_message(session, after_s):
+    file, sent = session
+    got = sent_by(replay_scenario(file), after_s=after_s)
+    shifts = set()
+    for camera in ("cam00", "cam01", "cam02"):
+        before, after = ([r for r in rows if r.header.camera_id == camera] for rows in (sent, got))
+        assert [said(r) for r in after] == [said(r) for r in before]
+        assert [r.header.sequence for r in after] == list(range(len(before)))
+        shifts |= {b.header.generated_ns - a.header.generated_ns for a, b in zip(before, after)}
+    assert len(shifts) == 1, "all cameras share the node's clock: every stamp is shifted by the same"
+
+
+def test_a_cut_recording_replays_what_is_whole(session, tmp_path, caplog):
+    file, sent = session
+    data = file.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 3])
+    with caplog.at_level(logging.WARNING):
+        got = sent_by(replay_scenario(tmp_path / "cut.mcap"))
+    assert "cut short at byte" in caplog.text and "complete messages are used" in caplog.text
+    part = Session(tmp_path / "cut.mcap")
+    for camera, frames in part.frames.items():
+        before, after = ([r for r in rows if r.header.camera_id == camera] for rows in (sent, got))
+        assert [said(r) for r in after] == [said(r) for r in before[: len(frames)]]
+    assert 10 < len(got) < len(sent)
+
+
+def test_a_replay_goes_round_in_step_with_the_clock(session):
+    file, sent = session
+    got = sent_by(replay_scenario(file, loop="restart"), ["cam01"], seconds=3.5)
+    mine = [r for r in sent if r.header.camera_id == "cam01"]
+    begin = min(r.header.generated_ns for r in sent)
+    places = {r.header.generated_ns - begin: k for k, r in enumerate(mine)}
+    span = max(r.header.generated_ns for r in sent) - begin
+    assert len(got) > len(mine), "more than one round"
+    # The next round begins a usual interval after the last frame.
+    gaps = sorted(b - a for a, b in pairwise(places))
+    period = next(p for g in gaps for p in (span + g,) if got[0].header.generated_ns % p in places)
+    for request in got:
+        place = places[request.header.generated_ns % period]
+        assert said(request) == said(mine[place])
+    assert all(b.header.generated_ns > a.header.generated_ns for a, b in pairwise(got))
+
+
+def test_cameras_may_be_renamed_or_wrong(session, tmp_path):
+    file, _ = session
+    scenario = replay_scenario(file, assignment={"cam00": "cam00", "cam01": "cam02", "cam02": "cam01"})
+    (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+    recorded = Session(file)
+    assert camera.capture(0).payload == recorded.payload(recorded.frames["cam02"][0])
+    with pytest.raises(ScenarioError, match=r"no camera 'nobody'.*cam00"):
+        build_cameras(s := replay_scenario(file, assignment={"cam01": "nobody"}), source_config(s), ["cam01"])
+    with pytest.raises(ScenarioError, match=r"source\.file: .*does not exist"):
+        build_cameras(s := replay_scenario(tmp_path / "no.mcap"), source_config(s), ["cam01"])
+    (tmp_path / "text.mcap").write_text("no recording")
+    with pytest.raises(ScenarioError, match=r"source\.file: .*is no MCAP file"):
+        build_cameras(s := replay_scenario(tmp_path / "text.mcap"), source_config(s), ["cam01"])
+    SessionWriter(tmp_path / "empty.mcap", {}).close({})
+    with pytest.raises(ValueError, match="holds no frames"):
+        build_cameras(s := replay_scenario(tmp_path / "empty.mcap"), source_config(s), ["cam01"])
+    with pytest.raises(ScenarioError, match="replayed as it was"):
+        source_config(replay_scenario(file, effects={"sensor_noise": None}))
+
+
+def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
+    pose = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    data = payload.encode(np.zeros((24, 32, 3), np.uint8))
+    writer = SessionWriter(tmp_path / "a.mcap", {})
+    lens = Pinhole(32, 24, 40.0, 40.0, 16.0, 12.0)
+    for session, sequence, at_ms in (("a", 0, 1000), ("a", 1, 2000), ("b", 0, 1500), ("b", 1, 3000)):
+        at_ns = at_ms * 1_000_000
+        frame = Frame("cam01", session, sequence, at_ns, pose, lens, "jpeg", data)
+        writer.frame(to_request(frame), at_ns + 5)
+    writer.close({})
+    scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam01": "cam01", "cam02": "y"})
+    with caplog.at_level(logging.WARNING):
+        (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+    assert "cam01: 1 frames do not follow the one before in time" in caplog.text
+    pace = camera.pace(7)
+    assert [pace.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and pace.after(2, 0) == (None, 0)
+
+
+@pytest.mark.slow
+def test_a_whole_edge_server_records_what_it_decides(session, tmp_path):
+    """Decisions, and their scores when these are known, beside the frames they were made on."""
+    file, _ = session
+    port = free_port()
+    top = {"name": "edge", "seed": 3, "cameras": CAMERAS, "edge": EDGE}
+    edge = parse(top, tmp_path / "e.yaml")
+    options = Options(f"127.0.0.1:{port}", tmp_path / "out", record=tmp_path / "b.mcap")
+    server = EdgeServer(edge, read_config(edge), options)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+
+    async def scene() -> None:
+        node = node_of(replay_scenario(file, loop="restart"), f"127.0.0.1:{port}")
+        running = asyncio.ensure_future(node.run())
+        async with asyncio.timeout(90):
+            while not any(p.psnr_db is not None for p in server.state.publications()):
+                await asyncio.sleep(0.1)
+        node.stop()
+        await running
+
+    try:
+        asyncio.run(scene())
+    finally:
+        server.stop()
+        thread.join(30)
+    status = json.loads((tmp_path / "out/edge.json").read_text())
+    found = Session(tmp_path / "b.mcap")
+    assert found.cut is None
+    assert status["recording"] == {
+        "file": "b.mcap", "written": found.messages.total(), "dropped": 0, "failed": False
+    }  # fmt: skip
+    delivered = {c["camera"]: c["delivered"] for c in status["cameras"]}
+    assert {camera: len(frames) for camera, frames in found.frames.items()} == delivered
+    assert found.messages["/decisions"] == status["updates"]["count"]
+    assert 0 < found.messages["/scores"] <= found.messages["/decisions"]
+
+
+def test_what_to_install_is_said(tmp_path):
+    plan = tmp_path / "r.yaml"
+    plan.write_text(f"cameras: {{count: 2}}\nsource: {{kind: mcap, file: {tmp_path / 'a.mcap'}}}\n")
+    (tmp_path / "a.mcap").write_bytes(b"never read")
+    record = ["run", str(plan), "--record", str(tmp_path / "b.mcap"), "--out", str(tmp_path / "out")]
+    replay = ["run", str(plan), "--all", "--to", "127.0.0.1:1"]
+    for command, words in (("edge_server.cli", record), ("camera_node.cli", replay)):
+        code = (
+            f"import sys; sys.modules['mcap'] = None\nfrom {command} import main\nsys.exit(main({words!r}))"
+        )
+        ended = run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert ended.returncode == 2
+        assert ended.stderr.splitlines()[-1].endswith("recordings need MCAP: pip install 'freshfield[mcap]'")
+
+
+def test_nothing_is_loaded_where_nothing_is_recorded():
+    code = "import sys, edge_server.server, edge_server.cli, camera_node.build; print('mcap' in sys.modules)"
+    assert run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

@@ -1,0 +1,85 @@
+"""What the edge exports, the node's own readers read back: every pixel, every point where it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from camera_node.pose.rig import read_tum
+from camera_node.sources.formats import open_dataset
+from edge_server.export import Shot
+from edge_server.export.colmap import Cloud, write_model
+from edge_server.export.source import write_images
+from edge_server.export.trajectory import write_tum
+from edge_server.export.transforms import write_transforms
+from edge_server.offline.recorded import load_recorded
+from freshfield.geometry import Pinhole, Pose, se3_inverse
+from tests.camera_node import sets
+
+BENT = Pinhole(64, 48, 60.0, 61.0, 31.2, 24.9, (-0.08, 0.02, 0.002, -0.003))
+NEAR_PX = 0.01
+
+
+def shots() -> list[Shot]:
+    """One picture a camera, half of the lenses bent."""
+    straight, bent = sets.rig(3), sets.rig(3, BENT)
+    cameras = [straight[0], bent[1], straight[2], bent[0]]
+    return [Shot(f"view{k}", c.shows(0), c.camera_to_world, c.lens) for k, c in enumerate(cameras)]
+
+
+def pixels(camera_to_world: np.ndarray, lens: Pinhole, points: np.ndarray = sets.POINTS) -> np.ndarray:
+    inverse = se3_inverse(camera_to_world)
+    return lens.project(points @ inverse[:3, :3].T + inverse[:3, 3])
+
+
+@pytest.mark.parametrize("form", ["colmap text", "colmap binary", "transforms"])
+def test_exports_read_back_to_the_pixel(tmp_path, form):
+    of = shots()
+    write_images(tmp_path / "images", of)
+    if form == "transforms":
+        write_transforms(tmp_path, of)
+    else:
+        cloud = Cloud(sets.POINTS, np.zeros((200, 3), np.uint8), np.ones((200, len(of)), np.bool_))
+        write_model(tmp_path / "sparse/0", of, cloud, binary=form.endswith("binary"))
+    _, dataset = open_dataset(tmp_path)
+    assert len(dataset) == len(of)
+    for shot, record in zip(of, dataset):
+        assert record.intrinsics == shot.intrinsics
+        there, back = (
+            pixels(shot.camera_to_world, shot.intrinsics),
+            pixels(record.camera_to_world, record.intrinsics),
+        )
+        assert np.abs(there - back).max() < NEAR_PX
+        np.testing.assert_array_equal(record.read(), shot.image)
+
+
+def test_a_colmap_model_is_what_fit_starts_from(tmp_path):
+    of = shots()
+    write_images(tmp_path / "images", of)
+    write_model(
+        tmp_path / "sparse/0", of, Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 4), bool))
+    )
+    found = load_recorded(tmp_path, holdout="view1")
+    assert [v.camera for v in found.training] == ["view0.png", "view2.png", "view3.png"]
+    assert [v.camera for v in found.held_out] == ["view1.png"] and found.held_out[0].intrinsics == BENT
+
+
+def test_the_sets_own_split_can_be_held_out(tmp_path):
+    sets.write_eyeful(tmp_path, sets.rig(3))
+    found = load_recorded(tmp_path, holdout="split", name="eyeful")
+    assert {v.camera for v in found.held_out} == {"10/10_DSC0000", "10/10_DSC0001"}
+    assert len(found.training) == 4
+    sets.write_colmap(tmp_path / "c", sets.rig(3), "PINHOLE", True)
+    with pytest.raises(ValueError, match="does not say what it keeps for testing"):
+        load_recorded(tmp_path / "c", holdout="split")
+
+
+def test_trajectories_are_read_to_the_nanosecond(tmp_path):
+    poses = [Pose.from_matrix(c.camera_to_world) for c in sets.rig(3)]
+    write_tum(tmp_path / "path.tum", [(1_000_000_000 * k + 123, pose) for k, pose in enumerate(poses)])
+    track = read_tum(tmp_path / "path.tum", False, 0)
+    for k, pose in enumerate(poses):
+        paired = track.at(1_000_000_000 * k + 123)
+        assert paired.gap_ns == 0
+        lens = sets.rig(1)[0].lens
+        assert np.abs(pixels(paired.pose.matrix(), lens) - pixels(pose.matrix(), lens)).max() < NEAR_PX

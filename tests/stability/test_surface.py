@@ -1,0 +1,152 @@
+"""Surfaces from depth that is empty, noisy, contradictory or no number: bounded errors, never NaN."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.surface import SurfaceError
+from edge_server.surface.depth import DepthMap, depth_map, rendered
+from edge_server.surface.mesh import cleaned, extracted
+from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
+from edge_server.surface.sharpen import sharpened
+from edge_server.surface.volume import Grid, bounds_of, fused
+from tests.edge_server.surface.shapes import LENS, RADIUS_M, BallRenderer, around, ball_depth, ball_maps
+
+skimage = pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+
+GRID = Grid((-0.13,) * 3, (0.13,) * 3, 0.005, 0.02)
+RNG = np.random.default_rng(11)
+GREY = np.full((64, 64, 3), 90, np.uint8)
+
+
+def with_depth(found: DepthMap, depth: np.ndarray) -> DepthMap:
+    return depth_map(depth.astype(np.float32), found.color, found.camera_to_world, found.intrinsics)
+
+
+def radii(maps, **settings) -> np.ndarray:
+    mesh = mesh_of_maps(maps, MeshSettings(voxel_m=0.005, bounds=(GRID.lower, GRID.upper), **settings))
+    assert np.isfinite(mesh.vertices).all()
+    return np.linalg.norm(mesh.vertices, axis=1)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, -np.inf, 1e30, 1e-30])
+def test_depth_that_is_nothing_gives_no_surface_and_says_so(value):
+    maps = [with_depth(m, np.full((64, 64), value)) for m in ball_maps(3)]
+    volume = fused(GRID, maps)
+    for array in (volume.blocks.distance, volume.blocks.weight, volume.blocks.color):
+        assert np.isfinite(array).all()
+    with pytest.raises(SurfaceError, match="no surface"):
+        extracted(volume)
+    if not any(m.seen.any() for m in maps):
+        with pytest.raises(SurfaceError, match="no camera sees anything solid"):
+            bounds_of(maps, 0.01)
+
+
+def test_no_maps_at_all():
+    with pytest.raises(SurfaceError, match="no surface"):
+        extracted(fused(GRID, []))
+
+
+def test_noise_averages_out():
+    quiet = ball_maps(30)
+    noisy = [with_depth(m, m.depth + RNG.normal(0, 0.002, m.depth.shape)) for m in quiet]
+    found = radii(noisy, steepest_deg=70.0)
+    # 2 mm of noise a pixel; a voxel hears of some dozens of them.
+    assert abs(np.median(found) - RADIUS_M) < 0.001
+    assert np.percentile(np.abs(found - RADIUS_M), 90) < 0.003
+
+
+def test_one_camera_that_contradicts_all_others_is_outvoted():
+    maps = ball_maps(30)
+    liar = with_depth(maps[7], np.where(maps[7].seen, maps[7].depth - 0.06, maps[7].depth))
+    found = radii([*maps[:7], liar, *maps[8:]], min_weight=0.2)
+    assert np.percentile(np.abs(found - RADIUS_M), 99) < 0.004
+
+
+def test_cameras_that_agree_on_nothing_stay_within_bounds():
+    maps = [with_depth(m, RNG.uniform(0.2, 0.6, m.depth.shape)) for m in ball_maps(12)]
+    volume = fused(GRID, maps)
+    assert np.abs(volume.blocks.distance).max() <= GRID.band_m + 1e-6  # (3.8)
+    assert np.isfinite(volume.blocks.color).all()
+
+
+def test_single_pixels_of_nonsense_do_not_spread():
+    maps = []
+    for m in ball_maps(20):
+        depth = m.depth.copy()
+        depth[RNG.random(depth.shape) < 0.05] = RNG.choice([np.nan, -3.0, 0.0, 1e20])
+        maps.append(with_depth(m, depth))
+    assert np.percentile(np.abs(radii(maps) - RADIUS_M), 95) < 0.003
+
+
+def test_a_million_equal_maps_would_not_overflow():
+    """Weights add up (3.10): the mean must hold when one more says nothing new."""
+    one = ball_maps(1)
+    volume = fused(GRID, one)
+    heavy = volume.blocks._replace(weight=volume.blocks.weight * 1e6)
+    before = heavy.distance.copy()
+    from edge_server.fields.kernels.pool import shared_pool
+    from edge_server.surface.kernels.fuse import fuse
+    from edge_server.surface.volume import as_look
+
+    shared_pool().run(fuse, heavy, as_look(one[0]), GRID.voxel_m, GRID.band_m)
+    known = volume.blocks.weight > 0
+    np.testing.assert_allclose(heavy.distance[known], before[known], atol=1e-6)
+
+
+def test_a_camera_within_the_surface_and_one_behind_it():
+    inside = np.eye(4)
+    inside[:3, 3] = (0.0, 0.0, 0.05)
+    look = depth_map(np.full((64, 64), 0.04, np.float32), GREY, inside, LENS)
+    volume = fused(GRID, [look, *ball_maps(8)])
+    assert np.isfinite(volume.blocks.distance).all()
+
+
+def test_a_renderer_that_has_diverged():
+    class Diverged(BallRenderer):
+        def render(self, camera_to_world, intrinsics):
+            good = super().render(camera_to_world, intrinsics)
+            return replace(good, depth=good.depth * np.nan, opacity=good.opacity * np.nan)
+
+    maps = list(rendered(Diverged(), [(pose, LENS) for pose in around(3)]))
+    assert not any(m.seen.any() or m.trust.any() for m in maps)
+
+
+@pytest.mark.parametrize("level", [0, 90, 255])
+def test_pictures_without_texture_leave_depth_where_it_was(level):
+    maps = ball_maps(8)
+    flat = [np.full((64, 64, 3), level, np.uint8)] * 8
+    found = sharpened(maps, flat)
+    for before, after in zip(maps, found):
+        both = before.seen & after.seen
+        assert both.sum() > 0.8 * before.seen.sum()
+        assert np.abs(after.depth[both] - before.depth[both]).max() < 0.004
+        assert after.trust[both].max() < 0.1  # a flat picture says nothing
+
+
+def test_pictures_of_noise_do_not_make_a_surface_anywhere_else():
+    maps = ball_maps(8)
+    noise = [RNG.integers(0, 255, (64, 64, 3), dtype=np.uint8) for _ in maps]
+    found = sharpened(maps, noise)
+    for before, after in zip(maps, found):
+        both = before.seen & after.seen
+        assert np.isfinite(after.depth[both]).all()
+        # Of the depth, all passes together may search no farther than this.
+        assert (np.abs(after.depth / np.where(both, before.depth, 1) - 1)[both] < 0.14).all()
+
+
+def test_cameras_that_see_nothing_in_common_are_left_as_they_are():
+    pose = around(1)[0]
+    alone = [depth_map(ball_depth(LENS, pose), GREY, pose, LENS)]
+    (found,) = sharpened(alone, [GREY])
+    assert found.seen.sum() > 0.8 * alone[0].seen.sum()
+    np.testing.assert_array_equal(found.depth[found.seen], alone[0].depth[found.seen])
+
+
+def test_a_volume_of_one_block():
+    tiny = Grid((0.09, -0.02, -0.02), (0.11, 0.02, 0.02), 0.005, 0.01)
+    mesh = cleaned(extracted(fused(tiny, ball_maps(20))))
+    assert len(mesh.faces) and np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS_M).max() < 0.003

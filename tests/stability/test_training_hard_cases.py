@@ -1,0 +1,98 @@
+"""Training where hardly anything works: nothing arrives, nothing moves, pictures are damaged, one camera.
+Rewards that cannot be had teach nothing, everything stays finite, and it goes on learning afterwards."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_server.offline.training.choosing import choices, named
+from edge_server.offline.training.contest import hold, rivals, rows
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.setting import Setting, seeds
+from edge_server.offline.training.trainer import Course, read_log, train
+from edge_server.scheduler.learned.rewards import Reward, make_reward
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
+from tests.edge_server.offline.training.small import NOTHING, scenario, setting
+
+REWARD = make_reward("set", distance=0.0)
+SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)
+WAIT = Spec("wait", StateLayout(("age",)), (0.0, 50.0, 150.0), hidden=8)
+NEVER = {"faults": {"loss": {"probability": 1.0}}}
+
+
+def course(spec: Spec = SELECT, reward: Reward = REWARD, **more) -> Course:
+    return Course(spec, reward, **{"episodes": 6, "batch": 3, **more})
+
+
+def weights_after(what: Setting, taught: Course, out: Path) -> dict[str, np.ndarray]:
+    with Crew(NOTHING) as crew:
+        found = train(what, taught, crew, out, lambda line: None).actor.weights
+    assert all(np.isfinite(w).all() for w in found.values())
+    return found
+
+
+@pytest.mark.parametrize(("spec", "scratch"), [(SELECT, True), (WAIT, False)], ids=["select", "wait, warm"])
+def test_where_nothing_ever_arrives_nothing_is_learnt(spec, scratch, tmp_path):
+    silent = setting(NEVER, scratch=scratch)
+    found = weights_after(silent, course(spec), tmp_path)
+    assert all(row["reward"] is None and row["dropped"] == row["fits"] for row in read_log(tmp_path))
+    other = weights_after(silent, dataclasses.replace(course(spec), episodes=3), tmp_path / "shorter")
+    assert all(np.array_equal(w, other[name]) for name, w in found.items())
+    with Crew(NOTHING) as crew:
+        contest = hold(silent, crew, seeds(0, "test", 2), rivals((50.0,), ["threshold"], ("random",)), REWARD)
+    assert all(np.isnan(row["reward"]) for row in rows(contest))
+
+
+def test_a_still_scene_has_no_moving_pixels_and_says_so_by_its_missing_rewards(tmp_path):
+    still = setting()
+    source = {**still.scenario.source, "speed_m_per_s": 0.0}
+    still = dataclasses.replace(still, scenario=dataclasses.replace(still.scenario, source=source))
+    weights_after(still, course(reward=make_reward("set", fidelity="moving", distance=0.0)), tmp_path)
+    assert all(row["reward"] is None and row["psnr_db"] is not None for row in read_log(tmp_path))
+    weights_after(still, course(), tmp_path / "whole")
+    assert all(row["reward"] is not None for row in read_log(tmp_path / "whole"))
+
+
+def test_damaged_late_and_doubled_frames(tmp_path):
+    channel = {
+        "preset": "ch6",
+        "faults": {"corruption": {"probability": 0.3}, "duplication": {"probability": 0.3},
+                   "blackout": {"windows_ms": [[0.0, 1000.0]]}},
+    }  # fmt: skip
+    weights_after(setting(channel), course(WAIT), tmp_path)
+    assert all(row["reward"] is not None for row in read_log(tmp_path))
+
+
+def test_one_camera_that_reports_and_one_that_rewards(tmp_path):
+    alone = Setting(
+        scenario(cameras={"count": 2, "held_out": ["cam00"]}),
+        steps=3,
+        decisions=2,
+        lead_ms=800.0,
+        span_ms=400.0,
+    )
+    weights_after(alone, course(tries=2), tmp_path)
+    # There is one set, so that no try is better than another.
+    assert all(row["views"] == 1.0 for row in read_log(tmp_path))
+
+
+def test_a_constant_reward_teaches_nothing_and_harms_nothing(tmp_path):
+    constant = Reward("constant", 0.0, 0.0, 0.0, age=1e-300)
+    before = weights_after(setting(), course(reward=constant, episodes=3), tmp_path / "a")
+    after = weights_after(setting(), course(reward=constant, episodes=12), tmp_path / "b")
+    assert max(np.abs(after[n] - w).max() for n, w in before.items()) < 0.1
+
+
+def test_a_decision_of_nobody_is_an_outcome_without_scores():
+    with Crew(NOTHING) as crew:
+        silent = setting(NEVER)
+        moments = crew.draw(silent, [3])[0]
+        for name in ("all", "threshold:50", "wait:50", "random", "freshen"):
+            chosen = choices(named(name), moments)
+            found = crew.evaluate(silent, [(m.seed, m.number, c) for m, c in zip(moments, chosen)])
+            assert all(o.psnr_db is None and o.views == 0.0 and np.isfinite(o.wait_ms) for o in found)
