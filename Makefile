@@ -42,11 +42,20 @@ BROWSER := $(firstword $(shell command -v chromium chromium-browser google-chrom
 help:  ## what there is to make
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(firstword $(MAKEFILE_LIST)) | expand -t 22
 
-demo: .venv/.ok-run  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
+# An arm's client library, where the scenario (a file, or the name of a shipped one) has an arm.
+ARM := $(if $(shell grep -ls '^ *arm:' $(SCENARIO) deploy/scenarios/$(SCENARIO).yaml),.venv/.ok-arm)
+
+demo: .venv/.ok-run $(ARM)  ## run a scenario: SCENARIO=FILE FOR=60s OUT=runs/demo PORT=8080 DATA=FOLDER
 	@$(PY) deploy/up.py $(SCENARIO) --for $(FOR) --out $(OUT) --port $(PORT) $(if $(DATA),--data $(DATA))
 
+# Two passes: what only computes on all cores, then what meets clocks and ports. 5: nothing was selected.
+CHOSEN = ($(SELECT))$(if $(BROWSER),, and not browser)
 test: .venv/.ok-test  ## all tests but the slow ones (the browser's too, where there is one)
-	$(PY) -m pytest -m "($(SELECT))$(if $(BROWSER),, and not browser)" $(PYTEST)
+	@echo "tests that compute, side by side"; $(PY) -m pytest -n logical --dist worksteal \
+	  -m "$(CHOSEN) and side_by_side" $(PYTEST); first=$$?; \
+	echo "tests that need the machine to themselves"; $(PY) -m pytest \
+	  -m "$(CHOSEN) and not side_by_side" $(PYTEST); second=$$?; \
+	for code in $$first $$second; do [ $$code = 0 ] || [ $$code = 5 ] || exit $$code; done
 
 lint: .venv/.ok-test  ## ruff: rules and format
 	$(PY) -m ruff check .
@@ -104,7 +113,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@touch $@
 
 .venv/.ok-edge: .venv/.ok-torch .venv/.ok-numba
-	@$(INSTALL) -e '.[edge,up]'
+	@$(INSTALL) -e '.[edge,embed,up]'
 	@touch $@
 
 # The field's kernels are compiled at their first use, which takes most of a minute: better beside the
@@ -119,12 +128,17 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@$(MAKE) --no-print-directory -j2 .venv/.ok-edge .venv/.ok-kernels
 	@touch $@
 
-.venv/.ok-test: .venv/.ok-run pyproject.toml
-	@echo "test tools"
-	@$(INSTALL) -e '.[edge,up,test,dev]'
+.venv/.ok-arm: .venv/.ok-run
+	@$(INSTALL) -e '.[ur]'
 	@touch $@
 
-# What slow tests need besides: Ray, some 240 MB.
+.venv/.ok-test: .venv/.ok-run pyproject.toml
+	@echo "test tools"
+	@$(INSTALL) -e '.[edge,embed,up,test,dev]'
+	@touch $@
+
+# What slow tests need besides: Ray, some 240 MB; gymnasium and Stable-Baselines3, the oracle of our own PPO;
+# scikit-image and pycolmap for surfaces; and what tests of cameras and arms skip without, 200 MB.
 .venv/.ok-slow: .venv/.ok-test
-	@$(INSTALL) -e '.[cluster]'
+	@$(INSTALL) -e '.[cluster,gym,oracle,surface,colmap,ur,oak,realsense,kinematics,teleop,mcap]'
 	@touch $@

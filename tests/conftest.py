@@ -15,6 +15,27 @@ settings.load_profile("freshfield")
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# What computes, in virtual time or none: whoever runs beside it changes nothing but how long it takes. All
+# else meets clocks, ports or whole deployments and has the machine to itself.
+_SIDE_BY_SIDE = (
+    "camera_node/calibrate", "camera_node/world", "edge_server/embed", "edge_server/export",
+    "edge_server/fidelity", "edge_server/fields", "edge_server/offline", "edge_server/report",
+    "edge_server/scheduler", "edge_server/surface", "edge_server/treatments", "stability",
+    *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
+    *(f"channel_emu/test_{name}.py" for name in (
+        "accuracy", "chain", "chain_statistics", "closed_forms", "config", "faults", "fit", "link", "server",
+        "simulate", "traffic", "uniforms",
+    )),
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    tests = ROOT / "tests"
+    for item in items:
+        apart = any(item.path.is_relative_to(tests / place) for place in _SIDE_BY_SIDE)
+        if apart and item.get_closest_marker("alone") is None:
+            item.add_marker("side_by_side")
+
 
 @pytest.fixture(autouse=True)
 def _same_priority() -> Iterator[None]:

@@ -26,6 +26,24 @@ def test_fidelity(tmp_path, capsys):
     assert "256.ssim_ms" in capsys.readouterr().out
 
 
+def test_embed(tmp_path, capsys, monkeypatch):
+    for name in ("onnxruntime", "onnx"):
+        pytest.importorskip(name, reason="the extra embed is not installed")
+    from edge_server.offline import bench_embed
+
+    monkeypatch.setattr(bench_embed, "BATCHES", (1, 3))
+    model = bench_embed.MODELS / "detector_int8.onnx"
+    found = bench("embed", tmp_path / "bench.json", "--model", str(model))
+    assert set(found) == {"threads", "repeats", "detector_int8"}
+    for size in ("128", "320"):
+        for n in ("1", "3"):
+            row = found["detector_int8"][size][n]
+            assert min(row["ratio"], row["embed_ms"], row["runtime_ms"], row["camera_ms"]) > 0.0
+    assert "| detector_int8 | 320 | 3 | " in capsys.readouterr().out
+    assert edge_server(["bench", "embed", "--quick", "--model", str(tmp_path / "no.onnx")]) == 1
+    assert "no.onnx: no such file" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_field(tmp_path, monkeypatch):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)

@@ -411,6 +411,7 @@ def test_faults_leave_the_estimates_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_a_live_recording_is_fitted_to_the_channel_that_made_it(tmp_path: Path) -> None:
     """Some seconds on the wall clock: cameras, emulator and the edge's ingest; only the trace is known."""
     section = {**FAST, "chain": {"mu1_per_ms": 1 / 400, "mu2_per_ms": 1 / 400}}

@@ -26,7 +26,7 @@ def same(a: LinkRun, b: LinkRun) -> None:
 
 
 CHANNELS = [
-    *({"preset": p} for p in ("ideal", "ch5", "ch6", "ch6-high", "ch6-low", "ch6-slow")),
+    *({"preset": p} for p in ("ideal", "ch5", "ch6", "ch6-high", "ch6-low", "ch6-slow", "swing")),
     *({"preset": "ch6", "discipline": d, "service_state": s}
       for d in DISCIPLINES for s in ("at-start", "modulated")),
     *({"preset": "ch6", "discipline": d, "queue_limit": 2, "chain": {"scope": "per-camera"}}
