@@ -81,7 +81,7 @@ def test_the_oldest_gives_way():
 
 def test_updates_hand_them_to_the_field_and_report_frames_only():
     policy = make_policy("all", None, np.random.default_rng(0))
-    u = Updates(FrameBuffer(["hand"]), policy, tiny_field(), 0, Keyframes(KeyframesConfig()))
+    u = Updates(FrameBuffer(["hand"]), policy, tiny_field(), 0, keyframes=Keyframes(KeyframesConfig()))
     given, fit, reset = [], u.field.fit, u.field.reset
 
     def watched(views, budget):
