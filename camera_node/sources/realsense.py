@@ -110,10 +110,10 @@ class RealsenseFeed:
 
 
 class Stamps:
-    """A frame's stamp as nanoseconds of our clock."""
+    """A frame's stamp as nanoseconds of our clock. utc: the host's, which the library stamps by."""
 
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
+    def __init__(self, clock: Clock, utc: Callable[[], int] = time.time_ns) -> None:
+        self._clock, self._utc = clock, utc
         self._device = ArrivalClock()
 
     def captured_ns(self, frame: Any) -> int:
@@ -122,7 +122,7 @@ class Stamps:
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6)
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return self._device.ours_ns(stamp_ns, now_ns)
-        return now_ns - (time.time_ns() - stamp_ns)
+        return now_ns - (self._utc() - stamp_ns)
 
 
 def taken(frame: Any, stamps: Stamps) -> tuple[int, Image]:

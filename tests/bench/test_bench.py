@@ -130,7 +130,8 @@ def test_a_field_that_does_not_exist_is_refused(capsys):
 def test_limits(tmp_path):
     found = bench("limits", tmp_path / "bench.json")
     limits = found["machine"]
-    assert all(limits[f"reads_{size}mb_m_per_s"] > 0.0 for size in (1, 64)) and limits["gemm_g_per_s"] > 0.0
+    assert limits["reads_1mb_m_per_s"] > limits["reads_64mb_m_per_s"] > 0.0
+    assert limits["gemm_g_per_s"] > 1.0
     for scene in ("tile", "room"):
         kernels = found[scene]["kernels"]
         assert sum(k["share"] for k in kernels.values()) == pytest.approx(

@@ -168,10 +168,9 @@ def test_a_budget_in_seconds_is_kept_while_things_move() -> None:
     spent = []
     for t_ms in range(100, 1000, 100):
         report = field.fit(_ball_at(t_ms), Budget(seconds=0.3))
-        assert report.seconds >= 0.85 * 0.3 and report.steps >= 1
-        spent.append((report.seconds, report.steps))
-    seconds, steps = np.median(spent, axis=0)  # the machine may hold one up
-    assert seconds <= 1.1 * 0.3 and steps > 3
+        assert report.seconds >= 0.85 * 0.3 and report.steps > 3
+        spent.append(report.seconds)
+    assert np.median(spent) <= 1.1 * 0.3
 
 
 def test_a_snapshot_does_not_change_while_the_field_trains(trained: SplatField) -> None:
