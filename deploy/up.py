@@ -1,6 +1,7 @@
 """Starts every process of one scenario on this machine, watches them, and writes the report at the end.
 
     python deploy/up.py SCENARIO [--for 60s] [--out DIR] [--port 8080] [--data DIR] [--seed N]
+                                 [--policy NAME[:VALUE]] [--learn [REWARD]]
 
 It only starts the three commands that are also run by hand on separate machines: camera-node, channel-emu
 and edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of --for stop them in the order of the data.
@@ -29,6 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
             return _refuse(f"port {args.port} is taken by another program; choose one with --port (PORT=)")
         if args.data is not None and not args.data.is_dir():
             return _refuse(f"{args.data}: no such folder of recorded data (--data)")
+        if _lies_in(args.policy, args.out):
+            return _refuse(f"--policy {args.policy}: {args.out} is emptied first; name another --out")
         options = Options(
             out=args.out,
             duration_s=args.duration_s,
@@ -38,6 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
             restart=args.restart,
             table=not args.no_table,
             process_per_camera=args.process_per_camera,
+            edge=_edge_options(args),
         )
         return Run(scenario, options).main()
     except (scenarios.ScenarioError, FolderError, MissingCommand) as error:
@@ -58,6 +62,18 @@ def _port(text: str) -> int:
     return int(text)
 
 
+def _lies_in(policy: str | None, out: Path) -> bool:
+    """Whether what was learnt is a file of the earlier run that this one replaces."""
+    kind, _, file = (policy or "").partition(":")
+    return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())
+
+
+def _edge_options(args: argparse.Namespace) -> tuple[str, ...]:
+    """Words for the edge server, which knows what they may be. One word each: a value may be empty."""
+    given = (("policy", args.policy), ("learn", args.learn), ("fallback", args.fallback))
+    return tuple(f"--{name}={value}" for name, value in given if value is not None)
+
+
 def _refuse(message: str) -> int:
     print(f"up: {message}", file=sys.stderr)
     return 2
@@ -72,6 +88,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--port", type=_port, default=8080, help="of the page, on 127.0.0.1 (default 8080)")
     add("--data", type=Path, help="folder of recorded data, for scenarios that stream it")
     add("--seed", type=int, help="instead of the scenario's own")
+    add("--policy", metavar="NAME[:VALUE]", help="instead of the scenario's: threshold:120, bandit:FILE")
+    add(
+        "--learn", nargs="?", const="", metavar="REWARD[:moving]",
+        help="bandit:FILE goes on learning, by this reward (default: the one it was trained with)",
+    )  # fmt: skip
+    add("--fallback", metavar="NAME[:VALUE]", help="beside what learns (default: the best of its training)")
     add(
         "--restart", action="store_true", help="start a process again when it dies, instead of ending the run"
     )

@@ -8,11 +8,15 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from freshfield import transport
 from freshfield.scenario import ScenarioError, load
 from freshfield.session import SessionError
 from freshfield.transport import TransportError
+
+if TYPE_CHECKING:
+    from edge_server.config import EdgeConfig, LearnConfig
 
 DESCRIPTION = """\
 The edge of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
@@ -106,10 +110,12 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
     )
     run.add_argument(
         "--learn", nargs="?", const="", metavar="REWARD[:moving]",
-        help="bandit:FILE goes on learning, by this reward [the one it was trained with]",
+        help="bandit:FILE goes on learning, by this reward [edge.learn, else the one it was trained with]",
     )  # fmt: skip
     run.add_argument(
-        "--fallback", metavar="NAME[:VALUE]", help="beside what learns [the best of its training]"
+        "--fallback",
+        metavar="NAME[:VALUE]",
+        help="beside what learns [edge.learn, else the best of its training]",
     )
     run.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     run.add_argument("--data", type=Path, metavar="DIR", help="folder of data sets (its lpips/ is found)")
@@ -137,6 +143,7 @@ def _run(args: argparse.Namespace) -> int:
             config = replace(config, policy=PolicyConfig(*read_policy(args.policy)))
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
+    config = replace(config, learn=_learn(args, config))
     options = Options(
         listen=args.listen,
         out=args.out,
@@ -147,14 +154,14 @@ def _run(args: argparse.Namespace) -> int:
         lpips_folder=weights_folder(args.lpips, args.data),
         resume=args.resume,
         checkpoint_s=args.checkpoint_every,
-        learn=args.learn,
-        fallback=args.fallback,
         record=args.record,
     )
     try:
         server = EdgeServer(scenario, config, options)
     except SessionError as error:
         raise ScenarioError(f"--record: {error}") from None
+    except ScenarioError:
+        raise
     except ValueError as error:  # field options, a checkpoint that does not fit: the message says what
         raise ScenarioError(f"{scenario.path}: {error}") from None
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -167,6 +174,23 @@ def _run(args: argparse.Namespace) -> int:
         timer.start()
     server.run()
     return 0
+
+
+def _learn(args: argparse.Namespace, config: EdgeConfig) -> LearnConfig | None:
+    """How the policy goes on learning; a fixed one that --policy puts in the scenario's place does not."""
+    from edge_server.config import LearnConfig
+    from edge_server.scheduler import BANDIT
+
+    asked = config.learn
+    if args.policy and not args.policy.startswith(BANDIT):
+        asked = None
+    if args.learn is not None:
+        asked = LearnConfig(args.learn or (asked.reward if asked else ""), asked.fallback if asked else "")
+    if args.fallback is None:
+        return asked
+    if asked is None:
+        raise ScenarioError("--fallback: nothing learns beside it: give --policy bandit:FILE and --learn")
+    return LearnConfig(asked.reward, args.fallback)
 
 
 def _add_report(commands: argparse._SubParsersAction) -> None:

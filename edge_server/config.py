@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from edge_server.scheduler import Policy, embedding_of, learnt_policy
@@ -22,6 +23,17 @@ class PolicyConfig:
 
     name: str = "all"
     value: float | None = None
+
+
+@dataclass(frozen=True)
+class LearnConfig:
+    """How a policy that was learnt goes on learning while it is used (``edge-server run``; in virtual time
+    nobody does). reward: NAME or NAME:moving of edge_server.scheduler.learned.rewards; empty: the one it was
+    trained with. fallback: the fixed policy beside it, NAME or NAME:VALUE; empty: the best of its
+    training."""
+
+    reward: str = ""
+    fallback: str = ""
 
 
 @dataclass(frozen=True)
@@ -61,6 +73,21 @@ class KeyframesConfig:
 
 
 @dataclass(frozen=True)
+class ExportConfig:
+    """What a run leaves at its end besides its report: deploy/up.py has ``edge-server export`` make it. mesh:
+    file in the run's folder, .ply or .glb. voxel_mm: of the mesh; None: what a pixel spans at the surface."""
+
+    mesh: str
+    voxel_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if Path(self.mesh).name != self.mesh or Path(self.mesh).suffix.lower() not in (".ply", ".glb"):
+            raise ValueError(f"mesh: expected a file name that ends in .ply or .glb, got {self.mesh!r}")
+        if self.voxel_mm is not None and not 0.01 <= self.voxel_mm <= 1000.0:
+            raise ValueError(f"voxel_mm: expected 0.01 to 1000, got {self.voxel_mm:g}")
+
+
+@dataclass(frozen=True)
 class EdgeConfig:
     """The edge section of a scenario.
 
@@ -76,8 +103,10 @@ class EdgeConfig:
     their noise. metrics: further ones to score with: perceptual, the stand-in where there is no LPIPS
     (fidelity.perceptual). embedding: an edge_server.embed.EmbeddingConfig for policies that look at what
     cameras see; None: nothing is embedded. keyframes: earlier viewpoints of cameras that move go on
-    supervising; not given, nothing of the kind is loaded or kept. foreground: an
+    supervising; not given, nothing of the kind is loaded or kept. learn: a policy bandit:FILE goes on
+    learning, by the held-out cameras; not given, it stays as it is. foreground: an
     edge_server.foreground.ForegroundConfig, cuts the background out of every view; None: views stay whole.
+    export: an ``ExportConfig``, what deploy/up.py makes of the field when the run ends.
     """
 
     field: str = "ngp"
@@ -95,6 +124,8 @@ class EdgeConfig:
     embedding: Any = None  # named here, its module would be imported whether a scenario asks for it or not
     keyframes: KeyframesConfig | None = None
     foreground: Any = None  # as embedding
+    learn: LearnConfig | None = None
+    export: ExportConfig | None = None
 
     def __post_init__(self) -> None:
         if not 10.0 <= self.update_ms <= 3_600_000.0:

@@ -7,7 +7,6 @@ lower priority), and observers (scoring, page, metrics), which only read what wa
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import json
 import logging
 import threading
@@ -22,6 +21,7 @@ from grpc_reflection.v1alpha import reflection
 
 from edge_server.buffer import FrameBuffer
 from edge_server.config import EdgeConfig, embedding_for, open_embedder
+from edge_server.decisions import Decisions
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.fields import View, checkpoint
@@ -43,7 +43,6 @@ from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, fr
 if TYPE_CHECKING:  # loaded only where a policy was learnt, or a run is recorded
     from edge_server.recorder import Recorder
     from edge_server.scheduler.learned.lessons import Lessons
-    from edge_server.scheduler.learned.record import DecisionRecord
 
 log = logging.getLogger(__name__)
 
@@ -68,11 +67,6 @@ class Options:
     lpips_folder: Path | None = None
     resume: Path | None = None
     checkpoint_s: float | None = None
-    learn: str | None = None
-    """A learnt policy goes on learning, by this reward (NAME or NAME:moving; empty: by the one it was trained
-    with)."""
-    fallback: str | None = None
-    """The fixed policy beside one that learns; None takes the best of its training."""
     record: Path | None = None
 
 
@@ -133,7 +127,7 @@ class EdgeServer:
             self.clock, self.buffer, scenario.held_out, self.ledger, self.scoring.held_out_frame,
             None if self.recorder is None else self.recorder.frame,
         )  # fmt: skip
-        self._decisions: DecisionRecord | None = None
+        self._decisions = Decisions(options.out, self._embedding)
         self.updates.number = updates
         self.loop = Loop(
             self.updates,
@@ -275,7 +269,7 @@ class EdgeServer:
             self.state.bounds = getattr(self.field, "bounds", None)
         self.state.publish(publication, renderer)
         self.journal.published(publication)
-        self._record_decision(publication)
+        self._decisions.keep(self.updates.policy, publication.number)
         self.journal.poses(views)
         if self.recorder is not None:
             self.recorder.published(publication)
@@ -289,20 +283,6 @@ class EdgeServer:
         if final and self.recorder is not None:
             self.recorder.scored(publication, self.clock.now_ns())
 
-    def _record_decision(self, publication: Publication) -> None:
-        """Keep what a learnt policy saw, so that it can be explained (edge-server explain)."""
-        decided = decision_of(self.updates.policy)
-        if decided is None or decided.number != publication.number:
-            return
-        if self._decisions is None:
-            from edge_server.scheduler.learned.record import DecisionRecord
-
-            embedding = self._embedding
-            self._decisions = DecisionRecord(
-                self.options.out, None if embedding is None else dataclasses.asdict(embedding)
-            )
-        self._decisions.write(decided)
-
     def _say(self, line: str) -> None:
         self.state.last_decision = line
 
@@ -311,18 +291,24 @@ class EdgeServer:
 
     def _lessons(self, policy: Policy) -> Lessons | None:
         """What lets ``policy`` go on learning, where that was asked for. ValueError where it cannot."""
-        if self.options.learn is None:
+        learn = self.config.learn
+        if learn is None:
             return None
         if not policy.name.startswith(BANDIT):
-            raise ValueError(f"{policy.name} cannot learn: --learn needs --policy bandit:FILE")
+            raise ValueError(f"{policy.name} cannot learn: only bandit:FILE can (--policy, edge.policy)")
         if not self.scenario.held_out:
             raise ValueError("nothing is held out (cameras.held_out), so that there is no reward to learn by")
         from edge_server.scheduler.learned.lessons import open_lessons
 
-        return open_lessons(
-            Path(policy.name.removeprefix(BANDIT)), self.options.learn, self.options.fallback,
+        lessons = open_lessons(
+            Path(policy.name.removeprefix(BANDIT)), learn.reward, learn.fallback,
             self.scenario.rng("lessons"), self.lpips_missing, self.options.out,
         )  # fmt: skip
+        by = lessons.reward
+        if by.distance and by.distance_is == "perceptual" and "perceptual" not in self.config.metrics:
+            raise ValueError("the policy was trained by the stand-in distance, which nothing measures here: "
+                             "list it in the scenario, edge.metrics: [perceptual]")  # fmt: skip
+        return lessons
 
     def _learning(self) -> str:
         """How learning goes, for people; empty where nobody learns, or another policy was chosen."""
@@ -405,7 +391,7 @@ class EdgeServer:
             ],
             "rejected": dict(self.ingest.rejected),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
-            "decisions_lost": 0 if self._decisions is None else self._decisions.lost,
+            "decisions_lost": self._decisions.lost,
             "stale_on_arrival": self.buffer.stale_on_arrival,
             "check_ms": {f"p{p}": self.ingest.check_ms.percentile(p) for p in (50, 99)},
             "updates": {

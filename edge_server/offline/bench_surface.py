@@ -27,7 +27,15 @@ from edge_server.offline.scan import DISTANCE_M, Scan, exact_depth, scan, truth_
 from edge_server.offline.usage import BenchError, Usage
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
-from edge_server.surface.metrics import SEEN_BY, Truth, compare, depth_error_mm
+from edge_server.surface.metrics import (
+    SEEN_BY,
+    TARGET_CHAMFER_MM,
+    TARGET_COMPLETE,
+    WITHIN_M,
+    Truth,
+    compare,
+    depth_error_mm,
+)
 from edge_server.surface.reconstruct import MeshSettings, maps_of, mesh_of_maps
 
 # What is fitted, by name: representation and options.
@@ -37,7 +45,10 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "ngp": ("ngp", {}),
     "voxel": ("voxel", {}),
 }
-TARGET = "chamfer at most 1.5 mm, completeness at least 95 % at 3 mm"
+TARGET = (
+    f"chamfer at most {TARGET_CHAMFER_MM:g} mm, completeness at least {100 * TARGET_COMPLETE:g} % at "
+    f"{1e3 * WITHIN_M:g} mm"
+)
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ def exact_scene(scenario: Scenario, source: WorldConfig) -> tuple[Scene, Effects
         scene = make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: source: {error}") from None
-    effects = load(scenario, source, scenario.held_out[0])
+    effects = load(scenario, source, (scenario.held_out or scenario.cameras)[0])
     return (scene, NO_EFFECTS) if effects is None else (effects.extend(scene), effects)
 
 

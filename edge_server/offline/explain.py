@@ -23,9 +23,10 @@ What moved a decision of a learnt policy (bandit:FILE): part of the state, camer
   edge-server explain runs/room                          # the newest decision
   edge-server explain runs/room --decision 123 --camera cam04
 
-A run keeps its newest decisions in RUN/decisions. Shares are Shapley values of the logit of what was done,
-against average cameras of the training: they sum to the whole. Regions are found by painting them over and
-embedding the picture again; that needs a policy that looks at pictures.
+A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out. Shares are
+Shapley values of the logit of what was done, against average cameras of the training: they sum to the whole.
+Regions are found by painting them over and embedding the picture again; that needs a policy that looks at
+pictures.
 """
 
 # Cameras that have a bar of their own.

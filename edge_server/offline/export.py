@@ -11,11 +11,13 @@ from pathlib import Path
 
 from edge_server.export import ExportError, file_names
 from edge_server.surface import SurfaceError
+from freshfield.files import write_json
 
 DESCRIPTION = """\
 Write what a run or a fit has made as files for other programs. RUN is its folder, or a checkpoint in it.
 
   edge-server export runs/demo --mesh tile.ply
+  edge-server export runs/cell --mesh tile.ply --measure cell      how far it is from the true surface
   edge-server export runs/fit-tile --mesh tile.glb --voxel 1 --watertight
   edge-server export runs/demo/snapshot-000120.npz --splats tile.ply
   edge-server export runs/demo --colmap out/colmap --transforms out/nerf --trajectory out/path.tum
@@ -76,6 +78,9 @@ def _parser() -> argparse.ArgumentParser:
     mesh("--keep", type=float, default=0.02, metavar="SHARE", help="of the largest piece's area, that others "
          "need to stay [%(default)g]")  # fmt: skip
     mesh("--pieces", type=int, metavar="N", help="at most [all of them]")
+    mesh("--measure", metavar="SCENARIO", help="of the run: where its scene is synthetic and still, say how "
+         "far the mesh is from the true surface")  # fmt: skip
+    mesh("--json", type=Path, metavar="FILE", help="size, seconds of each stage and, of --measure, distances")
     mesh("--memory", type=float, default=2048.0, metavar="MB", help="for voxels [%(default)g]")
     return parser
 
@@ -86,6 +91,8 @@ class Export:
     def __init__(self, args: argparse.Namespace) -> None:
         self.args = args
         self._said = ("", 0.0)
+        self._began = time.perf_counter()
+        self._stages: dict[str, tuple[float, float]] = {}  # when each began and when it was last heard of
 
     @cached_property
     def source(self):
@@ -128,6 +135,8 @@ class Export:
             raise ExportError(f"--count {args.count}: expected 1 or more")
         if args.binary and args.colmap is None:
             raise ExportError("--binary is for --colmap DIR")
+        if args.mesh is None and (args.measure is not None or args.json is not None):
+            raise ExportError("--measure and --json are for --mesh FILE")
         self._settings()
 
     def _settings(self):
@@ -154,6 +163,7 @@ class Export:
     def _mesh(self, path: Path) -> None:
         from edge_server.surface.reconstruct import mesh_of_maps
 
+        begin = time.perf_counter()
         mesh = mesh_of_maps(self.maps, self._settings(), self._progress)
         if path.suffix.lower() == ".glb":
             from edge_server.export.glb import write_mesh
@@ -161,8 +171,31 @@ class Export:
             from edge_server.export.ply import write_mesh
         path.parent.mkdir(parents=True, exist_ok=True)
         write_mesh(path, mesh.vertices, mesh.faces, mesh.color)
+        spent_s = time.perf_counter() - begin
         closed = ", watertight" if mesh.watertight else ""
         print(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices{closed}", flush=True)
+        found = None if self.args.measure is None else self._measured(mesh)
+        if self.args.json is None:
+            return
+        about = {
+            "file": path.name,
+            "triangles": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "watertight": mesh.watertight,
+            "cameras": len(self.source.views),
+            "seconds": round(spent_s, 3),
+            "stages_s": {name: round(end - start, 3) for name, (start, end) in self._stages.items()},
+            "measured": found,
+        }
+        write_json(self.args.json, about, indent=1)
+
+    def _measured(self, mesh):
+        from edge_server.offline.mesh_truth import in_words, measured
+
+        found = measured(mesh, self.args.measure, self.source.views)
+        unknown = "not measured: the true surface is known of synthetic scenes that stand still"
+        print(f"  {in_words(found) if found else unknown}", flush=True)
+        return found
 
     def _points(self, path: Path) -> None:
         from edge_server.export.ply import write_points
@@ -219,6 +252,9 @@ class Export:
         """A line a second, and one when a stage is done."""
         name, at = self._said
         now = time.perf_counter()
+        # A stage has begun when the one before it was last heard of.
+        begin = max((end for _, end in self._stages.values()), default=self._began)
+        self._stages[what] = (self._stages.get(what, (begin, now))[0], now)
         if share >= 1.0 or what != name or now - at >= 1.0:
             self._said = (what, now)
             print(f"  {what:10} {100 * share:3.0f} %", flush=True)

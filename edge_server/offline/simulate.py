@@ -16,7 +16,8 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.sources.records import DatasetError
-from edge_server.config import ComputeConfig, PolicyConfig, read_config
+from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_config
+from edge_server.decisions import Decisions
 from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
 from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.offline.deployment import deploy
@@ -64,7 +65,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if config.lpips != "none":
             metric, missing = open_lpips(lpips, cast(Network, config.lpips))
         scorer = Scorer(metric, config.noisy_truth, perceptual=listed_metric(config.metrics))
-        deployment = deploy(scenario, terms, scorer=scorer, data=base)
+        decisions: Decisions | None = None
+
+        def published(publication: Publication) -> None:
+            if decisions is not None:
+                decisions.keep(deployment.updates.policy, publication.number)
+
+        deployment = deploy(scenario, terms, scorer=scorer, data=base, on_published=published)
+        if args.out is not None:
+            decisions = Decisions(args.out, embedding_for(config, deployment.updates.policy))
+        if config.learn is not None:
+            print("  edge.learn: in virtual time nobody learns, the policy stays as it is", file=sys.stderr)
         _run(deployment, args.seconds, quiet=args.json)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
@@ -211,7 +222,8 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]",
     )
-    add("--out", type=Path, metavar="DIR", help="write simulation.json and series.jsonl there")
+    add("--out", type=Path, metavar="DIR",
+        help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
     add("--json", action="store_true", help="everything, as one JSON object")
     return parser
 

@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import os
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 from camera_node.sources.records import DatasetError
 from edge_server.config import open_embedder, read_config
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
+from edge_server.fields.registry import field_names
 from edge_server.offline.study.trial import Folders
 from edge_server.offline.training.choosing import Maker
 from edge_server.offline.training.contest import Contest, hold, rivals, write_rows
@@ -31,8 +31,8 @@ from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
 Learns when and of which views to update the field: decisions are drawn from the scenario in virtual time,
-each action is carried out by a real field fit and rewarded on the held-out camera at the instant of
-publication.
+each action is carried out by a real field fit and rewarded on a held-out camera at the instant of
+publication. Another camera, which is not trained on either, reports how well it learnt.
 
   edge-server train-scheduler room19 --out runs/select
   edge-server train-scheduler room19 --kind wait --reward corrected --episodes 200 --out runs/wait
@@ -42,13 +42,17 @@ publication.
   --kind threshold   how old a view may be (6.3)
   --kind wait        how long to wait for younger ones (6.3, algorithm 2)
 
+  --on whole | moving   whose PSNR it is. Of the whole image of a scene that hardly moves it teaches to ignore
+                        how old views are; where nothing moves there are no moving pixels
+
   --reward set        0.02 PSNR + 0.5 SSIM - LPIPS (5.19); usual for select
   --reward corrected  -F_w (6.36-6.38), a better SSIM rewarded; usual for threshold and wait
   --reward thesis     -F_w as printed, which rewards a worse SSIM
 
-An episode is --decisions decisions at random instants. Of each, --tries actions are carried out from the same
-field, so that they can be compared; --warm starts them from a field that remembers, else from nothing.
-Pictures are small (--size) and the field is quick (--field), so that there are many decisions.
+An episode is --decisions decisions at random instants. Of each, --tries actions are carried out from a copy
+of the same field, so that they can be compared: one that knows the scene, or nothing (--scratch, the thesis).
+In a world each episode has a motion of its own, so that it is tested on motions it never saw. Pictures are
+small (--size) and the field is quick (--field), so that there are many decisions.
 
 OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
 apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. After Ctrl-C the same
@@ -86,13 +90,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) -> None:
-    began = time.monotonic()
+    print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judged.scoring)}")
+    if course.reward.fidelity == "whole" and not course.reward.age:
+        print("  the reward is of the whole image and has no term of age: where little moves it teaches to "
+              "ignore how old views are (--on moving)")  # fmt: skip
+    if not setting.draws_motions:
+        print("  every episode has the same motion: it is tested on unseen channels and instants alone")
+    # They are about what an earlier training left here.
+    for name in ("summary.json", "contest.csv"):
+        (args.out / name).unlink(missing_ok=True)
     learner = train(setting, course, crew, args.out, lambda line: print(f"  {line}", flush=True))
-    spent = time.monotonic() - began
     rows = read_log(args.out)
+    spent = sum(row["seconds"] for row in rows)
     write_rows(args.out / "training.csv", rows)
-    if spent > 1.0:
-        print(f"  {course.episodes} episodes; trained for {spent:.0f} s", flush=True)
+    print(f"  {course.episodes} episodes; trained for {spent:.0f} s in all", flush=True)
     if not args.test:
         draw_curve(args.out / "training.png", rows)
         return
@@ -100,20 +111,27 @@ def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) 
     omegas = course.spec.omegas_ms or OMEGAS_MS["threshold"]
     everybody: dict[str, Maker | Actor] = {**rivals(omegas, kinds), LEARNT: learner.actor}
     contest = hold(
-        setting, crew, seeds(course.seed, "test", args.test), everybody, course.reward,
+        setting.judged, crew, seeds(course.seed, "test", args.test), everybody, course.reward,
         lambda line: print(f"  on unseen seeds: {line}", flush=True),
     )  # fmt: skip
-    _report(args.out, contest, kinds[0], rows, spent)
+    about = {
+        "reward_name": course.reward.name, "on": course.reward.fidelity, "seconds": round(spent, 1),
+        "rewarded_from": setting.rewarding, "judged_from": setting.judged.scoring,
+        "motions": setting.draws_motions,
+    }  # fmt: skip
+    _report(args.out, contest, kinds[0], rows, about)
 
 
-def _report(out: Path, contest: Contest, fixed: str, rows: list[dict[str, Any]], spent: float) -> None:
+def _report(
+    out: Path, contest: Contest, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]
+) -> None:
     write_rows(out / "contest.csv", rows_of(contest))
     found = summary(contest, LEARNT, fixed)
-    levels = {"random": found["rewards"]["random"][0], f"best fixed ({found['best_fixed']})":
-              found["rewards"][found["best_fixed"]][0], LEARNT: found["reward"][0]}  # fmt: skip
-    draw_curve(out / "training.png", rows, {k: v for k, v in levels.items() if v is not None})
-    reward = contest.reward
-    about = {"reward_name": reward.name, "on": reward.fidelity, "seconds": round(spent, 1)}
+    names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
+    levels = {label: found["rewards"][name][0] for label, name in names.items()}
+    # From another camera a reward has another zero, which the course of the training does not share.
+    told = {} if about["rewarded_from"] != about["judged_from"] else levels
+    draw_curve(out / "training.png", rows, {k: v for k, v in told.items() if v is not None})
     write_json(out / "summary.json", {**found, **about}, indent=1)
     for line in lines(contest, LEARNT, fixed):
         print(f"  {line}")
@@ -126,25 +144,65 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     if source.get("kind") == "world" and args.size:
         source |= {"width": args.size, "height": args.size}
     if args.field:
+        if args.field not in field_names():
+            raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {args.field!r}")
         edge["field"] = args.field
         edge["field_options"] = {"effort": "low"} if args.field in ("splat", "voxel", "ngp") else {}
+    if args.distance == "perceptual":
+        edge["metrics"] = sorted({*edge.get("metrics", ()), "perceptual"})
     edge["policy"] = {"name": "all"}
-    given = dataclasses.replace(scenario, source=source, edge=edge)
+    report = _reporting(args, scenario)
+    held_out = tuple(c for c in scenario.cameras if c in {*scenario.held_out, *report})
+    given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
     return Setting(
         given,
-        steps=args.fit_steps or (20 if args.warm else 50),
-        scratch=not args.warm,
+        report=report,
+        motions=not args.same_motion,
+        steps=args.fit_steps or (50 if args.scratch else 20),
+        scratch=args.scratch,
         decisions=args.decisions,
         compute=read_config(given).compute,
         parts=_parts(args.parts),
     )
 
 
-def reward_of(name: str, on: str, lpips_folder: Path | None) -> tuple[Reward, str | None]:
-    """The reward of a name, on the whole image or its moving pixels. Where LPIPS has no weights its term is
-    left out, and the second value says so."""
+def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
+    """Cameras that report. By themselves: the last of several that are held out, else one in the middle of
+    those that are trained on, which then is not."""
+    if args.report == "none" or not scenario.held_out:
+        return ()
+    if args.report:
+        asked = tuple(args.report.split(","))
+        if unknown := [c for c in asked if c not in scenario.cameras]:
+            raise ValueError(f"--report: {', '.join(unknown)} is not one of the scenario's cameras")
+        if set(scenario.held_out) <= set(asked):
+            raise ValueError("--report: a held-out camera must be left to reward")
+        return asked
+    if len(scenario.held_out) > 1:
+        return scenario.held_out[-1:]
+    if len(scenario.training) < 3 or args.network == "flat":
+        raise ValueError(
+            "--report: no camera can be spared to report ("
+            + ("--network flat learns for as many as there are" if args.network == "flat" else "too few")
+            + "): hold two out in the scenario, or --report none judges from the one that rewards"
+        )
+    return (scenario.training[len(scenario.training) // 2],)
+
+
+def reward_of(
+    name: str, on: str, lpips_folder: Path | None, network: str = "alex", distance: str = "lpips"
+) -> tuple[Reward, str | None]:
+    """The reward of a name, on the whole image or its moving pixels. network: the scenario's edge.lpips.
+    distance: lpips, perceptual (its stand-in) or none. Where LPIPS is asked for and cannot be had its term
+    is left out, and the second value says so."""
     reward = make_reward(name, fidelity=on)  # type: ignore[arg-type]
-    _, missing = open_lpips(lpips_folder)
+    if distance == "none":
+        return dataclasses.replace(reward, distance=0.0), None
+    if distance == "perceptual":
+        return dataclasses.replace(reward, distance_is="perceptual"), None
+    missing: str | None = "the scenario's edge.lpips is none"
+    if network != "none":
+        _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]
     found = available(reward, missing)
     return found, None if found == reward else f"the reward has no term of distance: {missing}"
 
@@ -163,10 +221,11 @@ def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
 
 def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Course:
     name = args.reward or ("set" if args.kind == "select" else "corrected")
-    reward, missing = reward_of(name, args.on, folders.lpips)
+    network = read_config(setting.scenario).lpips
+    reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
     if missing:
         print(f"  {missing}")
-    given = tuple(float(v) for v in args.omegas.split(",")) if args.omegas else None
+    given = _omegas(args)
     spec = Spec(
         args.kind,
         layout_of(setting, setting.parts),
@@ -175,6 +234,17 @@ def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Cou
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
     )
     return Course(spec, reward, args.episodes, args.batch, args.tries, args.seed)
+
+
+def _omegas(args: argparse.Namespace) -> tuple[float, ...] | None:
+    if args.omegas is None:
+        return None
+    if args.kind == "select":
+        raise ValueError("--omegas: --kind select chooses cameras, not an omega")
+    try:
+        return tuple(float(v) for v in args.omegas.split(","))
+    except ValueError:
+        raise ValueError(f"--omegas: expected milliseconds such as 20,60,120, got {args.omegas!r}") from None
 
 
 def _parts(text: str) -> tuple[str, ...]:
@@ -213,13 +283,23 @@ def _parser() -> argparse.ArgumentParser:
     add("--reward", choices=tuple(REWARDS), help="[set for select, else corrected]")
     add("--on", choices=("whole", "moving"), default="whole", help="pixels of the PSNR [%(default)s]")
     add(
+        "--distance",
+        choices=("lpips", "perceptual", "none"),
+        default="lpips",
+        help="the reward's distance; perceptual is the stand-in where LPIPS has no weights [%(default)s]",
+    )
+    add("--report", metavar="CAM,...",
+        help="cameras that only report; none: the one that rewards [the last of several that are held out, "
+        "else one of the training cameras]")  # fmt: skip
+    add("--same-motion", action="store_true", help="the scene's own motion in every episode")
+    add(
         "--parts", default="age,pose", metavar="P,...", help=f"of the state: {', '.join(PARTS)} [%(default)s]"
     )
     add("--omegas", metavar="MS,...", help="what threshold and wait choose from")
     add("--network", choices=("pooled", "flat"), default="pooled",
         help="pooled takes any number of cameras, flat is the thesis's [%(default)s]")  # fmt: skip
-    add("--warm", action="store_true", help="updates go on with a field that knows the scene")
-    add("--fit-steps", type=int, metavar="N", help="of an update [50; 20 with --warm]")
+    add("--scratch", action="store_true", help="updates begin with nothing, as in the thesis")
+    add("--fit-steps", type=int, metavar="N", help="of an update [20; 50 with --scratch]")
     add("--size", type=int, default=64, metavar="PX", help="of a world's pictures, 0: its own [%(default)s]")
     add("--field", default="splat", metavar="NAME", help="representation, '': the scenario's [%(default)s]")
     add("--seed", type=int, default=0, metavar="K", help="[%(default)s]")

@@ -13,7 +13,7 @@ from edge_server.offline.training.choosing import choices, named
 from edge_server.offline.training.contest import hold, rivals, rows
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.setting import Setting, seeds
-from edge_server.offline.training.trainer import Course, read_log, train
+from edge_server.offline.training.trainer import Course, TrainingError, read_log, train
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -37,25 +37,37 @@ def weights_after(what: Setting, taught: Course, out: Path) -> dict[str, np.ndar
 
 
 @pytest.mark.parametrize(("spec", "scratch"), [(SELECT, True), (WAIT, False)], ids=["select", "wait, warm"])
-def test_where_nothing_ever_arrives_nothing_is_learnt(spec, scratch, tmp_path):
+def test_where_nothing_ever_arrives_training_says_so_instead_of_learning_nothing(spec, scratch, tmp_path):
     silent = setting(NEVER, scratch=scratch)
-    found = weights_after(silent, course(spec), tmp_path)
-    assert all(row["reward"] is None and row["dropped"] == row["fits"] for row in read_log(tmp_path))
-    other = weights_after(silent, dataclasses.replace(course(spec), episodes=3), tmp_path / "shorter")
-    assert all(np.array_equal(w, other[name]) for name, w in found.items())
+    with pytest.raises(TrainingError, match="nothing had arrived"):
+        weights_after(silent, course(spec), tmp_path)
+    assert not (tmp_path / "policy.npz").exists()
     with Crew(NOTHING) as crew:
         contest = hold(silent, crew, seeds(0, "test", 2), rivals((50.0,), ["threshold"], ("random",)), REWARD)
     assert all(np.isnan(row["reward"]) for row in rows(contest))
 
 
-def test_a_still_scene_has_no_moving_pixels_and_says_so_by_its_missing_rewards(tmp_path):
+def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
     still = setting()
     source = {**still.scenario.source, "speed_m_per_s": 0.0}
     still = dataclasses.replace(still, scenario=dataclasses.replace(still.scenario, source=source))
-    weights_after(still, course(reward=make_reward("set", fidelity="moving", distance=0.0)), tmp_path)
-    assert all(row["reward"] is None and row["psnr_db"] is not None for row in read_log(tmp_path))
+    with pytest.raises(TrainingError, match=r"psnr_moving: nothing moves.*--on whole"):
+        weights_after(still, course(reward=make_reward("set", fidelity="moving", distance=0.0)), tmp_path)
     weights_after(still, course(), tmp_path / "whole")
     assert all(row["reward"] is not None for row in read_log(tmp_path / "whole"))
+
+
+def test_a_later_batch_without_rewards_teaches_nothing_and_harms_nothing(tmp_path):
+    """A blackout from some episodes on: what was learnt before it stays as it was."""
+    with Crew(NOTHING) as crew:
+        learner = train(setting(), course(), crew, tmp_path, lambda line: None)
+        before = learner.actor.weights
+        moments = crew.draw(setting(NEVER), [1])[0]
+    states = [m.state for m in moments]
+    actions, logps = learner.act(states)
+    told = learner.update(learner.batch(states, actions, logps, [None] * len(states)))
+    assert told.dropped == len(states)
+    assert all(np.array_equal(w, learner.actor.weights[name]) for name, w in before.items())
 
 
 def test_damaged_late_and_doubled_frames(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.world.scene import make_scene
-from edge_server.offline.detector.scenes import Boxes, own_rig, variation
+from edge_server.offline.detector.scenes import Boxes, own_rig, scene_of, variation
 from edge_server.offline.progress import Progress
 
 SHARD_SHOTS = 20
@@ -61,6 +61,11 @@ def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers
     return joined([part for part in found if part is not None])
 
 
+def scenes_of(purpose: str, shots: int, seed: int) -> list[str]:
+    """The shipped scene that each picture of ``render`` is a variation of."""
+    return [scene_of(_seed(seed, k), purpose) for k in range(shots) for _ in range(INSTANTS)]
+
+
 def of_own_rigs(side: int) -> dict[str, Pictures]:
     """The shipped scenes through some of their own cameras."""
     return {
@@ -83,7 +88,7 @@ def _render_shard(job: tuple[str, int, int, int, int, Path]) -> None:
     purpose, seed, first, shots, side, path = job
     parts = []
     for k in range(first, first + shots):
-        shot, rng = variation(seed * 1_000_003 + k, purpose, side)
+        shot, rng = variation(_seed(seed, k), purpose, side)
         parts.append(Pictures(*shot.take(list(rng.uniform(0.0, 12.0, INSTANTS)))))
     whole = joined(parts)
     counts = [len(b) for b in whole.boxes]
@@ -91,6 +96,11 @@ def _render_shard(job: tuple[str, int, int, int, int, Path]) -> None:
     with part.open("wb") as file:
         np.savez(file, images=whole.images, counts=counts, boxes=np.concatenate(whole.boxes))
     part.replace(path)  # whole or not there: Ctrl-C leaves no half shard
+
+
+def _seed(seed: int, number: int) -> int:
+    """Of a set's variation of this number."""
+    return seed * 1_000_003 + number
 
 
 def _load(path: Path) -> Pictures | None:

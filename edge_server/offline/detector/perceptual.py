@@ -7,6 +7,7 @@ import itertools
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,17 @@ Fit the perceptual distance of the shipped detector's backbone (thesis 3.34, 3.3
 
 Renderings of our own scenes are distorted in ten ways (blur, noise, JPEG, exposure, stale, ghost, coarse,
 displaced, floaters, warped) at random strength; weights that are not negative and a power are fitted to what
-LPIPS says of them, and the rank correlation with LPIPS is measured on worlds that were not fitted to, and
-on what a field of ours renders of the shipped scenes while it learns. Needs the weights of LPIPS; whoever
-uses the distance does not. In OUT: perceptual.npz and perceptual.json.
+LPIPS says of them, and the rank correlation with LPIPS is measured on variations that were not fitted to,
+and on what a field of ours renders of the shipped scenes while it learns. All of these are room, tower or
+tile; for a scene of another kind look at what is found with one scene left out of the fit altogether. Needs
+the weights of LPIPS; whoever uses the distance does not. In OUT: perceptual.npz and perceptual.json.
 """
 # The power's range, and where its search starts.
 POWERS, _START = (0.3, 2.0), 0.7
 # Added to distances within the fit, whose logarithm is taken: a thousandth of the smallest that matter.
 _NEAR = 1e-6
 TRIES = 5  # distortions of each picture
+UNSEEN = "unseen variations"
 _PART = 32
 _TOLD_EVERY = 20  # parts
 
@@ -66,7 +69,7 @@ class FitFailed(ValueError):
 
 def run(args: argparse.Namespace) -> dict[str, Any]:
     """Render, distort, fit, measure, write; returns what perceptual.json holds."""
-    from edge_server.offline.detector.dataset import Pictures, of_own_rigs, render
+    from edge_server.offline.detector.dataset import Pictures, of_own_rigs, render, scenes_of
     from edge_server.offline.detector.network import LAYERS
     from edge_server.offline.detector.renderings import field_renderings
     from edge_server.offline.progress import Progress
@@ -100,14 +103,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     x, y = compare(distort(known, "perceptual")[0], "fit")
     weights, power = fit(x, y)
     unseen = render("perceptual-held-out", held, args.side, args.seed, folder, args.workers)
-    tests = {"unseen worlds": distort(unseen, "unseen worlds")}
+    tests = {UNSEEN: distort(unseen, "unseen worlds")}
     for name, pictures in of_own_rigs(args.side).items():
         tests[f"own rig of {name}"] = distort(pictures, name)
     tests["field renderings"] = field_renderings(args.side, args.seed)
-    rank = {}
+    rank, by_scene = {}, [Compared(x, y, scenes_of("perceptual", worlds, args.seed))]
     for name, (pairs, names) in tests.items():
         xt, yt = compare(pairs, name)
         rank[name] = correlation((xt @ weights) ** power, yt, names)
+        if name == UNSEEN:
+            by_scene.append(Compared(xt, yt, scenes_of("perceptual-held-out", held, args.seed)))
     split = np.split(weights, np.cumsum(layers.widths())[:-1])
     taps = tuple(layers.taps)
     Perceptual(layers, split, power)  # what is written can be read
@@ -119,6 +124,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             for tap, part in zip(taps, _slices(layers.widths()))
         },
         "channels_used": int((weights > 0).sum()), "channels": len(weights), "unseen": rank,
+        "scene_left_out_of_the_fit": left_out(by_scene),
     }  # fmt: skip
     write_json(args.out / "perceptual.json", told, indent=1)
     return told
@@ -162,6 +168,36 @@ def fit(x: Array, y: Array) -> tuple[Array, float]:
     return np.asarray(best.x[:-1] / scale), float(best.x[-1])
 
 
+@dataclass(frozen=True)
+class Compared:
+    """Differences (n, D), LPIPS (n,), and the scene of each picture, of which there are ``TRIES`` pairs."""
+
+    x: Array
+    y: Array
+    scenes: list[str]
+
+    def of(self, scene: str, others: bool = False) -> tuple[Array, Array]:
+        """The pairs of a scene, or those of all others."""
+        chosen = (np.repeat(self.scenes, TRIES) == scene) != others
+        return self.x[chosen], self.y[chosen]
+
+
+def left_out(known: Sequence[Compared]) -> dict[str, Any]:
+    """``correlation`` on all pairs of each scene, with weights and power fitted to the others' of the first
+    set: what to expect of a scene that is no variation of those fitted to. (The backbone has seen variations
+    of all of them.)"""
+    found = {}
+    for scene in sorted(set(known[0].scenes)):
+        x, y = known[0].of(scene, others=True)
+        if not len(y):
+            continue
+        weights, power = fit(x, y)
+        xs, ys = (np.concatenate(part) for part in zip(*(some.of(scene) for some in known)))
+        found[scene] = correlation((xs @ weights) ** power, ys, [scene] * len(ys))
+        del found[scene]["spearman_by_distortion"]
+    return found
+
+
 def correlation(found: Array, true: Array, names: Sequence[str]) -> dict[str, Any]:
     """Spearman's and Pearson's correlation, the mean error, and Spearman's for each single distortion."""
     from scipy.stats import pearsonr, spearmanr
@@ -183,7 +219,8 @@ def correlation(found: Array, true: Array, names: Sequence[str]) -> dict[str, An
 def show(told: dict[str, Any]) -> str:
     """The outcome for people."""
     lines = [f"fitted to {told['fitted_to']} on {told['pairs']} pairs, power {told['power']:.2f}"]
-    for name, found in told["unseen"].items():
+    left = {f"{name} not fitted to": row for name, row in told["scene_left_out_of_the_fit"].items()}
+    for name, found in (told["unseen"] | left).items():
         lines.append(
             f"  {name:20} Spearman {found['spearman']:.3f}  Pearson {found['pearson']:.3f}  "
             f"mean error {found['mean_absolute_error']:.3f}  ({found['pairs']} pairs)"

@@ -98,11 +98,20 @@ def own_rig(name: str, camera: str, side: int) -> Shot:
     return Shot(scene.world, *scene.cameras[camera], tuple(KINDS.index(k) for k in kinds))
 
 
+def scene_of(seed: int, purpose: str) -> str:
+    """Name of the shipped scene that ``variation`` begins with."""
+    return _begun(seed, purpose)[0]
+
+
+def _begun(seed: int, purpose: str) -> tuple[str, np.random.Generator]:
+    rng = np.random.default_rng(np.random.SeedSequence([seed, *purpose.encode()]))
+    return str(rng.choice(list(_SHARES), p=list(_SHARES.values()))), rng
+
+
 def variation(seed: int, purpose: str, side: int) -> tuple[Shot, np.random.Generator]:
     """The shot that a seed makes, and the generator to draw its instants from. ``purpose`` keeps training and
     held-out worlds apart whatever their seeds."""
-    rng = np.random.default_rng(np.random.SeedSequence([seed, *purpose.encode()]))
-    name = str(rng.choice(list(_SHARES), p=list(_SHARES.values())))
+    name, rng = _begun(seed, purpose)
     scene = make_scene(name, {"count": 1, "width": side, "height": side})
     statics = tuple(p for p in scene.world.statics if isinstance(p.shape, Quad) or rng.random() < _PRESENT)
     things = _small_things(rng) if name == "tile" else _things(rng, name)

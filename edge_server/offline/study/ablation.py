@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from edge_server.offline.study.base import Ask, Point, Table, Verdict
 from edge_server.offline.study.learning import (
     FOUR_VIEWPOINTS,
-    Lesson,
     School,
     better,
     embeddings_missing,
     fixed_of,
+    named_runs,
     room,
+    runs_of,
 )
 from edge_server.offline.train_scheduler import OMEGAS_MS, layout_of
-from edge_server.offline.training.contest import rivals, rows, write_rows
+from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
 from edge_server.offline.training.trainer import Course
 from edge_server.scheduler.learned.spec import Spec
 
@@ -44,27 +46,32 @@ class Ablation:
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
         with School(ask) as school:
-            reward, mine = school.reward("set", "moving"), {}
+            reward = school.reward("set", "moving")
+            mine: dict[str, Any] = {}
             for name, used in variants.items():
                 spec = Spec("select", layout_of(setting, used))
-                lesson = Lesson(f"{self.name}-{name}", setting, Course(spec, reward, EPISODES[ask.quick]))
-                mine[f"learnt {name}"] = school.teach(lesson).actor
+                course = Course(spec, reward, EPISODES[ask.quick])
+                learnt = school.teach_all(f"{self.name}-{name}", setting, course)
+                mine |= named_runs(f"learnt {name}", learnt)
             everybody: dict[str, Any] = {
                 **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
             }  # fmt: skip
             contest = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
         write_rows(ask.out / f"{self.name}.csv", rows(contest))
-        about, base = "room, ch5, moving, four viewpoints", contest.rewards("learnt age")
-        best, told = contest.best_fixed("threshold")[0], fixed_of(contest, "threshold")
-        found = [better(f"{about}, {name}", "better than the best fixed threshold.",
-                        contest.rewards(f"learnt {name}"), best, f"against {told}; ")
-                 for name in variants]  # fmt: skip
-        found += [better(f"{about}, {name}", "better than age alone.",
-                         contest.rewards(f"learnt {name}"), base)
-                  for name in variants if name != "age"]  # fmt: skip
-        if "all" in variants:
-            found.append(
-                better(about, "semantics add to age and pose.", contest.rewards("learnt all"),
-                       contest.rewards("learnt age+pose"))
-            )  # fmt: skip
-        return found
+        return judge(contest, list(variants))
+
+
+def judge(contest: Contest, variants: Sequence[str]) -> list[Verdict]:
+    """What each variant of the state is worth, by the contest of what was learnt with them."""
+    about, learnt = (
+        "room, ch5, moving, four viewpoints",
+        {n: runs_of(contest, f"learnt {n}") for n in variants},
+    )
+    best, told = contest.best_fixed("threshold")[0], fixed_of(contest, "threshold")
+    found = [better(f"{about}, {name}", "better than the best fixed threshold.", runs, best,
+                    f"against {told}; ") for name, runs in learnt.items()]  # fmt: skip
+    found += [better(f"{about}, {name}", "better than age alone.", runs, learnt["age"])
+              for name, runs in learnt.items() if name != "age"]  # fmt: skip
+    if "all" in learnt:
+        found.append(better(about, "semantics add to age and pose.", learnt["all"], learnt["age+pose"]))
+    return found

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from edge_server.offline.study.base import Ask, Point, Table, Verdict
-from edge_server.offline.study.learning import Lesson, School, better, room
+from edge_server.offline.study.learning import RUNS, Lesson, School, better, room
 from edge_server.offline.train_scheduler import OMEGAS_MS
 from edge_server.offline.training.choosing import choose, named
 from edge_server.offline.training.contest import PerSeed, rivals, write_rows
@@ -31,8 +32,9 @@ BEFORE, AFTER = 10, 60
 # Episodes whose rewards come back together: live, they come some seconds after the decisions.
 _TOGETHER = 5
 AGE = -0.003
-# The nearest to the held-out camera.
+# The nearest to the camera that rewards.
 DYING = "cam01"
+NOTHING_LOST, NOT_WITHIN = "nothing was lost", "not within the run"
 POLICIES = ("fixed", "learnt", "still learning", "learnt afterwards")
 
 Rewards = dict[str, list[float]]
@@ -64,15 +66,20 @@ class Drift:
         with School(ask) as school:
             reward = dataclasses.replace(school.reward("corrected"), age=AGE)
             for name, (before, after, gone) in list(changes().items())[: 1 if ask.quick else None]:
+                settings = room(before), room(after, silent=(gone,) if gone else ())
+                trainings = RUNS[ask.quick]
+                each = max(1, len(ask.repeats(3, 9)) // trainings)
                 runs = [
-                    _one_run(school, name, room(before), room(after), reward, run, ask.quick, gone)
-                    for run in ask.repeats(3, 10)
-                ]
-                found += _judge(f"room, {name}", runs)
-                _draw(ask, name, runs)
+                    [_one_run(school, name, *settings, reward, training, training * each + k, ask.quick)
+                     for k in range(each)]
+                    for training in range(trainings)
+                ]  # fmt: skip
+                found += judge(f"room, {name}", runs)
+                together = [run for of in runs for run in of]
+                _draw(ask, name, together)
                 written += [
                     {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
-                    for r, run in enumerate(runs) for policy, values in run.items()
+                    for r, run in enumerate(together) for policy, values in run.items()
                     for k, value in enumerate(values)
                 ]  # fmt: skip
         write_rows(ask.out / f"{self.name}.csv", written)
@@ -85,15 +92,15 @@ def _one_run(
     before: Setting,
     after: Setting,
     reward: Reward,
+    training: int,
     run: int,
     quick: bool,
-    gone: str | None,
 ) -> Rewards:
-    """Rewards of every decision, by policy: the same decisions for all of them."""
+    """Rewards of every decision as the reporting cameras have them, by policy: the same decisions for all."""
     spec = Spec("threshold", StateLayout(("age", "pose")), OMEGAS_MS["threshold"])
-    course = Course(spec, reward, EPISODES[quick], tries=3)
-    home = school.teach(Lesson("drift-before", before, course))
-    there = school.teach(Lesson(f"drift-{name.replace(' ', '-')}", after, course))
+    course = Course(spec, reward, EPISODES[quick], tries=3, seed=training)
+    home = school.teach(Lesson(f"drift-before-{training}", before, course))
+    there = school.teach(Lesson(f"drift-{name.replace(' ', '-')}-{training}", after, course))
     chosen = school.contest(before, rivals(spec.omegas_ms, ["threshold"], ("random",)), reward, 6, seed=7)
     fixed = named(chosen.best_fixed("threshold")[1])
     rng = np.random.default_rng([run, 7])
@@ -116,50 +123,40 @@ def _one_run(
         for start in range(0, count, _TOGETHER):
             part = numbers[start : start + _TOGETHER]
             moments = [m for episode in school.crew.draw(setting, part) for m in episode]
-            if gone and setting is after:
-                moments = [without(m, gone) for m in moments]
             for policy in POLICIES:
                 rewards[policy] += _decide(school, setting, policies[policy], moments, reward, number)
             number += len(moments)
     return rewards
 
 
-def without(moment: Moment, camera: str) -> Moment:
-    """The same decision had ``camera`` never sent anything."""
-    state = moment.state
-    silent = np.array([c == camera for c in moment.cameras])
-    return dataclasses.replace(
-        moment,
-        arrivals=tuple(a for a in moment.arrivals if a.camera != camera),
-        state=dataclasses.replace(
-            state, ages_ms=np.where(silent, np.nan, state.ages_ms), reported=state.reported & ~silent
-        ),
-    )
-
-
 def _decide(
     school: School, setting: Setting, policy: Policy, moments: list[Moment], reward: Reward, first: int
 ) -> list[float]:
-    """Rewards of decisions that are numbered from ``first`` on; one that learns learns from them."""
-    choices = [choose(policy, m, first + k) for k, m in enumerate(moments)]
-    outcomes = school.crew.evaluate(setting, [(m.seed, m.number, c) for m, c in zip(moments, choices)])
-    totals = [r.total if (r := reward.of(outcome)).complete else None for outcome in outcomes]
+    """Rewards of decisions that are numbered from ``first`` on, as the reporting cameras have them; one that
+    learns learns from those of the rewarding ones."""
+    asked = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
+
+    def totals(of: Setting) -> list[float | None]:
+        found = [reward.of(outcome) for outcome in school.crew.evaluate(of, asked)]
+        return [r.total if r.complete else None for r in found]
+
     if isinstance(policy, Apprentice):
-        for k, total in enumerate(totals):
+        for k, total in enumerate(totals(setting)):
             if policy.scored(first + k, total):
                 policy.learn()
-    return [np.nan if total is None else total for total in totals]
+    return [np.nan if total is None else total for total in totals(setting.judged)]
 
 
-def _judge(about: str, runs: list[Rewards]) -> list[Verdict]:
-    """Over the second half of what follows the change, when there has been time to learn."""
+def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
+    """Over the second half of what follows the change, when there has been time to learn. runs: of each
+    training."""
 
-    def late(policy: str) -> PerSeed:
-        return {r: float(np.nanmean(_after(run[policy])[len(_after(run[policy])) // 2 :]))
-                for r, run in enumerate(runs)}  # fmt: skip
+    def late(policy: str) -> list[PerSeed]:
+        return [{r: float(np.nanmean(_after(run[policy])[len(_after(run[policy])) // 2 :]))
+                 for r, run in enumerate(of)} for of in runs]  # fmt: skip
 
-    recovered = [recovery(run) for run in runs]
-    told = ", ".join("not within the run" if r is None else f"{r} decisions" for r in recovered)
+    recovered = [recovery(run) for of in runs for run in of]
+    told = ", ".join(r if isinstance(r, str) else f"{r} decisions" for r in recovered)
     return [
         better(about, "one that goes on learning is better than what was learnt before the change.",
                late("still learning"), late("learnt"),
@@ -171,15 +168,16 @@ def _judge(about: str, runs: list[Rewards]) -> list[Verdict]:
     ]  # fmt: skip
 
 
-def recovery(run: Rewards) -> int | None:
+def recovery(run: Rewards) -> int | str:
     """Decisions after the change until the one that learns has made up half of what the change cost the
-    learnt one, beside one learnt on the new channel; None: not within the run, or it cost nothing."""
+    learnt one, beside one learnt on the new channel; or, in words, that it cost nothing or is not made up
+    within the run."""
     mine, old, new = (smoothed(_after(run[p]), 40) for p in ("still learning", "learnt", "learnt afterwards"))
     lost = float(np.nanmean(new - old))
     if not lost > 0.0:
-        return None
+        return NOTHING_LOST
     there = np.flatnonzero((mine - old >= 0.5 * lost) & (np.arange(len(mine)) >= 20))
-    return int(there[0]) if len(there) else None
+    return int(there[0]) if len(there) else NOT_WITHIN
 
 
 def _after(values: list[float]) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 from camera_node.config import WorldConfig, source_config
 from edge_server.offline.deployment import exact_scene
 from edge_server.offline.study.base import Ask, Verdict, by_bool
-from edge_server.offline.study.statistics import interval, paired
+from edge_server.offline.study.statistics import Interval, crossed, interval
 from edge_server.offline.study.trial import Trial
 from edge_server.offline.train_scheduler import reward_of
 from edge_server.offline.training.choosing import Maker
@@ -38,6 +38,13 @@ FIELD = "splat"
 FIELD_OPTIONS = {"effort": "low"}
 SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
+# From here what was learnt is judged; no reward has come from here and no update has seen it.
+REPORT = ("cam05", "cam08")
+# Trainings of one lesson: how differently the same lesson may be learnt is part of an interval.
+RUNS = {True: 1, False: 3}
+
+Runs = Sequence[PerSeed]
+"""Rewards by seed of each of several trainings of the same lesson."""
 
 
 @dataclass(frozen=True)
@@ -68,24 +75,28 @@ def room(
     scene: str = "room",
     speed_m_per_s: float = 1.0,
     held_out: tuple[str, ...] = ("cam00",),
+    report: tuple[str, ...] = REPORT,
     embedding: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> Setting:
-    """The usual setting: a world at 64 x 64, nineteen cameras of which one is held out, a splat field. more:
-    of ``Setting``. channel: a preset or a section. embedding: the section ``edge.embedding``."""
+    """The usual setting: a world at 64 x 64, nineteen cameras, of which ``held_out`` reward and ``report``
+    report, and a splat field that is warm. more: of ``Setting``; ``scratch`` is the thesis's. channel: a
+    preset or a section. embedding: the section ``edge.embedding``."""
     section = {"preset": channel} if isinstance(channel, str) else dict(channel)
     trial = Trial(
         scene, 0, section, size=SIZE, field=FIELD, field_options=FIELD_OPTIONS, speed_m_per_s=speed_m_per_s
     )
-    scenario = dataclasses.replace(trial.scenario(), held_out=held_out)
+    scenario = trial.scenario()
+    apart = tuple(c for c in scenario.cameras if c in {*held_out, *report})
+    scenario = dataclasses.replace(scenario, held_out=apart)
     if embedding is not None:
         scenario = dataclasses.replace(scenario, edge={**scenario.edge, "embedding": dict(embedding)})
-    return Setting(scenario, **{"steps": 50, **more})
+    return Setting(scenario, report=report, **{"steps": 50 if more.get("scratch") else 20, **more})
 
 
 class Nearest:
-    """The k cameras that stand nearest to the held-out one, whatever their age: what can be won by knowing
-    from where the field will be looked at, without looking at the state."""
+    """The k cameras that stand nearest to those that reward, whatever their age: what can be won by knowing
+    from where the reward comes, without looking at the state."""
 
     name = "nearest"
     parameter = "k"
@@ -95,7 +106,7 @@ class Nearest:
         source = cast(WorldConfig, source_config(setting.scenario))
         scene, _ = exact_scene(setting.scenario, source)
         stand = {camera: pose[:3, 3] for camera, (_, pose) in scene.cameras.items()}
-        watched = [stand[camera] for camera in setting.scenario.held_out]
+        watched = [stand[camera] for camera in setting.rewarding]
         far = {
             c: min(float(np.linalg.norm(stand[c] - w)) for w in watched) for c in setting.scenario.training
         }
@@ -152,6 +163,14 @@ class School:
         seconds = sum(row["seconds"] for row in rows)
         return Learnt(lesson, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
 
+    def teach_all(self, name: str, setting: Setting, course: Course) -> list[Learnt]:
+        """The lesson, taught as many times as is asked for: each time other episodes, another beginning."""
+        runs = range(RUNS[self.ask.quick])
+        return [
+            self.teach(Lesson(f"{name}-{run}", setting, dataclasses.replace(course, seed=run)))
+            for run in runs
+        ]  # fmt: skip
+
     def contest(
         self,
         setting: Setting,
@@ -160,7 +179,19 @@ class School:
         count: int,
         seed: int = 0,
     ) -> Contest:
-        """All of ``everybody`` on ``count`` seeds that nobody trained on."""
+        """All of ``everybody`` on ``count`` seeds that nobody trained on, judged by the cameras that report:
+        none of what they are asked is what was rewarded."""
+        return self.contest_as_rewarded(setting.judged, everybody, reward, count, seed)
+
+    def contest_as_rewarded(
+        self,
+        setting: Setting,
+        everybody: Mapping[str, Maker | Actor],
+        reward: Reward,
+        count: int,
+        seed: int = 0,
+    ) -> Contest:
+        """The same judged by the cameras that rewarded, too: beside the other, never instead of it."""
         return hold(
             setting, self.crew, seeds(seed, "test", count), everybody, reward,
             lambda line: print(f"  contest: {line}", flush=True),
@@ -184,32 +215,67 @@ def fixed_of(contest: Contest, kind: str) -> str:
     return f"{name} {span(interval(list(values.values())))}"
 
 
-def mean_of(contest: Contest, names: Sequence[str]) -> PerSeed:
-    """Mean reward over several trainings of the same lesson, by seed of testing."""
-    each = [contest.rewards(name) for name in names]
+def mean_of(runs: Runs) -> PerSeed:
+    """Mean reward over several trainings of the same lesson, by seed of testing; for what is told, never for
+    an interval, which would not know how differently the same lesson is learnt."""
     found: PerSeed = {}
-    for s in each[0]:
-        values = [e[s] for e in each]
-        found[s] = (
-            None if any(v is None for v in values) else sum(v for v in values if v is not None) / len(each)
-        )
+    for s in runs[0]:
+        values = [v for run in runs if (v := run[s]) is not None]
+        found[s] = sum(values) / len(runs) if len(values) == len(runs) else None
     return found
 
 
-def better(about: str, claim: str, mine: PerSeed, other: PerSeed, found: str = "") -> Verdict:
+def named_runs(name: str, learnt: Sequence[Learnt | Actor]) -> dict[str, Actor]:
+    """The actors of several trainings of one lesson as a contest takes them."""
+    return {f"{name}-{run}": one.actor if isinstance(one, Learnt) else one for run, one in enumerate(learnt)}
+
+
+def runs_of(contest: Contest, name: str) -> Runs:
+    """Rewards of each of the trainings that ``named_runs`` called ``name``."""
+    of = [n for n in contest.outcomes if n.startswith(f"{name}-") and n[len(name) + 1 :].isdigit()]
+    return [contest.rewards(n) for n in of]
+
+
+def over(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
+    """Paired difference, over seeds and, where they are of several trainings, over those: run r of the one
+    with run r of the other, which saw the same episodes."""
+    ours, theirs = _runs(mine), _runs(other)
+    if len(theirs) == 1:
+        theirs = list(theirs) * len(ours)
+    differences: list[PerSeed] = [
+        {s: None if (x := a[s]) is None or (y := b.get(s)) is None else x - y for s in a}
+        for a, b in zip(ours, theirs, strict=True)
+    ]
+    return crossed(differences)
+
+
+def _runs(values: PerSeed | Runs) -> Runs:
+    return [values] if isinstance(values, dict) else values
+
+
+def _told_of(found: Interval, runs: int) -> str:
+    """The difference for people, and what its interval is over."""
+    trainings = f"{runs} trainings and " if runs > 1 else ""
+    alone = "" if runs > 1 else " of a single training"
+    return f"difference {span(found)} over {trainings}{found.count} seeds{alone}"
+
+
+def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, found: str = "") -> Verdict:
     """Whether ``mine`` is better than ``other``: the paired interval says."""
-    over = paired(mine, other)
-    return Verdict(about, claim, f"{found}difference {span(over)} over {over.count} seeds.",
-                   by_bool(over.above(0.0)))  # fmt: skip
+    difference = over(mine, other)
+    told = _told_of(difference, len(_runs(mine)))
+    return Verdict(about, claim, f"{found}{told}.", by_bool(difference.above(0.0)))
 
 
-def no_worse(about: str, claim: str, mine: PerSeed, other: PerSeed, share: float = 0.01) -> Verdict:
+def no_worse(
+    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, share: float = 0.01
+) -> Verdict:
     """Whether ``mine`` loses no more than ``share`` of the size of ``other``'s mean reward."""
-    over, base = paired(mine, other), interval(list(other.values())).mean
+    difference, base = over(mine, other), crossed(_runs(other)).mean
+    told = _told_of(difference, len(_runs(mine)))
     return Verdict(
-        about, claim,
-        f"difference {span(over)} at {base:.4f}, that is {100 * over.mean / abs(base):+.2f} %.",
-        by_bool(over.above(-share * abs(base))),
+        about, claim, f"{told} at {base:.4f}, that is {100 * difference.mean / abs(base):+.2f} %.",
+        by_bool(difference.above(-share * abs(base))),
     )  # fmt: skip
 
 

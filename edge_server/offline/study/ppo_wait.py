@@ -6,11 +6,20 @@ import dataclasses
 from typing import Any
 
 from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
-from edge_server.offline.study.learning import Lesson, School, better, mean_of, no_worse, room
-from edge_server.offline.study.statistics import interval, paired
+from edge_server.offline.study.learning import (
+    School,
+    better,
+    mean_of,
+    named_runs,
+    no_worse,
+    over,
+    room,
+    runs_of,
+)
+from edge_server.offline.study.statistics import crossed
 from edge_server.offline.train_scheduler import OMEGAS_MS
 from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
-from edge_server.offline.training.report import percent, span
+from edge_server.offline.training.report import percent, quartiles, span
 from edge_server.offline.training.trainer import Course
 from edge_server.scheduler.learned.spec import Action, Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -48,14 +57,10 @@ class PpoWait:
                 everybody: dict[str, Any] = {}
                 for kind in KINDS:
                     spec = Spec(kind, StateLayout(("age", "pose")), OMEGAS_MS[kind])
-                    lesson = f"{self.name}-{channel}{age:g}-{kind}"
-                    learnt = [
-                        school.teach(Lesson(f"{lesson}-{run}", setting,
-                                            Course(spec, reward, EPISODES[ask.quick], tries=3, seed=run)))
-                        for run in range(1 if ask.quick else 3)
-                    ]  # fmt: skip
+                    course = Course(spec, reward, EPISODES[ask.quick], tries=3)
+                    learnt = school.teach_all(f"{self.name}-{channel}{age:g}-{kind}", setting, course)
                     everybody |= rivals(OMEGAS_MS[kind], [kind], ("random", "all"))
-                    everybody |= {f"learnt-{kind}-{run}": one.actor for run, one in enumerate(learnt)}
+                    everybody |= named_runs(f"learnt-{kind}", learnt)
                 contest = school.contest(setting, everybody, reward, len(ask.repeats(16, 100)))
                 verdicts += judge(case, channel, contest)
                 written += rows(contest, channel=channel, age_weight=age)
@@ -66,15 +71,12 @@ class PpoWait:
 def judge(case: str, channel: str, contest: Contest) -> list[Verdict]:
     """What a case's contest says of the thesis's claims and ours."""
     found = []
-    learnt = {
-        k: mean_of(contest, [n for n in contest.outcomes if n.startswith(f"learnt-{k}-")]) for k in KINDS
-    }
+    learnt = {kind: runs_of(contest, f"learnt-{kind}") for kind in KINDS}
     for kind in KINDS:
         about, mine = f"room, {case}, {kind}", learnt[kind]
         best, name = contest.best_fixed(kind)
         varies = contest.varies(kind)
-        low, middle, high = varies["quartiles"]
-        same = paired(mine, contest.rewards(name))
+        same = over(mine, contest.rewards(name))
         told = (
             f"the best is {name}, over which it has {span(same)} where that is known from the very seeds it "
             "is tested on; over the best as the other half of the seeds chose it, "
@@ -87,17 +89,17 @@ def judge(case: str, channel: str, contest: Contest) -> list[Verdict]:
             found.append(no_worse(about, claim, mine, best))
         found.append(
             better(about, "better than a uniformly random set.", mine, contest.rewards("random"),
-                   f"{percent(mine, contest.rewards('random'))}; ")
+                   f"{percent(mean_of(mine), contest.rewards('random'))}; ")
         )  # fmt: skip
         found.append(
             Verdict(about, "the best omega differs between decisions, so that there is something to win.",
-                    f"quartiles {low:g}, {middle:g}, {high:g} ms; to know it would be worth "
-                    f"{span(varies['gain'])} over the best fixed one; learnt "
-                    f"{span(interval(list(mine.values())))}.", by_bool(varies["gain"].above(0.0)))
+                    f"as one fit has it, it is {quartiles(varies)}; to know it would be worth "
+                    f"{span(varies['gain'])} over the best fixed one, as another fit has it; learnt "
+                    f"{span(crossed(mine))}.", by_bool(varies["gain"].above(0.0)))
         )  # fmt: skip
     wait, threshold = learnt["wait"], learnt["threshold"]
     found.append(
         better(f"room, {case}", f"waiting beats thresholds, both learnt (6.5.3: by {THESIS_PERCENT} %).",
-               wait, threshold, f"{percent(wait, threshold)}; ")
+               wait, threshold, f"{percent(mean_of(wait), mean_of(threshold))}; ")
     )  # fmt: skip
     return found

@@ -3,18 +3,29 @@ what a larger embedding is worth."""
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
-from edge_server.offline.study.learning import Learnt, Lesson, School, embeddings_missing, room
-from edge_server.offline.study.statistics import interval, paired
+from edge_server.offline.study.learning import (
+    Learnt,
+    School,
+    better,
+    embeddings_missing,
+    named_runs,
+    over,
+    room,
+    runs_of,
+)
+from edge_server.offline.study.statistics import crossed
 from edge_server.offline.train_scheduler import OMEGAS_MS, layout_of
-from edge_server.offline.training.contest import rivals, rows, write_rows
-from edge_server.offline.training.report import smoothed, span
-from edge_server.offline.training.trainer import Course
+from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
+from edge_server.offline.training.report import span
+from edge_server.offline.training.trainer import Course, Row, stage_file
 from edge_server.report.style import CYCLE, figure, label_lines
+from edge_server.scheduler.learned.decide import Actor
 from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -23,6 +34,8 @@ EPISODES = {True: 60, False: 600}
 BUDGETS = (10, 25, 50, 100)
 QUICK_BUDGETS = (10, 50)
 JUDGED_STEPS = 100
+# Shares of a training after which what has been learnt is judged.
+STAGES = (0.05, 0.1, 0.25, 0.5, 1.0)
 DIMS = (0, 4, 32)
 
 
@@ -40,16 +53,22 @@ class RewardCost:
         with School(ask) as school:
             reward = school.reward("set")
             course = Course(Spec("select", StateLayout(("age", "pose"))), reward, EPISODES[ask.quick])
-            learnt = {steps: school.teach(Lesson(f"{self.name}-{steps}", room("ch5", steps=steps), course))
+            course = dataclasses.replace(course, stages=stages(course.batches))
+            learnt = {steps: school.teach_all(f"{self.name}-{steps}", room("ch5", steps=steps), course)
                       for steps in budgets}  # fmt: skip
             everybody: dict[str, Any] = {
                 **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")),
-                **{f"learnt by {steps} steps": one.actor for steps, one in learnt.items()},
             }
-            contest = school.contest(judged, everybody, reward, len(ask.repeats(8, 100)))
+            for steps, stage in itertools.product(budgets, course.stages):
+                then = [_then(one, stage) for one in learnt[steps]]
+                everybody |= named_runs(_called(steps, stage), then)
+            # Everything at every stage of every training, by dear fits: fewer seeds than elsewhere.
+            contest = school.contest(judged, everybody, reward, len(ask.repeats(8, 40)))
+            spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in course.stages]
+                     for steps, runs in learnt.items()}  # fmt: skip
             written = rows(contest, what="fit budget")
-            found = _by_budget(contest, learnt)
-            _draw(ask, learnt)
+            found = judge(contest, course.stages, spent)
+            _draw(ask, contest, course.stages, spent)
             if not ask.quick:
                 sized, more = _by_dim(school, ask, reward)
                 written, found = written + sized, found + more
@@ -57,20 +76,57 @@ class RewardCost:
         return found
 
 
-def _by_budget(contest: Any, learnt: dict[int, Learnt]) -> list[Verdict]:
-    cheap, dear = min(learnt), max(learnt)
-    over = paired(contest.rewards(f"learnt by {cheap} steps"), contest.rewards(f"learnt by {dear} steps"))
-    told = ", ".join(
-        f"{steps} steps {span(interval(list(contest.rewards(f'learnt by {steps} steps').values())))} after "
-        f"{one.seconds:.0f} s" for steps, one in learnt.items()
+def stages(batches: int) -> tuple[int, ...]:
+    """After how many batches what has been learnt is judged: early often, then at ever longer intervals."""
+    return tuple(sorted({max(1, round(batches * share)) for share in STAGES}))
+
+
+def spent_s(logs: Sequence[Sequence[Row]], batches: int) -> float:
+    """Processor time of all fits of the first so many batches, mean over trainings. Each fit counts as what
+    it took when it was carried out, so that a training whose fits were known already is no cheaper."""
+    return sum(row["fit_seconds"] for rows in logs for row in rows[:batches]) / len(logs)
+
+
+def judge(contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]) -> list[Verdict]:
+    """Whether a cheap reward has taught more when a dear one has had as much time for its fits, all judged by
+    the contest's fits. spent: budget -> seconds of fits at each of the stages."""
+    about = f"room, ch5, judged by fits of {JUDGED_STEPS} steps"
+    cheap, dear = min(spent), max(spent)
+    curves = {steps: [runs_of(contest, _called(steps, stage)) for stage in stages] for steps in spent}
+    told = "; ".join(
+        f"{steps} steps a fit " + ", ".join(f"{span(crossed(runs))} after {at:.1f} s"
+                                            for runs, at in zip(curves[steps], spent[steps]))
+        for steps in spent
     )  # fmt: skip
+    same = over(curves[cheap][-1], curves[dear][-1])
+    number = Verdict(
+        about,
+        "for the same number of decisions a cheap reward teaches as much as a dear one (no worse by 0.01).",
+        f"{cheap} less {dear} steps: {span(same)}; {told}.",
+        by_bool(same.above(-0.01)),
+    )
+    claim = f"for the same time of fits {cheap} steps a fit teach more than {dear}."
+    theirs = _as_long(spent[cheap][-1], spent[dear])
     return [
-        Verdict(
-            f"room, ch5, judged by fits of {JUDGED_STEPS} steps",
-            "for the same number of decisions a cheap reward teaches as much as a dear one (no worse).",
-            f"{told}; {cheap} less {dear}: {span(over)}.", by_bool(over.above(-0.01)),
-        )
+        number,
+        better(about, claim, curves[cheap][-1], curves[dear][theirs],
+               f"after {spent[cheap][-1]:.1f} and {spent[dear][theirs]:.1f} s of fits: "),
     ]  # fmt: skip
+
+
+def _as_long(limit_s: float, dear: Sequence[float]) -> int:
+    """The first stage of the dear one that took at least as long as the cheap one, or its last: the dear one
+    is given the benefit of the difference."""
+    return next((k for k, seconds in enumerate(dear) if seconds >= limit_s), len(dear) - 1)
+
+
+def _called(steps: int, stage: int) -> str:
+    return f"{steps} steps, {stage} batches"
+
+
+def _then(learnt: Learnt, batches: int) -> Actor:
+    """What it had learnt after so many batches."""
+    return Actor.load(stage_file(learnt.folder, batches))
 
 
 def _by_dim(school: School, ask: Ask, reward: Any) -> tuple[list[dict[str, Any]], list[Verdict]]:
@@ -79,34 +135,30 @@ def _by_dim(school: School, ask: Ask, reward: Any) -> tuple[list[dict[str, Any]]
         print(f"  embedding sizes are left out: {missing}")
         return [], []
     setting = room("ch5", parts=("semantics", "age", "pose"))
-    mine: dict[str, Any] = {}
+    contests: dict[str, Contest] = {}
     for dim in DIMS:
         with_dim = setting if not dim else room("ch5", parts=setting.parts, embedding={"dim": dim})
         layout = layout_of(with_dim, ("semantics", "age", "pose") if dim else ("age", "pose"))
-        lesson = Lesson(
+        learnt = school.teach_all(
             f"reward-cost-d{dim}", with_dim, Course(Spec("select", layout), reward, EPISODES[False])
         )
-        actor = school.teach(lesson).actor
-        contest = school.contest(with_dim, {**rivals((), (), ("random",)), f"d = {dim}": actor}, reward,
-                                 len(ask.repeats(8, 100)))  # fmt: skip
-        mine[f"d = {dim}"] = contest
-    rewards = {name: contest.rewards(name) for name, contest in mine.items()}
-    base = rewards["d = 0"]
-    verdicts = [
-        Verdict("room, ch5", f"{name} is better than none.", f"difference {span(paired(values, base))}.",
-                by_bool(paired(values, base).above(0.0)))
-        for name, values in rewards.items() if name != "d = 0"
-    ]  # fmt: skip
-    return [row for name, c in mine.items() for row in rows(c, what=name)], verdicts
+        everybody: dict[str, Any] = {**rivals((), (), ("random",)), **named_runs(f"d = {dim}", learnt)}
+        contests[f"d = {dim}"] = school.contest(with_dim, everybody, reward, len(ask.repeats(8, 100)))
+    return [row for name, c in contests.items() for row in rows(c, what=name)], judge_dims(contests)
 
 
-def _draw(ask: Ask, learnt: dict[int, Learnt]) -> None:
+def judge_dims(contests: dict[str, Contest]) -> list[Verdict]:
+    """Whether each embedding is worth more than none, ``d = 0``."""
+    runs = {name: runs_of(contest, name) for name, contest in contests.items()}
+    return [better("room, ch5", f"{name} is better than none.", values, runs["d = 0"])
+            for name, values in runs.items() if name != "d = 0"]  # fmt: skip
+
+
+def _draw(ask: Ask, contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]) -> None:
     with figure(ask.out / "reward-cost.png", 1, height_inch=3.0) as (_, axes):
-        for k, (steps, one) in enumerate(learnt.items()):
-            seconds = np.cumsum([row["seconds"] for row in one.rows])
-            values = smoothed(np.array([np.nan if r["reward"] is None else r["reward"] for r in one.rows]))
-            # Rewards of different budgets have different zeros: what is gained since the start is compared.
-            axes[0, 0].plot(
-                seconds, values - values[0], color=CYCLE[k % len(CYCLE)], label=f"{steps} steps a fit"
-            )
-        label_lines(axes[0, 0], "reward gained in training", "seconds of training", "What a reward costs")
+        for k, (steps, seconds) in enumerate(spent.items()):
+            means = [crossed(runs_of(contest, _called(steps, stage))).mean for stage in stages]
+            axes[0, 0].plot(seconds, means, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
+                            label=f"{steps} steps a fit")  # fmt: skip
+        label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of fits (processor time)",
+                    "What a reward costs")  # fmt: skip

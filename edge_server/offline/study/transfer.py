@@ -6,9 +6,17 @@ import dataclasses
 from typing import Any
 
 from edge_server.offline.study.base import Ask, Point, Table, Verdict
-from edge_server.offline.study.learning import Lesson, School, better, fixed_of, no_worse, room
+from edge_server.offline.study.learning import (
+    School,
+    better,
+    fixed_of,
+    named_runs,
+    no_worse,
+    room,
+    runs_of,
+)
 from edge_server.offline.train_scheduler import OMEGAS_MS
-from edge_server.offline.training.contest import rivals, rows, write_rows
+from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
 from edge_server.offline.training.setting import Setting
 from edge_server.offline.training.trainer import Course
 from edge_server.scheduler.learned.spec import Spec
@@ -41,26 +49,33 @@ class Transfer:
         with School(ask) as school:
             reward = dataclasses.replace(school.reward("corrected"), age=AGE)
             places = settings(ask.quick)
+            course = Course(spec, reward, EPISODES[ask.quick], tries=3)
             learnt = {
-                place: school.teach(
-                    Lesson(f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",
-                           setting, Course(spec, reward, EPISODES[ask.quick], tries=3))
-                ).actor
+                place: school.teach_all(
+                    f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",
+                    setting, course,
+                )
                 for place, setting in places.items()
             }  # fmt: skip
             for place, setting in places.items():
                 everybody: dict[str, Any] = {
                     **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
-                    "learnt at home": learnt[HOME], "learnt here": learnt[place],
+                    **named_runs("learnt at home", learnt[HOME]), **named_runs("learnt here", learnt[place]),
                 }  # fmt: skip
                 contest = school.contest(setting, everybody, reward, len(ask.repeats(8, 100)))
                 written += rows(contest, place=place)
-                home, here = contest.rewards("learnt at home"), contest.rewards("learnt here")
-                best = contest.best_fixed("wait")[0]
-                found.append(better(place, f"learnt in {HOME}, better than the best fixed wait here.", home,
-                                    best, f"against {fixed_of(contest, 'wait')}; "))  # fmt: skip
-                if place != HOME:
-                    found.append(no_worse(place, f"learnt in {HOME}, it loses no more than 5 % to what is "
-                                          "learnt here.", home, here, 0.05))  # fmt: skip
+                found += judge(place, contest)
         write_rows(ask.out / f"{self.name}.csv", written)
         return found
+
+
+def judge(place: str, contest: Contest) -> list[Verdict]:
+    """How what was learnt at home does at a place, beside what was learnt there."""
+    home, here = runs_of(contest, "learnt at home"), runs_of(contest, "learnt here")
+    best, told = contest.best_fixed("wait")[0], fixed_of(contest, "wait")
+    found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best,
+                    f"against {told}; ")]  # fmt: skip
+    if place != HOME:
+        claim = f"learnt in {HOME}, it loses no more than 5 % to what is learnt here."
+        found.append(no_worse(place, claim, home, here, 0.05))
+    return found

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
-from edge_server.offline.study.learning import Lesson, School, better, room
-from edge_server.offline.study.statistics import paired
+from edge_server.offline.study.learning import School, better, named_runs, over, room, runs_of
 from edge_server.offline.train_scheduler import OMEGAS_MS
-from edge_server.offline.training.contest import rivals, rows, write_rows
+from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
 from edge_server.offline.training.report import span
 from edge_server.offline.training.trainer import Course
 from edge_server.scheduler.learned.rewards import Reward
@@ -31,36 +31,36 @@ class Weights:
         setting, spec = room("swing"), Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
         with School(ask) as school:
             rewards = variants(school)
-            learnt = {
-                name: school.teach(
-                    Lesson(f"{self.name}-{name}", setting,
-                           Course(spec, reward, EPISODES[ask.quick], tries=3))
-                ).actor
-                for name, reward in rewards.items()
-            }  # fmt: skip
-            everybody: dict[str, Any] = {
-                **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
-                **{f"learnt {name}": actor for name, actor in learnt.items()},
-            }
+            everybody: dict[str, Any] = {**rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all"))}
+            for name, reward in rewards.items():
+                course = Course(spec, reward, EPISODES[ask.quick], tries=3)
+                learnt = school.teach_all(f"{self.name}-{name}", setting, course)
+                everybody |= named_runs(f"learnt {name}", learnt)
             contest = school.contest(setting, everybody, rewards["corrected"], len(ask.repeats(8, 100)))
         found, written = [], []
         for name, reward in rewards.items():
             contest.reward = reward
             written += rows(contest, judged_by=name)
-            mine, about = contest.rewards(f"learnt {name}"), f"room, swing, {name}"
-            best, fixed = contest.best_fixed("wait")
-            claim = "what was learnt by it is better than the best fixed wait."
-            found.append(better(about, claim, mine, best, f"the best is {fixed}; "))
-            losses = {o: paired(mine, contest.rewards(f"learnt {o}")) for o in rewards if o != name}
-            worst = max(losses, key=lambda o: losses[o].mean)
-            answers = [loss.above(0.0) for loss in losses.values()]
-            found.append(
-                Verdict(about, "it matters: what was learnt by other weights is worse by these.",
-                        "; ".join(f"{o} {span(loss)}" for o, loss in losses.items()) + f"; most: {worst}.",
-                        by_bool(None if None in answers and True not in answers else True in answers))
-            )  # fmt: skip
+            found += judge(contest, name, list(rewards))
         write_rows(ask.out / f"{self.name}.csv", written)
         return found
+
+
+def judge(contest: Contest, name: str, names: Sequence[str]) -> list[Verdict]:
+    """What was learnt by the reward ``name``, and by the others of ``names``, judged by ``name``, which is
+    the contest's reward."""
+    mine, about = runs_of(contest, f"learnt {name}"), f"room, swing, {name}"
+    best, fixed = contest.best_fixed("wait")
+    losses = {o: over(mine, runs_of(contest, f"learnt {o}")) for o in names if o != name}
+    worst = max(losses, key=lambda o: losses[o].mean)
+    answers = [loss.above(0.0) for loss in losses.values()]
+    return [
+        better(about, "what was learnt by it is better than the best fixed wait.", mine, best,
+               f"the best is {fixed}; "),
+        Verdict(about, "it matters: what was learnt by other weights is worse by these.",
+                "; ".join(f"{o} {span(loss)}" for o, loss in losses.items()) + f"; most: {worst}.",
+                by_bool(None if None in answers and True not in answers else True in answers)),
+    ]  # fmt: skip
 
 
 def variants(school: School) -> dict[str, Reward]:

@@ -7,6 +7,7 @@ differences are paired. The unit that repeats is the episode's seed.
 from __future__ import annotations
 
 import csv
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -23,6 +24,8 @@ from edge_server.scheduler.learned.decide import Actor
 from edge_server.scheduler.learned.rewards import Reward
 
 PerSeed = dict[int, float | None]
+At = tuple[int, int]
+"""Seed of an episode and number of a decision."""
 
 # What there is without learning, thresholds and waits aside.
 RIVALS = (
@@ -35,10 +38,13 @@ _ASKED_AT_ONCE = 400
 
 @dataclass
 class Contest:
-    """Outcomes by policy and decision. reward: by which they are judged; another one costs nothing."""
+    """Outcomes by policy and decision. reward: by which they are judged; another one costs nothing. again:
+    the same choices carried out once more, with other luck: what looked best at a decision is measured where
+    it was not chosen, since the best of many lucky fits is better than any of them."""
 
     reward: Reward
-    outcomes: dict[str, dict[tuple[int, int], Outcome]] = field(default_factory=dict)
+    outcomes: dict[str, dict[At, Outcome]] = field(default_factory=dict)
+    again: dict[str, dict[At, Outcome]] = field(default_factory=dict)
 
     def value(self, outcome: Outcome) -> float | None:
         """Its reward; None where a term is missing: it could not be compared."""
@@ -46,23 +52,21 @@ class Contest:
         return found.total if found.complete else None
 
     def rewards(self, name: str) -> PerSeed:
-        """seed -> mean reward of its decisions. ``hindsight``: at every decision the best of all that was
-        tried there, which no policy can beat and none can know."""
-        if name != HINDSIGHT:
-            return _by_seed({at: self.value(o) for at, o in self.outcomes[name].items()})
-        best: dict[tuple[int, int], float | None] = {}
-        for found in self.outcomes.values():
-            for at, outcome in found.items():
-                value = self.value(outcome)
-                if value is not None:
-                    best[at] = max(value, known) if (known := best.get(at)) is not None else value
-        return _by_seed(best)
+        """seed -> mean reward of its decisions. ``hindsight``: at every decision what was the best of all
+        that was tried there, which none can know: chosen by one fit and measured by another."""
+        if name == HINDSIGHT:
+            return _by_seed(self._top(list(self.outcomes))[0])
+        return _by_seed(self._values(name))
+
+    def seeds(self, name: str) -> tuple[int, int]:
+        """How many seeds there are, and how many have a value."""
+        found = self.rewards(name)
+        return len(found), sum(v is not None for v in found.values())
 
     def term(self, name: str, term: str) -> Interval:
         """Mean of one term of the outcomes over seeds."""
-        return interval(
-            list(_by_seed({at: getattr(o, term) for at, o in self.outcomes[name].items()}).values())
-        )
+        found = {at: _mean([getattr(o, term) for o in self._fits(name, at)]) for at in self.outcomes[name]}
+        return interval(list(_by_seed(found).values()))
 
     def best_fixed(self, kind: str) -> tuple[PerSeed, str]:
         """Rewards of ``kind`` (threshold, wait) at its best value, chosen on one half of the seeds and
@@ -85,17 +89,39 @@ class Contest:
 
     def varies(self, kind: str) -> dict[str, Any]:
         """How far the best value of ``kind`` differs between decisions, and what knowing it would be worth:
-        hindsight among these values alone minus the best fixed one, paired over seeds."""
+        hindsight among these values alone minus the best fixed one, paired over seeds. Nothing is known of
+        either where every choice was carried out only once."""
         names = [name for name in self.outcomes if name.startswith(f"{kind}:")]
-        at_all = list(self.outcomes[names[0]])
-        table = np.array([[_number(self.value(self.outcomes[n][at])) for n in names] for at in at_all])
-        usable = np.isfinite(table).all(axis=1)
-        best = table[usable].argmax(axis=1)
-        values = np.array([float(n.partition(":")[2]) for n in names])
-        top = dict(zip([at for at, ok in zip(at_all, usable) if ok], table[usable].max(axis=1).tolist()))
+        top, best = self._top(names)
         gain = paired(_by_seed(top), self.best_fixed(kind)[0])
-        quartiles = np.percentile(values[best], [25, 50, 75]) if len(best) else [np.nan] * 3
-        return {"quartiles": [float(q) for q in quartiles], "gain": gain}
+        values = [float(names[k].partition(":")[2]) for k in best]
+        quartiles = np.percentile(values, [25, 50, 75]).tolist() if values else [None] * 3
+        return {"quartiles": quartiles, "gain": gain}
+
+    def _fits(self, name: str, at: At) -> list[Outcome]:
+        second = self.again.get(name, {}).get(at)
+        return [self.outcomes[name][at], *([second] if second is not None else [])]
+
+    def _values(self, name: str) -> dict[At, float | None]:
+        return {at: _mean([self.value(o) for o in self._fits(name, at)]) for at in self.outcomes[name]}
+
+    def _top(self, names: Sequence[str]) -> tuple[dict[At, float | None], list[int]]:
+        """Decision -> the reward of what was the best of ``names``: chosen by each of two fits and measured
+        by the other, of those that have both; None where none has. And the number of each best one."""
+        found: dict[At, float | None] = {}
+        best: list[int] = []
+        for at in self.outcomes[names[0]] if names else ():
+            pairs = {k: [self.value(o) for o in self._fits(n, at)] for k, n in enumerate(names)
+                     if at in self.outcomes[n]}  # fmt: skip
+            known = {k: p for k, p in pairs.items() if len(p) == 2 and None not in p}
+            if not known:
+                found[at] = None
+                continue
+            numbers, table = list(known), np.array(list(known.values()), float)
+            first, second = table.argmax(axis=0).tolist()
+            found[at] = float(table[first, 1] + table[second, 0]) / 2
+            best += [numbers[first], numbers[second]]
+        return found, best
 
 
 def hold(
@@ -106,25 +132,32 @@ def hold(
     reward: Reward,
     say: Any = None,
 ) -> Contest:
-    """Carry out what each of ``rivals`` chooses at every decision of every seed."""
+    """Carry out what each of ``rivals`` chooses at every decision of every seed, twice, with fields of other
+    seeds. Give it ``Setting.judged``: what rewarded does not judge."""
+    contest = Contest(reward, {name: {} for name in rivals}, {name: {} for name in rivals})
     episodes = crew.draw(setting, seeds)
     asked: list[tuple[str, Asked]] = []
-    for place, (name, rival) in enumerate(rivals.items()):
-        for moments in episodes:
+    # All that is asked of one episode stands together: its pictures and its field are at hand once.
+    for moments in episodes:
+        for place, (name, rival) in enumerate(rivals.items()):
             if isinstance(rival, Actor):
                 acts, _ = rival.act([m.state for m in moments])
                 chosen = [of_action(rival.spec, a, m) for a, m in zip(acts, moments)]
             else:
                 chosen = choices(rival, moments, place)
             asked += [(name, (m.seed, m.number, c)) for m, c in zip(moments, chosen)]
-    contest = Contest(reward)
-    for first in range(0, len(asked), _ASKED_AT_ONCE):
-        part = asked[first : first + _ASKED_AT_ONCE]
-        found = crew.evaluate(setting, [a for _, a in part])
-        for (name, (seed, number, _)), outcome in zip(part, found):
-            contest.outcomes.setdefault(name, {})[seed, number] = outcome
-        if say is not None:
-            say(f"{min(first + _ASKED_AT_ONCE, len(asked))}/{len(asked)} evaluations")
+    fits = [
+        (contest.outcomes, setting),
+        (contest.again, dataclasses.replace(setting, repeat=setting.repeat + 1)),
+    ]
+    for turn, (into, where) in enumerate(fits):
+        for first in range(0, len(asked), _ASKED_AT_ONCE):
+            part = asked[first : first + _ASKED_AT_ONCE]
+            found = crew.evaluate(where, [a for _, a in part])
+            for (name, (seed, number, _)), outcome in zip(part, found):
+                into[name][seed, number] = outcome
+            if say is not None:
+                say(f"{turn * len(asked) + first + len(part)}/{2 * len(asked)} evaluations")
     return contest
 
 
@@ -166,7 +199,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def _by_seed(values: Mapping[tuple[int, int], float | None]) -> PerSeed:
+def _by_seed(values: Mapping[At, float | None]) -> PerSeed:
     """Mean over each seed's decisions; None where one of them has no value, lest seeds be compared that
     lack different ones."""
     found: dict[int, list[float | None]] = {}
@@ -178,5 +211,7 @@ def _by_seed(values: Mapping[tuple[int, int], float | None]) -> PerSeed:
     }
 
 
-def _number(value: float | None) -> float:
-    return np.nan if value is None else value
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None where one is missing."""
+    known = [v for v in values if v is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import signal
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
@@ -29,9 +30,11 @@ from freshfield.files import Lines
 
 Asked = tuple[int, int, Choice]
 """Seed of an episode, number of a decision, what was chosen."""
+Progress = Callable[[int, int], None]
+_Task = tuple[list[str], list[Asked]]
 
-# Evaluations of one task: few enough that little is lost by Ctrl-C.
-_ASKED_A_TASK = 48
+# Evaluations of one task: few enough that little is lost by Ctrl-C, and that progress can be told.
+_ASKED_A_TASK = 8
 # Settings whose pictures a process keeps.
 _GROUNDS_KEPT = 3
 _GROUNDS: dict[tuple[str, Folders], Ground] = {}
@@ -51,9 +54,15 @@ def _draw(setting: Setting, folders: Folders, seeds: Sequence[int]) -> list[tupl
     return [ground.episode(seed).moments for seed in seeds]
 
 
-def _evaluate(setting: Setting, folders: Folders, asked: Sequence[Asked]) -> list[Outcome]:
-    ground = _ground(setting, folders)
-    return [ground.episode(seed).evaluate(number, choice) for seed, number, choice in asked]
+def _evaluate(setting: Setting, folders: Folders, asked: Sequence[Asked]) -> list[tuple[Outcome, float]]:
+    """Outcomes, and the milliseconds of processor time that each fit took."""
+    ground, found = _ground(setting, folders), []
+    for seed, number, choice in asked:
+        episode = ground.episode(seed)
+        before_s = episode.spent_s
+        outcome = episode.evaluate(number, choice)
+        found.append((outcome, round((episode.spent_s - before_s) * 1e3, 3)))
+    return found
 
 
 def _begin() -> None:
@@ -78,6 +87,7 @@ class Crew:
         self._pools: list[ProcessPoolExecutor] = []
         self._moments: dict[tuple[str, int], tuple[Moment, ...]] = {}
         self._known: dict[str, Outcome] = {}
+        self._fit_ms: dict[str, float] = {}
         self._lines: Lines | None = None
         if known is not None:
             self._read(known)
@@ -113,24 +123,45 @@ class Crew:
         for seed in seeds:
             self._moments.pop((setting.key, seed), None)
 
-    def evaluate(self, setting: Setting, asked: Sequence[Asked]) -> list[Outcome]:
-        """What each choice came to, in the order asked. After Ctrl-C the file has what was finished."""
+    def evaluate(
+        self, setting: Setting, asked: Sequence[Asked], say: Progress | None = None
+    ) -> list[Outcome]:
+        """What each choice came to, in the order asked. After Ctrl-C the file has what was finished. say: is
+        told how many of the evaluations that were not known are done, and how many there are."""
         keys = [self._key(setting, a) for a in asked]
         wanted = {key: a for key, a in zip(keys, asked) if key not in self._known}
-        tasks: list[tuple[list[str], list[Asked]]] = []
+        tasks: list[_Task] = []
         for place in range(self.jobs):
             mine = [(key, a) for key, a in wanted.items() if a[0] % self.jobs == place]
             for i in range(0, len(mine), _ASKED_A_TASK):
                 part = mine[i : i + _ASKED_A_TASK]
                 tasks.append(([key for key, _ in part], [a for _, a in part]))
-        sent = [(task, self._send(task[1][0][0], _evaluate, setting, task[1])) for task in tasks]
-        for (names, _), result in sent:
-            for name, outcome in zip(names, result.result()):
-                self._known[name] = outcome
+        done = 0
+        for names, found in self._carried_out(setting, tasks):
+            for name, (outcome, fit_ms) in zip(names, found):
+                self._known[name], self._fit_ms[name] = outcome, fit_ms
                 self.evaluated += 1
                 if self._lines is not None:
-                    self._lines.write(json.dumps({"key": name, **asdict(outcome)}))
+                    self._lines.write(json.dumps({"key": name, "fit_ms": fit_ms, **asdict(outcome)}))
+            done += len(names)
+            if say is not None:
+                say(done, len(wanted))
         return [self._known[key] for key in keys]
+
+    def fit_s(self, setting: Setting, asked: Sequence[Asked]) -> float:
+        """Processor time of the fits of what has been evaluated, each counted once and as what it took when
+        it was carried out, however long ago. KeyError where one has not been."""
+        return math.fsum(self._fit_ms[key] for key in {self._key(setting, a) for a in asked}) / 1e3
+
+    def _carried_out(self, setting: Setting, tasks: Sequence[_Task]) -> Iterator[tuple[list[str], list[Any]]]:
+        """Tasks as they are finished."""
+        if self.jobs == 1:
+            for names, part in tasks:
+                yield names, _evaluate(setting, self.folders, part)
+            return
+        sent = {self._send(part[0][0], _evaluate, setting, part): names for names, part in tasks}
+        for result in as_completed(sent):
+            yield sent[result], result.result()
 
     def _drawn(self, setting: Setting, seeds: Sequence[int]) -> tuple[list[int], list[tuple[Moment, ...]]]:
         parts = [[s for s in seeds if s % self.jobs == place] for place in range(self.jobs)]
@@ -172,7 +203,8 @@ class Crew:
         for line in path.read_text().splitlines():
             try:
                 found = json.loads(line)
-                key = str(found.pop("key"))
+                key, fit_ms = str(found.pop("key")), float(found.pop("fit_ms"))
                 self._known[key] = Outcome(**found)
+                self._fit_ms[key] = fit_ms
             except (ValueError, KeyError, TypeError):
                 continue

@@ -8,11 +8,12 @@ of one decision are comparable (thesis 5.4, algorithm 1; 6.3, algorithm 2).
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,11 +37,14 @@ from edge_server.scheduler.learned.observe import Embeddings, observe
 from edge_server.scheduler.learned.state import State
 from edge_server.views import Decoder
 from freshfield.frame import Frame
-from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario, ScenarioError
+
+if TYPE_CHECKING:
+    from edge_server.embed import Embedder
 
 Image = Callable[[str, float], NDArray[np.uint8]]
 # Episodes whose pictures and warm fields a process keeps.
-_EPISODES_KEPT = 96
+_EPISODES_KEPT = 32
 _TRUTHS_KEPT = 8192
 # The deployment's own edge never decides here.
 _NEVER_MS = 1e11
@@ -68,7 +72,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an update came to: fidelity on the held-out cameras (None where there is none), aaoi_ms (6.35: of
+    """What an update came to: fidelity on the scoring cameras (None where there is none), aaoi_ms (6.35: of
     the used views at publication; None of none), views used, and wait_ms from the decision to publication."""
 
     psnr_db: float | None
@@ -142,44 +146,82 @@ class _Recorder(FrameBuffer):
         self.record.append(Buffered(frame, frame.generated_edge_ns, received_ns))
 
 
-def _period_ns(scenario: Scenario, source: WorldConfig) -> int | None:
-    """After how long a world looks the same again; None where effects may change from one round to the
-    next."""
-    scene, effects = exact_scene(scenario, source)
-    return round(scene.period_s * 1e9) if scene.moving and effects is NO_EFFECTS else None
-
-
 def _remembered(image: Image, period_ns: int | None) -> Image:
     """``image``, rendered once for every instant of a round."""
     known = lru_cache(_TRUTHS_KEPT)(lambda camera, at_ns: image(camera, at_ns / 1e9))
     return lambda camera, t_s: known(camera, round(t_s * 1e9) % period_ns if period_ns else round(t_s * 1e9))
 
 
+@dataclass(frozen=True)
+class Stage:
+    """What is seen of one motion."""
+
+    truth: Truth
+    cameras: list[Camera]
+
+
 class Ground:
-    """What all episodes of a setting share in one process: pictures, truth, a field, an embedder."""
+    """What the episodes of a setting share in one process: a scorer, a field, an embedder, and the pictures
+    where all have the same motion."""
 
     def __init__(self, setting: Setting, folders: Folders) -> None:
         scenario = setting.scenario
-        edge = read_config(scenario)
+        self._edge = edge = read_config(scenario)
         source = source_config(scenario)
+        self._moving, self._period_ns = False, None
+        if isinstance(source, WorldConfig):
+            scene, effects = exact_scene(scenario, source)
+            self._moving = scene.moving and setting.motions and hasattr(scene.params, "motion_seed")
+            if scene.moving and effects is NO_EFFECTS and not self._moving:
+                self._period_ns = round(scene.period_s * 1e9)
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips, edge.lpips)[0]  # type: ignore[arg-type]
-        scorer = Scorer(lpips, edge.noisy_truth, perceptual=listed_metric(edge.metrics))
-        found = truth_of(scenario, source, edge, scorer, folders.data)
-        assert found is not None  # a setting has a camera held out
-        if isinstance(found, ExactTruth) and isinstance(source, WorldConfig):
-            found = replace(found, image=_remembered(found.image, _period_ns(scenario, source)))
+        self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=listed_metric(edge.metrics))
         self.setting, self.folders = setting, folders
-        self.truth: Truth = found
-        self.cameras: list[Camera] = training_cameras(scenario, folders.data)
-        self.field: Field = make_field(edge.field, {**edge.field_options, "threads": 1}, seed=scenario.seed)
-        self.embeddings: Embeddings | None = None
+        self._shared = None if self._moving else self._stage(scenario)
+        self._field: tuple[int, Field] | None = None
+        self._embedder: Embedder | None = None
         if "semantics" in setting.parts:
             # Nothing of it is loaded where no policy looks at pictures.
             from edge_server.embed import EmbeddingConfig, make_embedder
-            from edge_server.embed.cache import EmbeddingCache
 
-            self.embeddings = EmbeddingCache(make_embedder(edge.embedding or EmbeddingConfig()), Decoder())
+            self._embedder = make_embedder(edge.embedding or EmbeddingConfig())
         self._episodes: OrderedDict[int, Episode] = OrderedDict()
+
+    def scenario(self, seed: int) -> Scenario:
+        """The deployment of an episode."""
+        return self.setting.seeded(seed, self._moving)
+
+    def stage(self, seed: int) -> Stage:
+        """The pictures of an episode."""
+        return self._shared or self._stage(self.scenario(seed))
+
+    def embeddings(self) -> Embeddings | None:
+        """Of one episode: frames of the same number are other pictures in the next."""
+        if self._embedder is None:
+            return None
+        from edge_server.embed.cache import EmbeddingCache
+
+        return EmbeddingCache(self._embedder, Decoder())
+
+    def field(self, seed: int) -> Field:
+        """The field of an episode, in any state: whoever takes it resets or loads it."""
+        seed = self.setting.field_seed(seed)
+        if self._field is None or self._field[0] != seed:
+            options = {**self._edge.field_options, "threads": 1}
+            try:
+                self._field = seed, make_field(self._edge.field, options, seed=seed)
+            except ValueError as error:
+                raise ScenarioError(f"{self.setting.scenario.path}: edge: {error}") from None
+        return self._field[1]
+
+    def _stage(self, scenario: Scenario) -> Stage:
+        # The truth is of who scores; none of the others that are held out is rendered.
+        scoring = replace(scenario, held_out=self.setting.scoring)
+        truth = truth_of(scoring, source_config(scenario), self._edge, self._scorer, self.folders.data)
+        assert truth is not None  # a setting has a camera held out
+        if isinstance(truth, ExactTruth):
+            truth = replace(truth, image=_remembered(truth.image, self._period_ns))
+        return Stage(truth, training_cameras(scenario, self.folders.data))
 
     def episode(self, seed: int) -> Episode:
         """The episode of a seed: the same whether it is new or kept."""
@@ -197,12 +239,19 @@ class Episode:
 
     def __init__(self, ground: Ground, seed: int) -> None:
         self._ground, setting = ground, ground.setting
-        scenario = replace(setting.seeded(seed), edge={**setting.scenario.edge, "policy": {"name": "all"}})
+        scenario = replace(ground.scenario(seed), edge={**setting.scenario.edge, "policy": {"name": "all"}})
+        stage = ground.stage(seed)
+        self._truth = stage.truth
+        heard = tuple(c for c in scenario.cameras if c not in setting.silent)
         self._deployment: VirtualDeployment = deploy(
-            scenario, Terms(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
-            field=ground.field, cameras=ground.cameras, data=ground.folders.data, truth=ground.truth,
-        )  # fmt: skip
-        recorder = _Recorder(scenario.training)
+            replace(scenario, cameras=heard),
+            Terms(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
+            field=ground.field(seed),
+            cameras=[camera for camera in stage.cameras if camera.name in heard],
+            data=ground.folders.data,
+            truth=stage.truth,
+        )
+        recorder = _Recorder([c for c in scenario.training if c in heard])
         self._deployment.updates.buffer = recorder
         rng = scenario.rng("decisions")
         lead, span = setting.lead_ms / GRID_MS, setting.span_ms / GRID_MS
@@ -217,12 +266,15 @@ class Episode:
         self._views: dict[tuple[str, int], View | None] = {}
         self._warm: list[dict[str, NDArray[Any]]] = []
         self.seed = seed
+        self._embeddings = ground.embeddings()
+        self.spent_s = 0.0
+        """Processor time of the fits so far."""
         self.moments = tuple(self._moment(number) for number in range(setting.decisions))
 
     def evaluate(self, number: int, choice: Choice) -> Outcome:
-        """Fit what was chosen at a decision and score it at the instant of publication on the held-out
-        camera. Where nothing was chosen, or nothing of it can be decoded, there are no scores."""
-        setting, field, moment = self._ground.setting, self._ground.field, self.moments[number]
+        """Fit what was chosen at a decision and score it at the instant of publication on the setting's
+        scoring cameras. Where nothing was chosen, or nothing of it can be decoded, there are no scores."""
+        setting, moment = self._ground.setting, self.moments[number]
         newest = moment.newest(choice.at_ns)
         chosen = [newest[c] for c in choice.cameras]
         views = self._decoded(chosen)
@@ -239,12 +291,16 @@ class Episode:
             treatment = treatment_of(make_policy(choice.treatment, None, np.random.default_rng(0)))
             assert treatment is not None
             shown = treatment.treat(views, by_camera, published_ns)
-        if setting.scratch:
+        field = self._ground.field(self.seed)
+        warm = None if setting.scratch else self._warm_state(number)
+        began_s = time.process_time()
+        if warm is None:
             field.reset()
         else:
-            field.load_state(self._warm_state(number))
+            field.load_state(warm)
         field.fit(shown, Budget(steps=setting.steps))
-        score = self._ground.truth.score(field.snapshot(published_ns), published_ns)
+        self.spent_s += time.process_time() - began_s
+        score = self._truth.score(field.snapshot(published_ns), published_ns)
         ages_ms = [(published_ns - view.generated_ns) / 1e6 for view in views]
         views_used, wait_ms = float(len(views)), (published_ns - moment.now_ns) / 1e6
         aaoi_ms = float(np.mean(ages_ms))
@@ -268,8 +324,9 @@ class Episode:
         known = sorted((a for kept in before.values() for a in kept), key=lambda a: a.received_ns)
         reported = [max(kept, key=lambda a: a.generated_ns) for kept in before.values()]
         newest = {item.frame.camera: item for item in self._exposed(reported)}
-        cameras, ground = self._deployment.updates.buffer.cameras, self._ground
-        state = observe(cameras, newest, now_ns, ground.embeddings, ground.setting.parts)
+        setting = self._ground.setting
+        cameras = setting.scenario.training
+        state = observe(cameras, newest, now_ns, self._embeddings, setting.parts)
         return Moment(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)
 
     def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[Buffered, ...]:
@@ -286,7 +343,7 @@ class Episode:
 
     def _warm_state(self, number: int) -> dict[str, NDArray[Any]]:
         """The field before a decision; nothing that is chosen at any decision changes it."""
-        setting, field = self._ground.setting, self._ground.field
+        setting, field = self._ground.setting, self._ground.field(self.seed)
         while len(self._warm) <= number:
             moment = self.moments[len(self._warm)]
             # What was delivered by then is all in the record of the deployment, not of the moment.

@@ -14,7 +14,7 @@ from typing import Any
 from edge_server.offline.training.choosing import of_action
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.episode import Moment
-from edge_server.offline.training.setting import Setting
+from edge_server.offline.training.setting import SEEDS_A_PURPOSE, Setting, seeds
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import State
@@ -22,17 +22,20 @@ from edge_server.scheduler.learned.state import State
 
 @dataclass(frozen=True)
 class FitProblem:
-    """``scheduler.learned.problem.Problem``: seed s is decision s mod D of episode s div D, D being the
-    setting's decisions in an episode. spec: what an action means."""
+    """``scheduler.learned.problem.Problem``: seed s is decision s mod D of episode s div D of training, D
+    being the setting's decisions in an episode; whatever the seed, no episode is one that others are tested
+    on. spec: what an action means. run: whose episodes of training."""
 
     setting: Setting
     spec: Spec
     reward: Reward
     crew: Crew
+    run: int = 0
 
     def draw(self, seed: int) -> FitDecision:
         episode, number = divmod(seed, self.setting.decisions)
-        return FitDecision(self, self.crew.draw(self.setting, [episode])[0][number])
+        (of,) = seeds(self.run, "train", 1, episode % SEEDS_A_PURPOSE)
+        return FitDecision(self, self.crew.draw(self.setting, [of])[0][number])
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,8 @@ def summary(contest: Contest, learnt: str, fixed: str) -> dict[str, Any]:
     best, name = contest.best_fixed(fixed)
     varies = contest.varies(fixed)
     return {
-        "seeds": len(mine),
+        "seeds": contest.seeds(learnt)[1],
+        "seeds_without_value": contest.seeds(learnt)[0] - contest.seeds(learnt)[1],
         "reward": _told(interval(list(mine.values()))),
         "rewards": {n: _told(interval(list(contest.rewards(n).values())))
                     for n in (*contest.outcomes, HINDSIGHT)},
@@ -68,16 +69,23 @@ def lines(contest: Contest, learnt: str, fixed: str) -> list[str]:
     mine, random = contest.rewards(learnt), contest.rewards("random")
     best, name = contest.best_fixed(fixed)
     varies = contest.varies(fixed)
-    low, middle, high = varies["quartiles"]
+    drawn, known = contest.seeds(learnt)
+    lacking = "" if known == drawn else f"; {drawn - known} more have a decision without a reward"
     return [
-        f"reward {span(interval(list(mine.values())))} on {len(mine)} unseen seeds",
+        f"reward {span(interval(list(mine.values())))} on {known} unseen seeds{lacking}",
         f"over random {span(paired(mine, random))}, over the best fixed {fixed} ({name}) "
         f"{span(paired(mine, best))}",
         f"share of what could be won: {span(contest.share(mine), 2)}; the best fixed {fixed} has "
         f"{span(contest.share(best), 2)}",
-        f"the best {fixed} of a decision is {middle:g} ms (quartiles {low:g} to {high:g}); to know it would "
-        f"be worth {span(varies['gain'])} over the best fixed one",
+        f"the best {fixed} of a decision is {quartiles(varies)}; to know it would be worth "
+        f"{span(varies['gain'])} over the best fixed one",
     ]
+
+
+def quartiles(varies: dict[str, Any]) -> str:
+    """``contest.varies`` for people."""
+    low, middle, high = varies["quartiles"]
+    return "not known" if middle is None else f"{middle:g} ms (quartiles {low:g} to {high:g})"
 
 
 def percent(values: PerSeed, base: PerSeed) -> str:

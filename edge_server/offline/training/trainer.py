@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.offline.training.choosing import of_action
-from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.crew import Crew, Progress
 from edge_server.offline.training.episode import Moment, Outcome
 from edge_server.offline.training.setting import Setting, seeds
-from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.rewards import Reward, Rewarded
 from edge_server.scheduler.learned.spec import Spec
 from freshfield.files import write_json, write_text
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from edge_server.scheduler.learned.ppo import Learner
 
 Row = dict[str, Any]
+_TELL_EVERY_S = 5.0
 
 
 class TrainingError(ValueError):
@@ -43,7 +44,7 @@ class Course:
     and carried out at every decision. Of more than one, each is rewarded by how much better it did than the
     others of the same decision: their mean is an estimate of V(s) (5.24) that knows this very scene and
     channel, which no function of the state does. seed: of episodes and of the learner. checkpoint_every:
-    batches.
+    batches. stages: numbers of batches after which what has been learnt until then is kept, too.
     """
 
     spec: Spec
@@ -53,10 +54,13 @@ class Course:
     tries: int = 2
     seed: int = 0
     checkpoint_every: int = 5
+    stages: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if min(self.episodes, self.batch, self.tries, self.checkpoint_every) < 1:
             raise TrainingError("episodes, batch, tries and checkpoint_every: expected at least 1")
+        if not all(1 <= stage <= self.batches for stage in self.stages):
+            raise TrainingError(f"stages: expected numbers of batches from 1 to {self.batches}")
 
     @property
     def batches(self) -> int:
@@ -70,8 +74,9 @@ class Course:
 
 def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable[[str], None]) -> Learner:
     """Teach until the course is over; what is in ``out`` of the same course is gone on with. Writes
-    OUT/training.jsonl (a line a batch), OUT/training.json and, at its end, OUT/policy.npz. TrainingError
-    where ``out`` holds another course; KeyboardInterrupt leaves the last checkpoint there."""
+    OUT/training.jsonl (a line a batch), OUT/training.json, ``stage_file`` of each of the course's stages and,
+    at its end, OUT/policy.npz. TrainingError where ``out`` holds another course, or where no reward can be
+    had; KeyboardInterrupt leaves the last checkpoint there."""
     out.mkdir(parents=True, exist_ok=True)
     kept = _Kept(out, _key(setting, course))
     learner, rows = kept.load()
@@ -79,19 +84,28 @@ def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable
     if first and first < course.batches:
         say(f"going on after {first} of {course.batches} batches")
     if learner is None:
+        # What an earlier course left must not pass for what this one teaches.
+        (out / "policy.npz").unlink(missing_ok=True)
         learner = _new_learner(setting, course, crew)
+    learner.taught_by = dataclasses.asdict(course.reward)
     for number in range(first, course.batches):
         at = time.monotonic()
-        row = _one_batch(setting, course, crew, learner, number)
+        row = _one_batch(setting, course, crew, learner, number, say)
         rows.append({**row, "seconds": round(time.monotonic() - at, 3)})
         if (number + 1) % course.checkpoint_every == 0 or number + 1 == course.batches:
             kept.save(learner, rows)
+        if number + 1 in course.stages:
+            learner.save(stage_file(out, number + 1))
         spent = time.monotonic() - began
         left = spent / (number + 1 - first) * (course.batches - number - 1)
         say(f"{_told(course, row)}; {left:.0f} s left")
-    if not (out / "policy.npz").exists():
-        learner.save(out / "policy.npz")
+    learner.save(out / "policy.npz")
     return learner
+
+
+def stage_file(out: Path, batches: int) -> Path:
+    """Where a training in ``out`` keeps what had been learnt after so many batches."""
+    return out / f"after-{batches:05d}.npz"
 
 
 def read_log(out: Path) -> list[Row]:
@@ -99,8 +113,10 @@ def read_log(out: Path) -> list[Row]:
     return [json.loads(line) for line in (out / "training.jsonl").read_text().splitlines()]
 
 
-def _one_batch(setting: Setting, course: Course, crew: Crew, learner: Learner, number: int) -> Row:
-    """Draw, act, carry out, learn."""
+def _one_batch(
+    setting: Setting, course: Course, crew: Crew, learner: Learner, number: int, say: Callable[[str], None]
+) -> Row:
+    """Draw, act, carry out, learn. TrainingError where the first batch has not a single reward."""
     chosen = course.seeds(number)
     moments = [m for episode in crew.draw(setting, chosen) for m in episode]
     crew.forget(setting, chosen)
@@ -110,20 +126,51 @@ def _one_batch(setting: Setting, course: Course, crew: Crew, learner: Learner, n
     actions, logps = learner.act(states)
     asked = [(m.seed, m.number, of_action(course.spec, a, m)) for m, a in zip(each, actions)]
     before = crew.evaluated
-    outcomes = crew.evaluate(setting, asked)
+    outcomes = crew.evaluate(setting, asked, told_now_and_then(say, f"fits of batch {number + 1}"))
     found = [course.reward.of(outcome) for outcome in outcomes]
     # A reward that lacks a term is not comparable with one that does not.
     rewards = np.array([r.total if r.complete and r.total is not None else np.nan for r in found])
+    if number == 0 and not np.isfinite(rewards).any():
+        raise TrainingError(_why_not(outcomes, found))
     told = learner.update(learner.batch(states, actions, logps, compared(rewards, course.tries)))
     row: Row = {
         "batch": number, "episodes": chosen[-1] + 1 - course.seeds(0)[0], "reward": _mean(rewards),
         "decisions": len(moments), "fits": len(each), "carried_out": crew.evaluated - before,
+        "fit_seconds": crew.fit_s(setting, asked),
     }  # fmt: skip
     row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
     row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
     if course.spec.action != "select":
         row["omega_ms"] = _mean([course.spec.omegas_ms[int(a)] for a in actions])
     return row | {k: v for k, v in dataclasses.asdict(told).items() if k != "reward"}
+
+
+def told_now_and_then(say: Callable[[str], None], what: str) -> Progress:
+    """Progress for people, where it takes long."""
+    last_s = time.monotonic()
+
+    def told(done: int, count: int) -> None:
+        nonlocal last_s
+        if time.monotonic() - last_s >= _TELL_EVERY_S:
+            last_s = time.monotonic()
+            say(f"{done}/{count} {what}")
+
+    return told
+
+
+def _why_not(outcomes: list[Outcome], found: list[Rewarded]) -> str:
+    """Why not one of these has a reward, and what to do."""
+    if not any(outcome.views for outcome in outcomes):
+        return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
+    missing = list(dict.fromkeys(name for r in found for name in r.missing))
+    hints = {
+        "lpips": "lpips: see edge.lpips and --lpips, or leave it out with --distance none",
+        "perceptual": "perceptual: see edge.metrics, or leave it out with --distance none",
+        "psnr_moving": "psnr_moving: nothing moves where the held-out cameras look; --on whole",
+    }
+    return "no decision of the first batch has a reward, it lacks " + "; ".join(
+        hints.get(name, name) for name in missing
+    )
 
 
 def compared(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:

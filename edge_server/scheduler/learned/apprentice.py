@@ -2,10 +2,13 @@
 
 Three things keep it from doing harm. A **trust region**: an update moves it by no more than its
 specification's ``target_kl``, and all updates together by no more than ``bound`` from the policy that was
-loaded; what would go further is shortened. A **fixed policy beside it** takes a random small share of the
-decisions, so that there is a fair running estimate of both, with an interval. And a **fall-back**: while the
-estimate says that the fixed policy is better beyond doubt, it is the one that decides, and the learnt one
-gets the small share, from which it learns on, less sure of itself than it was.
+loaded, over the states of the batch; what would go further is shortened. A **fixed policy beside it** takes a
+random share of the decisions, a small one until there is a suspicion, so that both are estimated fairly. And
+a **fall-back**: once the fixed policy is better beyond doubt (``verdict``), it is the one that decides, and
+the learnt one gets the small share, from which it learns on, less sure of itself than it was.
+
+What a reward is live is not what it was in training, where it may have been the difference to another action
+of the same decision: what the learner knew of rewards' size, and what it expected of a state, begins anew.
 
 The rewards come from a held-out camera, later than the decisions; nothing waits for them.
 """
@@ -16,29 +19,24 @@ import logging
 import math
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from edge_server.scheduler import BANDIT, Epoch, Plan, Policy
+from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned.bandit import Bandit, Decided
 from edge_server.scheduler.learned.decide import Actor
 from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.verdict import Judge
 
 log = logging.getLogger(__name__)
 
 # Decisions whose reward may still come; a score that comes later than this is of no use.
 _OPEN = 256
-# Decisions that the estimates are of, the same for both policies: what was long ago was another channel, and
-# if one were judged by it and the other not, a change would look like a difference.
-WINDOW = 120
-# No verdict on fewer of either.
-LEAST = 10
 # What is left of a policy's preferences (its logits) when it has been found wanting: one that is sure of what
 # was right yesterday never tries anything else, and would learn nothing.
 _SOFTENED = 0.25
@@ -48,23 +46,25 @@ _HALVINGS = 6
 
 @dataclass(frozen=True)
 class Leash:
-    """share: of the decisions that goes to whoever does not decide. batch: decisions of one update. bound:
-    mean KL divergence in nats, from the policy that was loaded (or, after a fall-back, from what it was
-    softened to), that learning may not exceed. explore: share of chance in every action, however sure the
-    policy is. settle: first decisions that nobody is judged by: whatever is chosen, a field that begins with
-    nothing becomes better."""
+    """share: of the decisions that goes to whoever does not decide; half while there is a suspicion. batch:
+    decisions of one update. bound: mean KL divergence in nats, from the policy that was loaded (or, after a
+    fall-back, from what it was softened to), that learning may not exceed. explore: share of chance in every
+    action, however sure the policy is. settle: first decisions that nobody is judged by: whatever is chosen,
+    a field that begins with nothing becomes better. false_every: decisions between two changes of who decides
+    that were not called for, at least, on average."""
 
     share: float = 0.15
     batch: int = 32
     bound: float = 1.0
     explore: float = 0.02
     settle: int = 30
+    false_every: float = 20_000.0
 
     def __post_init__(self) -> None:
         if not (0.0 < self.share <= 0.5 and self.batch >= 1 and 0.0 < self.bound < math.inf):
             raise ValueError("leash: share in (0, 0.5], batch from 1, bound positive and finite")
-        if not (0.0 <= self.explore < 1.0 and self.settle >= 0):
-            raise ValueError("leash: explore from 0, below 1, settle from 0")
+        if not (0.0 <= self.explore < 1.0 and self.settle >= 0 and 1.0 < self.false_every < math.inf):
+            raise ValueError("leash: explore from 0, below 1, settle from 0, false_every above 1 and finite")
 
 
 @dataclass(frozen=True)
@@ -75,39 +75,23 @@ class Exploring(Actor):
     explore: float = 0.0
 
     def logits(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        own = super().logits(features)
-        if self.explore == 0.0:
-            return own
-        if self.spec.action == "select":
-            share = (1.0 - self.explore) / (1.0 + np.exp(-np.clip(own, -500.0, 500.0))) + 0.5 * self.explore
-            return np.log(share) - np.log1p(-share)
-        share = np.exp(own - np.logaddexp.reduce(own, axis=1, keepdims=True))
-        return np.log((1.0 - self.explore) * share + self.explore / own.shape[1])
+        return d.with_chance(np, self.spec.action, super().logits(features), self.explore)
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """Mean reward with the half width of its 95 % interval (None for fewer than ``LEAST``)."""
+class _Waiting:
+    """A decision whose reward may still come. decided: None where the fixed policy took it. probability: with
+    which it would have gone to the learnt one."""
 
-    mean: float | None
-    half: float | None
-    count: int
-
-    @staticmethod
-    def of(values: Sequence[float]) -> Estimate:
-        if not values:
-            return Estimate(None, None, 0)
-        found, n = np.array(values), len(values)
-        t = float(stats.t.ppf(0.975, n - 1)) if n >= LEAST else 0.0
-        half = t * float(found.std(ddof=1)) / math.sqrt(n) if n >= LEAST else None
-        return Estimate(float(found.mean()), half, len(found))
+    decided: Decided | None
+    probability: float
 
 
 class Apprentice:
     """A policy (``scheduler.Policy``) made of two: ``learner``'s, which explores and learns, and ``fixed``.
 
-    rng: of who decides and of exploration. ``plan`` and ``select`` belong to the loop's thread, ``learn`` to
-    one other, ``scored`` and ``status`` to any.
+    learner becomes its own. rng: of who decides and of exploration. ``plan`` and ``select`` belong to the
+    loop's thread, ``learn`` to one other, ``scored`` and ``status`` to any.
     """
 
     parameter = None
@@ -125,6 +109,7 @@ class Apprentice:
         self.moved = 0.0
         """KL divergence of what has been learnt from what was loaded, over the last batch."""
         self.fallen_back = False
+        learner.forget_rewards()
         self._learner = learner
         self._loaded = learner.actor
         self._bandit = Bandit(self._exploring(self._loaded), name, rng, explore=True)
@@ -135,9 +120,10 @@ class Apprentice:
         self.verdict = ""
         """What was last found of the two, for people."""
         self._policy: Policy = fixed
-        self._open: OrderedDict[int, Decided | None] = OrderedDict()
+        self._probability = 1.0
+        self._open: OrderedDict[int, _Waiting] = OrderedDict()
         self._ready: deque[tuple[Decided, float]] = deque(maxlen=4 * self.leash.batch)
-        self._rewards: deque[tuple[bool, float]] = deque(maxlen=WINDOW)
+        self._judge = Judge(better=False, false_every=self.leash.false_every)
 
     @property
     def embedding(self) -> tuple[int, str]:
@@ -154,8 +140,10 @@ class Apprentice:
     def plan(self, epoch: Epoch) -> Plan:
         if self._first is None:
             self._first = epoch.number
-        seldom = bool(self._rng.random() < self.leash.share)
-        learnt = seldom if self.fallen_back else not seldom
+        with self._lock:
+            share = 0.5 if self._judge.suspects else self.leash.share
+            self._probability = share if self.fallen_back else 1.0 - share
+        learnt = bool(self._rng.random() < self._probability)
         self._policy = self._bandit if learnt else self.fixed
         return self._policy.plan(epoch)
 
@@ -164,7 +152,8 @@ class Apprentice:
         if cameras:
             with self._lock:
                 decided = self._bandit.last if self._policy is self._bandit else None
-                self._open[epoch.number] = decided.without_frames() if decided else None
+                decided = decided.without_frames() if decided else None
+                self._open[epoch.number] = _Waiting(decided, self._probability)
                 while len(self._open) > _OPEN:
                     self._open.popitem(last=False)
         return cameras
@@ -177,13 +166,13 @@ class Apprentice:
         with self._lock:
             if number not in self._open:
                 return False
-            decided = self._open.pop(number)
+            found = self._open.pop(number)
             settled = number - (self._first or 0) >= self.leash.settle
             if settled and reward is not None and math.isfinite(reward):
-                self._rewards.append((decided is not None, reward))
-                if decided is not None:
-                    self._ready.append((decided, reward))
-            self._judge()
+                if found.decided is not None:
+                    self._ready.append((found.decided, reward))
+                if self._judge.saw(found.decided is not None, found.probability, reward):
+                    self._change_over()
             return len(self._ready) >= self.leash.batch
 
     def learn(self) -> dict[str, Any] | None:
@@ -202,6 +191,7 @@ class Apprentice:
             np.stack([decided.action for decided, _ in ready]),
             np.array([decided.logp for decided, _ in ready]),
             [reward for _, reward in ready],
+            explore=self.leash.explore,
         )
         before = self._learner.actor
         told = self._learner.update(batch)
@@ -214,7 +204,8 @@ class Apprentice:
             self.shortened += shortened
             self.moved = divergence(self._loaded, actor, batch.features)
         return {
-            "update": self.updates, "decisions": len(ready), "reward": told.reward, "step_kl": told.moved,
+            "update": self.updates, "decisions": len(ready), "reward": told.reward,
+            "kl_from_acted": told.moved, "step_kl": divergence(before, actor, batch.features),
             "kl_from_loaded": self.moved, "shortened": shortened, "fallen_back": self.fallen_back,
         }  # fmt: skip
 
@@ -227,7 +218,7 @@ class Apprentice:
     def status(self) -> dict[str, Any]:
         """For edge.json and the page."""
         with self._lock:
-            mine, other = self._estimates()
+            mine, other = self._judge.estimates
         return {
             "updates": self.updates, "shortened": self.shortened, "kl_from_loaded": self.moved,
             "kl_bound": self.leash.bound, "fallen_back": self.fallen_back, "fixed": name_of(self.fixed),
@@ -238,57 +229,46 @@ class Apprentice:
     def told(self) -> str:
         """One line for people."""
         with self._lock:
-            mine, other = self._estimates()
+            mine, other = self._judge.estimates
         who = "the learnt policy decides"
         if self.fallen_back:
             who = f"fallen back, the learnt policy was {self.verdict}"
-        return (
-            f"learning: {who}; reward {_shown(mine)}, {name_of(self.fixed)} {_shown(other)}; "
-            f"{self.updates} updates"
-        )
+        return f"learning: {who}; reward {mine}, {name_of(self.fixed)} {other}; {self.updates} updates"
 
     # --- inside -------------------------------------------------------------------------------------
 
-    def _estimates(self) -> tuple[Estimate, Estimate]:
-        """Of the learnt policy and of the fixed one; the caller holds the lock."""
-        mine, other = ([r for learnt, r in self._rewards if learnt is which] for which in (True, False))
-        return Estimate.of(mine), Estimate.of(other)
-
-    def _judge(self) -> None:
-        """Who is to decide: changed only beyond doubt, so that it does not flutter."""
-        mine, other = self._estimates()
-        if mine.half is None or other.half is None:
-            return
-        assert mine.mean is not None and other.mean is not None
-        gap, half = mine.mean - other.mean, math.hypot(mine.half, other.half)
-        worse, better = gap + half < 0.0, gap - half > 0.0
-        if (worse and not self.fallen_back) or (better and self.fallen_back):
-            self.fallen_back = self._soften = worse
-            # Both start anew: what they earned until now has been judged.
-            self._rewards.clear()
-            self.verdict = (
-                f"{'worse' if worse else 'better'} than {name_of(self.fixed)} by {abs(gap):.4f} +- {half:.4f}"
-            )
-            log.info(
-                "the learnt policy is %s: %s", self.verdict, "fallen back" if worse else "it decides again"
-            )
+    def _change_over(self) -> None:
+        """The other one decides from now on; the caller holds the lock."""
+        worse = not self._judge.better
+        mine, other = self._judge.estimates
+        found = "worse" if worse else "better"
+        self.verdict = f"{found} than {name_of(self.fixed)} (of late {mine}, {name_of(self.fixed)} {other})"
+        self.fallen_back = self._soften = worse
+        # What they have earned until now has been judged.
+        self._judge = Judge(better=worse, false_every=self.leash.false_every)
+        log.info("the learnt policy is %s: %s", self.verdict, "fallen back" if worse else "it decides again")
 
     def _exploring(self, actor: Actor) -> Actor:
         return Exploring(actor.spec, actor.weights, self.leash.explore, usual=actor.usual)
 
     def _held_back(self, before: Actor, after: Actor, features: NDArray[np.float64]) -> tuple[Actor, bool]:
-        """``after`` if it is within the bound, else the farthest of a few points on the way to it that is,
+        """``after`` if it is in the trust region, else the farthest of a few points on the way to it that is,
         else ``before``."""
-        if divergence(self._loaded, after, features) <= self.leash.bound:
+        if self._trusted(before, after, features):
             return after, False
         part = 1.0
         for _ in range(_HALVINGS):
             part *= 0.5
             weights = {n: w + part * (after.weights[n] - w) for n, w in before.weights.items()}
             between = replace(after, weights=weights)
-            if divergence(self._loaded, between, features) <= self.leash.bound:
+            if self._trusted(before, between, features):
                 return between, True
         return before, True
+
+    def _trusted(self, before: Actor, after: Actor, features: NDArray[np.float64]) -> bool:
+        """Of the policies without their share of chance, which makes what acts differ less, never more."""
+        step, whole = divergence(before, after, features), divergence(self._loaded, after, features)
+        return step <= after.spec.target_kl and whole <= self.leash.bound
 
 
 def divergence(reference: Actor, actor: Actor, features: NDArray[np.float64]) -> float:
@@ -315,9 +295,3 @@ def name_of(policy: Policy) -> str:
     if policy.name.startswith(BANDIT) or policy.value is None:
         return policy.name
     return f"{policy.name}:{policy.value:g}"
-
-
-def _shown(estimate: Estimate) -> str:
-    if estimate.mean is None:
-        return "not known yet"
-    return f"{estimate.mean:.3f}" + (f" +- {estimate.half:.3f}" if estimate.half is not None else "")

@@ -18,6 +18,8 @@ from edge_server.scheduler.learned.state import State
 
 KIND = "scheduler"
 """What the checkpoints of learners say they are."""
+# Of a learner's checkpoint, unpacked: both networks and what Adam remembers of them, at their largest.
+MOST_BYTES = 2**29
 
 
 @dataclass(frozen=True)
@@ -58,14 +60,14 @@ class Actor:
     def load(path: Path | str) -> Actor:
         """The actor of a learner's checkpoint. checkpoint.CheckpointError (a ValueError) for anything
         else."""
-        arrays, about = checkpoint.load(path, kind=KIND)
+        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=MOST_BYTES)
         spec = read_spec(path, about)
         expected = networks.new_actor(spec, np.random.default_rng(0))
         usual = np.zeros(spec.layout.width)
         found: dict[str, NDArray[np.float64]] = {}
         for name, like in {**expected, "usual": usual}.items():
             w = arrays.get("usual" if name == "usual" else f"actor.{name}")
-            if w is None or w.shape != like.shape or not np.isfinite(w).all():
+            if w is None or (w.shape, w.dtype) != (like.shape, like.dtype) or not np.isfinite(w).all():
                 raise checkpoint.CheckpointError(f"{path}: damaged: the actor's {name} is not whole")
             found[name] = w
         return Actor(spec, found, usual=found.pop("usual"))
@@ -76,4 +78,4 @@ def read_spec(path: Path | str, about: dict[str, Any]) -> Spec:
     try:
         return Spec.from_json(about["spec"])
     except (KeyError, TypeError, ValueError) as error:
-        raise checkpoint.CheckpointError(f"{path}: damaged: {error}") from None
+        raise checkpoint.CheckpointError(f"{path}: its policy cannot be used: {error}") from None

@@ -13,6 +13,7 @@ not reported (mask 0) cannot be drawn; where none has, the set is empty, with pr
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,20 @@ def omega_entropy(xp: Any, logits: Any) -> Any:
     """(B,) entropy of the categorical."""
     logps = omega_log_probabilities(xp, logits)
     return -(xp.exp(logps) * logps).sum(axis=-1)
+
+
+def with_chance(xp: Any, action: str, logits: Any, share: float) -> Any:
+    """Logits of the same shape, of a policy that leaves the ``share`` of each choice to chance: 1/2 of every
+    camera where ``action`` is select, else 1/K of every omega."""
+    if share == 0.0:
+        return logits
+    own, chance = math.log1p(-share), math.log(share)
+    if action == "select":
+        even = xp.full_like(logits, chance - math.log(2.0))
+        used, left = own - _softplus(xp, -logits), own - _softplus(xp, logits)
+        return xp.logaddexp(used, even) - xp.logaddexp(left, even)
+    each = xp.full_like(logits, chance - math.log(logits.shape[-1]))
+    return xp.logaddexp(own + omega_log_probabilities(xp, logits), each)
 
 
 def draw_sets(logits: Array, mask: Array, rng: np.random.Generator) -> NDArray[np.bool_]:

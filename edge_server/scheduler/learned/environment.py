@@ -9,6 +9,7 @@ MultiBinary(N) for ``select``, Discrete(K) else. Needs the extra ``gym`` (pip in
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ class BanditEnvironment(gymnasium.Env):
 
     An empty set cannot be carried out (K_t >= 1): the youngest camera is used instead, and ``info`` says
     ``forced``. What ``reset(seed)`` draws is decided by the seed; without one, episodes follow each other.
+    Where no reward could be had, learners that cannot take NaN get the mean of those so far (0 before the
+    first), which says neither good nor bad of the action, and ``info`` says ``missing``.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (gymnasium's own form)
@@ -45,6 +48,7 @@ class BanditEnvironment(gymnasium.Env):
             else gymnasium.spaces.Discrete(len(spec.omegas_ms))
         )
         self._decision: Decision | None = None
+        self._known, self._mean = 0, 0.0  # of the rewards so far
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -64,5 +68,9 @@ class BanditEnvironment(gymnasium.Env):
                 action[np.argmin(np.where(state.reported, np.nan_to_num(state.ages_ms), np.inf))] = True
                 forced = True
         reward, terms = decision.reward(action)
-        info = {"terms": terms, "forced": forced}
-        return self._spec.layout.features(state), float(reward), True, False, info
+        missing = not math.isfinite(reward)
+        if not missing:
+            self._known += 1
+            self._mean += (float(reward) - self._mean) / self._known
+        info = {"terms": terms, "forced": forced, "missing": missing}
+        return self._spec.layout.features(state), self._mean if missing else float(reward), True, False, info

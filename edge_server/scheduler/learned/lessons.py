@@ -85,21 +85,21 @@ class Lessons:
 def open_lessons(
     path: Path,
     reward: str,
-    fallback: str | None,
+    fallback: str,
     rng: np.random.Generator,
     lpips_missing: str | None,
     out: Path,
 ) -> Lessons:
-    """Lessons for the learner in ``path``. reward, fallback: as ``server.Options`` has them. ValueError for a
-    reward or policy that is not known, or a file that is no learner."""
+    """Lessons for the learner in ``path``. reward, fallback: as ``config.LearnConfig`` has them. ValueError
+    for a reward or policy that is not known, or a file that is no learner."""
     learner, known = Learner.load(path), of_training(path)
     name, _, value = (fallback or known.get("best_fixed") or _USUAL_FALLBACK).partition(":")
     try:
         fixed = make_live_policy(name, float(value) if value else None, rng)
     except ValueError as error:
-        raise ValueError(f"--fallback: {error}") from None
+        raise ValueError(f"fallback: {error}") from None
     apprentice = Apprentice(learner, fixed, f"{BANDIT}{path}", rng)
-    by = reward_for(learner.spec.action, reward, path, lpips_missing)
+    by = reward_for(learner.spec.action, reward, path, lpips_missing, learner.taught_by)
     log.info("learning by the reward %s on the %s image, beside %s", by.name, by.fidelity, fixed.name)
     return Lessons(apprentice, by, out)
 
@@ -114,10 +114,21 @@ def of_training(path: Path) -> dict[str, Any]:
     return {k: found[k] for k in ("reward_name", "on", "best_fixed") if isinstance(found.get(k), str)}
 
 
-def reward_for(spec_action: str, given: str | None, path: Path, lpips_missing: str | None) -> Reward:
+def reward_for(
+    spec_action: str,
+    given: str | None,
+    path: Path,
+    lpips_missing: str | None,
+    taught_by: dict[str, Any] | None = None,
+) -> Reward:
     """The reward to learn by: ``given`` (NAME or NAME:moving), else the one of the training, else the usual
-    one. Without LPIPS its term is left out: a reward that always lacks one would teach nothing. ValueError
-    for a name that is not known."""
+    one. taught_by: as the checkpoint has it. Without LPIPS its term is left out: a reward that always lacks
+    one would teach nothing. ValueError for a name that is not known, or where the checkpoint's is none."""
+    if taught_by is not None and not given:
+        try:
+            return available(Reward(**taught_by), lpips_missing)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: damaged: its reward: {error}; give --learn a reward") from None
     known = of_training(path)
     usual = "set" if spec_action == "select" else "corrected"
     name, _, on = (given or f"{known.get('reward_name', usual)}:{known.get('on', 'whole')}").partition(":")

@@ -16,6 +16,7 @@ small for more), random numbers are numpy's.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.decide import KIND, Actor, read_spec
+from edge_server.scheduler.learned.decide import KIND, MOST_BYTES, Actor, read_spec
 from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import State
 
@@ -53,12 +54,14 @@ _STREAMS = ("weights", "actions", "order")
 @dataclass(frozen=True)
 class Batch:
     """Decisions and what came of them. features (B, N, width); actions (B, N) bool or (B,) index of an
-    omega; logps (B,) when they were drawn; rewards (B,), NaN where none came of it."""
+    omega; logps (B,) when they were drawn; rewards (B,), NaN where none came of it. explore: share of chance
+    in how they were drawn, which is then part of the policy that is compared with it."""
 
     features: NDArray[np.float64]
     actions: NDArray[Any]
     logps: NDArray[np.float64]
     rewards: NDArray[np.float64]
+    explore: float = 0.0
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -91,6 +94,8 @@ class Learner:
     def __init__(self, spec: Spec, seed: int = 0) -> None:
         self.spec = spec
         self.seed = seed
+        self.taught_by: dict[str, Any] | None = None
+        """The reward that it was trained by, as the fields of ``rewards.Reward``; None: nobody said."""
         self.updates = 0
         self.decisions = 0
         streams = np.random.SeedSequence(seed).spawn(len(_STREAMS))
@@ -122,6 +127,16 @@ class Learner:
             for name, w in self._actor.items():
                 w.copy_(_as_expected(actor.weights[name], w))
 
+    def forget_rewards(self) -> None:
+        """From now on rewards are of another kind: their size, and what is expected of a state, are learnt
+        anew. The policy stays as it is."""
+        self._rewards = _Spread()
+        anew = networks.new_value(self.spec, self._rng["weights"])
+        with torch.no_grad():
+            for name, w in self._value.items():
+                w.copy_(torch.tensor(anew[name]))
+                self._adam.state.pop(w, None)
+
     def act(self, states: Sequence[State], explore: bool = True) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Actions, (B, N) bool or (B,) indices of omegas, and their log-probabilities (B,). explore False:
         the likeliest ones."""
@@ -143,10 +158,12 @@ class Learner:
         actions: NDArray[Any],
         logps: NDArray[np.float64],
         rewards: Sequence[float | None] | NDArray[np.float64],
+        explore: float = 0.0,
     ) -> Batch:
-        """What ``update`` learns from; a reward of None is one that could not be had."""
+        """What ``update`` learns from; a reward of None is one that could not be had. explore: as in
+        ``Batch``."""
         found = np.array([np.nan if r is None else r for r in rewards], np.float64)
-        return Batch(self.spec.layout.batch(states), np.asarray(actions), np.asarray(logps), found)
+        return Batch(self.spec.layout.batch(states), np.asarray(actions), np.asarray(logps), found, explore)
 
     # --- learning -----------------------------------------------------------------------------------
 
@@ -174,11 +191,17 @@ class Learner:
                 torch.tensor(batch.actions[usable]),
                 torch.tensor(batch.logps[usable]),
                 torch.tensor(self._rewards.standardised(rewards)),
+                batch.explore,
             )
         return Diagnostics(mean, dropped, **done)
 
     def _passes(
-        self, features: torch.Tensor, actions: torch.Tensor, logps: torch.Tensor, rewards: torch.Tensor
+        self,
+        features: torch.Tensor,
+        actions: torch.Tensor,
+        logps: torch.Tensor,
+        rewards: torch.Tensor,
+        explore: float,
     ) -> dict[str, Any]:
         """Passes over the batch in minibatches, until the policy has moved far enough."""
         spec = self.spec
@@ -197,7 +220,7 @@ class Learner:
             order = torch.tensor(self._rng["order"].permutation(len(rewards)))
             for some in order.split(spec.minibatch):
                 loss, figures = self._loss(
-                    features[some], actions[some], logps[some], advantages[some], rewards[some]
+                    features[some], actions[some], logps[some], advantages[some], rewards[some], explore
                 )
                 self._adam.zero_grad()
                 loss.backward()
@@ -230,10 +253,12 @@ class Learner:
         logps: torch.Tensor,
         advantages: torch.Tensor,
         rewards: torch.Tensor,
+        explore: float,
     ) -> tuple[torch.Tensor, tuple[float, ...]]:
         """The negative of (5.23), (6.42) with the value's error and the entropy, and figures to report."""
         spec = self.spec
         logits = networks.logits(torch, spec, self._actor, features)
+        logits = d.with_chance(torch, spec.action, logits, explore)
         now, entropy = log_probability(spec, logits, features, actions)
         log_ratio = torch.clamp(now - logps, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)
         ratio = torch.exp(log_ratio)
@@ -262,6 +287,7 @@ class Learner:
         about = {
             "spec": self.spec.as_json(),
             "seed": self.seed,
+            "taught_by": self.taught_by,
             "updates": self.updates,
             "decisions": self.decisions,
             "cameras_seen": self._cameras_seen,
@@ -273,11 +299,17 @@ class Learner:
     @staticmethod
     def load(path: Path | str) -> Learner:
         """A learner as ``save`` left it. checkpoint.CheckpointError (a ValueError) for anything else."""
-        arrays, about = checkpoint.load(path, kind=KIND)
+        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=MOST_BYTES)
+        spec = read_spec(path, about)
+        if "seed" not in about:
+            raise checkpoint.CheckpointError(
+                f"{path}: a policy and nothing that it could go on learning with: take the policy.npz of "
+                "edge-server train-scheduler, or the learnt.npz of a run that learnt"
+            )
         try:
-            learner = Learner(read_spec(path, about), int(about["seed"]))
+            learner = Learner(spec, int(about["seed"]))
             learner._restore(arrays, about)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise checkpoint.CheckpointError(f"{path}: damaged: {error}") from None
         return learner
 
@@ -288,16 +320,20 @@ class Learner:
                     w.copy_(_as_expected(arrays[f"{part}.{name}"], w))
         for i, parameter in enumerate(self._parameters):
             if f"adam.{i}.step" in arrays:  # before the first update Adam remembers nothing
+                step = np.asarray(arrays[f"adam.{i}.step"], np.float32)
+                mean, square = (
+                    _as_expected(arrays[f"adam.{i}.{n}"], parameter) for n in ("exp_avg", "exp_avg_sq")
+                )
+                if step.shape != () or not 1.0 <= step < np.inf or (square < 0.0).any():
+                    raise ValueError("what Adam remembers is not what it can have written")
                 self._adam.state[parameter] = {
-                    "step": torch.tensor(arrays[f"adam.{i}.step"]),
-                    **{
-                        n: _as_expected(arrays[f"adam.{i}.{n}"], parameter) for n in ("exp_avg", "exp_avg_sq")
-                    },
-                }
+                    "step": torch.tensor(step), "exp_avg": mean, "exp_avg_sq": square
+                }  # fmt: skip
+        self.taught_by = about.get("taught_by")
         self._usual = _as_expected(arrays["usual"], torch.tensor(self._usual)).numpy()
         self._cameras_seen = int(about["cameras_seen"])
         self.updates, self.decisions = int(about["updates"]), int(about["decisions"])
-        self._rewards = _Spread(**about["rewards"])
+        self._rewards = _Spread.from_json(about["rewards"])
         for name, rng in self._rng.items():
             rng.bit_generator.state = json.loads(about["streams"][name])
 
@@ -353,6 +389,14 @@ class _Spread:
 
     def standardised(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         return (values - self.mean) / self.scale
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> _Spread:
+        """ValueError for what ``as_json`` cannot have written."""
+        count, mean, variance = int(data["count"]), float(data["mean"]), float(data["variance"])
+        if not (0 <= count <= _MEMORY and math.isfinite(mean) and 0.0 <= variance < math.inf):
+            raise ValueError(f"rewards of mean {mean} and variance {variance}, {count} of them")
+        return _Spread(count, mean, variance)
 
     def as_json(self) -> dict[str, Any]:
         return {"count": self.count, "mean": self.mean, "variance": self.variance}

@@ -110,7 +110,8 @@ def read_decision(run: Path, number: int | None = None) -> Recorded:
     known = _numbered(run / FOLDER)
     if not known:
         raise ValueError(
-            f"{run}: no decisions are recorded: run edge-server with a policy that was learnt (bandit:FILE)"
+            f"{run}: no decisions are recorded: edge-server run, and simulate with --out, keep those of a "
+            "policy that was learnt (bandit:FILE)"
         )
     path = known[-1] if number is None else run / FOLDER / f"{number:06d}.npz"
     if path not in known:

@@ -7,10 +7,16 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from edge_server.scheduler.learned.state import StateLayout
+from edge_server.scheduler.learned.state import StateLayout, whole
 
 Action = Literal["select", "wait", "threshold"]
 ACTIONS: tuple[Action, ...] = ("select", "wait", "threshold")
+# A specification may come from a file of a stranger's: no network is allocated that is larger than these lead
+# to (with both networks and what Adam remembers, half a gigabyte), which is far beyond what a decision needs.
+MOST_HIDDEN = 1024
+MOST_OMEGAS = 4096
+MOST_CAMERAS = 4096
+MOST_FIRST_WEIGHTS = 2**22
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,8 @@ class Spec:
             raise ValueError(f"action {self.action!r} is not known; choose one of {', '.join(ACTIONS)}")
         if (self.action == "select") != (not self.omegas_ms):
             raise ValueError(f"action {self.action}: omegas_ms belong to wait and threshold, and only there")
+        if len(self.omegas_ms) > MOST_OMEGAS:
+            raise ValueError(f"omegas_ms: expected at most {MOST_OMEGAS}, got {len(self.omegas_ms)}")
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))
         if not rising or not all(math.isfinite(o) and o >= 0 for o in self.omegas_ms):
             raise ValueError(f"omegas_ms: expected finite values from 0, rising, got {self.omegas_ms}")
@@ -52,10 +60,17 @@ class Spec:
             raise ValueError(f"network {self.network!r} is not known; choose pooled or flat")
         if (self.network == "flat") != (self.cameras is not None):
             raise ValueError("cameras: a flat network has a fixed number of them, a pooled one takes any")
-        if self.cameras is not None and self.cameras < 1:
-            raise ValueError(f"cameras: expected a whole number from 1, got {self.cameras}")
-        if min(self.hidden, self.passes, self.minibatch) < 1:
-            raise ValueError("hidden, passes and minibatch: expected whole numbers from 1")
+        if self.cameras is not None:
+            whole("cameras", self.cameras, 1, MOST_CAMERAS)
+        whole("hidden", self.hidden, 1, MOST_HIDDEN)
+        whole("passes", self.passes, 1, 10_000)
+        whole("minibatch", self.minibatch, 1, 2**31)
+        first = self.layout.width * (self.cameras or 1) * self.hidden
+        if first > MOST_FIRST_WEIGHTS:
+            raise ValueError(
+                f"a first layer of {first} weights is larger than any that is trained here: fewer cameras, a "
+                "smaller dim or hidden"
+            )
         if not 0.0 < self.start < 1.0:
             raise ValueError(f"start: expected a probability between 0 and 1, got {self.start:g}")
         positive = (self.learning_rate, self.clip, self.max_gradient, self.target_kl)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 PARTS = STATE_PARTS
 POSE_WIDTH = 6
+# The widest embedding that can be configured (edge_server.embed).
+MOST_DIM = 4096
 # Features stay within this many of their usual spread: what lies beyond is a broken value, not information.
 _FEATURE_LIMIT = 8.0
 # A feature that hardly varies where it was standardised says nothing; it must not be blown up to noise.
@@ -83,12 +85,15 @@ class StateLayout:
             raise ValueError(f"state: no part is called {', '.join(unknown)}; there are {', '.join(PARTS)}")
         if not self.parts:
             raise ValueError(f"state: no parts; choose some of {', '.join(PARTS)}")
+        whole("state: dim", self.dim, 0, MOST_DIM)
         if ("semantics" in self.parts) != (self.dim > 0):
             raise ValueError(f"state: dim {self.dim} with parts {', '.join(self.parts)}: semantics has a dim")
         if not (0 < self.age_scale_ms < np.inf and 0 < self.oldest_ms < np.inf):
             raise ValueError("state: age_scale_ms and oldest_ms must be positive and finite")
         if not len(self.centre) == len(self.spread) in (0, self.dim):
             raise ValueError(f"state: centre and spread of embeddings must have {self.dim} values, or none")
+        if not (np.isfinite(self.centre).all() and all(0.0 < s < np.inf for s in self.spread)):
+            raise ValueError("state: centre of embeddings must be finite, spread positive and finite")
 
     @property
     def columns(self) -> dict[str, slice]:
@@ -166,3 +171,10 @@ class StateLayout:
             z[unknown] = 0.0
         # All of an embedding weighs at the start as much as one other feature, or d of them drown the age.
         return np.clip(z, -_FEATURE_LIMIT, _FEATURE_LIMIT) / np.sqrt(self.dim)
+
+
+def whole(name: str, value: object, least: int, most: int) -> None:
+    """ValueError where ``value`` is not a whole number within ``least`` and ``most``, as which a file may
+    have it: 64.0 is none."""
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+        raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {value!r}")

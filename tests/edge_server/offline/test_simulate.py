@@ -11,7 +11,12 @@ import yaml
 
 from edge_server.config import ComputeConfig, read_config
 from edge_server.offline.deployment import training_cameras
+from edge_server.offline.explain import main as explain
 from edge_server.offline.simulate import main
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.record import read_decision
+from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
 from freshfield.scenario import ScenarioError, load, parse
 from tests.edge_server.offline.sets import SMALL
 
@@ -49,6 +54,23 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
     assert run(path, capsys, "--compute", "zero")["update_ms"] == 0.0
     assert run(path, capsys, "--compute", "5:1", "--steps", "4")["update_ms"] == pytest.approx(21.0)
     assert run(path, capsys, "--policy", "wait-flush:60")["policy"] == "wait-flush"
+
+
+def test_what_a_learnt_policy_decided_can_be_explained_as_of_a_live_run(tmp_path: Path, capsys):
+    Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
+    out, file = tmp_path / "out", write(tmp_path, learn={})
+    words = ["--seconds", "1.5", "--out", str(out), "--policy", f"bandit:{tmp_path / 'policy.npz'}"]
+    assert main([str(file), *words]) == 0
+    assert "in virtual time nobody learns" in capsys.readouterr().err
+    lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    for number in (0, lines[-1]["number"]):
+        decided = read_decision(out, number).decided
+        used = [c for c, chosen in zip(decided.state.cameras, decided.action) if chosen]
+        assert lines[number]["selected"] == used
+    assert explain([str(out)]) == 0
+    assert f"decision {lines[-1]['number']}: " in capsys.readouterr().out
+    assert main([str(file), "--seconds", "1.5", "--out", str(tmp_path / "fixed"), "--policy", "all"]) == 0
+    assert not (tmp_path / "fixed" / "decisions").exists()
 
 
 def test_files_are_written_as_a_live_run_has_them(tmp_path: Path, capsys):

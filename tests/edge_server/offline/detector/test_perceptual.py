@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from camera_node.world.scene import make_scene
 from edge_server.cli import main as edge_server
+from edge_server.offline.detector import scenes
+from edge_server.offline.detector.dataset import INSTANTS, scenes_of
 from edge_server.offline.detector.distortions import DISTORTIONS, distorted
-from edge_server.offline.detector.perceptual import correlation, fit, pairs_of
+from edge_server.offline.detector.perceptual import TRIES, Compared, correlation, fit, left_out, pairs_of
 from tests.conftest import data_dir
 
 RNG = np.random.default_rng(6)
@@ -29,6 +32,40 @@ def test_a_distance_of_the_same_form_is_found_again(power):
     assert (found >= 0).all() and found == pytest.approx(weights, abs=0.1 * weights.max())
     told = correlation((x @ found) ** fitted, y, ["a"] * len(y))
     assert told["spearman"] > 0.999 and told["mean_absolute_error"] < 0.01
+
+
+def test_with_a_scene_left_out_the_rank_is_of_weights_that_have_not_seen_it():
+    """In either scene another channel is what counts."""
+    rng = np.random.default_rng(6)
+
+    def made(pictures: int) -> Compared:
+        scenes = ["plain", "odd"] * pictures
+        x = rng.exponential(0.02, (len(scenes) * TRIES, 2))
+        return Compared(x, np.where(np.repeat(scenes, TRIES) == "odd", x[:, 0], x[:, 1]), scenes)
+
+    found = left_out([made(40), made(20)])
+    assert set(found) == {"plain", "odd"}
+    for row in found.values():
+        assert row["pairs"] == 60 * TRIES and row["spearman"] < 0.3
+    alike = made(40)
+    alike.y[:] = alike.x.sum(axis=1)
+    assert all(row["spearman"] > 0.99 for row in left_out([alike]).values())
+
+
+def test_the_scene_of_a_picture_is_the_one_it_was_rendered_from(monkeypatch):
+    built = []
+
+    def make(name, *given):
+        built.append(name)
+        return make_scene(name, *given)
+
+    monkeypatch.setattr(scenes, "make_scene", make)
+    told = scenes_of("perceptual", 12, 3)[::INSTANTS]
+    for k, name in enumerate(told):
+        built.clear()
+        scenes.variation(3 * 1_000_003 + k, "perceptual", 16)
+        assert built[0] == name  # a cart of the tower may come after it
+    assert len(set(told)) > 1
 
 
 def test_what_would_need_negative_weights_gets_zeros():

@@ -3,16 +3,34 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from edge_server.offline.study import learning
-from edge_server.offline.study.base import Ask
+from edge_server.offline.study import (
+    ablation,
+    drift,
+    learning,
+    ppo_select,
+    ppo_wait,
+    reward_cost,
+    semantics,
+    transfer,
+    weights,
+)
+from edge_server.offline.study.base import DOES_NOT_HOLD, HOLDS, UNDECIDED, Ask, Verdict
 from edge_server.offline.study.command import LEARNING, make_study
 from edge_server.offline.study.learning import better, no_worse
 from edge_server.offline.study.trial import Folders
-from tests.edge_server.offline.training.small import FIELD
+from edge_server.offline.training.choosing import named
+from edge_server.offline.training.contest import Contest, hold
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.episode import Outcome
+from edge_server.offline.training.setting import seeds
+from edge_server.scheduler.learned.rewards import Reward, make_reward
+from tests.edge_server.offline.training.small import FIELD, reported
 
 SMALL = {"steps": 3, "decisions": 1, "lead_ms": 800.0, "span_ms": 400.0}
 
@@ -26,6 +44,7 @@ def small(monkeypatch):
         return usual(*args, **{**more, **SMALL})
 
     monkeypatch.setattr(learning, "SIZE", 24)
+    monkeypatch.setitem(learning.RUNS, True, 2)
     monkeypatch.setattr(learning, "FIELD_OPTIONS", FIELD)
     for name in LEARNING:
         module = f"edge_server.offline.study.{name.replace('-', '_')}"
@@ -51,6 +70,186 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, 
     assert [(v.about, v.claim, v.verdict) for v in again] == [(v.about, v.claim, v.verdict) for v in first]
     assert (tmp_path / "training/evaluations.jsonl").read_text().count("\n") == lines
     capsys.readouterr()
+
+
+def contest_of(levels: dict[str, float], seeds: int = 12) -> Contest:
+    """Every policy earns its level at every decision, but for what the seed does to all and a little luck."""
+    rng = np.random.default_rng(1)
+    asked = [(seed, n) for seed in range(seeds) for n in range(2)]
+    shared = {seed: rng.normal() for seed in range(seeds)}
+    found = Contest(Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0))
+    for into in (found.outcomes, found.again):
+        for name, level in levels.items():
+            psnr = {at: level + shared[at[0]] + 0.01 * rng.normal() for at in asked}
+            into[name] = {at: Outcome(v, None, None, None, None, 50.0, 3.0, 0.0) for at, v in psnr.items()}
+    return found
+
+
+def runs(name: str, level: float, count: int = 3) -> dict[str, float]:
+    return {f"{name}-{run}": level + 0.01 * run for run in range(count)}
+
+
+FIXED = {"random": 0.0, "all": 0.5, "threshold:40": 0.4, "threshold:80": 0.6, "wait:0": 0.4, "wait:60": 0.6}
+
+
+def answers(verdicts: Sequence[Verdict], *words: str) -> set[str]:
+    """What the verdicts say whose claim has one of the words; of all without words."""
+    found = {v.verdict for v in verdicts if not words or any(word in v.claim for word in words)}
+    assert found
+    return found
+
+
+WON = (
+    "something to be won",
+    "differs between decisions",
+)  # nothing is, here: levels do not depend on decisions
+
+
+@pytest.mark.parametrize(("level", "said"), [(3.0, HOLDS), (-3.0, DOES_NOT_HOLD)])
+def test_select_holds_if_and_only_if_what_was_learnt_is_better(level, said):
+    found = contest_of({**FIXED, "nearest:6": 0.3, "mask": 0.2, **runs("learnt", level)})
+    verdicts = ppo_select.judge("here", found)
+    assert answers([v for v in verdicts if WON[0] not in v.claim]) == {said}
+    assert answers(verdicts, WON[0]).isdisjoint({HOLDS})
+    assert answers(ppo_select._as_rewarded("here", found)) == {said}
+
+
+@pytest.mark.parametrize("channel", ["swing", "ch6"])
+@pytest.mark.parametrize(("level", "said"), [(3.0, HOLDS), (-3.0, DOES_NOT_HOLD)])
+def test_wait_holds_if_and_only_if_what_was_learnt_is_better(channel, level, said):
+    both = {**runs("learnt-wait", level + 0.2), **runs("learnt-threshold", level)}
+    verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **both}))
+    assert answers(verdicts, "best fixed omega", "uniformly random") == {said}
+    assert answers(verdicts, "waiting beats thresholds") == {HOLDS}
+    assert answers(verdicts, WON[1]).isdisjoint({HOLDS})
+    turned = {**runs("learnt-wait", level), **runs("learnt-threshold", level + 0.2)}
+    verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **turned}))
+    assert answers(verdicts, "waiting beats thresholds") == {DOES_NOT_HOLD}
+
+
+@pytest.mark.parametrize(("step", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_ablation_holds_if_and_only_if_more_of_the_state_is_better(step, said):
+    levels: dict[str, float] = dict(FIXED)
+    for k, name in enumerate(ablation.VARIANTS):
+        levels |= runs(f"learnt {name}", 3.0 + step * k)
+    verdicts = ablation.judge(contest_of(levels), list(ablation.VARIANTS))
+    assert answers(verdicts, "best fixed threshold") == {HOLDS}
+    assert answers(verdicts, "age alone", "semantics add") == {said}
+    levels |= runs("learnt age", -3.0)
+    verdicts = ablation.judge(contest_of(levels), list(ablation.VARIANTS))
+    assert [v.verdict for v in verdicts if "best fixed" in v.claim] == [DOES_NOT_HOLD, HOLDS, HOLDS, HOLDS]
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_semantics_hold_if_and_only_if_who_looks_does_better(gap, said):
+    found = contest_of({**FIXED, **runs("with", 3.0 + gap), **runs("without", 3.0)})
+    assert semantics.judge("x", found, True).verdict == said
+    assert semantics.judge("x", found, False).verdict == said
+
+
+@pytest.mark.parametrize(("gap", "said"), [(1.0, HOLDS), (-1.0, DOES_NOT_HOLD)])
+def test_weights_matter_if_and_only_if_other_weights_teach_worse(gap, said):
+    levels = {**FIXED, **runs("learnt a", 3.0), **runs("learnt b", 3.0 - gap)}
+    better_than_fixed, matters = weights.judge(contest_of(levels), "a", ["a", "b"])
+    assert (better_than_fixed.verdict, matters.verdict) == (HOLDS, said)
+    low = contest_of({**FIXED, **runs("learnt a", -3.0), **runs("learnt b", 0.0)})
+    assert weights.judge(low, "a", ["a", "b"])[0].verdict == DOES_NOT_HOLD
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.1, HOLDS), (-0.6, DOES_NOT_HOLD)])
+def test_what_is_learnt_transfers_if_and_only_if_it_loses_little(gap, said):
+    levels = {**FIXED, **runs("learnt at home", 3.0 + gap), **runs("learnt here", 3.0)}
+    verdicts = transfer.judge("elsewhere", contest_of(levels))
+    assert [v.verdict for v in verdicts] == [HOLDS, said]
+    low = contest_of({**FIXED, **runs("learnt at home", -3.0), **runs("learnt here", -6.0)})
+    assert transfer.judge(transfer.HOME, low)[0].verdict == DOES_NOT_HOLD
+
+
+@pytest.mark.parametrize(("gap", "said"), [(1.0, HOLDS), (-1.0, DOES_NOT_HOLD)])
+def test_a_cheap_reward_wins_if_and_only_if_it_taught_more_in_the_same_time(gap, said):
+    levels = dict(FIXED)
+    for stage in (1, 10):
+        levels |= runs(f"10 steps, {stage} batches", 3.0 + gap)
+        levels |= runs(f"50 steps, {stage} batches", 3.0 + (0.0 if stage == 1 else 2.0 * gap))
+    number, time = reward_cost.judge(contest_of(levels), (1, 10), {10: [2.0, 20.0], 50: [30.0, 300.0]})
+    # Of the same number of decisions the dear one taught more; in the time that they take it had not begun.
+    assert number.verdict == (DOES_NOT_HOLD if gap > 0 else HOLDS) and time.verdict == said
+    assert "after 20.0 and 30.0 s" in time.found
+    (dim,) = reward_cost.judge_dims(
+        {f"d = {d}": contest_of({"random": 0.0, **runs(f"d = {d}", d * gap)}) for d in (0, 4)}
+    )
+    assert dim.verdict == said
+
+
+def test_fits_that_were_known_cost_what_they_cost():
+    logs = [[{"fit_seconds": 2.0, "carried_out": 0}, {"fit_seconds": 4.0, "carried_out": 8}]] * 3
+    assert (reward_cost.spent_s(logs, 1), reward_cost.spent_s(logs, 2)) == (2.0, 6.0)
+    assert reward_cost.stages(60) == (3, 6, 15, 30, 60) and reward_cost.stages(1) == (1,)
+
+
+def drifting(still: float, there: float, count: int = 3) -> list[list[dict[str, list[float]]]]:
+    """Runs of trainings in which the learnt policy earns 1 before the change and 0 after it."""
+    rng = np.random.default_rng(2)
+    before, after = drift.BEFORE * 4, drift.AFTER * 4
+    late = {"fixed": 0.1, "learnt": 0.0, "still learning": still, "learnt afterwards": there}
+
+    def run() -> dict[str, list[float]]:
+        return {
+            name: [*(1.0 + 0.01 * rng.normal(size=before)), *(level + 0.01 * rng.normal(size=after))]
+            for name, level in late.items()
+        }  # fmt: skip
+
+    return [[run() for _ in range(count)] for _ in range(3)]
+
+
+@pytest.mark.parametrize(("still", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_drift_holds_if_and_only_if_learning_on_is_better(still, said):
+    found = drift.judge("here", drifting(still, 1.0))
+    assert [v.verdict for v in found] == [said, said, HOLDS]
+    assert drift.judge("here", drifting(still, -1.0))[2].verdict == DOES_NOT_HOLD
+
+
+def test_recovery_tells_that_nothing_was_lost_from_that_it_was_not_made_up():
+    ((recovered,),) = [[drift.recovery(r) for r in of] for of in drifting(0.9, 1.0, 1)[:1]]
+    assert isinstance(recovered, int) and recovered >= 20
+    assert drift.recovery(drifting(0.0, 1.0)[0][0]) == drift.NOT_WITHIN
+    assert drift.recovery(drifting(0.0, -1.0)[0][0]) == drift.NOTHING_LOST
+
+
+def test_where_a_camera_dies_the_policy_learnt_afterwards_is_another_one():
+    for name, (before, after, gone) in drift.changes().items():
+        there = learning.room(after, silent=(gone,) if gone else ())
+        assert learning.room(before).key != there.key, name
+        assert gone is None or (gone in there.silent and gone in there.scenario.training)
+
+
+def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
+    usual = learning.room()
+    assert usual.report == learning.REPORT and set(usual.report).isdisjoint(usual.rewarding)
+    assert set(usual.report).isdisjoint(usual.scenario.training)
+    assert set(learning.FOUR_VIEWPOINTS).isdisjoint(learning.REPORT)
+    reward, everybody = make_reward("set", distance=0.0), {"all": named("all"), "random": named("random")}
+    with learning.School(Ask(True, tmp_path, Folders())) as school:
+        found = school.contest(reported(), everybody, reward, 2)
+        same = school.contest_as_rewarded(reported(), everybody, reward, 2)
+    with Crew(Folders()) as crew:
+        expected = hold(reported().judged, crew, seeds(0, "test", 2), everybody, reward)
+    assert found.outcomes == expected.outcomes and found.again == expected.again
+    assert found.outcomes["all"] != same.outcomes["all"]
+
+
+def test_how_differently_the_same_lesson_is_learnt_is_part_of_an_interval():
+    base = {s: 0.01 * (s % 3) for s in range(40)}
+    alike = [{s: v + 0.2 + 0.01 * (-1) ** (s + r) for s, v in base.items()} for r in range(3)]
+    unlike = [{s: v + level for s, v in base.items()} for level in (0.7, 0.2, -0.3)]
+    assert better("a", "b", alike, base).verdict == HOLDS
+    # The mean is the same 0.2, and hardly differs between seeds; another training may come to anything.
+    assert better("a", "b", unlike, base).verdict == UNDECIDED
+    assert better("a", "b", learning.mean_of(unlike), base).verdict == HOLDS
+    assert "3 trainings and 40 seeds" in better("a", "b", alike, base).found
+    assert "of a single training" in better("a", "b", alike[0], base).found
+    assert learning.over(unlike, unlike).mean == 0.0
+    assert learning.RUNS[False] >= 3
 
 
 def test_verdicts_follow_from_the_paired_differences():

@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from edge_server.offline.study.statistics import Interval, interval, negated, optimum, paired, share_closed
+from edge_server.offline.study.statistics import (
+    Interval,
+    crossed,
+    interval,
+    negated,
+    optimum,
+    paired,
+    share_closed,
+)
 
 
 def test_an_interval_covers_the_mean_in_95_of_100():
@@ -73,3 +81,31 @@ def test_the_share_of_a_gap():
     found = share_closed(half, base, limit)
     assert 0.45 < found.low < 0.5 < found.high < 0.55
     assert math.isnan(share_closed(half, limit, base).mean), "nothing to close where the limit is no better"
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
+def test_an_interval_over_runs_and_seeds_covers_what_it_says(spread):
+    """Three trainings that differ by ``spread``, tried on the same 60 seeds, whose mean is nought."""
+    rng = np.random.default_rng(3)
+    covered = by_seeds = 0
+    for _ in range(400):
+        table = spread * rng.normal(size=(3, 1)) + rng.normal(size=(1, 60)) + rng.normal(size=(3, 60))
+        found = crossed([dict(enumerate(run)) for run in table.tolist()])
+        alone = interval(table.mean(axis=0).tolist())
+        assert found.mean == pytest.approx(alone.mean)
+        covered += found.low <= 0.0 <= found.high
+        by_seeds += alone.low <= 0.0 <= alone.high
+    assert covered >= 0.92 * 400
+    if spread == 1.0:  # the interval that leaves the trainings out
+        assert by_seeds < 0.5 * 400
+
+
+def test_runs_and_seeds_where_there_are_few_of_either():
+    assert crossed([]).count == 0
+    one = {0: 1.0, 1: 2.0, 2: 4.0}
+    assert crossed([one]) == interval(list(one.values()))
+    with_gap = crossed([one, {0: 2.0, 1: None, 2: 5.0}])
+    assert with_gap.count == 2 and with_gap.mean == 3.0
+    assert math.isnan(crossed([{0: 1.0}, {0: 2.0}]).low)
+    level = crossed([{0: 1.0, 1: 1.0}, {0: 1.0, 1: 1.0}])
+    assert (level.low, level.mean, level.high) == (1.0, 1.0, 1.0)

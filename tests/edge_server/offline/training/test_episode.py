@@ -33,8 +33,7 @@ def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) ->
     what = scenario(**more)
     edge = {**what.edge, "policy": {"name": policy, "value": value}}
     terms = Terms(steps=4, epoch_ms=60_000.0, first_ms=at_ns / 1e6, scratch=True, compute=Compute(5.0))
-    # One field for all episodes: what it is seeded with is no part of what they repeat.
-    field = make_field("splat", FIELD, seed=what.seed)
+    field = make_field("splat", FIELD, seed=setting().field_seed(seed))
     return deploy(dataclasses.replace(what, edge=edge, seed=seed), terms, field=field)
 
 

@@ -11,15 +11,23 @@ import numpy as np
 import pytest
 import yaml
 
-from edge_server.offline.train_scheduler import main
+from edge_server.offline.train_scheduler import main, reward_of
 from edge_server.offline.training.choosing import choices, named
 from edge_server.offline.training.contest import HINDSIGHT, hold, rivals, rows, write_rows
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.problem import FitProblem
 from edge_server.offline.training.report import draw_curve, lines, summary
 from edge_server.offline.training.setting import seeds
-from edge_server.offline.training.trainer import Course, TrainingError, compared, read_log, train
+from edge_server.offline.training.trainer import (
+    Course,
+    TrainingError,
+    compared,
+    read_log,
+    stage_file,
+    train,
+)
 from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.lessons import reward_for
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.rewards import Reward, make_reward
@@ -49,7 +57,7 @@ def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path):
         alone = train(setting(), COURSE, one, tmp_path / "one", quiet)
         both = train(setting(), COURSE, two, tmp_path / "two", quiet)
     assert same(alone, both) and not same(alone, Learner(COURSE.spec, COURSE.seed))
-    timeless = [[{k: v for k, v in row.items() if k != "seconds"} for row in read_log(tmp_path / name)]
+    timeless = [[{k: v for k, v in row.items() if "seconds" not in k} for row in read_log(tmp_path / name)]
                 for name in ("one", "two")]  # fmt: skip
     assert timeless[0] == timeless[1]
     with Crew(NOTHING) as crew:
@@ -119,17 +127,20 @@ def contest(tmp_path_factory):
         return hold(setting(), crew, seeds(0, "test", 6), {**names, "learnt": actor}, REWARD)
 
 
-def test_nobody_beats_hindsight_and_the_best_fixed_is_measured_where_it_was_not_chosen(contest):
+def test_hindsight_and_the_best_fixed_are_measured_where_they_were_not_chosen(contest):
     best = contest.rewards(HINDSIGHT)
-    for name in contest.outcomes:
-        assert all(best[s] >= r - 1e-12 for s, r in contest.rewards(name).items())
     values, name = contest.best_fixed("threshold")
     assert name in contest.outcomes
     for seed, value in values.items():
         assert value in (contest.rewards("threshold:40")[seed], contest.rewards("threshold:120")[seed])
     assert contest.share(contest.rewards("random")).mean == 0.0
     assert contest.share(best).mean == 1.0
-    assert contest.varies("threshold")["gain"].mean >= 0.0
+    for at in contest.outcomes["all"]:
+        first, second = ({n: contest.value(found[n][at]) for n in contest.outcomes}
+                         for found in (contest.outcomes, contest.again))  # fmt: skip
+        crossed = (second[max(first, key=first.get)] + first[max(second, key=second.get)]) / 2
+        assert contest._top(list(contest.outcomes))[0][at] == pytest.approx(crossed)
+    assert set(best) == {seed for seed, _ in contest.outcomes["all"]}
 
 
 def test_a_contest_is_told_in_a_table_and_in_words(contest, tmp_path: Path):
@@ -158,6 +169,12 @@ def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
         (["room", "--jobs", "0"], "--jobs"),
         (["room", "--episodes", "0"], "episodes"),
         (["lego", "--jobs", "1"], "lego"),
+        (["room", "--field", "nope"], "--field: expected one of ngp"),
+        (["room", "--omegas", "20,60"], "--kind select chooses cameras"),
+        (["room", "--kind", "wait", "--omegas", "20,soon"], "expected milliseconds such as"),
+        (["room", "--report", "cam77"], "cam77 is not one of"),
+        (["room", "--report", "cam00"], "left to reward"),
+        (["room", "--network", "flat"], "--report none"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys):
@@ -189,8 +206,13 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert main(words) == 0
     told = capsys.readouterr().out
     assert "2/2 episodes" in told and "over random" in told and "bandit:" in told
+    assert "rewarded from cam00; judged from cam03" in told
     kept = json.loads((out / "summary.json").read_text())
     assert kept["reward_name"] == "corrected" and kept["best_fixed"].startswith("threshold:")
+    assert (kept["rewarded_from"], kept["judged_from"], kept["motions"]) == (["cam00"], ["cam03"], True)
+    # The scenario asks for no LPIPS, so that the reward has no such term, wherever weights lie about.
+    learner = Learner.load(out / "policy.npz")
+    assert learner.taught_by["name"] == "corrected" and learner.taught_by["distance"] == 0.0
     for name in ("training.csv", "training.png", "contest.csv", "policy.npz"):
         assert (out / name).stat().st_size > 0
     policy = make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))
@@ -200,3 +222,152 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     lines_before = (out / "evaluations.jsonl").read_text()
     assert main(words) == 0  # finished: nothing is left to be evaluated
     assert (out / "evaluations.jsonl").read_text() == lines_before
+    # What the training took is what it took in all, not what its last session did.
+    assert json.loads((out / "summary.json").read_text())["seconds"] == kept["seconds"] > 0.0
+    assert main([*words[:-3], "1", "--test", "0", "--out", str(out)]) == 0
+    assert not (out / "summary.json").exists() and not (out / "contest.csv").exists()
+
+
+def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Path):
+    Learner(COURSE.spec, 77).save(tmp_path / "policy.npz")
+
+    def stop(line: str) -> None:
+        raise KeyboardInterrupt
+
+    with Crew(NOTHING) as crew:
+        with pytest.raises(KeyboardInterrupt):
+            train(setting(), COURSE, crew, tmp_path, stop)
+        assert not (tmp_path / "policy.npz").exists()
+        Learner(COURSE.spec, 77).save(tmp_path / "policy.npz")
+        learner = train(setting(), COURSE, crew, tmp_path, quiet)
+    assert same(Learner.load(tmp_path / "policy.npz"), learner)
+
+
+@pytest.mark.parametrize(
+    ("reward", "missing"),
+    [
+        (make_reward("set"), "lpips.*--distance none"),
+        (make_reward("set", distance_is="perceptual"), "edge.metrics"),
+    ],
+)
+def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(reward, missing, tmp_path: Path):
+    course = dataclasses.replace(COURSE, reward=reward)
+    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match=missing):
+        train(setting(), course, crew, tmp_path, quiet)
+    assert not (tmp_path / "training.json").exists()
+
+
+def test_the_distance_of_a_reward_follows_from_the_scenario_and_from_what_is_asked(tmp_path: Path):
+    weights = {"alex": ("alexnet_features.npz", "lin_alex_v0.1.npz")}
+    for names in weights.values():
+        for name in names:
+            (tmp_path / name).write_bytes(b"no weights")
+    reward, missing = reward_of("set", "whole", tmp_path, "none")
+    assert reward.distance == 0.0 and "edge.lpips is none" in missing
+    reward, missing = reward_of("set", "whole", tmp_path, "squeeze")
+    assert reward.distance == 0.0 and "squeeze" in missing
+    assert reward_of("set", "whole", None, "alex", "none") == (make_reward("set", distance=0.0), None)
+    stand_in, missing = reward_of("set", "moving", None, "alex", "perceptual")
+    assert missing is None and stand_in == make_reward("set", "moving", "perceptual")
+
+
+def test_a_stand_in_distance_is_measured_learnt_from_and_kept_for_live_use(tmp_path: Path, capsys):
+    file, out = tmp_path / "small.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump(RAW))
+    words = [str(file), "--distance", "perceptual", "--episodes", "1", "--batch", "1", "--decisions", "1",
+             "--fit-steps", "2", "--size", "24", "--test", "0", "--jobs", "1", "--same-motion", "--scratch",
+             "--out", str(out)]  # fmt: skip
+    assert main(words) == 0
+    assert "teaches to ignore how old views are" in " ".join(capsys.readouterr().out.split())
+    (row,) = read_log(out)
+    assert row["term_perceptual"] == pytest.approx(-row["perceptual"])
+    known = Learner.load(out / "policy.npz").taught_by
+    by = reward_for("select", "", out / "policy.npz", "no weights", known)
+    assert by == make_reward("set", distance_is="perceptual")
+    with pytest.raises(ValueError, match="its reward"):
+        reward_for("select", "", out / "policy.npz", None, {"name": "set", "sweets": 1.0})
+
+
+def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: Path):
+    known, seen = tmp_path / "known.jsonl", []
+
+    def stop(done: int, count: int) -> None:
+        seen.append((done, count))
+        raise KeyboardInterrupt
+
+    with Crew(NOTHING, known=known) as crew:
+        moments = [m for e in crew.draw(setting(), range(12)) for m in e]
+        asked = [(m.seed, m.number, c) for m in moments for c in choices(named("all"), [m])]
+        with pytest.raises(KeyboardInterrupt):
+            crew.evaluate(setting(), asked, stop)
+    ((done, count),) = seen
+    assert count == len(asked) == 24 and 0 < done <= 8
+    assert len(known.read_text().splitlines()) == done
+    with Crew(NOTHING, known=known) as crew:
+        crew.evaluate(setting(), asked)
+        assert crew.evaluated == count - done
+
+
+def test_progress_is_told_before_the_first_batch_is_over(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("edge_server.offline.training.trainer._TELL_EVERY_S", 0.0)
+    told: list[str] = []
+    course = dataclasses.replace(COURSE, episodes=6, batch=6)
+    with Crew(NOTHING) as crew:
+        train(setting(), course, crew, tmp_path, told.append)
+    assert len(told) >= 3 and told[0].endswith("fits of batch 1") and told[-1].startswith("6/6 episodes")
+
+
+def test_the_time_of_fits_is_that_of_when_they_were_carried_out(tmp_path: Path):
+    known = tmp_path / "known.jsonl"
+    with Crew(NOTHING, known=known) as crew:
+        moments = crew.draw(setting(), [7])[0]
+        asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
+        crew.evaluate(setting(), asked)
+        spent = crew.fit_s(setting(), asked)
+    assert spent > 0.0
+    with Crew(NOTHING, known=known) as crew:
+        crew.evaluate(setting(), asked)
+        assert crew.evaluated == 0 and crew.fit_s(setting(), asked * 2) == spent
+    # What an older version kept has no time, so that it is carried out again.
+    rows = [json.loads(line) for line in known.read_text().splitlines()]
+    known.write_text("".join(json.dumps({k: v for k, v in r.items() if k != "fit_ms"}) + "\n" for r in rows))
+    with Crew(NOTHING, known=known) as crew:
+        crew.evaluate(setting(), asked)
+        assert crew.evaluated == len(asked)
+
+
+def test_what_had_been_learnt_on_the_way_is_kept_at_the_stages(tmp_path: Path):
+    course = dataclasses.replace(COURSE, stages=(1, 3))
+    with Crew(NOTHING) as crew:
+        learner = train(setting(), course, crew, tmp_path / "a", quiet)
+        shorter = dataclasses.replace(COURSE, episodes=2)
+        first = train(setting(), shorter, crew, tmp_path / "b", quiet)
+    assert same(Learner.load(stage_file(tmp_path / "a", 1)), first)
+    assert same(Learner.load(stage_file(tmp_path / "a", 3)), learner) and not same(first, learner)
+    with pytest.raises(TrainingError, match="stages"):
+        dataclasses.replace(COURSE, stages=(4,))
+
+
+def test_other_learners_are_never_given_an_episode_that_policies_are_tested_on():
+    problem = FitProblem(setting(), COURSE.spec, REWARD, None)
+    drawn = []
+    problem = dataclasses.replace(problem, crew=SeenSeeds(drawn))
+    for seed in (0, 5, 2**31 - 1, 2 * 10**6 * 2 + 1, 123_456_789):
+        problem.draw(seed)
+    tested = {s // 10**6 for s in (seeds(0, "test", 1)[0], seeds(0, "choose", 1)[0])}
+    assert not {s // 10**6 for s in drawn} & tested and set(s // 10**6 for s in drawn) == {0}
+    assert drawn[2] == (2**31 - 1) // 2 % 10**6
+    other = dataclasses.replace(problem, run=3)
+    other.draw(8)
+    assert drawn[-1] == seeds(3, "train", 1, 4)[0]
+
+
+class SeenSeeds:
+    """Notes which episodes are drawn, and draws nothing."""
+
+    def __init__(self, drawn: list[int]) -> None:
+        self.drawn = drawn
+
+    def draw(self, setting, seeds):
+        self.drawn += seeds
+        return [(None,) * setting.decisions]

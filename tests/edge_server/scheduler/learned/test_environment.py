@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from edge_server.scheduler.learned.environment import BanditEnvironment
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.state import State
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, regret, teach
 
 SELECT = Spec("select", FreshOnes.layout)
@@ -54,6 +55,42 @@ def test_an_empty_set_becomes_the_youngest_camera():
     environment.reset(seed=1)
     *_, other = environment.step(youngest)
     assert other["terms"] == info["terms"] and not other["forced"]
+
+
+class _Sometimes:
+    """Two decisions of three have no reward."""
+
+    layout = FreshOnes.layout
+
+    def draw(self, seed: int):
+        decision = FreshOnes().draw(seed)
+        known = seed % 3 == 0
+        return _Known(decision.state, float(seed) if known else np.nan)
+
+
+@dataclass(frozen=True)
+class _Known:
+    state: State
+    worth: float
+
+    def reward(self, action):
+        return self.worth, {"value": None if np.isnan(self.worth) else self.worth}
+
+
+def test_where_no_reward_could_be_had_other_learners_get_the_mean_so_far():
+    environment = BanditEnvironment(_Sometimes(), SELECT, 6)
+    environment.reset(seed=0)
+    given, known = [], []
+    for _ in range(40):
+        *_, info = (found := environment.step(np.ones(6, np.int8)))
+        expected = np.mean(known) if known else 0.0
+        if info["missing"]:
+            assert found[1] == pytest.approx(expected)
+        else:
+            known.append(found[1])
+        given.append(info["missing"])
+        environment.reset()
+    assert 5 < len(known) < 35 and any(given) and np.isfinite(known).all()
 
 
 @pytest.mark.slow

@@ -101,7 +101,7 @@ def test_before_anything_is_learnt_every_camera_has_the_probability_asked_for(st
         ({"action": "select", "network": "flat"}, "fixed number"),
         ({"action": "select", "cameras": 4}, "fixed number"),
         ({"action": "select", "start": 1.0}, "between 0 and 1"),
-        ({"action": "select", "passes": 0}, "whole numbers"),
+        ({"action": "select", "passes": 0}, "whole number"),
         ({"action": "select", "learning_rate": float("nan")}, "positive"),
         ({"action": "select", "entropy": -1.0}, "not negative"),
     ],

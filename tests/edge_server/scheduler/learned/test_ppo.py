@@ -3,11 +3,14 @@ in a checkpoint."""
 
 from __future__ import annotations
 
+import zipfile
+
 import numpy as np
 import pytest
 
 from edge_server.fields import checkpoint
-from edge_server.scheduler.learned.decide import Actor
+from edge_server.scheduler.learned import networks
+from edge_server.scheduler.learned.decide import MOST_BYTES, Actor
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.spec import Spec
@@ -182,6 +185,104 @@ def test_a_checkpoint_that_could_not_be_learnt_from_is_refused(tmp_path, name):
     checkpoint.save(path, arrays, about, kind="scheduler")
     with pytest.raises(checkpoint.CheckpointError, match="damaged"):
         Learner.load(path)
+
+
+LARGE = {
+    "hidden": {"hidden": 30_000},
+    "cameras": {"network": "flat", "cameras": 10**9},
+    "cameras times width": {"network": "flat", "cameras": 4000, "hidden": 1024},
+    "dim": {"layout": {"parts": ["age", "semantics"], "dim": 10**9}},
+    "omegas": {"action": "wait", "omegas_ms": list(range(10**5))},
+}
+WRONG = {
+    "hidden is no whole number": {"hidden": 64.0},
+    "hidden is text": {"hidden": "64"},
+    "minibatch is no whole number": {"minibatch": 1.5},
+    "start is text": {"start": "a"},
+    "spread is zero": {"layout": {"parts": ["semantics"], "dim": 1, "centre": [0.0], "spread": [0.0]}},
+    "centre is infinite": {"layout": {"parts": ["semantics"], "dim": 1, "centre": [np.inf], "spread": [1.0]}},
+}
+
+
+@pytest.mark.parametrize("change", [*LARGE.values(), *WRONG.values()], ids=[*LARGE, *WRONG])
+def test_a_specification_that_nobody_trains_is_refused_before_anything_is_allocated(
+    tmp_path, monkeypatch, change
+):
+    path = save(Learner(select(), 0), tmp_path / "policy.npz")
+    arrays, about = checkpoint.load(path, kind="scheduler")
+    layout = {**about["spec"]["layout"], **change.get("layout", {})}
+    about["spec"] |= {**change, "layout": layout}
+    checkpoint.save(path, arrays, about, kind="scheduler")
+
+    def allocated(*_: object) -> None:
+        raise MemoryError("weights of that size")
+
+    monkeypatch.setattr(networks, "_orthogonal", allocated)
+    for load in (Learner.load, Actor.load):
+        with pytest.raises(checkpoint.CheckpointError, match="its policy cannot be used") as refused:
+            load(path)
+        assert str(refused.value).count(str(path)) == 1 and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("rewards", {"count": 5, "mean": float("nan"), "variance": 1.0}),
+        ("rewards", {"count": 5, "mean": 0.0, "variance": -1.0}),
+        ("rewards", {"count": -5, "mean": 0.0, "variance": 1.0}),
+        ("rewards", [1, 2, 3]),
+        ("seed", "zz"),
+        ("seed", -3),
+        ("updates", float("inf")),
+        ("streams", {}),
+    ],
+)
+def test_what_a_learner_remembers_must_be_what_it_can_have_remembered(tmp_path, key, value):
+    path = save(Learner(select(), 0), tmp_path / "policy.npz")
+    arrays, about = checkpoint.load(path, kind="scheduler")
+    checkpoint.save(path, arrays, {**about, key: value}, kind="scheduler")
+    with pytest.raises(checkpoint.CheckpointError, match="damaged") as refused:
+        Learner.load(path)
+    assert str(refused.value).count(str(path)) == 1 and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("name", "value"), [("adam.0.step", np.nan), ("adam.0.exp_avg_sq", -1.0)])
+def test_memories_of_adam_that_would_spoil_the_weights_are_refused(tmp_path, name, value):
+    learner = Learner(select(), 0)
+    teach(learner, FreshOnes(), 1)
+    path = save(learner, tmp_path / "policy.npz")
+    arrays, about = checkpoint.load(path, kind="scheduler")
+    arrays[name] = np.full_like(arrays[name], value)
+    checkpoint.save(path, arrays, about, kind="scheduler")
+    with pytest.raises(checkpoint.CheckpointError, match="damaged"):
+        Learner.load(path)
+
+
+def test_weights_that_are_no_numbers_are_refused(tmp_path):
+    path = save(Learner(select(), 0), tmp_path / "policy.npz")
+    arrays, about = checkpoint.load(path, kind="scheduler")
+    arrays["actor.in"] = arrays["actor.in"].astype(str)
+    checkpoint.save(path, arrays, about, kind="scheduler")
+    for load in (Learner.load, Actor.load):
+        with pytest.raises(checkpoint.CheckpointError, match="damaged"):
+            load(path)
+
+
+def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path):
+    path = tmp_path / "policy.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed, packed.open("actor.in.npy", "w") as file:
+        for _ in range(MOST_BYTES // 2**20 + 1):
+            file.write(bytes(2**20))
+    assert path.stat().st_size < 2**20
+    with pytest.raises(checkpoint.CheckpointError, match="unpacked it has"):
+        Actor.load(path)
+
+
+def test_what_only_decides_says_so_to_who_wants_it_to_learn(tmp_path):
+    Learner(select(), 0).actor.save(tmp_path / "policy.npz")
+    with pytest.raises(checkpoint.CheckpointError, match="nothing that it could go on learning") as refused:
+        Learner.load(tmp_path / "policy.npz")
+    assert "damaged" not in str(refused.value)
 
 
 def test_what_is_not_there_is_refused(tmp_path):
