@@ -129,20 +129,22 @@ class ArmConfig:
 @dataclass(frozen=True)
 class WorldConfig(SourceConfig):
     """A synthetic world. scene: ``room``, ``tile`` or ``tower``; size and lens of its cameras; how fast it
-    moves. params: further parameters of the scene by name. arm: carries those of the cameras that it lists;
-    what they see is rendered from where a simulated arm really is."""
+    moves. motion_seed: another motion of the same scene, drawn from it (path, sense, start, speed); not
+    given, the scene's own. params: further parameters of the scene by name. arm: carries those of the cameras
+    that it lists; what they see is rendered from where a simulated arm really is."""
 
     scene: str = "room"
     width: int | None = None
     height: int | None = None
     horizontal_fov_deg: float | None = None
     speed_m_per_s: float | None = None
+    motion_seed: int | None = None
     params: dict[str, Any] = field(default_factory=dict)
     arm: ArmConfig | None = None
 
     def scene_parameters(self) -> dict[str, Any]:
         """What the scene is made with: the keys above that were given, and ``params``."""
-        names = ("width", "height", "horizontal_fov_deg", "speed_m_per_s")
+        names = ("width", "height", "horizontal_fov_deg", "speed_m_per_s", "motion_seed")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return {**given, **self.params}
 

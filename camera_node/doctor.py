@@ -32,6 +32,7 @@ LEAST_FREE_GB = 2.0
 _EXCHANGES = 8
 _ANSWER_S = 2.0
 _LISTEN_S = 0.5
+_LEAST_REACHED = 0.6  # of a tour's viewpoints; with fewer, a side of the target stays unseen
 # extra -> (module, distribution)
 _PACKAGES = {
     "oak": (("depthai", "depthai"),),
@@ -100,7 +101,7 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iter
         if config.calibration is not None:
             yield _look("calibration", lambda: _calibration(scenario, config))
         for camera in scenario.cameras:
-            yield _look(f"camera {camera}", lambda camera=camera: _camera(camera, config))  # type: ignore[misc]
+            yield _look(f"camera {camera}", lambda camera=camera: _camera(scenario, camera, config))  # type: ignore[misc]
     if arm is not None:
         yield _look("hand-eye", lambda: _hand_eye(scenario, arm))
         yield _look("arm", lambda: _arm(scenario, arm))
@@ -113,6 +114,8 @@ def _look(part: str, examination: Callable[[], str]) -> Finding:
         return Finding(part, True, examination())
     except (ValueError, OSError) as error:
         return Finding(part, False, " ".join(str(error).split()).removeprefix(f"{part.split()[-1]}: "))
+    except Exception as error:  # libraries of devices raise what they like: the other parts count too
+        return Finding(part, False, f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def _python() -> str:
@@ -221,8 +224,10 @@ def _calibration(scenario: Scenario, config: LiveConfig) -> str:
     return f"{config.calibration}: {len(known)} cameras"
 
 
-def _camera(camera: str, config: LiveConfig) -> str:
+def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
     """Open it, take frames for half a second, close it."""
+    from camera_node.sources.live import calibrations
+
     module: Any = importlib.import_module(f"camera_node.sources.{config.kind}")
     clock = WallClock()
     feed = module.opener(camera, config.devices.get(camera), config, rate(config.fps or 15.0), clock)()
@@ -235,13 +240,19 @@ def _camera(camera: str, config: LiveConfig) -> str:
             taken = feed.grab(_LISTEN_S)
             if taken is not None:
                 ages_ms.append((clock.now_ns() - taken[0]) / 1e6)
-        lens = feed.intrinsics
+        lens, no_lens, stamped_by = feed.intrinsics, feed.no_lens, feed.stamped_by
     finally:
         feed.close()
     height, width = first[1].shape[:2]
-    known = "knows no intrinsics (source.calibration)" if lens is None else f"f = {lens.fx:.0f} px"
+    if camera in calibrations(scenario, config):
+        known = "its lens as calibrated"
+    elif lens is None:
+        raise Wrong(no_lens.removeprefix(f"{camera}: "))
+    else:
+        known = f"f = {lens.fx:.0f} px"
     age = f", {sum(ages_ms) / len(ages_ms):.0f} ms old when they come" if ages_ms else ""
-    return f"{width} x {height}, {len(ages_ms) / _LISTEN_S:.0f} frames a second{age}; {known}"
+    rate_hz = len(ages_ms) / _LISTEN_S
+    return f"{width} x {height}, {rate_hz:.0f} frames a second{age}, stamped by {stamped_by}; {known}"
 
 
 def _hand_eye(scenario: Scenario, arm: ArmConfig) -> str:
@@ -251,6 +262,13 @@ def _hand_eye(scenario: Scenario, arm: ArmConfig) -> str:
 
     model = arm_model(scenario, arm)
     mounts = hand_eyes(scenario, arm, arm.cameras)
+    for camera, mount in mounts.items():
+        if mount.details.get("example") and not arm.simulated:
+            raise Wrong(
+                f"{arm.cameras[camera]}: still the example's, not this bench's: camera-node calibrate "
+                f"hand-eye --live {scenario.path} --camera {camera} --board SPEC --out FILE (with {camera}: "
+                "null)"
+            )
     where = [
         f"{camera} {mount.setup}, {1e3 * float(np.linalg.norm(mount.transform[:3, 3])):.0f} mm away"
         for camera, mount in mounts.items()
@@ -284,11 +302,22 @@ def _arm(scenario: Scenario, arm: ArmConfig) -> str:
 def _path(scenario: Scenario, arm: ArmConfig) -> str:
     from camera_node.pose.mount import EYE_TO_HAND
     from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
-    from camera_node.pose.path import tour, viewpoints
+    from camera_node.pose.path import reached_by_ring, tour, viewpoints
 
     assert arm.path is not None
     carried = [m for m in hand_eyes(scenario, arm, arm.cameras).values() if m.setup != EYE_TO_HAND]
     if not carried:
         raise Wrong("no camera is on the hand: there is nothing to drive")
-    stops = tour(arm_model(scenario, arm), base_matrix(arm), carried[0].transform, arm.path)
-    return f"the arm reaches {len(stops)} of {len(viewpoints(arm.path))} viewpoints"
+    model, base, mount = arm_model(scenario, arm), base_matrix(arm), carried[0].transform
+    stops = tour(model, base, mount, arm.path)
+    count = len(viewpoints(arm.path))
+    said = f"the arm reaches {len(stops)} of {count} viewpoints"
+    if len(stops) >= _LEAST_REACHED * count:
+        return said
+    rings = ", ".join(
+        f"{elevation_deg:g} degrees {reached} of {count // len(arm.path.elevations_deg)}"
+        for elevation_deg, reached in zip(
+            arm.path.elevations_deg, reached_by_ring(stops, model, base, mount, arm.path)
+        )
+    )
+    raise Wrong(f"{said} ({rings}): change radius_m, elevations_deg, azimuths_deg or where the base stands")

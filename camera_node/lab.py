@@ -17,7 +17,10 @@ def add_commands(commands: Any) -> None:
     simulate = commands.add_parser(
         "simulate-arm", help="a simulated UR controller that real client programs connect to",
         description="Serves the ports of a Universal Robots controller whose arm is simulated: state and "
-        "registers (30004), dashboard (29999), programs (30001-30003).",
+        "registers (30004), dashboard (29999), programs (30001-30003). Of a program's commands it knows "
+        "moveJ, servoJ, servoStop, speedJ, speedStop, stopJ, setWatchdog, kickWatchdog and stopScript; "
+        "others (moveL, forceMode, getForwardKinematics, ...), and what a real arm refuses, stop the program "
+        "with a warning.",
     )  # fmt: skip
     add = simulate.add_argument
     add("scenario", nargs="?", help="take address, robot and calibration from this scenario's source.arm")
@@ -36,13 +39,20 @@ def add_commands(commands: Any) -> None:
     drive = commands.add_parser(
         "drive-arm", help="take the camera on an arm round its target",
         description="Moves the arm of a scenario along the viewpoints of its source.arm.path, there and "
-        "back, until Ctrl-C. Asks before it moves a real one.",
+        "back, until Ctrl-C. Prints the joint angles first, and asks before it moves a real arm.",
     )  # fmt: skip
     drive.add_argument("scenario", help="a scenario whose source.arm has a path")
     drive.add_argument(
         "--rounds", type=int, default=0, metavar="N", help="tours to make (default 0: on and on)"
     )
-    drive.add_argument("--show", action="store_true", help="print the joint angles (degrees) and do not move")
+    drive.add_argument(
+        "--show",
+        action="store_true",
+        help="print what would be driven from where the arm stands, and do not move",
+    )
+    drive.add_argument(
+        "--joints", metavar="DEG,...", help="of --show: from there instead, six angles in degrees"
+    )
     drive.add_argument("--yes", action="store_true", help="the arm's space is clear: do not ask")
 
     _add_teleop(commands)

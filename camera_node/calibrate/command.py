@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,6 +37,17 @@ from, one of:
                  enough. The hand's poses are those that the camera's source gives (without hand_eye), or
                  --hand CSV of them, by seconds since the first frame
 """
+
+
+MAX_GAP_MS, WANT_MM = 50.0, 0.5
+# Option -> what it goes with: said with anything else, it would be ignored.
+_GO_WITH = {
+    "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
+    **dict.fromkeys(
+        ("camera", "data", "want_mm", "moving", "samples", "preview", "seconds", "tracks"), ("live",)
+    ),
+}  # fmt: skip
+_SPELT = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,18 +100,21 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add("--eye-to-hand", action="store_true", help="the camera stands, the hand holds the target")
     add("--method", default="refined", metavar="NAME",
         help="whose answer is given: tsai, park, horaud, andreff, daniilidis or refined (default)")
-    add("--max-gap-ms", type=float, default=50.0, metavar="MS",
-        help="of streams: what is farther from a hand pose is not used (default %(default)g)")
+    add("--max-gap-ms", type=float, metavar="MS",
+        help=f"of streams: what is farther from a hand pose is not used (default {MAX_GAP_MS:g})")
     add("--json", action="store_true",
-        help="print {transform, time_offset_s, residual_mm, residual_deg, method}")
+        help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
     add("--out", type=Path, metavar="FILE.yaml", help="for the node (source.trajectory.hand_eye)")
     add("--plot", type=Path, metavar="FILE.png", help="residuals, axes of the turns, scatter of the target")
     live = parser.add_argument_group("with --live").add_argument
     live("--camera", metavar="ID", help="of the scenario")
     live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
-    live("--want-mm", type=float, default=0.5, metavar="MM",
-         help="enough when the standard deviation is below this (default %(default)g)")
-    live("--moving", action="store_true", help="take pictures while the hand moves too")
+    live("--want-mm", type=float, metavar="MM",
+         help=f"enough when the standard deviation is below this (default {WANT_MM:g})")
+    live("--moving", action="store_true", help="take pictures while the hand moves too; with an arm, the "
+         "time offset between its stamps and the camera's is estimated from the motion")
+    live("--tracks", type=Path, metavar="DIR",
+         help="with --moving and an arm: keeps both streams, hand.csv and target.csv, for --hand, --target")
     live("--samples", type=Path, metavar="FILE",
          help="keeps each sample as --pairs reads it; goes on with those that are there")
     live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
@@ -130,6 +145,12 @@ def _hand_eye(args: argparse.Namespace) -> int:
         raise CalibrationError(
             "expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO"
         )
+    for option, goes_with in _GO_WITH.items():
+        if getattr(args, option) not in (None, False) and not given & set(goes_with):
+            places = " or ".join(_SPELT[each] for each in goes_with)
+            raise CalibrationError(f"--{option.replace('_', '-')}: goes with {places}")
+    args.max_gap_ms = MAX_GAP_MS if args.max_gap_ms is None else args.max_gap_ms
+    args.want_mm = WANT_MM if args.want_mm is None else args.want_mm
     from camera_node.calibrate import handeye, report
 
     if args.method not in handeye.ALL_METHODS:
@@ -139,6 +160,9 @@ def _hand_eye(args: argparse.Namespace) -> int:
         report.write_yaml(found, args.out)
     if args.plot is not None:
         report.plot(found, args.plot)
+    if args.json:
+        for warning in found.warnings:
+            _say(f"note: {warning}")
     print(json.dumps(found.answer()) if args.json else report.show(found))
     return 0
 
@@ -162,6 +186,8 @@ def _found(args: argparse.Namespace) -> Calibration:
         return handeye.calibrate_tracks(hand, target, setup, args.method, args.max_gap_ms / 1e3)
     if args.board is None:
         raise CalibrationError("--board SPEC: say what the target is")
+    if args.live is not None and args.camera is None:
+        raise CalibrationError("--camera ID: say which of the scenario's cameras")
     board = parse(args.board)
     lens = None if args.lens is None else folder.read_lens(args.lens)
     if args.live is not None:
@@ -198,17 +224,19 @@ def _target(args: argparse.Namespace) -> int:
     from camera_node.calibrate.targets import parse
 
     board = parse(args.board)
-    width = round(board.size_m[0] / 0.0254 * args.dpi)
+    width, height = (round(side_m / 0.0254 * args.dpi) for side_m in board.size_m)
     if not 64 <= width <= 32_000:
         raise CalibrationError(f"--dpi: makes a picture {width} pixels wide, expected 64 to 32000")
-    picture = board.draw(width)
+    # Drawn finer, in whole pixels a module, and brought to size: rounding each module would add up over them.
+    fine = board.draw(board.modules * math.ceil(2 * width / board.modules))
+    picture = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
     # Detectors need white around what they look for.
     border = max(8, width // 10)
     if not cv2.imwrite(str(args.out), np.pad(picture, border, constant_values=255)):
         raise CalibrationError(f"--out: {args.out} cannot be written (does its folder exist? .png?)")
     print(
         f"{args.out}: print it at {args.dpi:g} dpi without scaling; without its white border it must measure "
-        f"{board.size_m[0] * 1e3:.1f} x {board.size_m[1] * 1e3:.1f} mm"
+        f"{board.pattern_m[0] * 1e3:.1f} x {board.pattern_m[1] * 1e3:.1f} mm"
     )
     return 0
 

@@ -41,7 +41,9 @@ def read_pairs(file: Path, setup: str) -> Samples:
     """A JSON list of [end-effector in base, target in camera], each 4 x 4. Raises CalibrationError."""
     try:
         data = json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except OSError as error:
+        raise CalibrationError(f"{file}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise CalibrationError(f"{file}: cannot be read as JSON: {error}") from None
     if not isinstance(data, list):
         raise CalibrationError(f"{file}: expected a list of pairs of 4 x 4 matrices")
@@ -232,8 +234,13 @@ def _number(file: Path) -> int | None:
 
 
 def _rigid(matrix: object) -> Array:
+    given = np.asarray(matrix, dtype=np.float64)
+    if given.shape != (4, 4) or not np.allclose(given[3], [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError(
+            f"got {' x '.join(map(str, given.shape))} numbers, or a last row that is not 0 0 0 1"
+        )
     try:
-        return Pose.from_matrix(np.asarray(matrix, dtype=np.float64)).matrix()
+        return Pose.from_matrix(given).matrix()
     except GeometryError as error:
         raise ValueError(str(error)) from None
 

@@ -21,6 +21,7 @@ from camera_node.calibrate.motions import (
 from camera_node.calibrate.offset import Timed, calibrate_streams
 from camera_node.calibrate.refine import Refined, left_out, refine
 from camera_node.calibrate.solve import METHODS, Residuals, residuals, solve
+from camera_node.pose.mount import MAX_OFFSET_S
 
 REFINED = "refined"
 ALL_METHODS = (*METHODS, REFINED)
@@ -28,6 +29,11 @@ ALL_METHODS = (*METHODS, REFINED)
 _GOOD_POSES = 10
 _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
 _STRANGE_DEG = 1.0
+# Beyond these it is no calibration: poses the wrong way round, in millimetres, or of something else.
+_WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
+_ADVICE = (
+    "are the poses hand in base and target in camera, not their inverses, in metres, and is the set-up right?"
+)
 # As good as exact beside any camera.
 EXACT_ARM = (1e-6, 1e-6)
 
@@ -70,13 +76,17 @@ class Calibration:
         return 0.0 if self.timed is None else self.timed.offset_s
 
     def answer(self) -> dict[str, Any]:
-        """For scripts: {transform, time_offset_s, residual_mm, residual_deg, method}."""
+        """For scripts: {transform, time_offset_s, residual_mm, residual_deg, method}, and what the answer is
+        worth: {std_mm, std_deg, warnings}."""
         return {
             "transform": self.transform.tolist(),
             "time_offset_s": self.time_offset_s,
             "residual_mm": self.residuals.rms_mm,
             "residual_deg": self.residuals.rms_deg,
             "method": self.method,
+            "std_mm": self.refined.std_mm,
+            "std_deg": self.refined.std_deg,
+            "warnings": list(self.warnings),
         }
 
 
@@ -119,6 +129,7 @@ def _calibration(
     chosen = next(r for r in rows if r.method == method)
     if chosen.transform is None or chosen.residuals is None:
         raise CalibrationError(chosen.error)
+    _refuse_nonsense(chosen.transform, chosen.residuals)
     exact = None
     if samples.covariance is not None:
         start = (refined.x, refined.y)
@@ -128,6 +139,20 @@ def _calibration(
         samples, method, chosen.transform, chosen.residuals, tuple(rows), refined, left_deg, left_mm, groups,
         spread, exact, timed, tuple(_warnings(samples, refined, chosen.residuals, spread, timed)),
     )  # fmt: skip
+
+
+def _refuse_nonsense(transform: Array, off: Residuals) -> None:
+    """Raises CalibrationError for what a script must not take for an answer. Medians: a few wild samples
+    among good ones do no harm."""
+    median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
+    away_m = float(np.linalg.norm(transform[:3, 3]))
+    if median_mm > _WORST_MM or median_deg > _WORST_DEG:
+        raise CalibrationError(
+            f"the poses do not fit together (residuals {median_mm:.0f} mm, {median_deg:.1f} degrees in the "
+            f"median): {_ADVICE}"
+        )
+    if away_m > _FARTHEST_M:
+        raise CalibrationError(f"the camera would be {away_m:.1f} m away: {_ADVICE}")
 
 
 def _warnings(
@@ -144,8 +169,7 @@ def _warnings(
     median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
     if median_mm > _LARGE_RESIDUAL_MM or median_deg > _LARGE_RESIDUAL_DEG:
         out.append(
-            f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): are the "
-            "poses hand in base and target in camera, not their inverses, in metres, and is the set-up right?"
+            f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
         )
     strange = mismatch_deg(samples)
     threshold = max(_STRANGE_DEG, 5 * float(np.median(strange)))
@@ -153,6 +177,11 @@ def _warnings(
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
             f"degrees) and counts for {min(1.0, refined.weights[i]):.2f}"
+        )
+    if timed is not None and abs(timed.offset_s) >= MAX_OFFSET_S:
+        out.append(
+            f"the time offset is {timed.offset_s:.0f} s: the two streams count from different beginnings, "
+            "and no node can use it: give both on the clocks that it will meet"
         )
     if timed is not None and timed.unpaired:
         out.append(f"{timed.unpaired} target poses have no hand pose near enough in time and are not used")

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,16 +19,21 @@ from numpy.typing import NDArray
 
 from camera_node.calibrate import CalibrationError
 from camera_node.calibrate.folder import pairs_json, read_pairs
-from camera_node.calibrate.handeye import Calibration, calibrate
+from camera_node.calibrate.handeye import Calibration, calibrate, calibrate_tracks
 from camera_node.calibrate.motions import Array, Samples
 from camera_node.calibrate.session import KEPT, MOVING, Session, Step, preview
 from camera_node.calibrate.targets import Target
-from camera_node.config import source_config
+from camera_node.calibrate.tracks import Tracks, follow_arm
+from camera_node.config import ArmConfig, source_config
 from camera_node.pose.pairing import tidy
 from camera_node.pose.rig import PoseProvider, Trajectory, TrajectoryError, read_samples
 from camera_node.sources import Source, open_sources
 from freshfield import files, payload, scenario
-from freshfield.geometry import Pinhole
+from freshfield.clock import WallClock
+from freshfield.geometry import Pinhole, se3_inverse
+
+if TYPE_CHECKING:
+    from camera_node.pose.arm import ArmStream
 
 Image = NDArray[np.uint8]
 
@@ -41,6 +47,10 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     if args.camera not in plan.cameras:
         raise CalibrationError(f"--camera: {plan.path} has {', '.join(plan.cameras)}, got {args.camera}")
     config = source_config(plan)
+    arm: ArmConfig | None = getattr(config, "arm", None)
+    to_base = None if arm is None or args.hand is not None else _to_base(plan, arm, args.camera)
+    if args.tracks is not None and not (args.moving and to_base is not None):
+        raise CalibrationError("--tracks: goes with --moving and the poses of a scenario's arm")
     try:
         source = open_sources(plan, config, [args.camera], args.data)[args.camera]
     except (ValueError, OSError) as error:
@@ -68,15 +78,50 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
             raise CalibrationError(str(error)) from None
     session = Session(board, setup, args.want_mm, args.moving, before, keep)
     pace = _Pace(float(source.fps), args.seconds)
+    tracks = Tracks() if args.moving and to_base is not None else None
+    stream = None
     try:
-        guide(source, config.codec, lens, session, pace, show, hands)
+        if tracks is not None and arm is not None:
+            stream = _follow(plan, arm, tracks)
+        # What never repeats goes by the time of day, as a node's ticks do.
+        first = round(WallClock().now_ns() * source.fps / 10**9) if source.contents is None else 0
+        guide(
+            source, config.codec, lens, session, pace, show, hands,
+            to_base=to_base, tracks=tracks, first=first,
+        )  # fmt: skip
     except KeyboardInterrupt:
         print("\nstopped; what there is:", file=sys.stderr)
     except OSError as error:
         raise CalibrationError(f"--samples or --preview cannot be written: {error}") from None
     finally:
+        if stream is not None:
+            stream.stop()
         source.release()
-    return calibrate(session.samples(), args.method)
+    if tracks is None:
+        return calibrate(session.samples(), args.method)
+    if args.tracks is not None:
+        tracks.write(args.tracks)
+    return calibrate_tracks(tracks.hand(), tracks.target(), setup, args.method, args.max_gap_ms / 1e3)
+
+
+def _follow(plan: scenario.Scenario, arm: ArmConfig, tracks: Tracks) -> ArmStream:
+    try:
+        return follow_arm(plan, arm, tracks)
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
+
+
+def _to_base(plan: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
+    """Base-from-world (4, 4): an arm's poses come in the world, and a calibration is asked for in its base.
+    Raises CalibrationError, ScenarioError."""
+    from camera_node.pose.mounted import base_matrix
+
+    if camera not in arm.cameras or arm.cameras[camera] is not None:
+        raise CalibrationError(
+            f"{plan.path}: source.arm.cameras: set {camera}: null for the calibration (also for a camera "
+            "that stands): its poses are then the hand's"
+        )
+    return se3_inverse(base_matrix(arm))
 
 
 def guide(
@@ -88,25 +133,40 @@ def guide(
     show: Callable[[Image, Step, Session], None],
     hands: PoseProvider | None = None,
     move: Callable[[Array], None] | None = None,
+    to_base: Array | None = None,
+    tracks: Tracks | None = None,
+    first: int = 0,
 ) -> Step | None:
     """Offer the source's shots to the session until there is enough, ``pace`` says that time is over, or a
     recording has been seen once. lens: instead of the source's own. hands: poses of the hand by time since
-    tick 0; None: the shots' own poses are the hand's. move: brings the hand to a pose (4, 4), or refuses by
-    ValueError; None: an operator does. Returns the last step."""
-    step = None
+    the first shot; None: the shots' own poses are the hand's. move: brings the hand to a pose (4, 4), or
+    refuses by ValueError; None: an operator does. to_base: base-from-world (4, 4), where the shots' poses are
+    in the world. tracks: keeps where the target was seen, and decides when it is enough. first: the source's
+    tick to begin with. Returns the last step."""
+    step, begin_ns = None, None
     for tick in itertools.count():
         if (source.contents is not None and tick >= source.contents) or not pace(tick):
             return step
         try:
-            shot = source.read(source.content(tick))
-            hand = shot.pose if hands is None else hands.at(round(tick * 10**9 / source.fps)).pose
+            shot = source.read(source.content(first + tick))
+            t_ns = shot.captured_ns
+            if begin_ns is None:
+                begin_ns = round(first * 10**9 / source.fps) if t_ns is None else t_ns
+            if t_ns is None:
+                t_ns = round((first + tick) * 10**9 / source.fps)
+            hand = shot.pose if hands is None else hands.at(t_ns - begin_ns).pose
         except ValueError as error:  # one shot that cannot be had; later ones may
             print(f"\n{error}", file=sys.stderr)
             continue
         image = shot.image
         if isinstance(image, bytes):
             image = payload.decode(image, codec, shot.intrinsics.width, shot.intrinsics.height)
-        step = session.offer(image, lens or shot.intrinsics, hand.matrix())
+        matrix = hand.matrix() if to_base is None else to_base @ hand.matrix()
+        step = session.offer(image, lens or shot.intrinsics, matrix)
+        if tracks is not None:
+            if session.seen is not None:
+                tracks.add_target(t_ns, session.seen.pose)
+            step = tracks.judged(step)
         show(image, step, session)
         if step.enough:
             return step

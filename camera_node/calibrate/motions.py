@@ -155,7 +155,7 @@ def diversity(samples: Samples) -> Diversity:
         )
     elif half.sum() >= small.sum():
         reason = (
-            f"all turns but {int(usable.sum())} are near 180 degrees, where the axis' sign is lost; add "
+            f"{_all_but(int(usable.sum()))} turns are near 180 degrees, where the axis' sign is lost; add "
             "poses turned by 20 to 90 degrees"
         )
     else:
@@ -191,6 +191,10 @@ def mismatch_deg(samples: Samples) -> Array:
         b = angles(np.swapaxes(target[others], 1, 2) @ target[i])
         out[i] = math.degrees(float(np.median(np.abs(a - b)))) if len(others) else 0.0
     return out
+
+
+def _all_but(count: int) -> str:
+    return f"all but {count} of the" if count else "all"
 
 
 def _too_few(count: int) -> str:

@@ -12,7 +12,7 @@ from camera_node.calibrate import CalibrationError
 from camera_node.calibrate.handeye import Calibration, Row
 from camera_node.calibrate.motions import Rotation, rotation_vectors
 from camera_node.calibrate.solve import still
-from camera_node.pose.mount import EYE_IN_HAND
+from camera_node.pose.mount import EYE_IN_HAND, MAX_OFFSET_S
 from freshfield import files
 
 _BLUE, _RED, _GREY = "#0072B2", "#D55E00", "#999999"
@@ -54,23 +54,28 @@ def show(found: Calibration) -> str:
 def to_yaml(found: Calibration) -> str:
     """What ``camera_node.pose.mount.read_hand_eye`` reads, and how it was found."""
     answer = found.answer()
+    warnings = answer.pop("warnings")
     data = {
         "setup": found.samples.setup,
         "transform": [[round(v, 9) for v in row] for row in answer.pop("transform")],
         **answer,
         "poses": len(found.samples),
-        "std_mm": found.refined.std_mm,
-        "std_deg": found.refined.std_deg,
         "leave_out_mm": found.left_out_mm,
         "leave_out_deg": found.left_out_deg,
         "arm_noise_mm": found.refined.robot_m * 1e3,
         "arm_noise_deg": float(np.degrees(found.refined.robot_rad)),
-        "warnings": list(found.warnings),
+        "warnings": warnings,
     }
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
 
 
 def write_yaml(found: Calibration, path: Path) -> None:
+    """Raises CalibrationError, also for what the node would refuse."""
+    if abs(found.time_offset_s) >= MAX_OFFSET_S:
+        raise CalibrationError(
+            f"--out: {path} is not written: the node would refuse a time offset of "
+            f"{found.time_offset_s:.0f} s: give both streams on clocks with one beginning"
+        )
     try:
         files.write_text(path, to_yaml(found))
     except OSError as error:

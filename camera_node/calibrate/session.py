@@ -74,6 +74,8 @@ class Session:
         self._diversity = diversity(self.samples())
         self.corners: Corners | None = None
         """Found in the last picture."""
+        self.seen: Seen | None = None
+        """The target in the last picture, where its pose could be told."""
         self._solve()
 
     def samples(self) -> Samples:
@@ -89,14 +91,14 @@ class Session:
     def offer(self, image: NDArray[np.uint8], lens: Pinhole, hand: Array) -> Step:
         """Look at a picture taken with the hand at ``hand`` (4, 4), in base."""
         last, self._last = self._last, hand
-        self.corners = None
+        self.corners = self.seen = None
         if not self._moving and (last is None or _apart(last, hand) > 1.0):
             return self._step(MOVING, "hold still")
         self.corners = self._target.find(grey(image))
         if self.corners is None:
             return self._step("target not found", "bring all of it into the picture, well lit")
         try:
-            seen = locate(self.corners, lens)
+            self.seen = seen = locate(self.corners, lens)
         except CalibrationError as error:
             return self._step("target unclear", str(error))
         like = self._most_alike(hand)

@@ -57,12 +57,15 @@ class Seen:
 @dataclass(frozen=True)
 class Target:
     """name: as it was spelled. size_m: of the picture, width and height. find: corners in a grey picture, or
-    None. draw: the picture, so many pixels wide."""
+    None. draw: the picture, so many pixels wide; exact in multiples of ``modules``, of which it is so many
+    wide. pattern_m: what is not white of it, width and height."""
 
     name: str
     size_m: tuple[float, float]
     find: Callable[[Grey], Corners | None]
     draw: Callable[[int], Grey]
+    modules: int
+    pattern_m: tuple[float, float]
 
 
 def parse(spelling: str) -> Target:
@@ -156,7 +159,8 @@ def _charuco(
     def draw(width: int) -> Grey:
         return np.asarray(board.generateImage((width, round(width * down / across))), dtype=np.uint8)
 
-    return Target(name, (across * side, down * side), find, draw)
+    size = across * side, down * side
+    return Target(name, size, find, draw, across, size)
 
 
 def _chessboard(name: str, corners: str, square: str) -> Target:
@@ -191,7 +195,8 @@ def _chessboard(name: str, corners: str, square: str) -> Target:
         board = (np.indices((down + 1, across + 1)).sum(axis=0) % 2 * 255).astype(np.uint8)
         return np.pad(np.kron(board, np.ones((cell, cell), np.uint8)), cell, constant_values=255)
 
-    return Target(name, ((across + 3) * side, (down + 3) * side), find, draw)
+    size, pattern = (((across + n) * side, (down + n) * side) for n in (3, 1))
+    return Target(name, size, find, draw, across + 3, pattern)
 
 
 def _apriltag(name: str, family: str, number: str, size: str) -> Target:
@@ -214,7 +219,7 @@ def _apriltag(name: str, family: str, number: str, size: str) -> Target:
     def draw(width: int) -> Grey:
         return np.asarray(cv2.aruco.generateImageMarker(dictionary, wanted, width), dtype=np.uint8)
 
-    return Target(name, (side, side), find, draw)
+    return Target(name, (side, side), find, draw, dictionary.markerSize + 2, (side, side))
 
 
 def _qr(name: str, size: str, *text: str) -> Target:
@@ -228,14 +233,15 @@ def _qr(name: str, size: str, *text: str) -> Target:
         corners = pixels.reshape(4, 2).astype(np.float64)
         return Corners(square_corners(picture, corners) + 0.5, _square(side))
 
+    code = cv2.QRCodeEncoder.create().encode(wanted or "freshfield")
+    # The encoder's own quiet zone is two modules wide, of which none belongs to the code's size.
+    dark = np.flatnonzero((code == 0).any(axis=0))
+    code = code[dark[0] : dark[-1] + 1, dark[0] : dark[-1] + 1]
+
     def draw(width: int) -> Grey:
-        code = cv2.QRCodeEncoder.create().encode(wanted or "freshfield")
-        # The encoder's own quiet zone is two modules wide, of which none belongs to the code's size.
-        dark = np.flatnonzero((code == 0).any(axis=0))
-        code = code[dark[0] : dark[-1] + 1, dark[0] : dark[-1] + 1]
         return np.asarray(cv2.resize(code, (width, width), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
-    return Target(name, (side, side), find, draw)
+    return Target(name, (side, side), find, draw, len(code), (side, side))
 
 
 def _square(side: float) -> Array:

@@ -19,6 +19,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -93,8 +94,9 @@ class ArmStream:
 
     frequency_hz: samples asked for, at most 500. interpolate: joints between two samples, else the nearest
     one. max_gap_ms: no pose farther from a sample than this. stale_s: how long its state may stand still.
-    ``start`` raises ArmError; after that the stream
-    mends itself, and ``trouble`` says what is wrong ("" where nothing is).
+    each: called with the stamp (ns, our clock) and joints (6,) of every sample, from the stream's thread.
+    ``start`` raises ArmError; after that the stream mends itself, and ``trouble`` says what is wrong (""
+    where nothing is).
     """
 
     def __init__(
@@ -105,9 +107,10 @@ class ArmStream:
         interpolate: bool = True,
         max_gap_ms: float = 20.0,
         stale_s: float = STALE_S,
+        each: Callable[[int, Joints], None] | None = None,
     ) -> None:
         self.host = host
-        self._stale_s = stale_s
+        self._stale_s, self._each = stale_s, each
         self.trouble = "not connected yet"
         self.connections = 0
         self._clock = clock
@@ -203,7 +206,10 @@ class ArmStream:
                     if stamp_s < last_s:
                         clock = ArrivalClock()  # the controller was started anew
                     last_s = stamp_s
-                    self._samples.add(clock.ours_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints))
+                    t_ns, angles = clock.ours_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints)
+                    self._samples.add(t_ns, angles)
+                    if self._each is not None:
+                        self._each(t_ns, angles)
                     self._judge(mode, safety)
                 if whole and not brought:
                     brought, patience_s = True, self._stale_s
@@ -256,3 +262,7 @@ class HandPoses:
         """Raises PoseGapError where no sample is near enough."""
         joints, gap_ns = self._stream.at(t_ns, self._wait_s)
         return Paired(Pose.from_matrix(self._base @ self._model.forward(joints)), gap_ns)
+
+    def close(self) -> None:
+        """Let go of the arm."""
+        self._stream.stop()

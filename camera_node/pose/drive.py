@@ -1,7 +1,8 @@
 """``camera-node drive-arm``: takes the camera on an arm round its target, viewpoint by viewpoint, for ever.
 
-Moves are started and then watched, never waited for inside the library: Ctrl-C, SIGTERM or a state that
-stands still stop the arm where it is.
+Moves are started and then watched, never waited for inside the library: Ctrl-C, SIGTERM, a closed terminal,
+an arm or a state that stands still, and a program that was stopped at the pendant end the drive, and the arm
+comes to rest. Should this process itself vanish, the controller's own watchdog stops the arm.
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ import os
 import signal
 import sys
 import threading
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from camera_node.pose.arm import STALE_S, ArmError, ArmStream, probe
-from camera_node.pose.controller.command import arm_of
+from camera_node.pose.controller.command import arm_of, read_joints
 from camera_node.pose.mount import EYE_TO_HAND
 from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
-from camera_node.pose.path import PathError, tour
+from camera_node.pose.path import FARTHEST_RAD, PathError, tour
 from camera_node.pose.rig import PoseGapError
 from freshfield.clock import WallClock
 from freshfield.scenario import ScenarioError, load
@@ -31,8 +33,11 @@ CONTROL_S = 8
 STOPPING_S = 5.0
 _SIMULATED_STALE_S = 10.0
 _ARRIVED_RAD = 1e-3
+# Over so long a slow arm has turned farther than its encoders tremble.
+_STILL_S, _STILL_RAD = 5.0, 1e-3
 _POLL_S = 0.05
 _STOP_RAD_S2 = 2.0
+_MOVED_RAD = 0.01
 
 
 def run(args: argparse.Namespace) -> int:
@@ -40,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
     )
+    if args.joints is not None and not args.show:
+        raise ScenarioError("--joints: goes with --show: a drive begins where the arm stands")
     scenario = load(args.scenario)
     config = arm_of(scenario)
     if config.path is None:
@@ -49,29 +56,65 @@ def run(args: argparse.Namespace) -> int:
     if not carried:
         raise ScenarioError(f"{scenario.path}: source.arm.cameras: none of them is on the hand")
     model, base = arm_model(scenario, config), base_matrix(config)
-    stream: ArmStream | None = None
-    start = None
-    if not args.show:
-        # Where nothing can be hit, a machine too busy to simulate is no reason to stop.
-        patience_s = _SIMULATED_STALE_S if config.simulated else STALE_S
-        stream = ArmStream(config.host, WallClock(), 50.0, max_gap_ms=1e3 * patience_s, stale_s=patience_s)
-        stream.start()
-        start = stream.at(WallClock().now_ns(), 0.0)[0]
+    # Where nothing can be hit, a machine too busy to simulate is no reason to stop.
+    patience_s = _SIMULATED_STALE_S if config.simulated else STALE_S
+    stream = ArmStream(config.host, WallClock(), 50.0, max_gap_ms=1e3 * patience_s, stale_s=patience_s)
     try:
-        stops = tour(model, base, carried[0].transform, config.path, start)
-    except PathError as error:
-        raise ScenarioError(f"{scenario.path}: source.arm.path: {error}") from None
-    print(f"{len(stops)} viewpoints", flush=True)
-    if stream is None:
-        for joints in stops:
-            print(" ".join(f"{angle:8.2f}" for angle in np.rad2deg(joints)))
-        return 0
-    try:
+        start = _start(args, stream)
+        try:
+            stops = tour(model, base, carried[0].transform, config.path, start)
+        except PathError as error:
+            raise ScenarioError(f"{scenario.path}: source.arm.path: {error}") from None
+        _print_tour(stops, start)
+        if args.show:
+            return 0
+        assert start is not None
+        first_rad = np.abs(stops[0] - start).max()
+        if first_rad > FARTHEST_RAD and not config.simulated:
+            raise ArmError(
+                f"arm at {config.host}: the first move would turn a joint by {np.rad2deg(first_rad):.0f} "
+                f"degrees, more than {np.rad2deg(FARTHEST_RAD):.0f}: bring it nearer to the first viewpoint "
+                "with the pendant"
+            )
         if not (args.yes or config.simulated or _agreed(config.host)):
             return 2
-        return _drive(stream, stops, config.path.speed_rad_s, config.path.acceleration_rad_s2, args.rounds)
+        if np.abs(stream.at(WallClock().now_ns(), 0.0)[0] - start).max() > _MOVED_RAD:
+            raise ArmError(f"arm at {config.host}: it has been moved since the tour was printed: start again")
+        pace = _Pace(config.path.speed_rad_s, config.path.acceleration_rad_s2, patience_s)
+        return _drive(stream, stops, pace, args.rounds)
     finally:
         stream.stop()
+
+
+def _start(args: argparse.Namespace, stream: ArmStream) -> np.ndarray | None:
+    """Where the tour begins: --joints, or where the arm stands; None where it is only to be shown and does
+    not say. Raises ArmError."""
+    if args.joints is not None:
+        return read_joints(args.joints)
+    try:
+        stream.start()
+        return stream.at(WallClock().now_ns(), 0.0)[0]
+    except ArmError as error:
+        if not args.show:
+            raise
+        print(
+            f"{error}\nWithout it, this is the tour of an arm near its first viewpoint: from elsewhere other "
+            "postures may be nearer (--joints)",
+            file=sys.stderr,
+        )
+        return None
+
+
+def _print_tour(stops: list[np.ndarray], start: np.ndarray | None) -> None:
+    """The number of viewpoints, and joint angles line by line, as they will be driven."""
+    print(f"{len(stops)} viewpoints")
+    rows = [(str(k), joints) for k, joints in enumerate(stops, 1)]
+    for name, joints in rows if start is None else [("stands at", start), *rows]:
+        print(f"{name:>10} " + " ".join(f"{angle:8.2f}" for angle in np.rad2deg(joints)))
+    if start is not None:
+        far_deg = np.rad2deg(np.abs(stops[0] - start).max())
+        print(f"(degrees); the first move turns a joint by {far_deg:.0f}")
+    sys.stdout.flush()
 
 
 def _agreed(host: str) -> bool:
@@ -81,21 +124,31 @@ def _agreed(host: str) -> bool:
     return answer.strip().lower() in ("y", "yes")
 
 
-def _drive(stream: ArmStream, stops: list[np.ndarray], speed: float, acceleration: float, rounds: int) -> int:
+@dataclass(frozen=True)
+class _Pace:
+    """How fast, and how long a controller and this process may hear nothing of each other."""
+
+    speed_rad_s: float
+    acceleration_rad_s2: float
+    patience_s: float
+
+
+def _drive(stream: ArmStream, stops: list[np.ndarray], pace: _Pace, rounds: int) -> int:
     control = connect_control(stream.host)
     asked = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: asked.set())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            signal.signal(number, lambda *_: asked.set())
     done = 0
     try:
+        if not control.setWatchdog(1.0 / pace.patience_s):
+            raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_why(stream)}")
         while not asked.is_set() and (rounds == 0 or done < rounds):
             # There and back, so that the end of a round is the beginning of the next.
             for joints in stops if done % 2 == 0 else stops[::-1]:
-                if not control.moveJ(joints.tolist(), speed, acceleration, True):
-                    raise ArmError(
-                        f"arm at {stream.host}: it refuses to move: {stream.trouble or 'see the pendant'}"
-                    )
-                if not _arrive(stream, joints, asked):
+                if not control.moveJ(joints.tolist(), pace.speed_rad_s, pace.acceleration_rad_s2, True):
+                    raise ArmError(f"arm at {stream.host}: it refuses to move: {_why(stream)}")
+                if not _arrive(stream, control, joints, asked, pace.patience_s):
                     break
             done += 1
     except ArmError as error:
@@ -104,6 +157,10 @@ def _drive(stream: ArmStream, stops: list[np.ndarray], speed: float, acceleratio
         os._exit(1)  # the library's destructor would wait for an arm that may be gone
     _stop(control)
     return 0
+
+
+def _why(stream: ArmStream) -> str:
+    return stream.trouble or "see the pendant"
 
 
 def _stop(control: Any) -> None:
@@ -121,18 +178,37 @@ def _stop(control: Any) -> None:
     signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def _arrive(stream: ArmStream, goal: np.ndarray, asked: threading.Event) -> bool:
-    """Wait until the joints are there; False if asked to stop. Raises ArmError for one that says nothing."""
+def _arrive(
+    stream: ArmStream, control: Any, goal: np.ndarray, asked: threading.Event, patience_s: float
+) -> bool:
+    """Wait until the joints are there; False if asked to stop. Raises ArmError for one that says nothing,
+    stands still on the way, or whose program has ended."""
     clock = WallClock()
+    still_ns = round(max(_STILL_S, patience_s) * 1e9)
+    at, since_ns = np.full(6, np.inf), 0
     while not asked.wait(_POLL_S):
+        now_ns = clock.now_ns()
         try:
-            joints, _ = stream.at(clock.now_ns())
+            joints, _ = stream.at(now_ns)
         except PoseGapError as error:
             raise ArmError(f"{error}: stopped") from None
         if stream.trouble:  # joint angles still come, but the arm has been stopped
             raise ArmError(f"{stream.trouble}: stopped")
-        if np.abs(joints - goal).max() < _ARRIVED_RAD:
+        left_rad = float(np.abs(joints - goal).max())
+        if left_rad < _ARRIVED_RAD:
             return True
+        where = f"{np.rad2deg(left_rad):.1f} degrees from its goal"
+        if not (control.isProgramRunning() and control.kickWatchdog()):
+            raise ArmError(
+                f"arm at {stream.host}: its program was ended {where}: at the pendant, by a fault, or by "
+                "leaving remote control"
+            )
+        if np.abs(joints - at).max() > _STILL_RAD:
+            at, since_ns = joints, now_ns
+        elif now_ns - since_ns > still_ns:
+            raise ArmError(
+                f"arm at {stream.host}: it stands still, {where}: is it paused, or the speed slider at zero?"
+            )
     return False
 
 

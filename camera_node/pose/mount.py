@@ -18,9 +18,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from camera_node.pose.rig import FixedPose, Paired, PoseProvider
+from camera_node.pose.rig import Closing, FixedPose, Paired, PoseProvider
 from freshfield.geometry import GeometryError, Pose
 
+# Of a file: more is the difference of two clocks' beginnings, such as 1970 and a machine's start.
+MAX_OFFSET_S = 1e6
 EYE_IN_HAND, EYE_TO_HAND = "eye-in-hand", "eye-to-hand"
 SETUPS = (EYE_IN_HAND, EYE_TO_HAND)
 
@@ -59,6 +61,11 @@ class Mounted:
         paired = self._hand.at(t_ns + self._offset_ns)
         return Paired(Pose.from_matrix(paired.pose.matrix() @ self._transform), paired.gap_ns)
 
+    def close(self) -> None:
+        """Let go of what gives the hand's poses."""
+        if isinstance(self._hand, Closing):
+            self._hand.close()
+
 
 def read_hand_eye(path: Path) -> HandEye:
     """Raises HandEyeError, one line naming file and key."""
@@ -83,8 +90,10 @@ def read_hand_eye(path: Path) -> HandEye:
         raise HandEyeError(f"{path}: transform: {error}") from None
     try:
         offset_s = float(data.pop("time_offset_s", 0.0))
-        if not abs(offset_s) < 1e6:
+        if not abs(offset_s) < MAX_OFFSET_S:
             raise ValueError
     except (ValueError, TypeError):
-        raise HandEyeError(f"{path}: time_offset_s: expected seconds") from None
+        raise HandEyeError(
+            f"{path}: time_offset_s: expected seconds, less than {MAX_OFFSET_S:g} either way"
+        ) from None
     return HandEye(setup, transform, offset_s, data)

@@ -1,8 +1,9 @@
 """A tour for a camera on an arm: viewpoints around a target, and postures that take the camera to them.
 
 Viewpoints that the arm does not reach, reaches only next to a singularity, or cannot get to from the one
-before without a part of it coming too low, are left out. This knows one floor and no other obstacle: on a
-real bench, watch the first round with a hand on the stop.
+before without the middle of one of its joints coming below the floor, are left out. Links, camera and cable
+have a thickness that ``floor_m`` must allow for. This knows one floor and no other obstacle: on a real bench,
+watch the first round with a hand on the stop.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from freshfield.geometry import look_at, se3_inverse
 Array = NDArray[np.float64]
 
 _LOOKS = 12  # postures that are looked at between two viewpoints
-_FARTHEST_RAD = 2.0  # that a joint turns between two: beyond, the arm would be flung into another posture
+FARTHEST_RAD = 2.0  # that a joint turns between two: beyond, the arm would be flung into another posture
 
 
 class PathError(ValueError):
@@ -66,6 +67,21 @@ def tour(
     return best
 
 
+def reached_by_ring(
+    stops: Sequence[Array], arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig
+) -> list[int]:
+    """How many of each ring's viewpoints the postures ``stops`` (N, 6) of a tour take the camera to, in the
+    order of ``path.elevations_deg``."""
+    poses = viewpoints(path)
+    ring = len(poses) // len(path.elevations_deg)
+    places = np.array([pose[:3, 3] for pose in poses])
+    out = [0] * len(path.elevations_deg)
+    for joints in stops:
+        at = (base @ arm.forward(joints) @ hand_eye)[:3, 3]
+        out[int(np.argmin(np.linalg.norm(places - at, axis=1))) // ring] += 1
+    return out
+
+
 def _follow(
     arm: ArmModel, base: Array, goals: Sequence[Array], begin: Array | None, first: Array, floor_m: float
 ) -> list[Array]:
@@ -75,7 +91,7 @@ def _follow(
     for goal in goals:
         for posture in arm.inverse(goal, at):
             come_from = at if visited else posture.joints if begin is None else begin
-            far = bool(visited) and np.abs(posture.joints - come_from).max() > _FARTHEST_RAD
+            far = bool(visited) and np.abs(posture.joints - come_from).max() > FARTHEST_RAD
             if not posture.singular and not far and _clear(arm, base, come_from, posture.joints, floor_m):
                 at = posture.joints
                 visited.append(at)
@@ -84,7 +100,8 @@ def _follow(
 
 
 def _clear(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> bool:
-    """Whether no joint beyond the shoulder comes below the floor on the way from ``a`` to ``b``."""
+    """Whether the middle of no joint beyond the shoulder comes below the floor on the way from ``a`` to
+    ``b``; links are not looked at."""
     for part in np.linspace(0.0, 1.0, _LOOKS):
         heights = (base @ arm.links((1.0 - part) * a + part * b))[2:, 2, 3]
         if heights.min() < floor_m:

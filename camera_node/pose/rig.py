@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -40,6 +40,13 @@ class PoseProvider(Protocol):
     def at(self, t_ns: int) -> Paired:
         """Raises PoseGapError where no sample is near enough."""
         ...
+
+
+@runtime_checkable
+class Closing(Protocol):
+    """A provider that holds a connection, until ``close``."""
+
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,15 @@
 """Any camera that OpenCV opens: USB cameras, and network cameras by address.
 
 Drivers of Linux (V4L2) stamp a frame when its transfer begins, on the machine's monotonic clock, and OpenCV
-hands that on; other back ends give no stamp that can be trusted, so there the instant of arrival less
-``latency_ms`` has to do. A thread reads without a pause, so that nothing waits in the driver and grows old.
+hands that on; where the exposure was set, half of it is taken off. Other back ends give no stamp that can be
+trusted, so there the instant of arrival less ``latency_ms`` has to do. Which of the two it is, the first
+frame decides for as long as the camera is open. A thread reads without a pause, so that nothing waits in the
+driver and grows old.
 """
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -23,10 +26,13 @@ from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario
 
+log = logging.getLogger("camera-node")
+
 _OPEN_MS = 2500
 _READ_MS = 2000
 # A stamp on the machine's own clock is younger than this; anything else is another clock.
 _PLAUSIBLE_NS = 1_000_000_000
+_BY_KERNEL, _BY_ARRIVAL = "the kernel", "their arrival, less latency_ms"
 _MANUAL = 1  # V4L2 calls it so
 
 
@@ -34,14 +40,20 @@ class OpenCvFeed:
     """An open capture. intrinsics: OpenCV knows none."""
 
     intrinsics: Pinhole | None = None
+    stamped_by = ""
 
     def __init__(
         self, camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock
     ) -> None:
         self._camera, self._clock = camera, clock
+        self.no_lens = (
+            f"{camera}: this camera does not know its intrinsics: calibrate it (camera-node calibrate "
+            "intrinsics) and name the file in source.calibration"
+        )
         self._latency_ns = round(config.latency_ms * 1e6)
+        self._half_exposure_ns = (config.exposure_us or 0) * 500
         self._capture = _open(camera, "0" if device is None else device)
-        self._stamped = self._capture.getBackendName() == "V4L2"
+        self._v4l2 = self._capture.getBackendName() == "V4L2"
         for key, value in (
             (cv2.CAP_PROP_FRAME_WIDTH, config.width),
             (cv2.CAP_PROP_FRAME_HEIGHT, config.height),
@@ -59,16 +71,29 @@ class OpenCvFeed:
             raise CameraError(
                 f"{self._camera}: the camera gives no more frames: unplugged, or its stream ended"
             )
-        now_ns = self._clock.now_ns()
-        captured_ns = now_ns - self._latency_ns
-        if self._stamped:
-            age_ns = time.monotonic_ns() - round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            if 0 <= age_ns < _PLAUSIBLE_NS:
-                captured_ns = now_ns - age_ns
+        age_ns = self._age_ns()
+        if age_ns is None:
+            return None
+        captured_ns = self._clock.now_ns() - age_ns
         ok, picture = self._capture.retrieve()
         if not ok or picture is None:
             raise CameraError(f"{self._camera}: a frame could not be decoded")
         return captured_ns, cast(Image, np.ascontiguousarray(picture[:, :, ::-1]))
+
+    def _age_ns(self) -> int | None:
+        """Of the frame that was just grabbed; None for one whose stamp is of another clock than the first
+        one's, so that nobody knows when it was."""
+        stamp_age_ns = None
+        if self._v4l2 and self.stamped_by != _BY_ARRIVAL:
+            stamp_age_ns = time.monotonic_ns() - round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            if not 0 <= stamp_age_ns < _PLAUSIBLE_NS:
+                stamp_age_ns = None
+        if not self.stamped_by:
+            self.stamped_by = _BY_ARRIVAL if stamp_age_ns is None else _BY_KERNEL
+            log.info("%s: its frames are stamped by %s", self._camera, self.stamped_by)
+        if self.stamped_by == _BY_ARRIVAL:
+            return self._latency_ns
+        return None if stamp_age_ns is None else stamp_age_ns + self._half_exposure_ns
 
     def close(self) -> None:
         self._capture.release()

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.config import LiveConfig
-from camera_node.pose.rig import FixedPose, PoseProvider
+from camera_node.pose.rig import Closing, FixedPose, PoseProvider
 from camera_node.sources import Shot, Source
 from camera_node.sources.calibration import Calibrated, load_calibration
 from camera_node.sources.playback import rate
@@ -46,6 +46,10 @@ class Feed(Protocol):
 
     intrinsics: Pinhole | None
     """The device's own, for images as ``grab`` returns them; None where it knows none."""
+    no_lens: str
+    """Why ``intrinsics`` is None, and what to do, in one line; "" else."""
+    stamped_by: str
+    """Where a frame's instant comes from, for people; known when the first frame is here."""
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
         """The next frame: when the middle of it was exposed (ns, our clock) and uint8 RGB (H, W, 3); None
@@ -53,6 +57,37 @@ class Feed(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+def as_camera_error(camera: str, error: Exception) -> CameraError:
+    """What a camera's driver raised, in one line that names the camera."""
+    if isinstance(error, CameraError):
+        return error
+    return CameraError(f"{camera}: {type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def opened(camera: str, open_feed: Callable[[], Feed]) -> Feed:
+    """Raises CameraError, whatever the driver raises."""
+    try:
+        return open_feed()
+    except Exception as error:
+        raise as_camera_error(camera, error) from None
+
+
+def close_quietly(feed: Feed) -> None:
+    """A camera that is gone may say so once more."""
+    try:
+        feed.close()
+    except Exception as error:
+        log.debug("closing a camera: %s", error)
+
+
+def lens_or_why(find: Callable[[], Pinhole]) -> tuple[Pinhole | None, str]:
+    """``intrinsics`` and ``no_lens`` of a feed: a camera that was calibrated here needs none of its own."""
+    try:
+        return find(), ""
+    except CameraError as error:
+        return None, str(error)
 
 
 class LiveSource:
@@ -80,14 +115,19 @@ class LiveSource:
         self._newest: tuple[int, Image] | None = None
         self._trouble = "none since the last one"
         self._stop = threading.Event()
-        feed = open_feed()
+        feed = opened(camera, open_feed)
         try:
             first = feed.grab(first_frame_s)
             if first is None:
                 raise CameraError(f"{camera}: the camera opened, but sent no frame for {first_frame_s:g} s")
-            self.intrinsics = self._lens(calibrated or feed.intrinsics, first[1])
-        except BaseException:
-            feed.close()
+            lens = calibrated or feed.intrinsics
+            if lens is None:
+                raise CameraError(feed.no_lens)
+            self.intrinsics = self._lens(lens, first[1])
+        except BaseException as error:
+            close_quietly(feed)
+            if isinstance(error, Exception):
+                raise as_camera_error(camera, error) from None
             raise
         self._newest = first
         atexit.register(self.close)
@@ -122,13 +162,8 @@ class LiveSource:
         if self._thread.is_alive():
             self._thread.join(_GONE_S)
 
-    def _lens(self, lens: Pinhole | None, image: Image) -> Pinhole:
+    def _lens(self, lens: Pinhole, image: Image) -> Pinhole:
         height, width = image.shape[:2]
-        if lens is None:
-            raise CameraError(
-                f"{self.camera}: this camera does not know its intrinsics: calibrate it (camera-node "
-                "calibrate intrinsics) and name the file in source.calibration"
-            )
         scaled = lens.scaled(width / lens.width)
         if (scaled.width, scaled.height) != (width, height):
             raise CameraError(
@@ -146,17 +181,20 @@ class LiveSource:
                     current = self._open()
                 if self._take(current):
                     failures = 0
-            except CameraError as error:
+            except (
+                Exception
+            ) as error:  # drivers raise what they like, and this thread is the camera's only one
+                trouble = as_camera_error(self.camera, error)
                 if not failures:
-                    log.warning("%s (trying again)", error)
-                self._trouble = str(error)
+                    log.warning("%s (trying again)", trouble)
+                self._trouble = str(trouble)
                 if current is not None:
-                    current.close()
+                    close_quietly(current)
                     current = None
                 self._stop.wait(BACKOFF_S[min(failures, len(BACKOFF_S) - 1)])
                 failures += 1
         if current is not None:
-            current.close()
+            close_quietly(current)
 
     def _take(self, feed: Feed) -> bool:
         """Wait a little for a frame and keep it; whether one came."""
@@ -183,24 +221,32 @@ def open_live(
 
     Raises ScenarioError, CameraError or ArmError.
     """
-    known = calibrations(scenario, config)
-    poses = _poses(scenario, config, cameras, known)
     if len(cameras) > 1:
         for camera in cameras:
             if camera not in config.devices:
                 raise ScenarioError(f"{scenario.path}: source.devices.{camera}: missing: which camera is it?")
     fps, clock = rate(config.fps or DEFAULT_FPS), WallClock()
-    sources: dict[str, Source] = {}
-    for camera in cameras:
-        sources[camera] = LiveSource(
-            camera,
-            fps,
-            opener(camera, config.devices.get(camera), config, fps, clock),
-            poses[camera],
-            known[camera].intrinsics if camera in known else None,
-            config.first_frame_s,
-        )
-    return sources
+    known = calibrations(scenario, config)
+    poses = _poses(scenario, config, cameras, known)
+    sources: dict[str, LiveSource] = {}
+    try:
+        for camera in cameras:
+            sources[camera] = LiveSource(
+                camera,
+                fps,
+                opener(camera, config.devices.get(camera), config, fps, clock),
+                poses[camera],
+                known[camera].intrinsics if camera in known else None,
+                config.first_frame_s,
+            )
+    except BaseException:
+        for source in sources.values():
+            source.close()
+        for pose in poses.values():
+            if isinstance(pose, Closing):
+                pose.close()
+        raise
+    return dict(sources)
 
 
 def calibrations(scenario: Scenario, config: LiveConfig) -> dict[str, Calibrated]:

@@ -19,7 +19,7 @@ import numpy as np
 from camera_node.config import OakConfig, SourceConfig
 from camera_node.sources import Source
 from camera_node.sources.coefficients import four_coefficients
-from camera_node.sources.live import CameraError, Feed, Image, open_live
+from camera_node.sources.live import CameraError, Feed, Image, as_camera_error, lens_or_why, open_live
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError
@@ -46,8 +46,11 @@ def library() -> Any:
 
 def find(camera: str, device: str | None) -> Any:
     """The device of a serial number, or the only one. Raises CameraError naming those that are there."""
-    there = library().Device.getAllAvailableDevices()
-    ids = [each.getDeviceId() for each in there]
+    try:
+        there = library().Device.getAllAvailableDevices()
+        ids = [each.getDeviceId() for each in there]
+    except RuntimeError as error:  # while one is being plugged in
+        raise as_camera_error(camera, error) from None
     if not there:
         raise CameraError(
             f"{camera}: no OAK camera found: is it plugged in (USB 3, its own supply), and may this "
@@ -64,6 +67,8 @@ def find(camera: str, device: str | None) -> Any:
 
 class OakFeed:
     """A running pipeline of one camera."""
+
+    stamped_by = "the device, at the middle of the exposure"
 
     def __init__(
         self, camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock
@@ -87,10 +92,11 @@ class OakFeed:
             self._frames = Frames(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
             self._pipeline.start()
             size = (config.width, config.height)
-            self.intrinsics: Pinhole | None = lens(
-                camera, self._device.readCalibration(), socket, size, config.rectify
+            calibration = self._device.readCalibration()
+            self.intrinsics, self.no_lens = lens_or_why(
+                lambda: lens(camera, calibration, socket, size, config.rectify)
             )
-        except (RuntimeError, CameraError) as error:
+        except Exception as error:
             self.close()
             if isinstance(error, CameraError):
                 raise
@@ -132,10 +138,11 @@ class Frames:
 def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rectified: bool) -> Pinhole:
     """Intrinsics of pictures of ``size`` from the device's calibration; straightened ones have no distortion.
 
-    Raises CameraError for a device that was never calibrated.
+    Raises CameraError for a device that was never calibrated, and for a lens model that is not OpenCV's.
     """
     width, height = size
     try:
+        model = calibration.getDistortionModel(socket)
         matrix = np.array(calibration.getCameraIntrinsics(socket, width, height))
         distortion = [] if rectified else list(calibration.getDistortionCoefficients(socket))
     except RuntimeError as error:
@@ -143,6 +150,11 @@ def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rect
             f"{camera}: the device holds no calibration of this camera ({_first_line(error)}): "
             "calibrate it and name the file in source.calibration"
         ) from None
+    if not rectified and model != library().CameraModel.Perspective:
+        raise CameraError(
+            f"{camera}: its lens is {model.name.lower()}: set source.rectify: true, or calibrate it and name "
+            "the file in source.calibration"
+        )
     found, off_px = four_coefficients(width, height, matrix, distortion)
     if off_px > _WORST_LENS_PX:
         log.warning(

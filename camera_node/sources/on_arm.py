@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from camera_node.config import ArmConfig
 from camera_node.pose.controller import TRUTH_PORT
+from camera_node.pose.controller.motion import STEP_S
 from camera_node.pose.kinematics import ArmModel
 from camera_node.pose.mounted import arm_model, base_matrix, camera_poses, hand_eyes
-from camera_node.pose.rig import PoseGapError, PoseProvider
+from camera_node.pose.rig import Closing, PoseGapError, PoseProvider
 from camera_node.sources import Shot, Source
 from camera_node.world import Scene
 from camera_node.world.cache import FrameCache
@@ -31,6 +32,7 @@ from freshfield.scenario import Scenario, ScenarioError
 Array = NDArray[np.float64]
 
 _ANSWER_S = 1.0
+_STRAY_NS = 2 * round(STEP_S * 1e9)  # between what is asked for and what the arm answers for
 
 
 class Truth:
@@ -41,7 +43,8 @@ class Truth:
         self._link: socket.socket | None = None
 
     def joints(self, t_ns: int) -> Array:
-        """Joint angles (6,) at ``t_ns``. Raises PoseGapError where nobody knows."""
+        """Joint angles (6,) at ``t_ns``. Raises PoseGapError where nobody knows: no answer, or one for
+        another instant."""
         try:
             if self._link is None:
                 self._link = socket.create_connection((self.host, TRUTH_PORT), _ANSWER_S)
@@ -57,7 +60,14 @@ class Truth:
             raise PoseGapError(
                 f"simulated arm at {self.host}: {error}: is camera-node simulate-arm running there?"
             ) from None
-        return np.array(json.loads(answer)["q"])
+        known = json.loads(answer)
+        away_ns = abs(known["t_ns"] - t_ns)
+        if away_ns > _STRAY_NS:
+            raise PoseGapError(
+                f"simulated arm at {self.host}: what it knows nearest is {away_ns / 1e6:.0f} ms away: is "
+                "this machine too busy to simulate it?"
+            )
+        return np.array(known["q"])
 
     def close(self) -> None:
         if self._link is not None:
@@ -111,6 +121,12 @@ class HandCamera:
 
     def release(self) -> None:
         """Nothing is kept."""
+
+    def close(self) -> None:
+        """Let go of the arm."""
+        if isinstance(self._poses, Closing):
+            self._poses.close()
+        self._truth.close()
 
 
 def open_hand_cameras(

@@ -1,7 +1,8 @@
 """Intel RealSense D400 cameras, the thesis's D435i among them: the colour stream (thesis 4.3.1).
 
 With the library's global time, a stamp is already the host's; where a device has none, its own clock is
-mapped to ours by the samples that took least.
+mapped to ours by the samples that took least. A stamp is of when a frame's readout began; where the frame's
+metadata say when the middle of its exposure was, it is moved there.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from camera_node.clocks import ArrivalClock
 from camera_node.config import RealsenseConfig, SourceConfig
 from camera_node.sources import Source
 from camera_node.sources.coefficients import four_coefficients
-from camera_node.sources.live import CameraError, Feed, Image, open_live
+from camera_node.sources.live import CameraError, Feed, Image, as_camera_error, lens_or_why, open_live
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario
+
+_LONGEST_EXPOSURE_US = 200_000  # a colour sensor of the series exposes no longer than 165 ms
 
 
 def library() -> Any:
@@ -42,7 +45,10 @@ def find(camera: str, device: str | None) -> str:
     Asked of the context: a pipeline would look for a camera for 15 s.
     """
     rs = library()
-    serials = [each.get_info(rs.camera_info.serial_number) for each in rs.context().query_devices()]
+    try:
+        serials = [each.get_info(rs.camera_info.serial_number) for each in rs.context().query_devices()]
+    except RuntimeError as error:  # while one is being plugged in
+        raise as_camera_error(camera, error) from None
     if not serials:
         raise CameraError(
             f"{camera}: no RealSense camera found: is it plugged in (USB 3), and may this user open it (udev "
@@ -59,6 +65,8 @@ def find(camera: str, device: str | None) -> str:
 
 class RealsenseFeed:
     """A running pipeline of one camera's colour stream."""
+
+    stamped_by = "the device, at the middle of the exposure where it tells that"
 
     def __init__(
         self, camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock
@@ -77,14 +85,15 @@ class RealsenseFeed:
                 f"{config.height} at {round(fps)} a second: {error}"
             ) from None
         try:
-            self.intrinsics: Pinhole | None = self._set_up(profile, config)
-        except BaseException:
+            found = self._set_up(profile, config)
+        except RuntimeError as error:
             self.close()
-            raise
+            raise as_camera_error(camera, error) from None
+        self.intrinsics, self.no_lens = lens_or_why(lambda: lens(camera, found))
         self._stamps = Stamps(clock)
 
-    def _set_up(self, profile: Any, config: RealsenseConfig) -> Pinhole:
-        """Stamps of the host's time and the exposure asked for; the lens."""
+    def _set_up(self, profile: Any, config: RealsenseConfig) -> Any:
+        """Stamps of the host's time and the exposure asked for; intrinsics as the library has them."""
         rs = library()
         for sensor in profile.get_device().query_sensors():
             if sensor.supports(rs.option.global_time_enabled):
@@ -93,7 +102,7 @@ class RealsenseFeed:
                 sensor.set_option(rs.option.enable_auto_exposure, 0)
                 sensor.set_option(rs.option.exposure, config.exposure_us / 100.0)  # it counts 100 us
         stream = profile.get_stream(rs.stream.color).as_video_stream_profile()
-        return lens(self._camera, stream.get_intrinsics())
+        return stream.get_intrinsics()
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
         """See ``Feed``."""
@@ -119,10 +128,20 @@ class Stamps:
     def captured_ns(self, frame: Any) -> int:
         """Global and system time are the host's UTC, of which our clock is a steady copy: ages carry over."""
         rs = library()
-        now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6)
+        now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6) - _since_exposed_ns(frame)
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return self._device.ours_ns(stamp_ns, now_ns)
         return now_ns - (self._utc() - stamp_ns)
+
+
+def _since_exposed_ns(frame: Any) -> int:
+    """From the middle of the exposure to the instant that the stamp is of, 0 where the frame does not say."""
+    value = library().frame_metadata_value
+    keys = (value.frame_timestamp, value.sensor_timestamp)
+    if not all(frame.supports_frame_metadata(key) for key in keys):
+        return 0
+    readout_us, exposed_us = (frame.get_frame_metadata(key) for key in keys)
+    return max(0, min(readout_us - exposed_us, _LONGEST_EXPOSURE_US)) * 1000
 
 
 def taken(frame: Any, stamps: Stamps) -> tuple[int, Image]:
@@ -146,7 +165,8 @@ def lens(camera: str, intrinsics: Any) -> Pinhole:
     distortion = [] if straight and not any(intrinsics.coeffs) else list(intrinsics.coeffs)
     if straight and distortion:
         raise CameraError(
-            f"{camera}: its pictures are straightened by coefficients that cannot be undone here"
+            f"{camera}: its pictures are straightened by coefficients that cannot be undone here: calibrate "
+            "the camera and name the file in source.calibration"
         )
     matrix = [[intrinsics.fx, 0, intrinsics.ppx], [0, intrinsics.fy, intrinsics.ppy], [0, 0, 1]]
     return four_coefficients(intrinsics.width, intrinsics.height, matrix, distortion)[0]

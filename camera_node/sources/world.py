@@ -54,8 +54,7 @@ class WorldSource:
 
     def prepare(self, stopped: Stopped) -> None:
         rays = self.intrinsics.width * self.intrinsics.height * self._frames.scene.params.supersample**2
-        repeats = self._frames.repeats_after is not None
-        if rays > _MAX_RAYS and repeats and self._frames.disk_error is None:
+        if rays > _MAX_RAYS and self._frames.on_disk:
             self._fill_elsewhere(stopped)
         self._frames.fill(stop=stopped)
 
@@ -110,6 +109,8 @@ def frame_caches(
                 effects=effects.get(camera) or NO_EFFECTS,
                 codec=config.codec,
                 quality=config.quality,
+                # A training draws hundreds of motions and sees none of them again.
+                on_disk=config.motion_seed is None,
             )
             for camera in cameras
         }

@@ -137,8 +137,9 @@ def _operate(
 ) -> int:
     """Tick until asked to end, then come to rest within the limits."""
     asked = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: asked.set())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            signal.signal(number, lambda *_: asked.set())
     period_s = 1.0 / operator.config.rate_hz
     status, started_s = 0, time.monotonic()
     next_s, shown_s, late = started_s, started_s, 0

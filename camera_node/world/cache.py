@@ -89,6 +89,11 @@ class FrameCache:
             self._root = folder or default_folder()
             self._folder = self._root / self.key()[:32]
 
+    @property
+    def on_disk(self) -> bool:
+        """Whether what is rendered outlives this process."""
+        return self._folder is not None
+
     def content(self, tick: int) -> int:
         """Which output of ``read`` tick number ``tick`` shows."""
         return tick % self.contents if self.contents else tick

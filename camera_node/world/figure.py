@@ -7,7 +7,7 @@ two-bone construction, arms swing against the legs. Speed is set by the length o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,28 +23,38 @@ _CYCLES = 3  # gait cycles in one loop: strides of about 1.2 m
 _ANKLE_M = 0.07
 _THIGH_M, _SHIN_M = 0.42, 0.41
 _UPPER_ARM_M, _FOREARM_M = 0.29, 0.25
+# How far a walk that is drawn may differ from the scene's own: its centre, the radii's factors, the speed's.
+# So far it stays clear of the furniture.
+_SHIFT_M, _STRETCH, _FASTER = 0.2, (0.75, 1.15), (0.7, 1.4)
 
 
 @dataclass(frozen=True)
 class Walk:
-    """An ellipse of ``radii`` times ``scale`` (metres), walked in ``period_s``."""
+    """An ellipse of ``radii`` times ``scale`` (metres), walked in ``period_s``. turn: 1.0 against the clock
+    seen from above, -1.0 with it. start_s: how far into the loop it is at instant 0."""
 
     centre: tuple[float, float]
     radii: tuple[float, float]
     period_s: float
     scale: float = 1.0
     still: bool = False
+    turn: float = 1.0
+    start_s: float = 0.0
+
+    def phase(self, t_s: float) -> float:
+        """Phase in [0, 1) of an instant."""
+        return motion.phase_of(t_s + self.start_s, self.period_s)
 
     def at(self, phase: float) -> tuple[float, float]:
         """Position on the floor at a phase, in metres."""
-        a = 2 * math.pi * phase
+        a = 2 * math.pi * phase * self.turn
         rx, ry = self.radii[0] * self.scale, self.radii[1] * self.scale
         return self.centre[0] + rx * math.cos(a), self.centre[1] + ry * math.sin(a)
 
     def heading(self, phase: float) -> tuple[float, float]:
         """Unit vector along the path at a phase."""
-        a = 2 * math.pi * phase
-        x, y = -self.radii[0] * math.sin(a), self.radii[1] * math.cos(a)
+        a = 2 * math.pi * phase * self.turn
+        x, y = -self.radii[0] * math.sin(a) * self.turn, self.radii[1] * math.cos(a) * self.turn
         n = math.hypot(x, y)
         return x / n, y / n
 
@@ -198,7 +208,7 @@ def walking_person(walk: Walk) -> Mover:
     """The figure as a mover of the world. ``walk.still`` freezes it at phase 0.62, mid-wave."""
 
     def matrices(t_s: float) -> Array:
-        phase = 0.62 if walk.still else motion.phase_of(t_s, walk.period_s)
+        phase = 0.62 if walk.still else walk.phase(t_s)
         out = motion.bone_frames(*bones(walk, phase))
         out[:, :3, :3] *= _SCALE_ROWS[:, None, :]
         return out
@@ -218,14 +228,30 @@ def loop_length_m(walk: Walk) -> float:
     return motion.mean_path_m(middles)
 
 
-def walk_at(centre: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float) -> Walk:
+def walk_at(
+    centre: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int | None = None
+) -> Walk:
     """The walk whose parts move at ``speed_m_per_s`` on average. The period is rounded to motion.TICK_S
-    and the ellipse stretched until the speed is right in spite of it. Zero speed stands still."""
+    and the ellipse stretched until the speed is right in spite of it. Zero speed stands still. seed: draws
+    another walk about the same place: its path, its sense, where on it it starts, and a speed about the one
+    given; None walks the loop as it is."""
     if speed_m_per_s == 0.0:
         return Walk(centre, radii, motion.TICK_S, still=True)
+    if seed is not None:
+        return _drawn(centre, radii, speed_m_per_s, seed)
     walk = Walk(centre, radii, 1.0)
     period = motion.period_for(loop_length_m(walk), speed_m_per_s)
     for _ in range(3):  # the length is nearly linear in the scale
         scale = walk.scale * speed_m_per_s * period / loop_length_m(walk)
         walk = Walk(centre, radii, period, scale)
     return walk
+
+
+def _drawn(centre: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int) -> Walk:
+    rng = np.random.default_rng(seed)
+    dx, dy = rng.uniform(-_SHIFT_M, _SHIFT_M, 2).tolist()
+    wide, deep = rng.uniform(*_STRETCH, 2).tolist()
+    speed = min(speed_m_per_s * float(np.exp(rng.uniform(*np.log(_FASTER)))), motion.MAX_SPEED_M_PER_S)
+    turn, start = (1.0 if rng.random() < 0.5 else -1.0), float(rng.random())
+    walk = walk_at((centre[0] + dx, centre[1] + dy), (radii[0] * wide, radii[1] * deep), speed)
+    return replace(walk, turn=turn, start_s=start * walk.period_s)

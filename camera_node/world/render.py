@@ -10,6 +10,7 @@ hangs, none of it is computed.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -176,6 +177,13 @@ class CameraRenderer:
         self._directions = np.ascontiguousarray(directions.reshape(-1, 3).T)
         self._bake()
         self._still = self._to_image(self._veiled(self._colour, self._clear))
+
+    def of(self, world: World) -> CameraRenderer:
+        """A renderer of ``world``, which differs from this one's in how its parts move and in nothing else:
+        what stands still is not rendered again."""
+        other = copy.copy(self)
+        other.world = world
+        return other
 
     def image(self, t_s: float, rows: Rows | None = None) -> Image:
         """The view at an instant, or only some of its rows: uint8 RGB (height or rows, width, 3). Equal

@@ -38,7 +38,7 @@ class Params(MovingParams):
 
 def build(params: Params) -> Scene:
     """The room as a scene."""
-    walk = walk_at(_LOOP_CENTRE, _LOOP_RADII_M, params.speed_m_per_s)
+    walk = walk_at(_LOOP_CENTRE, _LOOP_RADII_M, params.speed_m_per_s, params.motion_seed)
     grid = np.stack(np.meshgrid([-0.8, 0.2, 1.2], [-1.0, 0.0, 1.0], [2.95]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid, strength=0.80, reach_m=4.0, low=(0.30, 0.29, 0.29), high=(0.50, 0.52, 0.55),

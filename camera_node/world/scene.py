@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from camera_node.world.motion import MAX_SPEED_M_PER_S
 from camera_node.world.render import CameraRenderer, Image, World
 from camera_node.world.rig import Rig
 from camera_node.world.shapes import Array
@@ -29,6 +30,11 @@ _RANGES = (
     ("horizontal_fov_deg", 5.0, 150.0),
     ("supersample", 1, 8),
 )
+# Parameters that decide nothing that stands still.
+_OF_MOTION = ("speed_m_per_s", "motion_seed")
+# Renderers from which others of the same still world are made: two rigs of cameras.
+_STANDING_KEPT = 2 * MAX_CAMERAS
+_STANDING: dict[tuple[str, str], CameraRenderer] = {}
 
 
 class SceneError(ScenarioError):
@@ -59,14 +65,18 @@ class BaseParams:
 
 @dataclass(frozen=True)
 class MovingParams(BaseParams):
-    """speed_m_per_s: mean speed of what moves; 0 stands still."""
+    """speed_m_per_s: mean speed of what moves; 0 stands still. motion_seed: draws another motion, each seed
+    its own path, sense, start and speed (from 0.7 to 1.4 times the one given); None is the scene's own."""
 
     speed_m_per_s: float = 1.0
+    motion_seed: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= 8.0:
+        if self.speed_m_per_s != 0.0 and not 0.05 <= self.speed_m_per_s <= MAX_SPEED_M_PER_S:
             raise ValueError(f"speed_m_per_s must be 0 or within 0.05 to 8, got {self.speed_m_per_s}")
+        if self.motion_seed is not None and self.motion_seed < 0:
+            raise ValueError(f"motion_seed must be 0 or more, got {self.motion_seed}")
 
 
 @dataclass(frozen=True)
@@ -77,7 +87,8 @@ class Scene:
     that they look at, or away from where they look outward. bounds: (2, 3), lower and upper corner in
     metres of everything that can be seen (an effect's occluder apart).
     period_s: the frames repeat after this long, a multiple of 0.6 s. moving: False where every instant is
-    the same.
+    the same. stands: tells scenes apart by what stands still in them, for motions that are drawn: their
+    renderers share what they hold of it.
     """
 
     name: str
@@ -88,6 +99,7 @@ class Scene:
     bounds: Array
     period_s: float
     moving: bool = True
+    stands: str | None = field(default=None, repr=False, compare=False)
     _renderers: dict[str, CameraRenderer] = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -109,8 +121,18 @@ class Scene:
             if camera_id not in self.cameras:
                 known = ", ".join(self.cameras)
                 raise SceneError(f"scene {self.name}: no camera {camera_id!r}; it has {known}")
-            self._renderers[camera_id] = self.view(*self.cameras[camera_id])
+            self._renderers[camera_id] = self._shared(camera_id) or self.view(*self.cameras[camera_id])
         return self._renderers[camera_id]
+
+    def _shared(self, camera_id: str) -> CameraRenderer | None:
+        if self.stands is None:
+            return None
+        at = (self.stands, camera_id)
+        if at not in _STANDING:
+            while len(_STANDING) >= _STANDING_KEPT:
+                _STANDING.pop(next(iter(_STANDING)))
+            _STANDING[at] = self.view(*self.cameras[camera_id])
+        return _STANDING[at].of(self.world)
 
     def view(self, camera: Pinhole, camera_to_world: Array) -> CameraRenderer:
         """A renderer for any other camera."""
@@ -118,11 +140,13 @@ class Scene:
 
     def with_world(self, world: World, period_s: float, moving: bool) -> Scene:
         """The same cameras in another world (an effect adds to it)."""
-        return dataclasses.replace(self, world=world, period_s=period_s, moving=moving, _renderers={})
+        return dataclasses.replace(
+            self, world=world, period_s=period_s, moving=moving, stands=None, _renderers={}
+        )
 
     def with_cameras(self, cameras: Rig) -> Scene:
         """The same world through other cameras (an effect changes their lenses)."""
-        return dataclasses.replace(self, cameras=cameras, _renderers={})
+        return dataclasses.replace(self, cameras=cameras, stands=None, _renderers={})
 
 
 def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
@@ -133,7 +157,11 @@ def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
     if name not in SCENES:
         raise SceneError(f"unknown scene {name!r}; valid scenes: {', '.join(SCENES)}")
     module = importlib.import_module(f"camera_node.world.{name}")
-    return module.build(_checked(name, module.Params, params or {}))
+    scene: Scene = module.build(_checked(name, module.Params, params or {}))
+    if getattr(scene.params, "motion_seed", None) is None:
+        return scene
+    still = {k: v for k, v in dataclasses.asdict(scene.params).items() if k not in _OF_MOTION}
+    return dataclasses.replace(scene, stands=repr((name, still)))
 
 
 def _checked(name: str, model: type[Any], given: Mapping[str, Any]) -> Any:

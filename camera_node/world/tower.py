@@ -13,7 +13,6 @@ import numpy as np
 
 from camera_node.world import textures as tx
 from camera_node.world.figure import Walk, walk_at, walking_person
-from camera_node.world.motion import phase_of
 from camera_node.world.places import at, facing
 from camera_node.world.render import Light, Mover, Part, World
 from camera_node.world.rig import build_rig
@@ -44,7 +43,7 @@ class Params(MovingParams):
 
 def build(params: Params) -> Scene:
     """The workshop as a scene."""
-    walk = walk_at(_WALK_CENTRE, _WALK_RADII_M, params.speed_m_per_s)
+    walk = walk_at(_WALK_CENTRE, _WALK_RADII_M, params.speed_m_per_s, params.motion_seed)
     grid = np.stack(np.meshgrid([-2.6, 0.0, 2.6], [-2.6, 0.0, 2.6], [3.9]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid, strength=0.85, reach_m=4.5, low=(0.30, 0.30, 0.31), high=(0.50, 0.52, 0.55),
@@ -89,9 +88,9 @@ def _cart(walk: Walk, speed_m_per_s: float) -> Mover:
         radii = radii * (speed_m_per_s * walk.period_s / length_m)
 
     def matrices(t_s: float) -> Array:
-        a = 2 * math.pi * (_STILL_PHASE if walk.still else phase_of(t_s, walk.period_s))
+        a = 2 * math.pi * (_STILL_PHASE if walk.still else walk.phase(t_s)) * walk.turn
         x, y = _DRIVE_CENTRE[0] + radii[0] * math.cos(a), _DRIVE_CENTRE[1] + radii[1] * math.sin(a)
-        heading = math.atan2(radii[1] * math.cos(a), -radii[0] * math.sin(a))
+        heading = math.atan2(radii[1] * math.cos(a) * walk.turn, -radii[0] * math.sin(a) * walk.turn)
         return np.asarray(at(x, y, 0.0, math.degrees(heading)) @ local, dtype=np.float64)
 
     return Mover(tuple(part for part, _ in parts), matrices, contact=tuple((k, 0.2) for k in range(4, 8)))

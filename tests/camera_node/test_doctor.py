@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,31 @@ def test_an_arm_that_is_well(capsys, tmp_path):
     assert parts["arm's path"][0] and "of 45 viewpoints" in parts["arm's path"][1]
 
 
+def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path):
+    require_ur_rtde()
+    path = {**load("cell").source["arm"]["path"], "radius_m": 0.55}
+    code, parts = examined(capsys, cell_at(tmp_path, own_address(), path=path))
+    ok, said = parts["arm's path"]
+    assert code == 1 and ok is False
+    reached = int(re.search(r"reaches (\d+) of 45", said)[1])
+    rings = re.search(r"\(40 degrees (\d+) of 15, 60 degrees (\d+) of 15, 78 degrees (\d+) of 15\)", said)
+    assert 3 <= reached < 27 and sum(map(int, rings.groups())) == reached
+
+
+def test_the_examples_calibration_is_not_a_benchs(capsys, tmp_path):
+    require_ur_rtde()
+    _, parts = examined(capsys, cell_at(tmp_path, own_address(), simulated=False))
+    assert parts["hand-eye"][0] is False and "still the example's" in parts["hand-eye"][1]
+
+
+def test_a_part_that_fails_in_its_own_way_does_not_end_the_examination():
+    def broken():
+        raise RuntimeError("xioctl failed\nlast error 5")
+
+    finding = doctor._look("camera eye", broken)
+    assert (finding.ok, finding.said) == (False, "RuntimeError: xioctl failed last error 5")
+
+
 def test_every_fault_is_named_in_one_call(capsys, tmp_path):
     require_ur_rtde()
     code, parts = examined(
@@ -84,6 +110,9 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     _, parts = examined(capsys, str(file))
     camera.close()
     assert parts["camera eye"][0] and parts["camera eye"][1].startswith("64 x 48, ")
+    assert parts["camera eye"][1].endswith(
+        "stamped by their arrival, less latency_ms; its lens as calibrated"
+    )
     assert parts["calibration"] == (True, "calibration.json: 1 cameras")
     assert "network" in parts
     (tmp_path / "calibration.json").write_text(json.dumps({"other": CALIBRATION["eye"]}))

@@ -22,7 +22,7 @@ from freshfield.scenario import Scenario, ScenarioError, load
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C or SIGTERM. Raises ScenarioError; 1 where a port is taken."""
     host, arm = _which(args)
-    joints = _joints(args.joints)
+    joints = np.array(HOME_RAD) if args.joints is None else read_joints(args.joints)
     clock = WallClock()
     try:
         controller = Controller(arm, clock.now_ns(), joints, args.drift_ppm, args.noise_rad, args.seed)
@@ -59,6 +59,17 @@ def arm_of(scenario: Scenario) -> ArmConfig:
     return config
 
 
+def read_joints(text: str) -> np.ndarray:
+    """Six angles in degrees with commas, as radians (6,). Raises ScenarioError."""
+    try:
+        angles = [math.radians(float(part)) for part in text.split(",")]
+    except ValueError:
+        angles = []
+    if len(angles) != 6 or not all(abs(a) <= 2 * math.pi for a in angles):
+        raise ScenarioError(f"--joints: expected six angles within 360 degrees, with commas, got {text!r}")
+    return np.array(angles)
+
+
 def _which(args: argparse.Namespace) -> tuple[str, ArmModel]:
     if args.scenario is not None:
         scenario = load(args.scenario)
@@ -70,15 +81,3 @@ def _which(args: argparse.Namespace) -> tuple[str, ArmModel]:
     except KinematicsError as error:
         raise ScenarioError(f"--calibration: {error}") from None
     return args.host or "127.0.0.2", model
-
-
-def _joints(text: str | None) -> np.ndarray:
-    if text is None:
-        return np.array(HOME_RAD)
-    try:
-        angles = [math.radians(float(part)) for part in text.split(",")]
-    except ValueError:
-        angles = []
-    if len(angles) != 6 or not all(abs(a) <= 2 * math.pi for a in angles):
-        raise ScenarioError(f"--joints: expected six angles within 360 degrees, with commas, got {text!r}")
-    return np.array(angles)

@@ -2,7 +2,8 @@
 
 The client library drives an arm through registers: it uploads a program that reads command numbers from an
 input register and answers in an output register. Here that program is not interpreted; its commands are
-carried out directly, those that move joints and no others.
+carried out directly, those of ``SIMULATED`` and no others. What a real controller refuses, and what is not
+simulated, stops the program, as a fault does there: a client that took it for done would be wrong.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ _MAX_CATCH_UP_STEPS = 5_000
 
 MOVE_J, SERVO_J, SERVO_STOP, STOP_SCRIPT, NO_COMMAND = 1, 11, 16, 255, 0
 SPEED_J, SPEED_STOP, STOP_J = 9, 15, 34
+SET_WATCHDOG = 35
+SIMULATED = "moveJ, servoJ, servoStop, speedJ, speedStop, stopJ, setWatchdog, kickWatchdog, stopScript"
 READY, DONE = 1, 2
 PLAYING, STOPPED = 2, 1
 
@@ -57,12 +60,13 @@ class Controller:
         self.digital_out = 0
         self.runtime_state = STOPPED
         self.steps = 0
-        self.unknown: set[int] = set()
         self._start_ns = start_ns
         self._drift = 1.0 + drift_ppm * 1e-6
         self._noise_rad = noise_rad
         self._rng = np.random.default_rng(seed)
         self._busy = False
+        self._watchdog_steps: int | None = None
+        self._fed_at = 0
         self._history = np.tile(self.motion.q, (_HISTORY_STEPS, 1))
 
     def advance_to(self, now_ns: int, on_step: Callable[[], None] | None = None) -> None:
@@ -78,6 +82,8 @@ class Controller:
             self._history[self.steps % _HISTORY_STEPS] = self.motion.q
             if self._busy and not self.motion.moving:
                 self._finish()
+            if self._watchdog_steps is not None and self.steps - self._fed_at > self._watchdog_steps:
+                self.fault(f"its client has been silent for {self._watchdog_steps * STEP_S:g} s (watchdog)")
             if on_step is not None:
                 on_step()
 
@@ -118,13 +124,13 @@ class Controller:
     def start_program(self) -> None:
         """A client has uploaded its program."""
         self.motion.stop()
-        self.runtime_state, self._busy = PLAYING, False
+        self.runtime_state, self._busy, self._watchdog_steps = PLAYING, False, None
         self.output_int[0] = READY
         self.inputs.clear()
 
     def stop_program(self) -> None:
         self.motion.stop()
-        self.runtime_state, self._busy = STOPPED, False
+        self.runtime_state, self._busy, self._watchdog_steps = STOPPED, False, None
         self.output_int[0] = 0
 
     def take(self, given: dict[str, Any]) -> None:
@@ -134,30 +140,37 @@ class Controller:
         if "input_int_register_0" not in given or self.runtime_state != PLAYING:
             return
         command = int(given["input_int_register_0"])
+        self._fed_at = self.steps
         if command == NO_COMMAND:
             self.output_int[0] = READY
         elif command == STOP_SCRIPT:
             self.stop_program()
         elif command == SERVO_J:
-            self.motion.servo(self._doubles(0, 6))  # answers nothing: the next target follows at once
+            if not self.motion.servo(self._doubles(0, 6)):  # answers nothing: the next target follows at once
+                self.fault("servoJ to where the joints cannot go")
         elif command == SPEED_J:
-            self.motion.speed(self._doubles(0, 6), self._double(6))
+            if not self.motion.speed(self._doubles(0, 6), self._double(6)):
+                self.fault("speedJ without a speed or an acceleration")
         else:
             self._command(command)
 
     def _command(self, command: int) -> None:
         """One that is answered when it is done."""
         if command == MOVE_J:
-            self.motion.move(self._doubles(0, 6), self._double(6), self._double(7))
+            if not self.motion.move(self._doubles(0, 6), self._double(6), self._double(7)):
+                self.fault("moveJ to where the joints cannot go, or without a speed or an acceleration")
+                return
             self._busy = self.motion.moving
             if self.inputs.get("input_int_register_1", 0) == 1:  # asked for without waiting
                 self._busy = False
         elif command in (SERVO_STOP, SPEED_STOP, STOP_J):
             self.motion.stop(self._double(0))
             self._busy = self.motion.moving
-        elif command not in self.unknown:
-            self.unknown.add(command)
-            log.warning("command %d is not simulated: it is answered, and nothing moves", command)
+        elif command == SET_WATCHDOG and self._double(0) > 0:
+            self._watchdog_steps = round(1.0 / (self._double(0) * STEP_S))
+        else:
+            self.fault(f"command {command} is not simulated (it knows {SIMULATED})")
+            return
         if not self._busy:
             self._finish()
 
@@ -165,6 +178,11 @@ class Controller:
         self._busy = False
         if self.runtime_state == PLAYING:
             self.output_int[0] = DONE
+
+    def fault(self, why: str) -> None:
+        """Stop the program, as a controller does that is asked for what it cannot do."""
+        log.warning("simulated arm: %s: the program is stopped", why)
+        self.stop_program()
 
     def _set_outputs(self, given: dict[str, Any]) -> None:
         for name, shift in (("standard", 0), ("configurable", 8), ("tool", 16)):

@@ -14,6 +14,7 @@ from camera_node.calibrate import simulate
 from camera_node.calibrate.accuracy import streams
 from camera_node.calibrate.folder import Track, pairs_json, read_visp_pose
 from camera_node.calibrate.handeye import angle_deg, distance_mm
+from camera_node.calibrate.motions import inverse
 from camera_node.calibrate.targets import parse
 from camera_node.cli import main
 from camera_node.pose.mount import EYE_TO_HAND, read_hand_eye
@@ -43,15 +44,55 @@ def write_csv(file, track: Track) -> None:
     file.write_text("\n".join(lines) + "\n")
 
 
-def test_json_has_the_five_keys_and_nothing_else_is_printed(pairs, capsys):
+def test_json_is_the_answer_and_what_it_is_worth_and_nothing_else_is_printed(pairs, capsys):
     assert hand_eye("--pairs", pairs, "--json") == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
-    assert list(found) == ["transform", "time_offset_s", "residual_mm", "residual_deg", "method"]
+    assert list(found) == ["transform", "time_offset_s", "residual_mm", "residual_deg", "method",
+                           "std_mm", "std_deg", "warnings"]  # fmt: skip
+    assert 0.0 < found["std_mm"] < 1.0 and 0.0 < found["std_deg"] < 0.2 and found["warnings"] == []
     assert found["method"] == "refined" and found["time_offset_s"] == 0.0 and said.err == ""
     assert distance_mm(np.array(found["transform"]), X) < 1.5
     assert hand_eye("--pairs", pairs, "--json", "--method", "tsai") == 0
     assert json.loads(capsys.readouterr().out)["method"] == "tsai"
+
+
+def test_scripts_are_warned_too(tmp_path, capsys):
+    few = tmp_path / "few.json"
+    few.write_text(json.dumps(pairs_json(simulate.samples(6, np.random.default_rng(1)))))
+    assert hand_eye("--pairs", few, "--json") == 0
+    said = capsys.readouterr()
+    assert "6 poses: 10 to 20 well spread ones" in json.loads(said.out)["warnings"][0]
+    assert said.err.startswith("note: 6 poses: 10 to 20")
+
+
+@pytest.mark.parametrize("wrong", ["inverted", "millimetres"])
+def test_nonsense_is_refused_and_not_an_answer(wrong, tmp_path, capsys):
+    good = simulate.samples(15, np.random.default_rng(1))
+    hand, target = good.hand.copy(), good.target.copy()
+    if wrong == "inverted":
+        target = inverse(target)
+    else:
+        hand[:, :3, 3] *= 1e3
+        target[:, :3, 3] *= 1e3
+    file, out = tmp_path / "pairs.json", tmp_path / "hand.yaml"
+    file.write_text(json.dumps([[h.tolist(), t.tolist()] for h, t in zip(hand, target)]))
+    assert hand_eye("--pairs", file, "--json", "--out", out) == 2
+    said = capsys.readouterr()
+    assert "not their inverses, in metres" in said.err and said.out == "" and not out.exists()
+
+
+def test_an_offset_between_two_clocks_beginnings_is_told_and_not_written(tmp_path, capsys):
+    hand, target = streams(simulate.Sweep(0.15), 12.0, 1.7e9, np.random.default_rng(5))
+    write_csv(tmp_path / "hand.csv", hand)
+    write_csv(tmp_path / "seen.csv", target)
+    tracks = "--hand", tmp_path / "hand.csv", "--target", tmp_path / "seen.csv", "--json"
+    assert hand_eye(*tracks) == 0
+    assert "the two streams count from different beginnings" in capsys.readouterr().err
+    out = tmp_path / "hand.yaml"
+    assert hand_eye(*tracks, "--out", out) == 2
+    assert "the node would refuse a time offset of 1700000000 s" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_the_table_the_file_and_the_picture(pairs, tmp_path, capsys):
@@ -110,11 +151,28 @@ def test_mistakes_are_one_line(tmp_path, capsys, pairs):
     assert "expected one of FOLDER" in fails("--pairs", pairs, "--live", "room")
     assert "expected one of FOLDER" in fails("--hand", pairs)
     assert "expected one of FOLDER" in fails("--live", "room", "--target", pairs)
-    assert "cannot be read" in fails("--pairs", tmp_path / "none.json")
+    assert "none.json: cannot be read: No such file" in fails("--pairs", tmp_path / "none.json")
+    for ignored in (
+        ("--board", "qr:60mm"),
+        ("--lens", "x"),
+        ("--camera", "eye"),
+        ("--samples", "x"),
+        ("--moving",),
+    ):
+        assert f"{ignored[0]}: goes with " in fails("--pairs", pairs, *ignored)
+    assert "--max-gap-ms: goes with --hand CSV or --live" in fails(tmp_path, "--max-gap-ms", "5")
+    assert "--camera ID: say which" in fails("--live", "room", "--board", "qr:60mm")
+    flat = [[matrix[:3] for matrix in pair] for pair in json.loads(pairs.read_text())]
+    (tmp_path / "flat.json").write_text(json.dumps(flat))
+    assert "pair 1: expected [hand in base, target in camera], 4 x 4 each: got 3 x 4" in fails(
+        "--pairs", tmp_path / "flat.json"
+    )
     assert "--method: expected one of tsai" in fails("--pairs", pairs, "--method", "magic")
     assert "--board SPEC" in fails(tmp_path)
     assert "has 0 camera XML files" in fails(tmp_path, "--board", "qr:60mm")
-    assert "expected positive" in fails("--live", "room", "--board", "qr:60mm", "--want-mm", "-1")
+    assert "expected positive" in fails(
+        "--live", "room", "--camera", "cam00", "--board", "qr:60mm", "--want-mm", "-1"
+    )
     assert "--out" in fails("--pairs", pairs, "--out", tmp_path / "no" / "folder.yaml")
     assert "--plot" in fails("--pairs", pairs, "--plot", tmp_path / "no" / "folder.png")
     (tmp_path / "x.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,2,3\n")
@@ -135,6 +193,19 @@ def test_a_printed_target_is_one(spelling, tmp_path, capsys):
     # Metres a pixel, over the whole target: what --dpi says.
     pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
     assert pixels == pytest.approx(200 / 0.0254, rel=0.02)
+
+
+def test_a_printed_chessboard_measures_what_is_said(tmp_path, capsys):
+    """To half a pixel over the whole board, also where a square is not whole pixels (118.1 of them here)."""
+    file = tmp_path / "board.png"
+    assert main(["calibrate", "target", "chessboard:9x6:10mm", "--out", str(file), "--dpi", "300"]) == 0
+    assert "it must measure 100.0 x 70.0 mm" in capsys.readouterr().out
+    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    dark = np.argwhere(picture < 128)
+    measured_mm = (np.ptp(dark, axis=0) + 1)[::-1] / 300 * 25.4
+    assert measured_mm == pytest.approx((100.0, 70.0), abs=0.1)
+    corners = parse("chessboard:9x6:10mm").find(picture)
+    assert np.ptp(corners.pixels[:, 0]) / 300 * 25.4 == pytest.approx(80.0, abs=0.05)
 
 
 @pytest.mark.parametrize("what", ["hand-eye --pairs x", "intrinsics x --board x", "accuracy"])

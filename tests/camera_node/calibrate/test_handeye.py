@@ -15,6 +15,7 @@ from camera_node.calibrate.refine import bound, refine
 from camera_node.calibrate.solve import METHODS, residuals, solve
 from camera_node.calibrate.targets import parse
 from camera_node.pose.mount import EYE_IN_HAND, EYE_TO_HAND
+from freshfield.geometry import so3_exp
 from tests.conftest import data_dir
 
 X, Y = simulate.CAMERA_IN_HAND, simulate.TARGET_IN_BASE
@@ -145,10 +146,22 @@ def test_pairs_that_are_none(tmp_path, text, message):
         read_pairs(file, EYE_IN_HAND)
 
 
-def test_poses_given_the_wrong_way_round_are_warned_about():
+def test_poses_given_the_wrong_way_round_are_refused():
     good = simulate.samples(12, np.random.default_rng(5))
-    found = calibrate(Samples(inverse(good.hand), good.target))
-    assert any("not their inverses" in warning for warning in found.warnings)
+    with pytest.raises(CalibrationError, match=r"do not fit together .* not their inverses"):
+        calibrate(Samples(inverse(good.hand), good.target))
+
+
+def test_poses_that_fit_badly_are_warned_about():
+    bad = simulate.samples(12, np.random.default_rng(5), 0.1, 0.02)
+    assert any("residuals are large" in warning for warning in calibrate(bad).warnings)
+
+
+def test_half_turns_alone_are_called_what_they_are():
+    hand = np.tile(np.eye(4), (4, 1, 1))
+    hand[1:, :3, :3] = [so3_exp(turn) for turn in 0.99 * np.pi * np.eye(3)]
+    with pytest.raises(CalibrationError, match=r"^all turns are near 180 degrees"):
+        calibrate(Samples(hand, hand))
 
 
 # --- real data -------------------------------------------------------------------------------------

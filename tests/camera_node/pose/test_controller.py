@@ -86,6 +86,27 @@ def test_the_library_servos_the_arm(control, receive):
     assert abs(receive.getActualQ()[0] - start[0] - 0.059) < 0.01
 
 
+@pytest.mark.parametrize("wrong", ["beyond", "nan", "not simulated", "kinematics"])
+def test_what_it_cannot_do_stops_the_program_and_is_not_called_done(control, receive, wrong):
+    """As a fault does on a real one."""
+    before = receive.getActualQ()
+    if wrong == "kinematics":
+        with pytest.raises(RuntimeError, match="did not succeed"):
+            control.getForwardKinematics(before, [0.0] * 6)
+        done = False
+    elif wrong == "not simulated":
+        done = control.moveL([0.2, 0.2, 0.2, 0.0, 3.0, 0.0], 0.1, 0.5)
+    else:
+        done = control.moveJ([99.0 if wrong == "beyond" else float("nan"), *before[1:]], 1.0, 4.0)
+    assert not done and not control.isProgramRunning()
+    assert receive.getActualQ() == before
+    assert control.reuploadScript()
+    until = time.monotonic() + 10.0
+    while not control.isProgramRunning() and time.monotonic() < until:
+        time.sleep(0.01)
+    assert control.moveJ(before, 1.0, 4.0)
+
+
 def test_two_clients_at_once(arm, receive):
     from rtde_receive import RTDEReceiveInterface
 

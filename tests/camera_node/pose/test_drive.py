@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -13,6 +15,8 @@ import yaml
 
 from camera_node.cli import main
 from camera_node.config import source_config
+from camera_node.pose import drive as driving
+from camera_node.pose.arm import ArmError, ArmStream
 from camera_node.pose.controller.controller import HOME_RAD
 from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
 from camera_node.pose.path import tour
@@ -34,6 +38,44 @@ def cell(tmp_path):
     file = tmp_path / "cell.yaml"
     file.write_text(yaml.safe_dump(data))
     return file, arm["host"]
+
+
+def real(file):
+    """The same cell, its arm taken for a real one: no patience, and questions."""
+    data = yaml.safe_load(file.read_text())
+    data["source"]["arm"]["simulated"] = False
+    file.write_text(yaml.safe_dump(data))
+    return file
+
+
+def near(file):
+    """--joints of an arm that stands some 30 degrees before the first viewpoint."""
+    angles = np.add(np.rad2deg(stops_of(file)[0]), [30, 10, 0, 0, 0, 0])
+    return "--joints=" + ",".join(f"{angle:.3f}" for angle in angles)
+
+
+def wait_until_moving(truth, process):
+    clock = WallClock()
+    start = truth.joints(clock.now_ns())
+    while np.abs(truth.joints(clock.now_ns()) - start).max() < 0.05:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+def at_rest(truth, within_s=5.0):
+    clock, until = WallClock(), time.monotonic() + within_s
+    while time.monotonic() < until:
+        before = truth.joints(clock.now_ns())
+        time.sleep(0.1)
+        if np.array_equal(truth.joints(clock.now_ns()), before):
+            return True
+    return False
+
+
+def shown(text):
+    """Joint angles (N, 6) of the numbered lines, degrees."""
+    lines = [line.split() for line in text.splitlines()]
+    return np.array([line[1:] for line in lines if line and line[0].isdigit() and len(line) == 7], float)
 
 
 def drive(file, *options):
@@ -60,66 +102,130 @@ def test_a_round_visits_every_viewpoint_and_ends(cell):
             time.sleep(0.005)
         said = process.communicate()
         assert process.returncode == 0, said
-        assert said[0].strip() == "3 viewpoints"
+        np.testing.assert_allclose(shown(said[0]), np.rad2deg(stops_of(file)), atol=0.006)
         for stop in stops_of(file):
             assert min(np.abs(q - stop).max() for q in seen) < 0.02
         assert np.abs(truth.joints(clock.now_ns()) - stops_of(file)[-1]).max() < 2e-3
 
 
 @pytest.mark.slow
-def test_a_signal_stops_the_arm_where_it_is(cell):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_arm_where_it_is(cell, number):
     require_ur_rtde()
     file, host = cell
     with simulated_arm(host):
-        truth, clock = Truth(host), WallClock()
-        start = truth.joints(clock.now_ns())
+        truth = Truth(host)
         process = drive(file)
-        while np.abs(truth.joints(clock.now_ns()) - start).max() < 0.05:
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(signal.SIGTERM)
+        wait_until_moving(truth, process)
+        process.send_signal(number)
         assert process.wait(20.0) == 0
-        where = truth.joints(clock.now_ns())
-        time.sleep(0.3)
-        assert np.array_equal(truth.joints(clock.now_ns()), where)
+        assert at_rest(truth, 0.3)
 
 
 @pytest.mark.slow
 def test_an_arm_that_vanishes_ends_the_drive_with_one_line(cell):
     require_ur_rtde()
     file, host = cell
-    data = yaml.safe_load(file.read_text())
-    data["source"]["arm"]["simulated"] = False  # as with a real one: no patience
-    file.write_text(yaml.safe_dump(data))
-    with simulated_arm(host) as arm:
-        truth, clock = Truth(host), WallClock()
-        start = truth.joints(clock.now_ns())
-        process = drive(file, "--yes")
-        while np.abs(truth.joints(clock.now_ns()) - start).max() < 0.05:
-            assert process.poll() is None, process.communicate()
-            time.sleep(0.01)
+    with simulated_arm(host, near(file)) as arm:
+        process = drive(real(file), "--yes")
+        wait_until_moving(Truth(host), process)
         arm.kill()
         assert process.wait(30.0) == 1
         assert f"camera-node: arm at {host}" in process.communicate()[1]
 
 
-def test_a_real_arm_is_asked_about_first(cell):
+def test_a_drive_that_is_killed_leaves_no_arm_moving(cell):
+    """The controller's own watchdog misses it."""
     require_ur_rtde()
     file, host = cell
     data = yaml.safe_load(file.read_text())
-    data["source"]["arm"]["simulated"] = False
+    data["source"]["arm"]["path"]["speed_rad_s"] = 0.1  # the first move takes many seconds
     file.write_text(yaml.safe_dump(data))
+    with simulated_arm(host, near(file)):
+        truth = Truth(host)
+        process = drive(real(file), "--yes")
+        wait_until_moving(truth, process)
+        process.kill()
+        process.communicate()
+        assert at_rest(truth)
+        assert np.abs(truth.joints(WallClock().now_ns()) - stops_of(file)[0]).max() > 0.2
+
+
+def test_a_program_that_is_stopped_at_the_pendant_ends_the_drive(cell):
+    require_ur_rtde()
+    file, host = cell
     with simulated_arm(host):
+        truth = Truth(host)
         process = drive(file)
-        assert "say that its space is clear with --yes" in process.communicate(timeout=20)[1]
+        wait_until_moving(truth, process)
+        with socket.create_connection((host, 29999), 5.0) as dashboard:
+            dashboard.sendall(b"stop\n")
+            assert process.wait(20.0) == 1
+        assert "its program was ended" in process.communicate()[1]
+        assert at_rest(truth)
+
+
+def test_an_arm_that_stands_still_on_the_way_is_not_waited_for(monkeypatch):
+    require_ur_rtde()
+    monkeypatch.setattr(driving, "_STILL_S", 0.3)
+    host = own_address()
+    with simulated_arm(host):
+        stream = ArmStream(host, WallClock(), 50.0, max_gap_ms=5000.0, stale_s=5.0)
+        stream.start()
+        control = driving.connect_control(host)
+        try:
+            goal = np.array(HOME_RAD) + np.deg2rad([0, 0, 30, 0, 0, 0])  # where nobody has sent it
+            with pytest.raises(ArmError, match=r"stands still, 30.0 degrees from its goal"):
+                driving._arrive(stream, control, goal, threading.Event(), 0.3)
+        finally:
+            control.stopScript()
+            stream.stop()
+
+
+def test_a_first_move_through_half_the_bench_is_refused(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host, "--joints=170,-90,-90,-90,90,0"):
+        process = drive(real(file), "--yes")
+        said = process.communicate(timeout=20)
         assert process.returncode == 2
+        assert "the first move would turn a joint by" in said[1] and "with the pendant" in said[1]
+
+
+def test_a_real_arm_is_asked_about_first(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host, near(file)):
+        process = drive(real(file))
+        said = process.communicate(timeout=20)
+        assert "say that its space is clear with --yes" in said[1]
+        assert process.returncode == 2
+        assert "the first move turns a joint by 30" in said[0]  # before the question
+
+
+def test_what_is_shown_is_what_would_be_driven(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host):
+        process = drive(file, "--show")
+        said = process.communicate(timeout=20)[0]
+        assert process.returncode == 0 and at_rest(Truth(host), 0.3)
+    np.testing.assert_allclose(shown(said), np.rad2deg(stops_of(file)), atol=0.006)
+    assert "stands at     0.00   -90.00" in said
 
 
 def test_the_tour_is_shown_without_an_arm(cell, capsys):
-    file, _ = cell
+    require_ur_rtde()
+    file, host = cell
     assert main(["drive-arm", str(file), "--show"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "3 viewpoints" and len(lines[1].split()) == 6
+    said = capsys.readouterr()
+    assert len(shown(said.out)) == 3 and "first move" not in said.out
+    assert f"arm at {host}: nothing listens" in said.err and "--joints" in said.err
+    home = ",".join(f"{a:g}" for a in np.rad2deg(HOME_RAD))
+    assert main(["drive-arm", str(file), "--show", f"--joints={home}"]) == 0
+    np.testing.assert_allclose(shown(capsys.readouterr().out), np.rad2deg(stops_of(file)), atol=0.006)
+    assert main(["drive-arm", str(file), f"--joints={home}"]) == 2
+    assert "--joints: goes with --show" in capsys.readouterr().err
 
 
 def test_a_scenario_without_an_arm_or_a_path_is_refused(cell, capsys):

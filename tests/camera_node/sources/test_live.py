@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from camera_node.build import build_cameras
-from camera_node.config import source_config
-from camera_node.sources.live import CameraError
+from camera_node.config import CameraConfig, source_config
+from camera_node.pose.rig import FixedPose
+from camera_node.sources import camera as opencv_camera
+from camera_node.sources.live import CameraError, LiveSource, open_live
 from freshfield import payload
 from freshfield.clock import WallClock
+from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import ScenarioError, parse
 from tests.camera_node.sources.mjpeg import SIZE, NetworkCamera, number_of
 
@@ -185,3 +190,146 @@ def test_wrong_settings_are_refused(tmp_path, wrong):
     plan.source.pop("latency_ms", None)
     with pytest.raises(ScenarioError, match=next(k for k in wrong if k != "kind")):
         source_config(plan)
+
+
+LENS = Pinhole.from_fov(*SIZE, 60.0)
+STANDING = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+class Feed:
+    """A camera that gives frames until ``breaks_after`` of them, and then ``trouble``."""
+
+    stamped_by, no_lens = "itself", ""
+
+    def __init__(self, intrinsics=LENS, no_lens="", breaks_after=10**9, trouble=None):
+        self.intrinsics, self.no_lens = intrinsics, no_lens
+        self._left, self._trouble = breaks_after, trouble
+        self.closed = False
+
+    def grab(self, timeout_s):
+        time.sleep(0.01)
+        if self._left == 0:
+            raise self._trouble
+        self._left -= 1
+        return time.time_ns(), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+
+    def close(self):
+        self.closed = True
+        raise RuntimeError("it is gone")
+
+
+@pytest.mark.parametrize("where", ["opening", "grabbing"])
+def test_whatever_a_driver_raises_the_camera_is_opened_again(where):
+    trouble = RuntimeError("failed to set power state")
+    opened = []
+
+    def open_feed():
+        opened.append(
+            Feed(breaks_after=3, trouble=CameraError("eye: gone") if where == "opening" else trouble)
+        )
+        if len(opened) == 2 and where == "opening":
+            raise trouble
+        return opened[-1]
+
+    source = LiveSource("eye", Fraction(30), open_feed, STANDING)
+    until = time.monotonic() + WITHIN_S
+    while len(opened) < 4 and time.monotonic() < until:
+        time.sleep(0.01)
+    assert len(opened) >= 4 and opened[0].closed
+    assert patiently(lambda: source.read(0)).intrinsics == LENS
+    source.close()
+
+
+def test_whatever_a_driver_raises_at_the_start_is_one_line():
+    def open_feed():
+        raise RuntimeError("xioctl(VIDIOC_S_FMT) failed\nlast error: 5")
+
+    with pytest.raises(
+        CameraError, match=r"^eye: RuntimeError: xioctl\(VIDIOC_S_FMT\) failed last error: 5$"
+    ):
+        LiveSource("eye", Fraction(30), open_feed, STANDING)
+    feed = Feed(breaks_after=0, trouble=RuntimeError("no"))
+    with pytest.raises(CameraError, match="eye: RuntimeError: no"):
+        LiveSource("eye", Fraction(30), lambda: feed, STANDING)
+    assert feed.closed
+
+
+def test_a_lens_that_the_device_cannot_tell_is_missed_only_where_no_calibration_is_given():
+    why = "eye: the device holds no calibration: calibrate it"
+    source = LiveSource("eye", Fraction(30), lambda: Feed(None, why), STANDING, calibrated=LENS)
+    assert source.intrinsics == LENS
+    source.close()
+    with pytest.raises(CameraError, match=why):
+        LiveSource("eye", Fraction(30), lambda: Feed(None, why), STANDING)
+
+
+def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
+    first, arms = Feed(), []
+
+    class Arm:
+        def at(self, t_ns):
+            return STANDING.at(t_ns)
+
+        def close(self):
+            arms.append("closed")
+
+    def opener(camera, device, config, fps, clock):
+        def open_feed():
+            if camera == "other":
+                raise CameraError("other: no camera")
+            return first
+
+        return open_feed
+
+    plan = scenario(tmp_path, "0", {"eye": CALIBRATION["eye"], "other": CALIBRATION["eye"]})
+    both = {**plan.source, "devices": {"eye": "0", "other": "1"}}
+    plan = parse({"cameras": {"ids": ["eye", "other"]}, "source": both}, tmp_path / "scenario.yaml")
+    monkeypatch.setattr("camera_node.sources.live._poses", lambda *_: {"eye": Arm(), "other": STANDING})
+    with pytest.raises(CameraError, match="other: no camera"):
+        open_live(plan, source_config(plan), plan.cameras, opener)
+    assert first.closed and arms == ["closed"]
+    assert "camera eye" not in [thread.name for thread in threading.enumerate()]
+
+
+class Capture:
+    """OpenCV's, of frames with these stamps (ms before now on the monotonic clock)."""
+
+    def __init__(self, ages_ms, backend="V4L2"):
+        self._ages_ms, self._backend = list(ages_ms), backend
+
+    def getBackendName(self):
+        return self._backend
+
+    def set(self, key, value):
+        return True
+
+    def grab(self):
+        self._stamp_ms = time.monotonic_ns() / 1e6 - self._ages_ms.pop(0)
+        return True
+
+    def get(self, key):
+        return self._stamp_ms
+
+    def retrieve(self):
+        return True, np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "ages_ms, stamped_by, expected_ms",
+    [
+        ([50, 60, 1e6, -5, 40], "the kernel", [54, 64, None, None, 44]),
+        ([1e6, 50, 40], "their arrival, less latency_ms", [20, 20, 20]),
+    ],
+)
+def test_the_first_frame_decides_whose_stamps_count(monkeypatch, clock, ages_ms, stamped_by, expected_ms):
+    """A stamp of the kernel's is moved to the middle of the exposure; none changes its clock midway."""
+    monkeypatch.setattr(opencv_camera, "_open", lambda *_: Capture(ages_ms))
+    config = CameraConfig(kind="camera", exposure_us=8000, latency_ms=20.0)
+    feed = opencv_camera.OpenCvFeed("eye", "0", config, Fraction(30), clock)
+    for age_ms in expected_ms:
+        taken = feed.grab(1.0)
+        if age_ms is None:
+            assert taken is None
+        else:
+            assert (clock.now_ns() - taken[0]) / 1e6 == pytest.approx(age_ms, abs=3.0)
+    assert feed.stamped_by == stamped_by

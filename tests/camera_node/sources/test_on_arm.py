@@ -16,7 +16,9 @@ from camera_node.pose.arm import ArmError
 from camera_node.pose.kinematics import UR3E
 from camera_node.pose.mounted import base_matrix, hand_eyes
 from camera_node.pose.rig import PoseGapError
+from camera_node.sources.on_arm import Truth
 from freshfield import payload
+from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, ScenarioError, load
 from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm
 
@@ -57,6 +59,17 @@ def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands():
         assert np.array_equal(payload.decode(shot.payload, "png", 48, 48), expected)
         assert shot.intrinsics == fixed.source.intrinsics
         hand.source._poses._hand._stream.stop()
+
+
+def test_the_truth_of_another_instant_is_not_taken():
+    require_ur_rtde()
+    host = own_address()
+    with simulated_arm(host):
+        truth, clock = Truth(host), WallClock()
+        assert truth.joints(clock.now_ns()).shape == (6,)
+        for away_ns in (-3600 * 10**9, 10**9):
+            with pytest.raises(PoseGapError, match="ms away: is this machine too busy"):
+                truth.joints(clock.now_ns() + away_ns)
 
 
 def test_without_an_arm_one_line_says_what_to_start():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from fractions import Fraction
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -30,8 +32,8 @@ def intrinsics(model=None, coefficients=(0.0,) * 5):
     return found
 
 
-def frames(domain, stamps_ms):
-    """Colour frames of a software device, with these stamps."""
+def frames(domain, stamps_ms, metadata=()):
+    """Colour frames of a software device, with these stamps and metadata (key, value)."""
     device = rs.software_device()
     sensor = device.add_sensor("Color")
     stream = rs.video_stream()
@@ -41,6 +43,8 @@ def frames(domain, stamps_ms):
     queue = rs.frame_queue(10)
     sensor.open(profile)
     sensor.start(queue)
+    for key, value in metadata:
+        sensor.set_metadata(key, value)
     for number, stamp_ms in enumerate(stamps_ms):
         image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         image[:, :, 0] = 10 * number
@@ -61,6 +65,31 @@ def test_global_time_is_the_hosts():
     captured_ns, image = realsense.taken(frame, realsense.Stamps(clock))
     assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.uint8
     assert abs(captured_ns / 1e6 - stamp_ms) < 5.0
+
+
+def test_a_stamp_is_moved_to_the_middle_of_the_exposure():
+    clock, key = WallClock(), rs.frame_metadata_value
+    stamp_ms = time.time() * 1e3 - 40.0
+    told = [(key.frame_timestamp, 5_012_000), (key.sensor_timestamp, 5_000_000)]
+    (frame,) = frames(rs.timestamp_domain.global_time, [stamp_ms], told)
+    captured_ns, _ = realsense.taken(frame, realsense.Stamps(clock))
+    assert captured_ns / 1e6 - (stamp_ms - 12.0) == pytest.approx(0.0, abs=5.0)
+
+
+def test_a_lens_that_is_not_opencvs_opens_all_the_same(monkeypatch):
+    """Whoever calibrated it themselves names the file: the device is not asked."""
+    pipeline = MagicMock()
+    stream = pipeline.start.return_value.get_stream.return_value.as_video_stream_profile.return_value
+    stream.get_intrinsics.return_value = intrinsics(rs.distortion.kannala_brandt4)
+    monkeypatch.setattr(rs, "pipeline", lambda: pipeline)
+    monkeypatch.setattr(realsense, "find", lambda camera, device: "1")
+    scenario = parse({"cameras": {"ids": ["eye"]}, "source": {"kind": "realsense"}}, Path("scenario.yaml"))
+    feed = realsense.RealsenseFeed("eye", None, source_config(scenario), Fraction(15), WallClock())
+    assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_lens
+    stream.get_intrinsics.side_effect = RuntimeError("get_intrinsics failed")
+    with pytest.raises(CameraError, match="eye: RuntimeError: get_intrinsics failed"):
+        realsense.RealsenseFeed("eye", None, source_config(scenario), Fraction(15), WallClock())
+    assert pipeline.stop.called
 
 
 def test_a_devices_own_time_is_mapped_by_arrival():

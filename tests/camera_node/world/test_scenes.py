@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node.world import SCENES, SceneError, make_scene, preview, rig
+from camera_node.world import SCENES, SceneError, figure, make_scene, preview, rig
+from camera_node.world.shapes import Box
 from freshfield.geometry import Pose, world_rays
 
 SMALL = {"width": 48, "height": 48}
@@ -210,3 +211,65 @@ def test_preview_writes_every_camera(tmp_path: Path):
     sheet = cv2.imread(str(out))
     assert sheet.shape[0] >= 64 and sheet.shape[1] >= 96
     assert sheet.std() > 10
+
+
+@pytest.mark.parametrize("name", ["room", "tower"])
+def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
+    def seen(**params) -> np.ndarray:
+        scene = make_scene(name, {"count": 3, "supersample": 1, **SMALL, **params})
+        return np.concatenate([m.matrices(0.3).ravel() for m in scene.world.movers])
+
+    own, drawn = seen(), [seen(motion_seed=seed) for seed in range(6)]
+    assert np.array_equal(seen(motion_seed=2), drawn[2])
+    for k, one in enumerate(drawn):
+        assert not np.allclose(one, own) and not any(np.allclose(one, other) for other in drawn[:k])
+    still = seen(speed_m_per_s=0.0)
+    assert np.array_equal(seen(speed_m_per_s=0.0, motion_seed=4), still)
+    with pytest.raises(SceneError, match="motion_seed must be 0 or more"):
+        seen(motion_seed=-1)
+
+
+def test_motions_that_are_drawn_differ_in_speed_sense_start_and_path():
+    walks = [figure.walk_at((0.0, 0.95), (0.74, 0.54), 1.0, seed) for seed in range(40)]
+    speeds = [figure.loop_length_m(w) / w.period_s for w in walks]
+    assert 0.68 < min(speeds) < 0.85 and 1.15 < max(speeds) < 1.42
+    assert {w.turn for w in walks} == {1.0, -1.0}
+    assert np.ptp([w.start_s / w.period_s for w in walks]) > 0.8
+    assert np.ptp([w.centre[0] for w in walks]) > 0.3 and np.ptp([w.radii[1] for w in walks]) > 0.15
+
+
+def test_who_walks_the_other_way_looks_where_he_goes():
+    walk = next(w for s in range(9) if (w := figure.walk_at((0.0, 1.0), (0.7, 0.5), 1.0, s)).turn < 0)
+    for phase in np.linspace(0, 1, 13):
+        step = np.subtract(walk.at(phase + 1e-6), walk.at(phase - 1e-6))
+        assert np.allclose(step / np.linalg.norm(step), walk.heading(phase), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["room", "tower"])
+def test_renderers_of_drawn_motions_share_what_stands_still_and_nothing_else(name):
+    params = {"count": 2, "supersample": 1, **SMALL}
+    scenes = [make_scene(name, {**params, "motion_seed": seed}) for seed in (1, 2)]
+    images = [scene.render("cam01", 0.4) for scene in scenes]
+    for scene, image in zip(scenes, images):
+        assert np.array_equal(scene.view(*scene.cameras["cam01"]).image(0.4), image)
+    assert not np.array_equal(*images)
+    assert scenes[0].renderer("cam01")._colour is scenes[1].renderer("cam01")._colour
+    assert make_scene(name, params).stands is None  # nothing is kept where no motion is drawn
+
+
+@pytest.mark.parametrize("name", ["room", "tower"])
+@pytest.mark.parametrize("speed", [0.05, 1.0, 8.0])
+def test_drawn_motions_stay_within_the_bounds_and_out_of_the_furniture(name, speed):
+    for seed in range(6):
+        scene = make_scene(name, {"speed_m_per_s": speed, "motion_seed": seed, **SMALL})
+        boxes = [p for p in scene.world.statics if isinstance(p.shape, Box) and p.shape.half[2] > 0.1]
+        into = [(np.linalg.inv(p.matrix), np.array(p.shape.half)) for p in boxes]
+        for mover in scene.world.movers:
+            for t in np.linspace(0, scene.period_s, 21):
+                for part, m in zip(mover.parts, mover.matrices(t)):
+                    centre, radius = part.shape.bounding_sphere()
+                    at = m[:3, :3] @ centre + m[:3, 3]
+                    assert (at + radius < scene.bounds[1]).all()
+                    assert (at[:2] - radius > scene.bounds[0][:2]).all()
+                    for inverse, half in into:
+                        assert (np.abs(inverse[:3, :3] @ at + inverse[:3, 3]) > half).any()
