@@ -3,9 +3,11 @@
 The buffer holds the newest frame of a camera and nothing else. For a camera that stands still that is all
 there is to know; one that moves would have its field forget, update by update, what it no longer looks at. So
 of every view that was used, its viewpoint is kept if it lies apart from those kept before; where it does not,
-the newer picture takes the older one's place. They go to the field as views of cameras of their own, named
-``hand#3``: no camera of a scenario may be called so. Their ages are what they are: a scene that changes asks
-for few of them, or for a field that trusts old views less (``age_tau_ms``).
+the newer picture takes the older one's place. Apart from what is measured from where a viewpoint was first
+taken, never from the picture that has replaced it: a slow camera would push it along for ever. They go to the
+field as views of cameras of their own, named ``hand#3``: no camera of a scenario may be called so. Their ages
+are what they are: a scene that changes asks for few of them, or for a field that trusts old views less
+(``age_tau_ms``).
 """
 
 from __future__ import annotations
@@ -19,6 +21,25 @@ from edge_server.config import KeyframesConfig
 from edge_server.fields import View
 
 MARK = "#"
+_NEAR = 0.5
+
+
+@dataclasses.dataclass
+class _Slot:
+    """A viewpoint. anchor: the view that it was made for, which says where it is; view: its picture now."""
+
+    anchor: View
+    view: View
+    apart: float = 0.0
+    """How far the picture's place is from the anchor's, 1 where it would be another viewpoint."""
+
+
+@dataclasses.dataclass
+class _Kept:
+    """One camera's viewpoints by number, and the one that it is at."""
+
+    slots: dict[int, _Slot] = dataclasses.field(default_factory=dict)
+    at: int | None = None
 
 
 class Keyframes:
@@ -26,15 +47,15 @@ class Keyframes:
 
     def __init__(self, config: KeyframesConfig) -> None:
         self.config = config
-        self._kept: dict[str, dict[int, View]] = {}
+        self._kept: dict[str, _Kept] = {}
 
     def with_earlier(self, views: Sequence[View]) -> list[View]:
         """``views``, each with its own name, and the earlier viewpoints of their cameras after them."""
         earlier: list[View] = []
         for view in views:
-            kept = self._kept.setdefault(view.camera, {})
+            kept = self._kept.setdefault(view.camera, _Kept())
             own = self._keep(kept, view)
-            earlier.extend(each for slot, each in kept.items() if slot != own)
+            earlier.extend(slot.view for number, slot in kept.slots.items() if number != own)
         return [*views, *earlier]
 
     def forget(self) -> None:
@@ -42,22 +63,41 @@ class Keyframes:
         self._kept.clear()
 
     def __len__(self) -> int:
-        return sum(map(len, self._kept.values()))
+        return sum(len(kept.slots) for kept in self._kept.values())
 
-    def _keep(self, kept: dict[int, View], view: View) -> int:
-        """The slot that ``view`` now has."""
-        slot = next((each for each, known in kept.items() if self._alike(known, view)), len(kept))
-        if slot == self.config.most:
-            slot = min(kept, key=lambda each: kept[each].generated_ns)
-        if slot not in kept or kept[slot].generated_ns != view.generated_ns:
-            kept[slot] = dataclasses.replace(view, camera=f"{view.camera}{MARK}{slot}")
-        return slot
+    def _keep(self, kept: _Kept, view: View) -> int:
+        """The number of the viewpoint that ``view`` is at now."""
+        slots = kept.slots
+        apart, number = min(
+            ((self._apart(slot.anchor, view), each) for each, slot in slots.items()), default=(np.inf, 0)
+        )
+        if apart >= 1.0:
+            number, apart = len(slots), 0.0
+            if number == self.config.most:
+                number = min(slots, key=lambda each: slots[each].view.generated_ns)
+            slots[number] = _Slot(view, self._named(view, number))
+        elif slots[number].view.generated_ns != view.generated_ns and (
+            # On its way out of a viewpoint, a slow camera would leave each with a picture from its edge.
+            kept.at != number or apart <= max(_NEAR, slots[number].apart)
+        ):
+            slots[number].view, slots[number].apart = self._named(view, number), apart
+        kept.at = number
+        return number
 
-    def _alike(self, a: View, b: View) -> bool:
-        """Whether two views are from one viewpoint, through one lens."""
+    def _apart(self, a: View, b: View) -> float:
+        """How far two views are apart, 1 where they become two viewpoints; infinite through two lenses."""
         if a.intrinsics != b.intrinsics:
-            return False
+            return np.inf
         apart_m = float(np.linalg.norm(a.camera_to_world[:3, 3] - b.camera_to_world[:3, 3]))
         turned = a.camera_to_world[:3, :3].T @ b.camera_to_world[:3, :3]
         turned_deg = float(np.rad2deg(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0))))
-        return apart_m < self.config.apart_m and turned_deg < self.config.apart_deg
+        return max(_share(apart_m, self.config.apart_m), _share(turned_deg, self.config.apart_deg))
+
+    @staticmethod
+    def _named(view: View, number: int) -> View:
+        return dataclasses.replace(view, camera=f"{view.camera}{MARK}{number}")
+
+
+def _share(of: float, limit: float) -> float:
+    """``of / limit``; with a limit of zero everything is apart."""
+    return of / limit if limit > 0.0 else np.inf

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -65,8 +66,10 @@ def plan(
     data: Path | None = None,
     seed: int | None = None,
     process_per_camera: bool = False,
+    edge_options: Sequence[str] = (),
 ) -> Plan:
-    """Commands, addresses and log files of a run into ``out``."""
+    """Commands, addresses and log files of a run into ``out``. edge_options: further words for the edge
+    server."""
     edge_port, emulator_port = free_ports(2)
     edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
     file = str(scenario.path)
@@ -79,7 +82,7 @@ def plan(
         [
             *(program("edge-server"), "run", file, "--listen", edge_address),
             *("--page-host", LOOPBACK, "--page-port", str(page_port)),
-            *(*common, *recorded),
+            *(*common, *recorded, *edge_options),
         ],
         out / "log-edge.txt",
         _threads(_EDGE_THREADS, _cores()),

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 from freshfield.scenario import Scenario
-from launch import folder, net, processes
+from launch import folder, mesh, net, processes
 from launch.commands import Plan, plan, program
 from launch.display import Display, make_display
 from launch.processes import Child
@@ -26,11 +26,13 @@ _COMPILING = "compiling"
 """What the edge is doing, in its own words, before it can make a first update."""
 MAX_RESTARTS = 20
 REPORT_WITHIN_S = 300.0
+EXPORT_WITHIN_S = 1200.0
 
 
 @dataclass(frozen=True)
 class Options:
-    """out: folder of the run. duration_s: from when everything is up; 0: until told to stop."""
+    """out: folder of the run. duration_s: from when everything is up; 0: until told to stop. edge: further
+    words for the edge server's command."""
 
     out: Path
     duration_s: float = 60.0
@@ -40,6 +42,7 @@ class Options:
     restart: bool = False
     table: bool = True
     process_per_camera: bool = False
+    edge: tuple[str, ...] = ()
 
 
 class Run:
@@ -61,6 +64,7 @@ class Run:
     def main(self) -> int:
         """Run to the end; 0 if it ended as asked. Raises FolderError or MissingCommand before any start."""
         options = self.options
+        mesh.check(self.scenario)
         self.plan = plan(
             self.scenario,
             options.out,
@@ -68,6 +72,7 @@ class Run:
             options.data,
             options.seed,
             options.process_per_camera,
+            options.edge,
         )
         about = {"scenario": str(self.scenario.path), "seed": self.scenario.seed, "port": options.port}
         lock = folder.prepare(options.out, about)
@@ -82,6 +87,7 @@ class Run:
                     self._watch()
                 finally:
                     self._stop()
+            self._export()
             self._report()
         finally:
             lock.close()
@@ -120,7 +126,7 @@ class Run:
                 return
 
     def _start_nodes(self) -> None:
-        for child in (*self.plan.nodes, *self.plan.drivers):
+        for child in self.plan.nodes:
             child.start()
 
     def _get_ready(self, now_s: float) -> None:
@@ -141,6 +147,8 @@ class Run:
         waited_for = self._not_ready()
         if waited_for is None:
             self._ready_s = now_s
+            for driver in self.plan.drivers:
+                driver.start()  # before, the arm would make its tour for a field that cannot learn yet
         elif now_s - self._began_s > READY_WITHIN_S:
             self._mourn(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
 
@@ -202,6 +210,29 @@ class Run:
             for child in group:
                 if child.killed:
                     self._display.say(f"{child.role} did not end in time and was killed; see {child.log}")
+
+    def _export(self) -> None:
+        """Make what the scenario asks for besides the report. A signal, the second one of a run that was
+        stopped by one, breaks it off."""
+        export = mesh.child(self.scenario, self.options.out)
+        if export is None or self._dead:
+            return
+        self._display.say(f"making the mesh (Ctrl-C leaves it out); see {export.log}")
+        signals, begin_s = len(self._signals), time.monotonic()
+        export.start()
+        while export.running:
+            time.sleep(TICK_S)
+            if len(self._signals) > signals:
+                processes.kill(export)
+                self._display.say("no mesh: broken off")
+                return
+            if time.monotonic() - begin_s > EXPORT_WITHIN_S:
+                processes.kill(export)
+                self._mourn(f"the mesh was not ready after {EXPORT_WITHIN_S:.0f} s; see {export.log}")
+                return
+        assert export.process is not None
+        if export.process.returncode != 0:
+            self._mourn(export.obituary())
 
     def _report(self) -> None:
         """Join the books and write the report, whatever happened before."""

@@ -27,9 +27,25 @@ def summarise(out: Path) -> str:
         f"frames     {_f(frames.get('captured'), 'd')} captured, {_f(frames.get('sent'), 'd')} sent, "
         f"{_f(frames.get('delivered'), 'd')} delivered, {rejected} rejected; "
         f"the books {'close' if frames.get('closes') else 'DO NOT CLOSE'}",
+        *_mesh(report.get("mesh")),
         f"report     {out / 'report.html'}   {out / 'report.json'}",
     ]
     return "\n".join(lines)
+
+
+def _mesh(mesh: dict[str, Any] | None) -> list[str]:
+    """A line where the scenario asked for a mesh."""
+    if not mesh:
+        return []
+    found = mesh.get("measured")
+    line = f"mesh       {mesh['file']}: {mesh['triangles']:,} triangles, made in {mesh['seconds']:.0f} s"
+    if found:
+        line += (
+            f"; chamfer {found['chamfer_mm']:.2f} mm (target {found['target_chamfer_mm']:g}), "
+            f"{100 * found['complete']:.0f} % of the surface within {found['within_mm']:g} mm "
+            f"(target {100 * found['target_complete']:g})"
+        )
+    return [line]
 
 
 def _f(value: Any, form: str) -> str:

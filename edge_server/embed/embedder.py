@@ -103,7 +103,7 @@ def open_session(model: bytes, provider: str, threads: int, name: str) -> tuple[
         )
     options = ort.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 3
+    options.log_severity_level = 4  # an error is raised: printed, too, it would be said twice
     # Waiting threads would spin on the cores that the field is being fitted on.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     names = [_NAMES[chosen]] if chosen == "cpu" else [_NAMES[chosen], _NAMES["cpu"]]

@@ -4,7 +4,9 @@ It is thesis (3.34) and (3.35): features of the backbone's layers, normalised ov
 squared differences weighted by w_l^2 >= 0 and averaged over pixels, summed over layers, and
 g(d) = d^power. Weights and power were fitted to real LPIPS on distorted renderings of our own scenes
 (``edge-server train-perceptual``), so figures are of LPIPS's size and order, but they are not LPIPS: wherever
-they appear they are called ``perceptual``.
+they appear they are called ``perceptual``. Spearman's correlation with LPIPS is .90 on variations of those
+scenes that were not fitted to, .86 to .90 on one of the scenes where only the others were fitted to
+(``embed/models/perceptual.json``).
 """
 
 from __future__ import annotations

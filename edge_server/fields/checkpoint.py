@@ -49,19 +49,35 @@ def save(
         raise
 
 
-def load(path: Path | str, kind: str = "field") -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """The state and the facts of a checkpoint. CheckpointError: not there, damaged, or something else."""
+def load(
+    path: Path | str, kind: str = "field", most_bytes: int | None = None
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """The state and the facts of a checkpoint. most_bytes: of all arrays, unpacked; more are not read.
+    CheckpointError: not there, damaged, or something else."""
     path, expected = Path(path), _FORMAT.format(kind=kind)
     try:
+        if most_bytes is not None:
+            with zipfile.ZipFile(path) as packed:
+                size = sum(entry.file_size for entry in packed.infolist())
+            if size > most_bytes:
+                raise CheckpointError(
+                    f"{path}: unpacked it has {size} bytes, which no {kind}'s checkpoint has"
+                )
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         facts = json.loads(str(arrays.pop("__facts__")))
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such checkpoint") from None
+    except CheckpointError:
+        raise
+    except MemoryError:
+        raise CheckpointError(f"{path}: damaged: it claims arrays that no memory holds") from None
     except KeyError:
         raise CheckpointError(f"{path}: an npz file, but not a {kind}'s checkpoint") from None
-    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, TypeError, EOFError, RecursionError, zipfile.BadZipFile) as error:
         raise CheckpointError(f"{path}: damaged or not a checkpoint ({error})") from None
     if not isinstance(facts, dict) or facts.get("format") != expected:
         raise CheckpointError(f"{path}: written in another format than {expected}")
+    if not isinstance(facts.get("about"), dict):
+        raise CheckpointError(f"{path}: damaged or not a checkpoint (nothing is said about it)")
     return arrays, facts["about"]

@@ -42,6 +42,7 @@ def render_html(report: Report, figures: dict[str, Path]) -> str:
         _tiles(report),
         _section("What the field shows", _figure(figures, "comparison"), _fidelity_table(report)),
         _section("Fidelity over time", _figure(figures, "fidelity")),
+        _section("Mesh", _mesh_table(report)),
         _section("Age", _figure(figures, "ages"), _details("By camera", _age_table(report))),
         _section("Updates", _figure(figures, "updates"), _updates_line(report)),
         _section("Frames", _books(report), _details("By camera", _books_by_camera(report))),
@@ -126,6 +127,24 @@ def _fidelity_table(report: Report) -> str:
     if found["lpips_missing"]:
         said.append(f"LPIPS: {found['lpips_missing']}.")
     return _table(rows) + f"<p class=soft>{escape(' '.join(said))}</p>"
+
+
+def _mesh_table(report: Report) -> str:
+    """Nothing where the scenario asks for no mesh."""
+    mesh = report.get("mesh")
+    if not mesh:
+        return ""
+    found = mesh.get("measured")
+    rows = [["", "", "target"], ["triangles", f"{mesh['triangles']:,}", ""]]
+    if found:
+        within = f"surface within {found['within_mm']:g} mm of it"
+        rows += [
+            ["chamfer distance", _n(found["chamfer_mm"], 2, " mm"), _n(found["target_chamfer_mm"], 1, " mm")],
+            [within, _n(100 * found["complete"], 1, " %"), _n(100 * found["target_complete"], 0, " %")],
+            ["distance from the surface, median", _n(found["accuracy_median_mm"], 2, " mm"), ""],
+        ]
+    rows += [[f"{name}, seconds", _n(spent, 1), ""] for name, spent in mesh["stages_s"].items()]
+    return _table(rows) + f"<p class=soft>{escape(str(mesh['file']))}</p>"
 
 
 def _age_table(report: Report) -> str:

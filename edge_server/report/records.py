@@ -10,12 +10,17 @@ from typing import Any
 
 Row = dict[str, Any]
 
+MEASURED = (
+    "chamfer_mm", "complete", "accuracy_median_mm", "within_mm", "target_chamfer_mm", "target_complete",
+)  # fmt: skip
+
 
 @dataclass
 class Records:
     """Contents of a run's folder. ages: rows {t_s, age_ms: {camera: ms or None}}; processes: rows
-    {t_s, name: {rss_mb, cpu, pid}}; series: rows as in state.Publication; pictures: by name, those that
-    exist. notes: one line for people for whatever was missing or torn."""
+    {t_s, name: {rss_mb, cpu, pid}}; mesh: as ``edge-server export --json`` writes it; series: rows as in
+    state.Publication; pictures: by name, those that exist. notes: one line for people for whatever was
+    missing or torn."""
 
     out: Path
     edge: Row = field(default_factory=dict)
@@ -23,6 +28,7 @@ class Records:
     series: list[Row] = field(default_factory=list)
     ages: list[Row] = field(default_factory=list)
     processes: list[Row] = field(default_factory=list)
+    mesh: Row = field(default_factory=dict)
     pictures: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -38,11 +44,28 @@ def read_records(out: Path) -> Records:
     records.ages = _continuous(_read_lines(out / "ages.jsonl", records.notes))
     if (out / "processes.jsonl").exists():  # written only where one command started all processes
         records.processes = _continuous(_read_lines(out / "processes.jsonl", records.notes))
+    if (out / "mesh.json").exists():  # only where the scenario asks for one
+        records.mesh = _mesh(_read_json(out / "mesh.json", records.notes), records.notes)
     for name in ("truth", "rendered"):
         path = out / f"{name}.png"
         if path.is_file():
             records.pictures[name] = path
     return records
+
+
+def _mesh(data: Row, notes: list[str]) -> Row:
+    """``data`` if it is what the export writes, else nothing and a note."""
+    try:
+        found = data["measured"]
+        numbers = [data["triangles"], data["seconds"], *data["stages_s"].values()]
+        numbers += [] if found is None else [found[name] for name in MEASURED]
+        if isinstance(data["file"], str) and all(isinstance(n, int | float) for n in numbers):
+            return data
+    except (KeyError, TypeError, AttributeError):
+        pass
+    if data:
+        notes.append("mesh.json left out: not what edge-server export --json writes")
+    return {}
 
 
 def _read_json(path: Path, notes: list[str]) -> Row:

@@ -72,6 +72,8 @@ def assemble(records: Records) -> dict[str, Any]:
         },
         "notes": notes + books.notes,
     }
+    if records.mesh:
+        report["mesh"] = records.mesh
     if kind == "fit":
         report |= {"data": edge.get("data"), "frames": None, "age_ms": None, "channel": None, "notes": []}
     cleaned: dict[str, Any] = _finite(report)

@@ -22,6 +22,8 @@ STEEPEST_DEG = 75.0
 SEEN_BY = 2
 WITHIN_M = 0.003
 SAMPLES = 200_000
+# What the project aims at, from 0.3 m.
+TARGET_CHAMFER_MM, TARGET_COMPLETE = 1.5, 0.95
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,10 @@ def test_embed(tmp_path, capsys, monkeypatch):
     for size in ("128", "320"):
         for n in ("1", "3"):
             row = found["detector_int8"][size][n]
-            assert min(row["ratio"], row["embed_ms"], row["runtime_ms"], row["camera_ms"]) > 0.0
-    assert "| detector_int8 | 320 | 3 | " in capsys.readouterr().out
+            for name in ("ratio", "camera_ratio", "camera_cpu_ratio", "embed_ms", "runtime_ms", "camera_ms"):
+                assert row[name] > 0.0
+    told = capsys.readouterr().out
+    assert "| detector_int8 | 320 | 3 | " in told and "of 640 x 480 | its ratio" in told
     assert edge_server(["bench", "embed", "--quick", "--model", str(tmp_path / "no.onnx")]) == 1
     assert "no.onnx: no such file" in capsys.readouterr().err
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from pathlib import Path
 
@@ -44,6 +45,21 @@ def test_a_simulated_arm_without_a_path_stands_still(plan) -> None:
     assert plan(still).arms and not plan(still).drivers
 
 
+def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: Path) -> None:
+    from launch import commands, mesh
+
+    monkeypatch.setattr(mesh, "program", lambda name: name)
+    asked = mesh.child(CELL, tmp_path)
+    assert asked is not None
+    words = f"edge-server export {tmp_path} --mesh {tmp_path / 'tile.ply'} --measure {CELL.path}"
+    assert " ".join(asked.command) == f"{words} --json {tmp_path / 'mesh.json'}"
+    assert mesh.child(load("tile"), tmp_path) is None
+    monkeypatch.setattr(mesh.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(commands.MissingCommand, match=r"edge.export: a mesh needs scikit-image: pip install"):
+        mesh.check(CELL)
+    mesh.check(load("tile"))
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
@@ -52,14 +68,21 @@ def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
     text = CELL.path.read_text().replace("../lab/hand-eye-example.yaml", str(mount))
     text = re.sub(r"host: \S+", f"host: {own_address()}", text)
     text = text.replace("width: 128", "width: 48").replace("height: 128", "height: 48")
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
     run = Up(tmp_path, scenario=text)
     try:
         run.wait_for_updates(8)
         run.process.terminate()
-        assert run.end() == 0
+        assert run.end(300.0) == 0, run.output
     finally:
         run.process.kill()
     frames = run.report()["frames"]
     assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
     views = {tuple(line.split()) for line in (run.out / "log-driver.txt").read_text().splitlines()}
     assert ("29", "viewpoints") in views
+    # The arm sets out when the field can learn, not while it compiles.
+    rows = [json.loads(line) for line in (run.out / "processes.jsonl").read_text().splitlines()]
+    assert "driver" in rows[-1] and "driver" not in next(row for row in rows if "node" in row)
+    mesh = run.report()["mesh"]
+    assert (run.out / mesh["file"]).stat().st_size > 1000 and 0.0 < mesh["measured"]["complete"] < 1.0
+    assert "mm (target 1.5)" in run.output

@@ -206,6 +206,15 @@ def test_a_taken_port_is_refused_before_anything_starts(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+def test_what_an_earlier_run_has_learnt_is_not_thrown_away_by_the_next_one(tmp_path: Path) -> None:
+    (out := tmp_path / "run").mkdir()
+    (out / "run.json").write_text("{}")
+    (learnt := out / "learnt.npz").write_bytes(b"weights")
+    words = ("room", "--out", str(out), "--port", str(free_port()), "--policy", f"bandit:{learnt}", "--learn")
+    assert "is emptied first; name another --out" in refusal(*words)
+    assert learnt.read_bytes() == b"weights"
+
+
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "letter.txt").write_text("dear")
     assert "not an earlier run's" in refusal("room", "--out", str(tmp_path), "--port", str(free_port()))
@@ -218,3 +227,27 @@ def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
     import up as script
 
     assert script.seconds(text) == seconds
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], []),
+        (["--policy", "threshold:120"], ["--policy=threshold:120"]),
+        (["--policy", "bandit:a.npz", "--learn"], ["--policy=bandit:a.npz", "--learn="]),
+        (["--learn", "set", "--fallback", "all"], ["--learn=set", "--fallback=all"]),
+    ],
+)
+def test_who_decides_and_whether_it_learns_is_passed_on_to_the_edge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], expected: list[str]
+) -> None:
+    import up as script
+    from freshfield.scenario import load
+    from launch import commands
+
+    monkeypatch.setattr(commands, "program", lambda name: name)
+    asked = script._edge_options(script._parser().parse_args(["room", *words]))
+    found = commands.plan(load("room"), tmp_path, 8080, edge_options=asked)
+    assert [w for w in found.edge.command if w.startswith(("--policy", "--learn", "--fallback"))] == expected
+    others = [word for child in (found.emulator, *found.nodes) for word in child.command]
+    assert not set(expected) & set(others)

@@ -60,6 +60,31 @@ def test_a_place_seen_again_is_seen_anew():
     assert [v.image[0, 0, 0] for v in given[1:]] == [2, 1]
 
 
+@pytest.mark.parametrize("step_deg", [0.3, 1.0, 4.0])
+def test_a_slow_camera_leaves_as_many_viewpoints_behind_as_a_fast_one(step_deg):
+    kept = Keyframes(KeyframesConfig(most=48, apart_m=0.1, apart_deg=8.0))
+    walked = [view("hand", degrees, t_ms) for t_ms, degrees in enumerate(np.arange(0.0, 120.0, step_deg))]
+    for each in walked:
+        given = kept.with_earlier([each])
+    # A viewpoint each tenth of a metre or so, of the two metres walked.
+    assert 15 <= len(kept) <= 21
+    places = np.array([v.camera_to_world[:3, 3] for v in given])
+    for each in walked:  # nothing that it passed is forgotten, the start neither
+        assert np.linalg.norm(places - each.camera_to_world[:3, 3], axis=1).min() < 0.1
+    # Back the same way: no more viewpoints, and every picture a newer one.
+    for t_ms, each in enumerate(walked[::-1]):
+        given = kept.with_earlier([dataclasses.replace(each, generated_ns=(1000 + t_ms) * 1_000_000)])
+    assert len(kept) <= 21 and min(v.generated_ns for v in given) >= 1_000_000_000
+
+
+def test_a_camera_that_trembles_keeps_one_viewpoint_and_its_newest_picture():
+    kept = Keyframes(KeyframesConfig(apart_m=0.1))
+    for t_ms in range(20):
+        kept.with_earlier([view("hand", 0.2 * (-1) ** t_ms, t_ms)])
+    assert len(kept) == 1
+    assert kept.with_earlier([view("hand", 40, 20)])[1].generated_ns == 19_000_000
+
+
 def test_turning_and_another_lens_make_another_viewpoint():
     kept = Keyframes(KeyframesConfig(apart_m=10.0, apart_deg=5.0))
     kept.with_earlier([view("hand", 0, 0)])

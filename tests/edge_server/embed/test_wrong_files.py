@@ -130,3 +130,12 @@ def test_a_damaged_projection(tmp_path):
     for text in ("!", "AAAA", "AAAAAAAA" * 11):
         path = detector(tmp_path / "p.onnx", meta={"freshfield.projection": text})
         refused(path, "projection is damaged")
+
+
+def test_what_breaks_when_it_is_run_is_said_once_and_by_us(tmp_path, capfd):
+    """ONNX Runtime would print, in red, what it then raises."""
+    beyond = numpy_helper.from_array(np.array([0, 1, 2, 99], np.int64), "beyond")
+    gather = node("Gather", ["end", "beyond"], "some", axis=1)
+    path = detector(tmp_path / "g.onnx", extra=(gather,), weights=(beyond,))
+    refused(path, "ONNX Runtime cannot run it")
+    assert capfd.readouterr() == ("", "")

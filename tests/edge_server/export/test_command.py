@@ -57,6 +57,41 @@ def test_everything_at_once(run, tmp_path, capsys):
     assert len((tmp_path / "t.tum").read_text().splitlines()) == 1 + 8  # a rig that stands still: one file
 
 
+def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    mesh, about = tmp_path / "m.ply", tmp_path / "m.json"
+    wanted = (run, "--mesh", mesh, "--voxel", 10, "--min-weight", 0, "--no-sharpen", "--json", about)
+    assert export(*wanted, "--measure", "tile") == 0
+    said = capsys.readouterr().out
+    assert "mm (target 1.5)" in said and "% of the surface within 3 mm (target 95)" in said
+    told = json.loads(about.read_text())
+    # The field has learnt the tile for a second: what is found is of its size, and nowhere exact.
+    assert 0.5 < told["measured"]["chamfer_mm"] < 100.0 and 0.0 < told["measured"]["complete"] < 0.95
+    assert told["file"] == "m.ply" and told["triangles"] > 10 and told["cameras"] == 8
+    assert set(told["stages_s"]) == {"depth", "fuse", "extract"} and told["seconds"] > 0.0
+    assert export(*wanted, "--measure", "room") == 0
+    assert "not measured: the true surface is known of" in capsys.readouterr().out
+    assert json.loads(about.read_text())["measured"] is None
+    assert export(run, "--points", tmp_path / "p.ply", "--measure", "tile") == 2
+    assert "--measure and --json are for --mesh" in capsys.readouterr().err
+
+
+def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    from edge_server.offline.mesh_truth import measured
+    from edge_server.offline.scan import exact_depth, scan
+    from edge_server.surface.depth import depth_map
+    from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
+
+    near = scan(64, ((-0.065, 0.0, 0.03), (0.065, 0.0, 0.03)))
+    maps = [
+        depth_map(exact_depth(near.scene, v).astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
+        for v in near.views
+    ]
+    found = measured(mesh_of_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
+    assert found["chamfer_mm"] < 3.0 and found["complete"] > 0.7
+
+
 @pytest.mark.parametrize("name", field_names())
 def test_every_representation_comes_back_as_it_was(tmp_path, name):
     field = saved(tmp_path, name)

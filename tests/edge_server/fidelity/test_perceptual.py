@@ -129,8 +129,12 @@ def test_a_score_has_it_only_where_it_is_listed_and_never_as_lpips():
     assert small.perceptual is None
 
 
-def test_the_ranks_on_unseen_scenes_are_on_record():
+def test_the_ranks_are_on_record_those_of_scenes_that_were_not_fitted_to_apart():
     """What the fit measured travels with the coefficients."""
     told = json.loads((MODELS / "perceptual.json").read_text())
     assert told["fitted_to"] == "LPIPS-alex"
-    assert told["unseen"]["unseen worlds"]["spearman"] >= 0.9
+    assert told["unseen"]["unseen variations"]["spearman"] >= 0.9
+    left_out = told["scene_left_out_of_the_fit"]
+    assert set(left_out) == {"room", "tower", "tile"}
+    # Below the .9 of variations, and not by much.
+    assert 0.85 <= min(row["spearman"] for row in left_out.values()) < 0.9

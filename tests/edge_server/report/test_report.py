@@ -7,9 +7,11 @@ import sys
 import numpy as np
 import pytest
 
+from edge_server.config import ExportConfig
 from edge_server.report import build_report
 from edge_server.report.records import read_records
 from edge_server.report.report import METRICS, SERIES, assemble, fidelity, updates
+from launch.summary import summarise
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
 
 
@@ -88,6 +90,41 @@ def test_every_figure_is_drawn_and_inside_the_page(run):
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(names)
     assert "The books close." in page and "LPIPS-alex" in page
+
+
+def test_a_mesh_is_told_of_where_there_is_one(run, tmp_path):
+    assert "mesh" not in run[1] and "<h2>Mesh" not in (run[0] / "report.html").read_text()
+    measured = {"chamfer_mm": 6.926, "complete": 0.6074, "accuracy_median_mm": 1.1, "within_mm": 3.0,
+                "target_chamfer_mm": 1.5, "target_complete": 0.95}  # fmt: skip
+    mesh = {"file": "tile.ply", "triangles": 19794, "seconds": 11.6, "stages_s": {"fuse": 0.4}}
+    for found in (measured, None):
+        write_run(tmp_path)
+        (tmp_path / "mesh.json").write_text(json.dumps({**mesh, "measured": found}))
+        report = build_report(tmp_path)
+        assert report["mesh"] == {**mesh, "measured": found}
+        page, last = (tmp_path / "report.html").read_text(), summarise(tmp_path)
+        assert ("6.93 mm" in page and "60.7 %" in page) == (found is not None)
+        assert ("chamfer 6.93 mm (target 1.5), 61 % of the" in last) == (found is not None)
+        assert "tile.ply: 19,794 triangles, made in 12 s" in last
+
+
+@pytest.mark.parametrize(
+    "torn",
+    ['{"file": "a.ply"}', '{"file": "a.ply", "measured": {}, "stages_s": [], "triangles": 1}', "{", "[]"],
+)
+def test_a_mesh_file_that_is_none_costs_a_note(tmp_path, torn):
+    write_run(tmp_path)
+    (tmp_path / "mesh.json").write_text(torn)
+    report = build_report(tmp_path)
+    assert "mesh" not in report and any("mesh.json left out" in note for note in report["notes"])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"mesh": "../tile.ply"}, {"mesh": "tile.obj"}, {"mesh": "a.ply", "voxel_mm": 0}]
+)
+def test_an_export_that_cannot_be_made_is_refused_when_the_scenario_is_read(wrong):
+    with pytest.raises(ValueError, match=next(reversed(wrong))):
+        ExportConfig(**wrong)
 
 
 def test_the_page_needs_nothing_from_anywhere(run):

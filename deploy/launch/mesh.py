@@ -1,0 +1,40 @@
+"""The mesh at the end of a run, where the scenario asks for one (``edge.export``)."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+from freshfield.scenario import Scenario
+from launch.commands import MissingCommand, program
+from launch.processes import Child
+
+FIGURES = "mesh.json"
+
+
+def wanted(scenario: Scenario) -> dict[str, Any] | None:
+    """The section ``edge.export``; the edge server has checked it by the time that a mesh is made."""
+    section = scenario.edge.get("export")
+    return section if isinstance(section, dict) else None
+
+
+def check(scenario: Scenario) -> None:
+    """Raises MissingCommand before the run, not after it, where a mesh could not be made."""
+    if wanted(scenario) and importlib.util.find_spec("skimage") is None:
+        raise MissingCommand(
+            f"{scenario.path}: edge.export: a mesh needs scikit-image: pip install 'freshfield[surface]', or "
+            "take the key out"
+        )
+
+
+def child(scenario: Scenario, out: Path) -> Child | None:
+    """What makes the mesh of the run in ``out``, and measures it; None where none is asked for."""
+    section = wanted(scenario)
+    if section is None:
+        return None
+    command = [program("edge-server"), "export", str(out), "--mesh", str(out / str(section["mesh"]))]
+    if section.get("voxel_mm") is not None:
+        command += ["--voxel", str(section["voxel_mm"])]
+    command += ["--measure", str(scenario.path), "--json", str(out / FIGURES)]
+    return Child("export", "the export", command, out / "log-export.txt")
