@@ -55,6 +55,11 @@ class Publication:
     perceptual: float | None = None
     """The stand-in for LPIPS, where the scenario lists it (edge.metrics)."""
 
+    @property
+    def views(self) -> float:
+        """Number of cameras whose frames the update used."""
+        return float(len(self.selected))
+
     def scored(self, score: Score) -> Publication:
         """The same publication with its fidelity."""
         return replace(

@@ -31,14 +31,23 @@ _ANGLES_DEG = [(0.0, 3.0)] + [
 _HALF_M, _HEIGHT_M = 5.0, 4.0
 _WALK_CENTRE, _WALK_RADII_M = (0.2, -2.75), (1.35, 0.75)
 _DRIVE_CENTRE, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
+_WHO = 5  # stream of who is there
 _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
 @dataclass(frozen=True)
 class Params(MovingParams):
-    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still."""
+    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``, or
+    only ``one`` of them is there, which one the motion's seed draws: where something moves is then not known
+    from where cameras stand, but can be seen."""
 
     horizontal_fov_deg: float = 90.0
+    movers: str = "both"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.movers not in ("both", "one"):
+            raise ValueError(f"movers: expected both or one, got {self.movers!r}")
 
 
 def build(params: Params) -> Scene:
@@ -56,13 +65,22 @@ def build(params: Params) -> Scene:
         target=_MAST,
         world=World(
             (*_shell(), *_mast(), *_workshop()),
-            (walking_person(walk), _cart(walk, params.speed_m_per_s)),
+            _movers(params, walk),
             light,
         ),
         bounds=np.array([[-_HALF_M, -_HALF_M, 0.0], [_HALF_M, _HALF_M, _HEIGHT_M]]),
         period_s=walk.period_s,
         moving=not walk.still,
     )
+
+
+def _movers(params: Params, walk: Walk) -> tuple[Mover, ...]:
+    person, cart = walking_person(walk), _cart(walk, params.speed_m_per_s)
+    if params.movers == "both":
+        return person, cart
+    # A stream of its own: the walk is the same whoever else is there.
+    drawn = np.random.default_rng([_WHO, params.motion_seed or 0]).random() < 0.5
+    return (person,) if drawn else (cart,)
 
 
 def _cart(walk: Walk, speed_m_per_s: float) -> Mover:

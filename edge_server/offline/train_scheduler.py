@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from edge_server.offline.training.contest import rows as rows_of
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.report import draw_curve, lines, summary
 from edge_server.offline.training.setting import Setting, seeds
-from edge_server.offline.training.trainer import Course, TrainingError, read_log, train
+from edge_server.offline.training.trainer import REPORTS, Course, TrainingError, read_log, train
 from edge_server.scheduler.learned.decide import Actor
 from edge_server.scheduler.learned.rewards import REWARDS, Reward, available, make_reward
 from edge_server.scheduler.learned.spec import ACTIONS, Spec
@@ -60,7 +61,7 @@ command goes on, bit for bit; so it does whatever --jobs is.
 """
 OMEGAS_MS = {
     "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
-    "wait": (0.0, 20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 160.0, 200.0, 300.0),
+    "wait": (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0),
 }
 LEARNT = "learnt"
 
@@ -96,10 +97,10 @@ def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) 
               "ignore how old views are (--on moving)")  # fmt: skip
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
-    # They are about what an earlier training left here.
-    for name in ("summary.json", "contest.csv"):
-        (args.out / name).unlink(missing_ok=True)
     learner = train(setting, course, crew, args.out, lambda line: print(f"  {line}", flush=True))
+    # They are about an earlier call; one that was refused has left them alone.
+    for name in REPORTS:
+        (args.out / name).unlink(missing_ok=True)
     rows = read_log(args.out)
     spent = sum(row["seconds"] for row in rows)
     write_rows(args.out / "training.csv", rows)
@@ -158,7 +159,7 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
         given,
         report=report,
         motions=not args.same_motion,
-        steps=args.fit_steps or (50 if args.scratch else 20),
+        steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
         scratch=args.scratch,
         decisions=args.decisions,
         compute=read_config(given).compute,
@@ -225,6 +226,10 @@ def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Cou
     reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
     if missing:
         print(f"  {missing}")
+    if not 0.0 <= args.price < math.inf:
+        raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
+    if args.price:
+        reward = dataclasses.replace(reward, views=-args.price)
     given = _omegas(args)
     spec = Spec(
         args.kind,
@@ -288,6 +293,8 @@ def _parser() -> argparse.ArgumentParser:
         default="lpips",
         help="the reward's distance; perceptual is the stand-in where LPIPS has no weights [%(default)s]",
     )
+    add("--price", type=float, default=0.0, metavar="R",
+        help="what a view used takes off the reward; free ones hardly ever harm [0]")  # fmt: skip
     add("--report", metavar="CAM,...",
         help="cameras that only report; none: the one that rewards [the last of several that are held out, "
         "else one of the training cameras]")  # fmt: skip

@@ -70,6 +70,9 @@ with 95 % intervals over seeds, and whether it holds.
   semantics         where it helps to look at the pictures, and what it costs where it does not
   reward-cost       what is learnt against the time it takes, by the effort of a fit and the embedding
 
+Studies of what learns, ppo-select and below, take half an hour to an hour each with --quick on two cores,
+with one training an arm; without it, with three and more episodes, most of a day and more.
+
 Everything runs in virtual time from seeds: a trial gives the same figures bit for bit wherever it runs.
 Results are kept in OUT/trials by content; after Ctrl-C the same command goes on with what is missing.
 """
@@ -88,6 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     engine = Engine(args.out / "trials", folders, args.jobs, args.ray)
     try:
         _check(ask, args.jobs)
+        if set(names) <= set(LEARNING) and (scenes or args.ray):
+            raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
         for name in names:
             _run(name, ask, engine)
     except (ScenarioError, DatasetError, StudyError, TrainingError) as error:
@@ -142,7 +147,8 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--quick",
         action="store_true",
-        help="small pictures, few points and seeds: all in a quarter of an hour",
+        help="small pictures, few points and seeds: all in a quarter of an hour, and each of those that "
+        "learn in half an hour to an hour",
     )
     add("--seeds", type=int, metavar="N", help="repetitions of every point [the study's own]")
     add("--jobs", type=int, default=cores, metavar="J", help="processes [%(default)s]")

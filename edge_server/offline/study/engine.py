@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -21,14 +20,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 import camera_node
 import channel_emu
 import edge_server
 import freshfield
 from edge_server.fields.kernels.pool import THREADS_VARIABLE
 from edge_server.offline.study.trial import Folders, Row, Trial, run_trial
+from edge_server.offline.worker import begin
 from edge_server.report.machine import versions
 from freshfield.files import write_json
 
@@ -108,7 +106,7 @@ class Engine:
     ) -> Iterator[tuple[list[str], list[Row]]]:
         # Fresh processes: forking one that has threads of kernels in it would hang.
         jobs = min(self.jobs, len(tasks))
-        pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin, (_threads_each(jobs),))
+        pool = ProcessPoolExecutor(jobs, get_context("spawn"), begin, (_threads_each(jobs),))
         try:
             running: dict[Future[list[Row]], list[str]] = {
                 pool.submit(run_task, mappings, self.folders): task for task, mappings in zip(tasks, sent)
@@ -232,13 +230,6 @@ def _tasks(wanted: dict[str, Trial]) -> list[list[str]]:
 def _threads_each(jobs: int) -> int:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // jobs)
-
-
-def _begin(threads: int) -> None:
-    """In a worker process: as many threads as are its due; Ctrl-C is the parent's business."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ[THREADS_VARIABLE] = str(threads)
-    cv2.setNumThreads(threads)
 
 
 def _end_at_once(pool: ProcessPoolExecutor) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from camera_node.config import WorldConfig, source_config
 from edge_server.offline.deployment import exact_scene
 from edge_server.offline.study.base import Ask, Verdict, by_bool
+from edge_server.offline.study.engine import source_digest
 from edge_server.offline.study.statistics import Interval, crossed, interval
 from edge_server.offline.study.trial import Trial
 from edge_server.offline.train_scheduler import reward_of
@@ -264,6 +265,8 @@ def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, 
     """Whether ``mine`` is better than ``other``: the paired interval says."""
     difference = over(mine, other)
     told = _told_of(difference, len(_runs(mine)))
+    if difference.low == difference.high == 0.0:
+        return Verdict(about, claim, f"{found}{told}: it does the very same.", by_bool(False))
     return Verdict(about, claim, f"{found}{told}.", by_bool(difference.above(0.0)))
 
 
@@ -280,6 +283,7 @@ def no_worse(
 
 
 def _digest(lesson: Lesson) -> str:
-    """Lessons of one name and other settings stand beside each other."""
-    text = lesson.setting.key + repr(dataclasses.asdict(lesson.course))
+    """Lessons of one name and other settings stand beside each other, and so do those of other code: what
+    an earlier learner learnt must not pass for what this one does."""
+    text = source_digest() + lesson.setting.key + repr(dataclasses.asdict(lesson.course))
     return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -92,10 +92,11 @@ def judge(case: str, channel: str, contest: Contest) -> list[Verdict]:
                    f"{percent(mean_of(mine), contest.rewards('random'))}; ")
         )  # fmt: skip
         found.append(
-            Verdict(about, "the best omega differs between decisions, so that there is something to win.",
+            Verdict(about, "the best omega differs between decisions: who knew it beforehand would win.",
                     f"as one fit has it, it is {quartiles(varies)}; to know it would be worth "
-                    f"{span(varies['gain'])} over the best fixed one, as another fit has it; learnt "
-                    f"{span(crossed(mine))}.", by_bool(varies["gain"].above(0.0)))
+                    f"{span(varies['gain'])} over the best fixed one, as another fit has it; whether the "
+                    f"state tells it is another question; learnt {span(crossed(mine))}.",
+                    by_bool(varies["gain"].above(0.0)))
         )  # fmt: skip
     wait, threshold = learnt["wait"], learnt["threshold"]
     found.append(

@@ -82,14 +82,15 @@ def stages(batches: int) -> tuple[int, ...]:
 
 
 def spent_s(logs: Sequence[Sequence[Row]], batches: int) -> float:
-    """Processor time of all fits of the first so many batches, mean over trainings. Each fit counts as what
+    """Processor time of the first so many batches, mean over trainings: of drawing their episodes, and of
+    warm fields, fits and scores, most of which does not shrink with the effort of a fit. Each counts as what
     it took when it was carried out, so that a training whose fits were known already is no cheaper."""
-    return sum(row["fit_seconds"] for rows in logs for row in rows[:batches]) / len(logs)
+    return sum(row["processor_seconds"] for rows in logs for row in rows[:batches]) / len(logs)
 
 
 def judge(contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]) -> list[Verdict]:
-    """Whether a cheap reward has taught more when a dear one has had as much time for its fits, all judged by
-    the contest's fits. spent: budget -> seconds of fits at each of the stages."""
+    """Whether a cheap reward has taught more when a dear one has had as much time, all judged by the
+    contest's fits. spent: budget -> seconds of processor time at each of the stages."""
     about = f"room, ch5, judged by fits of {JUDGED_STEPS} steps"
     cheap, dear = min(spent), max(spent)
     curves = {steps: [runs_of(contest, _called(steps, stage)) for stage in stages] for steps in spent}
@@ -105,12 +106,12 @@ def judge(contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]
         f"{cheap} less {dear} steps: {span(same)}; {told}.",
         by_bool(same.above(-0.01)),
     )
-    claim = f"for the same time of fits {cheap} steps a fit teach more than {dear}."
+    claim = f"in the same time {cheap} steps a fit teach more than {dear}."
     theirs = _as_long(spent[cheap][-1], spent[dear])
     return [
         number,
         better(about, claim, curves[cheap][-1], curves[dear][theirs],
-               f"after {spent[cheap][-1]:.1f} and {spent[dear][theirs]:.1f} s of fits: "),
+               f"after {spent[cheap][-1]:.1f} and {spent[dear][theirs]:.1f} s of processor time: "),
     ]  # fmt: skip
 
 
@@ -160,5 +161,5 @@ def _draw(ask: Ask, contest: Contest, stages: Sequence[int], spent: dict[int, li
             means = [crossed(runs_of(contest, _called(steps, stage))).mean for stage in stages]
             axes[0, 0].plot(seconds, means, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
                             label=f"{steps} steps a fit")  # fmt: skip
-        label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of fits (processor time)",
+        label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of processor time",
                     "What a reward costs")  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -55,8 +55,8 @@ class Contest:
         """seed -> mean reward of its decisions. ``hindsight``: at every decision what was the best of all
         that was tried there, which none can know: chosen by one fit and measured by another."""
         if name == HINDSIGHT:
-            return _by_seed(self._top(list(self.outcomes))[0])
-        return _by_seed(self._values(name))
+            return _by_seed(self._top(list(self.outcomes))[0], self._nobodys())
+        return _by_seed(self._values(name), self._nobodys())
 
     def seeds(self, name: str) -> tuple[int, int]:
         """How many seeds there are, and how many have a value."""
@@ -93,10 +93,16 @@ class Contest:
         either where every choice was carried out only once."""
         names = [name for name in self.outcomes if name.startswith(f"{kind}:")]
         top, best = self._top(names)
-        gain = paired(_by_seed(top), self.best_fixed(kind)[0])
+        gain = paired(_by_seed(top, self._nobodys()), self.best_fixed(kind)[0])
         values = [float(names[k].partition(":")[2]) for k in best]
         quartiles = np.percentile(values, [25, 50, 75]).tolist() if values else [None] * 3
         return {"quartiles": quartiles, "gain": gain}
+
+    def _nobodys(self) -> set[At]:
+        """Decisions at which nobody's outcome has a value: nothing moves where the cameras look that judge,
+        say. That is in what was looked at, not in what was chosen."""
+        known = {at for of in self.outcomes.values() for at, o in of.items() if self.value(o) is not None}
+        return {at for of in self.outcomes.values() for at in of} - known
 
     def _fits(self, name: str, at: At) -> list[Outcome]:
         second = self.again.get(name, {}).get(at)
@@ -199,14 +205,16 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def _by_seed(values: Mapping[At, float | None]) -> PerSeed:
+def _by_seed(values: Mapping[At, float | None], nobodys: Container[At] = ()) -> PerSeed:
     """Mean over each seed's decisions; None where one of them has no value, lest seeds be compared that
-    lack different ones."""
+    lack different ones. nobodys: decisions that are left out; None where all of a seed's are."""
     found: dict[int, list[float | None]] = {}
-    for (seed, _), value in values.items():
-        found.setdefault(seed, []).append(value)
+    for (seed, number), value in values.items():
+        mine = found.setdefault(seed, [])
+        if (seed, number) not in nobodys:
+            mine.append(value)
     return {
-        seed: None if any(v is None for v in mine) else float(np.mean(np.array(mine, float)))
+        seed: float(np.mean(np.array(mine, float))) if mine and None not in mine else None
         for seed, mine in found.items()
     }
 

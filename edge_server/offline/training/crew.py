@@ -10,8 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
@@ -19,13 +17,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import cv2
-
-from edge_server.fields.kernels.pool import THREADS_VARIABLE
 from edge_server.offline.study.engine import source_digest
 from edge_server.offline.study.trial import Folders
 from edge_server.offline.training.episode import Choice, Ground, Moment, Outcome
 from edge_server.offline.training.setting import Setting
+from edge_server.offline.worker import begin
 from freshfield.files import Lines
 
 Asked = tuple[int, int, Choice]
@@ -55,7 +51,7 @@ def _draw(setting: Setting, folders: Folders, seeds: Sequence[int]) -> list[tupl
 
 
 def _evaluate(setting: Setting, folders: Folders, asked: Sequence[Asked]) -> list[tuple[Outcome, float]]:
-    """Outcomes, and the milliseconds of processor time that each fit took."""
+    """Outcomes, and the milliseconds of processor time that each took."""
     ground, found = _ground(setting, folders), []
     for seed, number, choice in asked:
         episode = ground.episode(seed)
@@ -66,10 +62,8 @@ def _evaluate(setting: Setting, folders: Folders, asked: Sequence[Asked]) -> lis
 
 
 def _begin() -> None:
-    """In a process of the crew: one thread; Ctrl-C is the parent's business."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ[THREADS_VARIABLE] = "1"
-    cv2.setNumThreads(1)
+    """In a process of the crew: one thread."""
+    begin(threads=1)
     import torch
 
     # How many threads share a convolution decides its last bits.
@@ -87,7 +81,7 @@ class Crew:
         self._pools: list[ProcessPoolExecutor] = []
         self._moments: dict[tuple[str, int], tuple[Moment, ...]] = {}
         self._known: dict[str, Outcome] = {}
-        self._fit_ms: dict[str, float] = {}
+        self._cost_ms: dict[str, float] = {}
         self._lines: Lines | None = None
         if known is not None:
             self._read(known)
@@ -138,20 +132,21 @@ class Crew:
                 tasks.append(([key for key, _ in part], [a for _, a in part]))
         done = 0
         for names, found in self._carried_out(setting, tasks):
-            for name, (outcome, fit_ms) in zip(names, found):
-                self._known[name], self._fit_ms[name] = outcome, fit_ms
+            for name, (outcome, cost_ms) in zip(names, found):
+                self._known[name], self._cost_ms[name] = outcome, cost_ms
                 self.evaluated += 1
                 if self._lines is not None:
-                    self._lines.write(json.dumps({"key": name, "fit_ms": fit_ms, **asdict(outcome)}))
+                    self._lines.write(json.dumps({"key": name, "cost_ms": cost_ms, **asdict(outcome)}))
             done += len(names)
             if say is not None:
                 say(done, len(wanted))
         return [self._known[key] for key in keys]
 
-    def fit_s(self, setting: Setting, asked: Sequence[Asked]) -> float:
-        """Processor time of the fits of what has been evaluated, each counted once and as what it took when
-        it was carried out, however long ago. KeyError where one has not been."""
-        return math.fsum(self._fit_ms[key] for key in {self._key(setting, a) for a in asked}) / 1e3
+    def cost_s(self, setting: Setting, asked: Sequence[Asked]) -> float:
+        """Processor time of what has been evaluated, episodes, warm fields, fits and scores, each evaluation
+        counted once and as what it took when it was carried out, however long ago. KeyError where one has not
+        been."""
+        return math.fsum(self._cost_ms[key] for key in {self._key(setting, a) for a in asked}) / 1e3
 
     def _carried_out(self, setting: Setting, tasks: Sequence[_Task]) -> Iterator[tuple[list[str], list[Any]]]:
         """Tasks as they are finished."""
@@ -203,8 +198,8 @@ class Crew:
         for line in path.read_text().splitlines():
             try:
                 found = json.loads(line)
-                key, fit_ms = str(found.pop("key")), float(found.pop("fit_ms"))
+                key, cost_ms = str(found.pop("key")), float(found.pop("cost_ms"))
                 self._known[key] = Outcome(**found)
-                self._fit_ms[key] = fit_ms
+                self._cost_ms[key] = cost_ms
             except (ValueError, KeyError, TypeError):
                 continue

@@ -238,6 +238,7 @@ class Episode:
     """One seed's deployment: its decisions, and the field fits of what is chosen there."""
 
     def __init__(self, ground: Ground, seed: int) -> None:
+        began_s = time.process_time()
         self._ground, setting = ground, ground.setting
         scenario = replace(ground.scenario(seed), edge={**setting.scenario.edge, "policy": {"name": "all"}})
         stage = ground.stage(seed)
@@ -267,13 +268,21 @@ class Episode:
         self._warm: list[dict[str, NDArray[Any]]] = []
         self.seed = seed
         self._embeddings = ground.embeddings()
-        self.spent_s = 0.0
-        """Processor time of the fits so far."""
         self.moments = tuple(self._moment(number) for number in range(setting.decisions))
+        self.spent_s = 0.0
+        """Processor time of all that was evaluated so far; the first one bears that of the episode itself."""
+        self._owed_s = time.process_time() - began_s
 
     def evaluate(self, number: int, choice: Choice) -> Outcome:
         """Fit what was chosen at a decision and score it at the instant of publication on the setting's
         scoring cameras. Where nothing was chosen, or nothing of it can be decoded, there are no scores."""
+        began_s = time.process_time() - self._owed_s
+        self._owed_s = 0.0
+        found = self._carried_out(number, choice)
+        self.spent_s += time.process_time() - began_s
+        return found
+
+    def _carried_out(self, number: int, choice: Choice) -> Outcome:
         setting, moment = self._ground.setting, self.moments[number]
         newest = moment.newest(choice.at_ns)
         chosen = [newest[c] for c in choice.cameras]
@@ -293,13 +302,11 @@ class Episode:
             shown = treatment.treat(views, by_camera, published_ns)
         field = self._ground.field(self.seed)
         warm = None if setting.scratch else self._warm_state(number)
-        began_s = time.process_time()
         if warm is None:
             field.reset()
         else:
             field.load_state(warm)
         field.fit(shown, Budget(steps=setting.steps))
-        self.spent_s += time.process_time() - began_s
         score = self._truth.score(field.snapshot(published_ns), published_ns)
         ages_ms = [(published_ns - view.generated_ns) / 1e6 for view in views]
         views_used, wait_ms = float(len(views)), (published_ns - moment.now_ns) / 1e6

@@ -89,9 +89,12 @@ def quartiles(varies: dict[str, Any]) -> str:
 
 
 def percent(values: PerSeed, base: PerSeed) -> str:
-    """Gain in mean reward over ``base``, in per cent of its size, as the thesis tells it."""
-    a, b = interval(list(values.values())).mean, interval(list(base.values())).mean
-    return f"{100.0 * (a - b) / abs(b):+.1f} %" if b else "-"
+    """Gain in mean reward over ``base``, in per cent of its size, as the thesis tells it. Where the reward's
+    zero, which is arbitrary, lies near ``base`` or between the two, there is no such figure."""
+    a, b = interval(list(values.values())), interval(list(base.values()))
+    if not (b.mean * a.mean > 0.0 and (b.low > 0.0 or b.high < 0.0)):
+        return f"no percentage ({a.mean:.4f} against {b.mean:.4f}, near zero or of other signs)"
+    return f"{100.0 * (a.mean - b.mean) / abs(b.mean):+.1f} %"
 
 
 def span(i: Interval, digits: int = 4) -> str:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 _TELL_EVERY_S = 5.0
+# What train-scheduler tells of a finished training, beside it.
+REPORTS = ("summary.json", "contest.csv")
 
 
 class TrainingError(ValueError):
@@ -85,7 +87,8 @@ def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable
         say(f"going on after {first} of {course.batches} batches")
     if learner is None:
         # What an earlier course left must not pass for what this one teaches.
-        (out / "policy.npz").unlink(missing_ok=True)
+        for name in ("policy.npz", *REPORTS):
+            (out / name).unlink(missing_ok=True)
         learner = _new_learner(setting, course, crew)
     learner.taught_by = dataclasses.asdict(course.reward)
     for number in range(first, course.batches):
@@ -136,7 +139,7 @@ def _one_batch(
     row: Row = {
         "batch": number, "episodes": chosen[-1] + 1 - course.seeds(0)[0], "reward": _mean(rewards),
         "decisions": len(moments), "fits": len(each), "carried_out": crew.evaluated - before,
-        "fit_seconds": crew.fit_s(setting, asked),
+        "processor_seconds": crew.cost_s(setting, asked),
     }  # fmt: skip
     row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
     row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}

@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
-TERMS = ("psnr", "ssim", "distance", "age")
+TERMS = ("psnr", "ssim", "distance", "age", "views")
 
 
 class Scored(Protocol):
@@ -53,7 +53,8 @@ class Rewarded:
 @dataclass(frozen=True)
 class Reward:
     """Weights of what is good (positive) and bad (negative): psnr a dB, ssim and distance a unit, age a
-    millisecond of aAoI (6.35). A weight of zero is no term.
+    millisecond of aAoI (6.35), views a view used: what sending, decoding and fitting it costs, for which the
+    thesis has no term. A weight of zero is no term.
 
     fidelity: PSNR of the ``whole`` image or of its ``moving`` pixels; a mostly static scene hides from the
     whole image what age costs. SSIM and the distance are always of the whole image. distance_is: ``lpips``,
@@ -67,6 +68,7 @@ class Reward:
     age: float = 0.0
     fidelity: Literal["whole", "moving"] = "whole"
     distance_is: Literal["lpips", "perceptual"] = "lpips"
+    views: float = 0.0
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(getattr(self, term)) for term in TERMS):
@@ -91,6 +93,7 @@ class Reward:
             "ssim": (self.ssim, score.ssim),
             self.distance_is: (self.distance, distance),
             "age": (self.age, aaoi_ms),
+            "views": (self.views, getattr(score, "views", None)),
         }
         terms = {
             name: None if metric is None or not math.isfinite(metric) else weight * metric

@@ -130,6 +130,19 @@ def test_the_share_of_moving_pixels():
     assert shares[0.5] < shares[1.0] < shares[4.0]
 
 
+def test_which_of_two_moves_in_the_tower_is_drawn_and_only_it_is_there():
+    small = {**SMALL, "supersample": 1, "movers": "one"}
+    known = [make_scene("tower", {**small, "motion_seed": seed}) for seed in range(24)]
+    assert all(len(scene.world.movers) == 1 for scene in known)
+    people = [len(scene.world.movers[0].parts) != len(known[0].world.movers[0].parts) for scene in known]
+    assert 6 <= sum(people) <= 18
+    both, alone = make_scene("tower", {**SMALL, "motion_seed": 0}), known[0].world.movers[0]
+    like = [mover for mover in both.world.movers if len(mover.parts) == len(alone.parts)]
+    assert [np.allclose(mover.matrices(0.7), alone.matrices(0.7)) for mover in like] == [True]
+    with pytest.raises(ValueError, match="both or one"):
+        make_scene("tower", {"movers": "none"})
+
+
 def test_the_share_of_moving_pixels_of_the_tower():
     tower = {"width": 64, "height": 64, "supersample": 1}
     shares = {v: moving_share(make_scene("tower", {**tower, "speed_m_per_s": v}), 8) for v in (1.0, 4.0)}

@@ -28,6 +28,7 @@ from edge_server.offline.training.choosing import named
 from edge_server.offline.training.contest import Contest, hold
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.episode import Outcome
+from edge_server.offline.training.report import percent
 from edge_server.offline.training.setting import seeds
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from tests.edge_server.offline.training.small import FIELD, reported
@@ -99,19 +100,17 @@ def answers(verdicts: Sequence[Verdict], *words: str) -> set[str]:
     return found
 
 
-WON = (
-    "something to be won",
-    "differs between decisions",
-)  # nothing is, here: levels do not depend on decisions
+WON = "differs between decisions"  # nothing does, here: levels do not depend on decisions
 
 
 @pytest.mark.parametrize(("level", "said"), [(3.0, HOLDS), (-3.0, DOES_NOT_HOLD)])
 def test_select_holds_if_and_only_if_what_was_learnt_is_better(level, said):
     found = contest_of({**FIXED, "nearest:6": 0.3, "mask": 0.2, **runs("learnt", level)})
     verdicts = ppo_select.judge("here", found)
-    assert answers([v for v in verdicts if WON[0] not in v.claim]) == {said}
-    assert answers(verdicts, WON[0]).isdisjoint({HOLDS})
+    assert answers([v for v in verdicts if WON not in v.claim]) == {said}
+    assert answers(verdicts, WON).isdisjoint({HOLDS})
     assert answers(ppo_select._as_rewarded("here", found)) == {said}
+    assert any("not over trainings" in v.found for v in verdicts)
 
 
 @pytest.mark.parametrize("channel", ["swing", "ch6"])
@@ -121,7 +120,7 @@ def test_wait_holds_if_and_only_if_what_was_learnt_is_better(channel, level, sai
     verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **both}))
     assert answers(verdicts, "best fixed omega", "uniformly random") == {said}
     assert answers(verdicts, "waiting beats thresholds") == {HOLDS}
-    assert answers(verdicts, WON[1]).isdisjoint({HOLDS})
+    assert answers(verdicts, WON).isdisjoint({HOLDS})
     turned = {**runs("learnt-wait", level), **runs("learnt-threshold", level + 0.2)}
     verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **turned}))
     assert answers(verdicts, "waiting beats thresholds") == {DOES_NOT_HOLD}
@@ -143,8 +142,11 @@ def test_ablation_holds_if_and_only_if_more_of_the_state_is_better(step, said):
 @pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
 def test_semantics_hold_if_and_only_if_who_looks_does_better(gap, said):
     found = contest_of({**FIXED, **runs("with", 3.0 + gap), **runs("without", 3.0)})
-    assert semantics.judge("x", found, True).verdict == said
-    assert semantics.judge("x", found, False).verdict == said
+    for moves in (True, False):
+        helps, *fixed = semantics.judge("x", found, moves)
+        assert helps.verdict == said and answers(fixed) == {HOLDS}
+    low = contest_of({**FIXED, "freshest-k:6": 9.0, **runs("with", 3.0 + gap), **runs("without", 3.0)})
+    assert answers(semantics.judge("x", low, True)[1:]) == {DOES_NOT_HOLD}
 
 
 @pytest.mark.parametrize(("gap", "said"), [(1.0, HOLDS), (-1.0, DOES_NOT_HOLD)])
@@ -182,7 +184,7 @@ def test_a_cheap_reward_wins_if_and_only_if_it_taught_more_in_the_same_time(gap,
 
 
 def test_fits_that_were_known_cost_what_they_cost():
-    logs = [[{"fit_seconds": 2.0, "carried_out": 0}, {"fit_seconds": 4.0, "carried_out": 8}]] * 3
+    logs = [[{"processor_seconds": 2.0, "carried_out": 0}, {"processor_seconds": 4.0, "carried_out": 8}]] * 3
     assert (reward_cost.spent_s(logs, 1), reward_cost.spent_s(logs, 2)) == (2.0, 6.0)
     assert reward_cost.stages(60) == (3, 6, 15, 30, 60) and reward_cost.stages(1) == (1,)
 
@@ -262,3 +264,28 @@ def test_verdicts_follow_from_the_paired_differences():
     assert [no_worse("a", "b", x, base).verdict for x in (up, down, same)] == [
         "holds", "does not hold", "holds"
     ]  # fmt: skip
+    # Who does the same at every decision is no better, and that is known.
+    alike = better("a", "b", [base, base], base)
+    assert alike.verdict == DOES_NOT_HOLD and "the very same" in alike.found
+    assert better("a", "b", {}, base).verdict == UNDECIDED
+
+
+@pytest.mark.parametrize(
+    ("mine", "base", "told"),
+    [
+        (1.2, 1.0, "+20.0 %"),
+        (-0.8, -1.0, "+20.0 %"),
+        (0.5, 0.001, "no percentage"),  # whose own interval has the zero in it
+        (0.1, -1.7, "no percentage"),
+    ],
+)
+def test_a_percentage_is_told_only_where_the_rewards_zero_is_far_away(mine, base, told):
+    values = {s: base + 0.01 * (-1) ** s for s in range(10)}
+    assert percent(dict.fromkeys(values, mine), values).startswith(told)
+
+
+@pytest.mark.parametrize(("jobs", "said"), [(1, HOLDS), (2, HOLDS), (8, UNDECIDED)])
+def test_only_two_processes_tell_how_long_two_cores_take(jobs, said, tmp_path: Path):
+    rows = [{"fits": 100, "carried_out": 100, "decisions": 50}]
+    found = ppo_select._time("x", [learning.Learnt(None, None, rows, 10.0, jobs, tmp_path)])  # type: ignore[arg-type]
+    assert found.verdict == said

@@ -239,6 +239,8 @@ def test_a_table_selects_by_labels():
         (["mat", "--seeds", "0"], "--seeds"),
         (["mat", "--scene", "moon"], "moon"),
         (["mat", "--jobs", "0"], "--jobs"),
+        (["ppo-wait", "--scene", "tower"], "scenes of their own"),
+        (["learning", "--ray", "local"], "scenes of their own"),
     ],
 )
 def test_bad_requests_get_one_line(words: list[str], why: str, tmp_path: Path, capsys):

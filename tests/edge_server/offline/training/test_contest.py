@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.offline.training.contest import HINDSIGHT, Contest
 from edge_server.offline.training.episode import Outcome
-from edge_server.offline.training.report import lines, summary
+from edge_server.offline.training.report import lines, percent, summary
 from edge_server.scheduler.learned.rewards import Reward
 
 OMEGAS = (20, 40, 60, 80, 100, 120, 150, 200, 300, 500)
@@ -73,6 +73,21 @@ def test_seeds_without_a_value_are_not_counted():
     assert "on 19 unseen seeds; 1 more have" in lines(found, "random", "threshold")[0]
 
 
+def test_a_decision_that_nobody_has_a_value_for_is_left_out_for_all():
+    found = contest_of(np.random.default_rng(0), 0.0)
+    whole = found.rewards("random")
+    for of in (found.outcomes, found.again):
+        for name in of:
+            of[name][3, 1] = outcome(None)
+            of[name].update({(4, n): outcome(None) for n in range(4)})
+    assert found.seeds("random") == (20, 19)
+    values = [outcome.psnr_db for of in (found.outcomes, found.again) for outcome in
+              (of["random"][3, n] for n in (0, 2, 3))]  # fmt: skip
+    mine = found.rewards("random")
+    assert mine[3] == pytest.approx(np.mean(values)) and mine[4] is None and mine[5] == whole[5]
+    assert found.rewards(HINDSIGHT)[3] is not None and found.varies("threshold")["gain"].count == 19
+
+
 def test_where_no_decision_has_a_value_the_summary_is_still_json():
     found = contest_of(np.random.default_rng(0), 0.0)
     for of in (found.outcomes, found.again):
@@ -90,3 +105,11 @@ def test_the_best_of_several_is_chosen_by_one_fit_and_measured_by_the_other():
     # The first fit prefers a, which the second has at 0.5; the second prefers b, which the first has at 1.
     assert found.rewards(HINDSIGHT) == {0: pytest.approx(0.75)}
     assert found.rewards("a") == {0: 1.75} and found.rewards("c") == {0: None}
+
+
+def test_a_base_that_may_be_zero_has_no_percentage():
+    base: dict[int, float | None] = {0: 1.0, 1: 1.1, 2: 0.9}
+    assert percent({seed: 1.5 * value for seed, value in base.items() if value}, base) == "+50.0 %"
+    assert "no percentage" in percent(base, {seed: -value for seed, value in base.items() if value})
+    assert "no percentage" in percent(base, {0: 0.01, 1: -0.02, 2: 0.012})
+    assert "no percentage" in percent(base, dict.fromkeys(base, 0.0))

@@ -112,3 +112,30 @@ def test_a_silent_camera_never_reports_and_is_another_setting():
             assert moment.state.reported[[0, 2, 3]].all()
     with pytest.raises(ValueError, match="not a training camera"):
         setting(silent=("cam00",))
+
+
+def test_what_an_evaluation_costs_is_all_that_it_takes_and_not_its_fit_alone(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("edge_server.offline.training.episode.time.process_time", lambda: clock[0])
+    episode = Ground(setting(scratch=False), NOTHING).episode(5)
+    clock[0] += 1000.0  # between two evaluations: somebody else's
+    field, truth = episode._ground.field(5), episode._truth
+    fit, score = field.fit, type(truth).score
+
+    def costly_fit(*args):
+        clock[0] += 10.0
+        return fit(*args)
+
+    def costly_score(*args):
+        clock[0] += 1.0
+        return score(*args)
+
+    monkeypatch.setattr(field, "fit", costly_fit)
+    monkeypatch.setattr(type(truth), "score", costly_score)
+    monkeypatch.setattr(episode, "_owed_s", 100.0)  # of the episode itself
+    at = episode.moments[0]
+    every = tuple(at.newest(at.now_ns))
+    episode.evaluate(0, Choice(every, at.now_ns))
+    assert episode.spent_s == 121.0  # with the warm field
+    episode.evaluate(0, Choice(every[:1], at.now_ns))
+    assert episode.spent_s == 132.0

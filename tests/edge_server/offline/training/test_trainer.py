@@ -175,6 +175,8 @@ def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
         (["room", "--report", "cam77"], "cam77 is not one of"),
         (["room", "--report", "cam00"], "left to reward"),
         (["room", "--network", "flat"], "--report none"),
+        (["room", "--price", "-1"], "--price: expected 0 or more"),
+        (["room", "--fit-steps", "0"], "expected at least 1"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys):
@@ -224,6 +226,10 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert (out / "evaluations.jsonl").read_text() == lines_before
     # What the training took is what it took in all, not what its last session did.
     assert json.loads((out / "summary.json").read_text())["seconds"] == kept["seconds"] > 0.0
+    # What is refused costs nothing that was there.
+    assert main([*words[:3], *words[5:]]) == 2 and "other settings" in capsys.readouterr().err
+    assert json.loads((out / "summary.json").read_text())["best_fixed"] == kept["best_fixed"]
+    assert (out / "contest.csv").exists() and (out / "policy.npz").exists()
     assert main([*words[:-3], "1", "--test", "0", "--out", str(out)]) == 0
     assert not (out / "summary.json").exists() and not (out / "contest.csv").exists()
 
@@ -317,20 +323,20 @@ def test_progress_is_told_before_the_first_batch_is_over(tmp_path: Path, monkeyp
     assert len(told) >= 3 and told[0].endswith("fits of batch 1") and told[-1].startswith("6/6 episodes")
 
 
-def test_the_time_of_fits_is_that_of_when_they_were_carried_out(tmp_path: Path):
+def test_the_time_of_evaluations_is_that_of_when_they_were_carried_out(tmp_path: Path):
     known = tmp_path / "known.jsonl"
     with Crew(NOTHING, known=known) as crew:
         moments = crew.draw(setting(), [7])[0]
         asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
         crew.evaluate(setting(), asked)
-        spent = crew.fit_s(setting(), asked)
+        spent = crew.cost_s(setting(), asked)
     assert spent > 0.0
     with Crew(NOTHING, known=known) as crew:
         crew.evaluate(setting(), asked)
-        assert crew.evaluated == 0 and crew.fit_s(setting(), asked * 2) == spent
+        assert crew.evaluated == 0 and crew.cost_s(setting(), asked * 2) == spent
     # What an older version kept has no time, so that it is carried out again.
     rows = [json.loads(line) for line in known.read_text().splitlines()]
-    known.write_text("".join(json.dumps({k: v for k, v in r.items() if k != "fit_ms"}) + "\n" for r in rows))
+    known.write_text("".join(json.dumps({k: v for k, v in r.items() if k != "cost_ms"}) + "\n" for r in rows))
     with Crew(NOTHING, known=known) as crew:
         crew.evaluate(setting(), asked)
         assert crew.evaluated == len(asked)

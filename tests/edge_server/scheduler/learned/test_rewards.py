@@ -7,7 +7,9 @@ import math
 import pytest
 
 from edge_server.fidelity.scorer import Score
+from edge_server.offline.training.episode import Outcome
 from edge_server.scheduler.learned.rewards import REWARDS, make_reward
+from edge_server.state import Publication
 
 
 def score(psnr_db=25.0, psnr_moving_db=20.0, ssim=0.9, lpips=0.2):
@@ -75,6 +77,18 @@ def test_weights_can_be_replaced_and_a_weight_of_zero_is_no_term():
     found = make_reward("corrected", distance=0.0, age=-0.001).of(score(), aaoi_ms=100.0)
     assert found.terms.keys() == {"psnr", "ssim", "age"}
     assert found.terms["age"] == pytest.approx(-0.1)
+
+
+def test_a_view_costs_its_price_in_a_simulated_update_and_in_a_live_one():
+    priced = make_reward("set", views=-0.01)
+    outcome = Outcome(20.0, None, 0.5, 0.1, None, 50.0, 3.0, 0.0)
+    assert priced.of(outcome).terms["views"] == pytest.approx(-0.03)
+    assert priced.of(outcome).total == pytest.approx(make_reward("set").of(outcome).total - 0.03)
+    live = Publication(
+        0, 1.0, 10**9, None, ("a", "b"), (1.0, 2.0), 1.5, 100.0, psnr_db=20.0, ssim=0.5, lpips=0.1
+    )
+    assert priced.of(live).terms["views"] == pytest.approx(-0.02)
+    assert priced.of(score()).missing == ("views",)  # a score alone does not know
 
 
 @pytest.mark.parametrize(
