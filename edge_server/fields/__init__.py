@@ -5,6 +5,7 @@ Adding a representation is one file here (and its kernels in ``kernels/``) plus 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -51,6 +52,8 @@ class Budget:
     def __post_init__(self) -> None:
         if (self.seconds is None) == (self.steps is None):
             raise ValueError("a budget is either seconds or steps")
+        if not 0 <= (self.steps if self.seconds is None else self.seconds) < math.inf:  # type: ignore[operator]
+            raise ValueError(f"a budget is finite and not negative, not {self}")
 
 
 @dataclass(frozen=True)

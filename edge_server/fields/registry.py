@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from edge_server.fields import Field
+from edge_server.fields.option_types import checked
 
 # name -> "module:function"; the function takes (options, seed) and raises ValueError for a wrong option
 _FIELDS: dict[str, str] = {
@@ -33,8 +34,23 @@ def option_help(name: str) -> dict[str, str]:
 
 def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
     """A fresh field. ValueError: no such representation, or an option it does not have (both are listed)."""
-    if name not in _FIELDS:
-        raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
+    given = _checked(name, options or {})
     module, _, function = _FIELDS[name].partition(":")
     make: Callable[[dict[str, Any], int], Field] = getattr(import_module(module), function)
-    return make(dict(options or {}), seed)
+    return make(given, seed)
+
+
+def settings_of(name: str, options: Mapping[str, Any] | None = None) -> Any:
+    """What options come to, defaults and effort among them: a dataclass. ValueError as ``make_field``."""
+    given = _checked(name, options or {})
+    return import_module(f"edge_server.fields.{name}_settings").make_settings(given)
+
+
+def _checked(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    if name not in _FIELDS:
+        raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
+    settings = getattr(import_module(f"edge_server.fields.{name}_settings"), f"{name.capitalize()}Settings")
+    given = checked(name, settings, options)
+    if not isinstance(given.get("effort", ""), str):
+        raise ValueError(f"{name}: effort must be a name, not {given['effort']!r}")
+    return given

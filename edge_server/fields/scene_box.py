@@ -18,6 +18,10 @@ Array = NDArray[np.float64]
 
 NEAR_SHARE = 0.4  # of the cameras' distance to the scene: nothing nearer to a lens, where rooms are found
 ASTRAY = 0.3  # sine of the angle by which a camera may look past the scene without being doubted
+AGREED = 0.15  # the same, within which half of the cameras look at a point that they do meet in
+ASIDE = 0.7  # the same, by which half of them look past a point that is none
+MOST_TRIED = 32  # cameras whose pairs are tried where they do not
+FAR = 10.0  # times the usual distance between cameras: nearer ones belong to the rig
 PLAIN = 8  # of 255, by which a plain background may vary
 
 
@@ -82,11 +86,12 @@ def scene_box(
     elif point is not None:
         centre = point
     elif len(views) > 1 and np.linalg.norm(axes.mean(axis=0)) < 0.5:
-        centre = origins.mean(axis=0)  # looking outwards
+        centre = _together(origins).mean(axis=0)  # looking outwards
     else:
         # Nothing tells how far the scene is: a few times the rig's own extent, or a room's width.
-        spread = float(np.linalg.norm(origins - origins.mean(axis=0), axis=1).max())
-        centre = origins.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
+        rig = _together(origins)
+        spread = float(np.linalg.norm(rig - rig.mean(axis=0), axis=1).max())
+        centre = rig.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
     distance = float(np.median(np.linalg.norm(origins - centre, axis=1)))
     distance = distance if distance > 1e-6 else 1.0
     pixel = distance / float(np.median([v.intrinsics.fx for v in views]))
@@ -119,14 +124,55 @@ def _meeting_point(origins: Array, axes: Array) -> Array | None:
         if past[worst] < max(ASTRAY, 4.0 * float(np.median(past[kept]))):
             break
         point = others
-    return point
+    if point is not None and _agreed(origins, axes, point):
+        return point
+    # A camera that is far away drags the point along, from where honest ones look as far astray as it does.
+    better = _where_most_meet(origins, axes)
+    if better is not None or point is None:
+        return better
+    return point if np.median(_past(origins, axes, point)) < ASIDE else None
+
+
+def _where_most_meet(origins: Array, axes: Array) -> Array | None:
+    """The point where all cameras but a quarter at most meet, if there is one: found from where two of them
+    do."""
+    some = np.unique(np.linspace(0, len(origins) - 1, MOST_TRIED).astype(int))
+    i, j = (some[k] for k in np.triu_indices(len(some), 1))
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    both = projectors[i] + projectors[j]
+    apart = np.linalg.eigvalsh(both)[:, 0] > 1e-3 if len(i) else np.zeros(0, np.bool_)
+    if len(origins) < 4 or not apart.any():
+        return None
+    place = (projectors @ origins[:, :, None])[:, :, 0]
+    points = np.linalg.solve(both[apart], (place[i] + place[j])[apart][:, :, None])[:, :, 0]
+    astray = np.median(_past(origins, axes, points), axis=-1)
+    first = int(np.argmin(astray))
+    past = _past(origins, axes, points[first])
+    kept = past <= max(ASTRAY, 4.0 * float(astray[first]))
+    if astray[first] >= AGREED or 4 * np.count_nonzero(~kept) > len(origins):
+        return None
+    point = converging_point(origins[kept], axes[kept])
+    # From very far away, a camera may look past the point by kilometres at a small angle.
+    return point if point is not None and _agreed(origins, axes, point) else points[first]
+
+
+def _agreed(origins: Array, axes: Array, point: Array) -> bool:
+    return bool(np.median(_past(origins, axes, point)) < AGREED)
 
 
 def _past(origins: Array, axes: Array, point: Array) -> Array:
-    """How far cameras (N,) look past a point: the sine of the angle, 1 and more where it is behind them."""
-    to_point = point - origins
-    ahead = (to_point * axes).sum(axis=1) / np.maximum(np.linalg.norm(to_point, axis=1), 1e-12)
+    """How far cameras (N,) look past a point (3,), or past each of several (M, 3) -> (M, N): the sine of the
+    angle, 1 and more where it is behind them."""
+    to_point = point[..., None, :] - origins
+    ahead = (to_point * axes).sum(axis=-1) / np.maximum(np.linalg.norm(to_point, axis=-1), 1e-12)
     return np.where(ahead < 0.0, 1.0 - ahead, np.sqrt(np.maximum(1.0 - ahead**2, 0.0)))
+
+
+def _together(origins: Array) -> Array:
+    """The places of cameras without those far away from the others; all, if those are more than a quarter."""
+    apart = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
+    kept = apart <= FAR * max(float(np.median(apart)), 1e-3)
+    return origins[kept] if 4 * np.count_nonzero(~kept) <= len(origins) else origins
 
 
 def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:

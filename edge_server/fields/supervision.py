@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.scene_box import SceneBox
-from freshfield.geometry import Pinhole, invertible
+from freshfield.geometry import GeometryError, Pinhole, Pose, invertible
 
 CHANGE = 16  # of 255, after blurring: above the noise of sensors and of video compression
 MARGIN_PX = 2
+# What no camera has and float32 would not bear: positions (geographic grids reach 1e7 m), and focal lengths,
+# as a share of the image's longer side.
+FARTHEST_M = 1e9
+FOCAL = (1e-3, 1e6)
 
 
 @dataclass
@@ -44,8 +48,20 @@ def check_view(view: View) -> None:
         )
     if np.shape(view.camera_to_world) != (4, 4) or not np.all(np.isfinite(view.camera_to_world)):
         raise ValueError(f"camera {view.camera}: camera_to_world must be a finite (4, 4) matrix")
+    try:
+        Pose.from_matrix(view.camera_to_world)
+    except GeometryError as error:
+        raise ValueError(f"camera {view.camera}: {error}") from None
+    if np.abs(view.camera_to_world[:3, 3]).max() > FARTHEST_M:
+        raise ValueError(f"camera {view.camera}: its position is more than {FARTHEST_M:g} m from the origin")
     if not np.all(np.isfinite(lens_row(camera))) or camera.fx <= 0 or camera.fy <= 0:
         raise ValueError(f"camera {view.camera}: intrinsics must be finite, focal lengths positive")
+    shortest, longest = (limit * max(camera.width, camera.height) for limit in FOCAL)
+    if not (shortest <= camera.fx <= longest and shortest <= camera.fy <= longest):
+        raise ValueError(
+            f"camera {view.camera}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are no lens "
+            f"for an image of {camera.width} x {camera.height}"
+        )
     if not invertible(camera):
         raise ValueError(f"camera {view.camera}: its distortion cannot be undone over the whole image")
     weight = view.weight

@@ -19,7 +19,7 @@ from camera_node.sources.records import DatasetError
 from camera_node.world.scene import SCENES, SceneError
 from edge_server.fidelity.lpips import Lpips
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fields.registry import field_names
+from edge_server.fields.registry import field_names, make_field, settings_of
 from edge_server.offline import sweep, update_time
 from edge_server.offline.fit import FitError, parse_options
 from edge_server.offline.frontier_output import write_output
@@ -137,7 +137,11 @@ def _parser() -> argparse.ArgumentParser:
 
 def _job(args: argparse.Namespace, plan: Plan) -> Frontier:
     name, _, value = args.policy.partition(":")
-    policy = make_policy(name, float(value) if value else None, np.random.default_rng(0))
+    try:
+        number = float(value) if value else None
+    except ValueError:
+        raise ValueError(f"--policy {args.policy}: {value!r} is not a number") from None
+    policy = make_policy(name, number, np.random.default_rng(0))
     plan = replace(plan, moving=replace(plan.moving, policy=name, policy_value=policy.value))
     if args.seeds is not None:
         if args.seeds < 1:
@@ -148,6 +152,8 @@ def _job(args: argparse.Namespace, plan: Plan) -> Frontier:
         raise ValueError(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
     options = parse_options(args.option)
     levels = [level for field in fields for level in sweep.efforts(field, options, plan.knobs)]
+    for level in levels:
+        make_field(level.field, level.options)  # what cannot be is said now, not between two measurements
     still = open_still(args.scene, plan.size, args.holdout, args.scale, args.frame)
     args.out.mkdir(parents=True, exist_ok=True)
     store = Store(args.out / "frontier.json", args.fresh)
@@ -243,7 +249,7 @@ class Frontier:
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
                 "figure": 1, "scene": self.still.describe(), "field": effort.field,
-                "options": effort.options, "divided": effort.divided,
+                "options": effort.options, "divided": effort.divided, "defaults": _settled(effort),
                 "seconds": planned_s, "seed": seed, "lpips": self.lpips is not None,
             }  # fmt: skip
             measure = partial(sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
@@ -313,10 +319,17 @@ class Frontier:
         steps = update_time.steps_for(update_s, compute)
         settings: Row = {
             "figure": 2, **asdict(plan.moving), "speed_m_per_s": speed, "field": effort.field,
-            "options": effort.options, "warm_steps": plan.warm_steps, "steps": steps, "seed": seed,
+            "options": effort.options, "defaults": _settled(effort), "warm_steps": plan.warm_steps,
+            "steps": steps, "seed": seed,
             "seconds": seconds, "compute": asdict(compute), "lpips": self.lpips is not None,
         }  # fmt: skip
         return settings, lambda: stage().run(steps, compute, seconds, self.lpips)
+
+
+def _settled(effort: sweep.Effort) -> str:
+    """What the options of an effort come to, as a digest: with another default, a point is another one."""
+    settings = settings_of(effort.field, effort.options)
+    return hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
 
 
 def _why_still(scene: str) -> str:

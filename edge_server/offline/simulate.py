@@ -74,6 +74,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         deployment = deploy(scenario, terms, scorer=scorer, data=base, on_published=published)
         if args.out is not None:
             decisions = Decisions(args.out, embedding_for(config, deployment.updates.policy))
+        if config.deadline_ms is not None:
+            print(
+                f"  edge.deadline_ms: virtual time counts steps; an update is {terms.steps} of them, with "
+                "the field's options as they stand",
+                file=sys.stderr,
+            )
         if config.learn is not None:
             print("  edge.learn: in virtual time nobody learns, the policy stays as it is", file=sys.stderr)
         _run(deployment, args.seconds, quiet=args.json)

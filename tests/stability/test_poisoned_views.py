@@ -108,8 +108,14 @@ def _turned(view: View, update: int) -> View:
     return replace(view, camera_to_world=pose)
 
 
+def _in_millimetres(view: View, update: int) -> View:
+    pose = view.camera_to_world.copy()
+    pose[:3, 3] *= 1000.0
+    return replace(view, camera_to_world=pose)
+
+
 PICTURES: list[Poison] = [_noise, _black, _inverted, _another_scene]
-POSES: list[Poison] = [_a_metre_off, _turned]
+POSES: list[Poison] = [_a_metre_off, _turned, _in_millimetres]
 
 
 class Deployment:

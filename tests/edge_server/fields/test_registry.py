@@ -7,9 +7,10 @@ import sys
 
 import pytest
 
+from edge_server.fields import Budget
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_settings import EFFORTS, NgpSettings, help_text, make_settings
-from edge_server.fields.registry import field_names, make_field
+from edge_server.fields.registry import field_names, make_field, option_help
 
 
 def test_make_field_passes_options_and_seed() -> None:
@@ -29,6 +30,43 @@ def test_unknown_names_list_the_valid_ones() -> None:
         make_field("ngp", {"levels": 99})
     with pytest.raises(ValueError, match="background"):
         make_field("ngp", {"background": "blu"})
+
+
+@pytest.mark.parametrize("name", field_names())
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ({"rays": "many"}, "rays must be a whole number, not 'many'"),
+        ({"gaussians": 100.5}, "gaussians must be a whole number, not 100.5"),
+        ({"cells": 64.0}, "cells must be a whole number"),
+        ({"nice": "x"}, "nice must be a whole number"),
+        ({"seed": True}, "seed must be a whole number"),
+        ({"contracted": "yes"}, "contracted must be true or false, not 'yes'"),
+        ({"exposure": "no"}, "exposure must be true or false"),
+        ({"rate_end": float("nan")}, "rate_end must be a finite number"),
+        ({"epsilon": "small"}, "epsilon must be a number, not 'small'"),
+        ({"background": 3}, "background must be text"),
+        ({"centre_m": [1, 2]}, "centre_m must be a list of 3 numbers"),
+        ({"centre_m": 5}, "centre_m must be a list of 3 numbers"),
+        ({"effort": ["high"]}, "effort must be a name"),
+    ],
+)
+def test_options_of_another_type_are_refused(name: str, option: dict, text: str) -> None:
+    if not set(option) <= {"effort", *option_help(name)}:
+        pytest.skip(f"{name} has no {', '.join(option)}")
+    with pytest.raises(ValueError, match=f"{name}: {text}"):
+        make_field(name, option)
+
+
+@pytest.mark.parametrize("wrong", [{"seconds": float("nan")}, {"seconds": float("inf")}, {"steps": -1}, {}])
+def test_a_budget_without_an_end_is_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match="a budget is"):
+        Budget(**wrong)
+
+
+def test_a_number_that_yaml_takes_for_text_is_one() -> None:
+    field = make_field("ngp", {"rate": "1e-3", "radius_m": None, "device": "cpu"})
+    assert isinstance(field, NgpField) and field.settings.rate == 1e-3 and field.settings.radius_m is None
 
 
 def test_efforts_are_ordered_and_can_be_overridden() -> None:

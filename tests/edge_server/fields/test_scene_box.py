@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields.scene_box import converging_point, plain_background, scene_box
+from edge_server.offline.still import synthetic
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import ring
 
@@ -78,6 +79,24 @@ def test_a_camera_that_looks_elsewhere_does_not_move_the_box(aside_m: float) -> 
     pose[:3, :3] = turned
     box = scene_box([replace(v, camera_to_world=pose) if v is views[2] else v for v in views])
     np.testing.assert_allclose(box.centre_m, expected.centre_m, atol=1e-9)
+
+
+@pytest.mark.parametrize("scene", ["tile", "room", "tower"])
+@pytest.mark.parametrize("off_m", [30.0, 1e3, 1e6])
+def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: float) -> None:
+    """Whichever it is, and in whatever direction: ahead, behind and aside of where it looks among them."""
+    views = synthetic(scene, cameras=13, size=16).training
+    expected, rng = scene_box(views), np.random.default_rng(0)
+    for k, view in enumerate(views):
+        aside = rng.normal(size=3)
+        axis = view.camera_to_world[:3, 2]
+        for direction in (aside / np.linalg.norm(aside), axis, -axis):
+            pose = view.camera_to_world.copy()
+            pose[:3, 3] += off_m * direction
+            box = scene_box([*views[:k], replace(view, camera_to_world=pose), *views[k + 1 :]])
+            moved_m = np.linalg.norm(np.subtract(box.centre_m, expected.centre_m))
+            assert moved_m < 0.15 * expected.radius_m and box.contracted == expected.contracted
+            assert box.radius_m == pytest.approx(expected.radius_m, rel=0.2)
 
 
 def test_where_many_cameras_disagree_all_are_heard() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.fields import voxel_settings
 from edge_server.offline import frontier, sweep
 from edge_server.offline.frontier_output import conclusion
 from edge_server.offline.still import synthetic
@@ -138,6 +139,29 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
     assert again[gone] == lost, "virtual time gives the same point again"
 
 
+def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch):
+    still, (effort, *_) = synthetic("tile", cameras=3, size=16), sweep.efforts("voxel", {}, knobs=False)
+    plan = replace(frontier.QUICK, planned_s=(0.5,))
+    measured = []
+
+    def fit(*args):
+        measured.append(args)
+        return {"steps": 1, "psnr_db": 20.0}
+
+    monkeypatch.setattr(sweep, "fit_from_scratch", fit)
+    for _ in range(2):
+        store = frontier.Store(tmp_path / "frontier.json")
+        frontier.Frontier(
+            tmp_path, store, plan, still, "tile", ("voxel",), [effort], None, "none", 0
+        )._from_scratch()
+    assert len(measured) == 1
+    monkeypatch.setitem(voxel_settings.EFFORTS, effort.name, {"rays": 77})
+    frontier.Frontier(
+        tmp_path, store, plan, still, "tile", ("voxel",), [effort], None, "none", 0
+    )._from_scratch()
+    assert len(measured) == 2
+
+
 def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_plan):
     write_photos(tmp_path / "set", 5)
     words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]
@@ -154,6 +178,9 @@ def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_plan):
         (["--seeds", "0"], "--seeds 0"),
         (["--field", "splot"], "no field is called splot; there are: ngp"),
         (["--option", "x"], "expected KEY=VALUE"),
+        (["--option", "levels=99"], "levels must be in 1..24"),
+        (["--option", "exposure=maybe"], "exposure must be true or false"),
+        (["--policy", "threshold:soon"], "'soon' is not a number"),
     ],
 )
 def test_what_cannot_work_is_refused(tmp_path, capsys, words, message):

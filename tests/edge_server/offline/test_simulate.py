@@ -56,6 +56,11 @@ def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
     assert run(path, capsys, "--policy", "wait-flush:60")["policy"] == "wait-flush"
 
 
+def test_a_deadline_is_said_to_choose_nothing_where_steps_are_counted(tmp_path: Path, capsys):
+    assert main([str(write(tmp_path, deadline_ms=300.0)), "--seconds", "0.5"]) == 0
+    assert "edge.deadline_ms: virtual time counts steps" in capsys.readouterr().err
+
+
 def test_what_a_learnt_policy_decided_can_be_explained_as_of_a_live_run(tmp_path: Path, capsys):
     Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
     out, file = tmp_path / "out", write(tmp_path, learn={})

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -29,6 +31,14 @@ def test_memory_and_processor_time_of_a_process():
     block = np.ones(8 * 2**20)  # 64 MB that are touched
     assert rss_mb() > 60.0 and peak_rss_mb() >= rss_mb() * 0.9
     assert cpu_s(os.getpid()) > 0.0 and block[0] == 1.0
+
+
+def test_the_peak_of_a_child_is_its_own():
+    block = np.ones(60 * 2**20)  # 500 MB that are touched; numpy and OpenCV alone take less than 200
+    program = "from edge_server.offline.usage import peak_rss_mb; print(peak_rss_mb())"
+    child = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert peak_rss_mb() > 500.0 and block[-1] == 1.0
+    assert float(child.stdout) < 400.0
 
 
 def test_a_process_that_is_gone_tells_nothing():

@@ -1,0 +1,56 @@
+"""Options of a representation held against the types of its settings, before anything is made with them.
+
+What is out of range is for the settings to say; this is for what is no number, no truth value or no text:
+an ``exposure: "no"`` would count as yes, and a rate of NaN as a field that learns nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from numbers import Integral, Real
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+
+def checked(name: str, kind: type, options: Mapping[str, Any]) -> dict[str, Any]:
+    """``options`` of the representation ``name`` as ``kind``, its settings, wants them. ValueError where one
+    is of another type. Options that ``kind`` does not have, and lists of any length, are left to others."""
+    hints = get_type_hints(kind)
+    return {key: _as(hints[key], f"{name}: {key}", v) if key in hints else v for key, v in options.items()}
+
+
+def _as(hint: Any, what: str, value: Any) -> Any:
+    if isinstance(hint, UnionType):
+        if value is None:
+            return None
+        hint = next(one for one in get_args(hint) if one is not type(None))
+    if get_origin(hint) is tuple:
+        parts = get_args(hint)
+        if parts[-1] is Ellipsis:
+            return value
+        if not isinstance(value, (list, tuple)) or len(value) != len(parts):
+            raise ValueError(f"{what} must be a list of {len(parts)} numbers, not {value!r}")
+        return tuple(_as(part, what, v) for part, v in zip(parts, value))
+    if hint is float:
+        return _number(what, value)
+    right = {
+        int: isinstance(value, Integral) and not isinstance(value, bool),
+        bool: isinstance(value, bool),
+        str: isinstance(value, str),
+    }
+    if not right.get(hint, True):
+        wanted = {int: "a whole number", bool: "true or false", str: "text"}[hint]
+        raise ValueError(f"{what} must be {wanted}, not {value!r}")
+    return value
+
+
+def _number(what: str, value: Any) -> Any:
+    if isinstance(value, str):
+        try:
+            value = float(value)  # YAML takes 1e-3 for text
+        except ValueError:
+            raise ValueError(f"{what} must be a number, not {value!r}") from None
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+        raise ValueError(f"{what} must be a finite number, not {value!r}")
+    return value
