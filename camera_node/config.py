@@ -57,10 +57,10 @@ class SourceConfig:
 class PathConfig:
     """The tour that ``camera-node drive-arm`` makes: viewpoints on rings around a target, looking at it.
 
-    target_m: in the world. radius_m: camera to target. elevations_deg: of the rings, in the order of the
-    tour. azimuths_deg: first and last of each ring (0 is on the target's -y side, 90 on its +x side).
+    target_m: in the world. radius_m: camera to target. elevations_deg: of the rings. azimuths_deg:
+    first and last of each ring, in the order of the tour (0 is on the target's -y side, 90 on its +x side).
     step_deg: between viewpoints of a ring. speed_rad_s, acceleration_rad_s2: of the fastest joint. floor_m:
-    nothing of the arm beyond the upper arm comes lower, in the world's z.
+    the middle of no joint beyond the shoulder comes lower, in the world's z.
     """
 
     target_m: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -156,14 +156,15 @@ def _hand_eye(args: argparse.Namespace) -> int:
     if args.method not in handeye.ALL_METHODS:
         raise CalibrationError(f"--method: expected one of {', '.join(handeye.ALL_METHODS)}")
     found = _found(args)
+    if args.json:
+        for warning in found.warnings:
+            _say(f"note: {warning}")
+    # First of all, or a file that cannot be written would take a session's answer with it.
+    print(json.dumps(found.answer()) if args.json else report.show(found), flush=True)
     if args.out is not None:
         report.write_yaml(found, args.out)
     if args.plot is not None:
         report.plot(found, args.plot)
-    if args.json:
-        for warning in found.warnings:
-            _say(f"note: {warning}")
-    print(json.dumps(found.answer()) if args.json else report.show(found))
     return 0
 
 

@@ -8,6 +8,7 @@ import os
 import secrets
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,8 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     to_base = None if arm is None or args.hand is not None else _to_base(plan, arm, args.camera)
     if args.tracks is not None and not (args.moving and to_base is not None):
         raise CalibrationError("--tracks: goes with --moving and the poses of a scenario's arm")
+    if args.tracks is not None:
+        _make(args.tracks)
     try:
         source = open_sources(plan, config, [args.camera], args.data)[args.camera]
     except (ValueError, OSError) as error:
@@ -102,6 +105,15 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     if args.tracks is not None:
         tracks.write(args.tracks)
     return calibrate_tracks(tracks.hand(), tracks.target(), setup, args.method, args.max_gap_ms / 1e3)
+
+
+def _make(folder: Path) -> None:
+    """Of ``--tracks``, before the session that would be lost without it. Raises CalibrationError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise CalibrationError(f"--tracks: {folder}: {error.strerror}") from None
 
 
 def _follow(plan: scenario.Scenario, arm: ArmConfig, tracks: Tracks) -> ArmStream:

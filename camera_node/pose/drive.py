@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,9 +154,9 @@ def _drive(stream: ArmStream, stops: list[np.ndarray], pace: _Pace, rounds: int)
             done += 1
     except ArmError as error:
         print(f"camera-node: {error}", file=sys.stderr, flush=True)
-        _stop(control)
+        within_reason(lambda: _stop(control))
         os._exit(1)  # the library's destructor would wait for an arm that may be gone
-    _stop(control)
+    within_reason(lambda: _stop(control))
     return 0
 
 
@@ -164,12 +165,12 @@ def _why(stream: ArmStream) -> str:
 
 
 def _stop(control: Any) -> None:
-    """Bring the arm to rest, as far as it still listens: the library waits for answers without an end."""
+    control.stopJ(_STOP_RAD_S2)
+    control.stopScript()
 
-    def ask() -> None:
-        control.stopJ(_STOP_RAD_S2)
-        control.stopScript()
 
+def within_reason(ask: Callable[[], None]) -> None:
+    """Ask an arm to come to rest, as far as it still listens: the library waits for answers without end."""
     # The default action ends this process even if the library holds Python's lock.
     signal.setitimer(signal.ITIMER_REAL, 2 * STOPPING_S)
     asking = threading.Thread(target=ask, daemon=True)

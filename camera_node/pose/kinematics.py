@@ -60,9 +60,17 @@ class ArmModel:
     nominal: ArmModel | None = None
     """The uncalibrated model that the closed form is solved for; None: this one."""
 
+    @property
+    def body(self) -> ArmModel:
+        """The model whose link frames lie within the arm's parts, as distances need them. A calibrated one's
+        do not: the factory's fit puts metres into lengths along parallel axes, which all but cancel at the
+        flange, so that the elbow's frame may lie in the next room."""
+        return self.nominal or self
+
     def links(self, joints: ArrayLike) -> Array:
         """Base-from-link transforms (7, 4, 4) of joint angles (6,) in radians: the base itself, then each
-        link's frame; the last one is the flange. Raises KinematicsError for angles that are not finite."""
+        link's frame; the last one is the flange. For where its parts are, ask ``body``. Raises
+        KinematicsError for angles that are not finite."""
         q = _joints(joints)
         out = np.empty((7, 4, 4))
         out[0] = np.eye(4)

@@ -1,9 +1,10 @@
 """A tour for a camera on an arm: viewpoints around a target, and postures that take the camera to them.
 
 Viewpoints that the arm does not reach, reaches only next to a singularity, or cannot get to from the one
-before without the middle of one of its joints coming below the floor, are left out. Links, camera and cable
-have a thickness that ``floor_m`` must allow for. This knows one floor and no other obstacle: on a real bench,
-watch the first round with a hand on the stop.
+before without coming near itself, or with the middle of a joint below the floor, are left out. For the floor,
+links, camera and cable have a thickness that ``floor_m`` must allow for. This knows the arm (with a camera of
+usual size on its flange), one floor and no other obstacle: on a real bench, watch the first round with a hand
+on the stop.
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node.config import PathConfig
 from camera_node.pose.kinematics import ArmModel
+from camera_node.teleop.capsules import Shape, links
 from freshfield.geometry import look_at, se3_inverse
 
 Array = NDArray[np.float64]
 
 _LOOKS = 12  # postures that are looked at between two viewpoints
+_TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and what holds it
+_MARGIN_M = 0.01  # between parts of the arm, whose capsules are rounded up
 FARTHEST_RAD = 2.0  # that a joint turns between two: beyond, the arm would be flung into another posture
 
 
@@ -30,18 +34,24 @@ class PathError(ValueError):
 
 
 def viewpoints(path: PathConfig) -> list[Array]:
-    """Camera-to-world (4, 4) of every viewpoint, ring after ring, there and back."""
-    first, last = path.azimuths_deg
-    count = max(2, round(abs(last - first) / path.step_deg) + 1)
-    ring = np.deg2rad(np.linspace(first, last, count))
+    """Camera-to-world (4, 4) of every viewpoint: from the highest ring down, beside that up again, and so on.
+    An arm comes farther so than ring by ring: it need not pass behind the target at a stretch."""
     target = np.array(path.target_m)
     poses = []
-    for k, elevation_deg in enumerate(path.elevations_deg):
+    for elevation_deg, a in _places(path):
         e = math.radians(elevation_deg)
-        for a in ring if k % 2 == 0 else ring[::-1]:
-            away = np.array([math.cos(e) * math.sin(a), -math.cos(e) * math.cos(a), math.sin(e)])
-            poses.append(look_at(target + path.radius_m * away, target))
+        away = np.array([math.cos(e) * math.sin(a), -math.cos(e) * math.cos(a), math.sin(e)])
+        poses.append(look_at(target + path.radius_m * away, target))
     return poses
+
+
+def _places(path: PathConfig) -> list[tuple[float, float]]:
+    """Elevation (degrees) and azimuth (radians) of every viewpoint."""
+    first, last = path.azimuths_deg
+    count = max(2, round(abs(last - first) / path.step_deg) + 1)
+    down = sorted(path.elevations_deg, reverse=True)
+    azimuths = np.deg2rad(np.linspace(first, last, count))
+    return [(e, float(a)) for k, a in enumerate(azimuths) for e in (down if k % 2 == 0 else down[::-1])]
 
 
 def tour(
@@ -62,7 +72,7 @@ def tour(
     if len(best) < 3:
         raise PathError(
             f"the arm reaches {len(best)} of {len(goals)} viewpoints: change radius_m, elevations_deg, "
-            "azimuths_deg or where the base stands"
+            "azimuths_deg, where the base stands, or the arm's posture before"
         )
     return best
 
@@ -72,13 +82,13 @@ def reached_by_ring(
 ) -> list[int]:
     """How many of each ring's viewpoints the postures ``stops`` (N, 6) of a tour take the camera to, in the
     order of ``path.elevations_deg``."""
-    poses = viewpoints(path)
-    ring = len(poses) // len(path.elevations_deg)
-    places = np.array([pose[:3, 3] for pose in poses])
+    elevations_deg = [elevation_deg for elevation_deg, _ in _places(path)]
+    places = np.array([pose[:3, 3] for pose in viewpoints(path)])
     out = [0] * len(path.elevations_deg)
     for joints in stops:
         at = (base @ arm.forward(joints) @ hand_eye)[:3, 3]
-        out[int(np.argmin(np.linalg.norm(places - at, axis=1))) // ring] += 1
+        nearest = int(np.argmin(np.linalg.norm(places - at, axis=1)))
+        out[path.elevations_deg.index(elevations_deg[nearest])] += 1
     return out
 
 
@@ -100,10 +110,10 @@ def _follow(
 
 
 def _clear(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> bool:
-    """Whether the middle of no joint beyond the shoulder comes below the floor on the way from ``a`` to
-    ``b``; links are not looked at."""
-    for part in np.linspace(0.0, 1.0, _LOOKS):
-        heights = (base @ arm.links((1.0 - part) * a + part * b))[2:, 2, 3]
-        if heights.min() < floor_m:
-            return False
-    return True
+    """Whether on the way from ``a`` to ``b`` no part of the arm comes near another, and the middle of no
+    joint beyond the shoulder below the floor."""
+    frames = links(arm.body, a + np.linspace(0.0, 1.0, _LOOKS)[:, None] * (b - a))
+    if (base @ frames)[:, 2:, 2, 3].min() < floor_m:
+        return False
+    apart, _ = Shape(arm, _TOOL_M, _TOOL_RADIUS_M).clearance(frames)
+    return bool(apart.min() >= _MARGIN_M)

@@ -50,8 +50,9 @@ def _rows(file: Path) -> np.ndarray:
         raise DatasetError(f"{file}: no such file")
     try:
         rows = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DatasetError(f"{file}: cannot be read as numbers of numpy: {error}; is it complete?") from None
+    except Exception as error:  # numpy reads a damaged header as Python, which raises anything
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise DatasetError(f"{file}: cannot be read as numbers of numpy: {why}; is it complete?") from None
     if (
         not isinstance(rows, np.ndarray)
         or rows.ndim != 2

@@ -51,6 +51,5 @@ def load_object(file: Path) -> Any:
     except FileNotFoundError:
         raise DatasetError(f"{file}: no such file") from None
     except Exception as error:  # a damaged pickle raises anything
-        raise DatasetError(
-            f"{file}: cannot be read: {error or type(error).__name__}; is it complete?"
-        ) from None
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise DatasetError(f"{file}: cannot be read: {why}; is it complete?") from None

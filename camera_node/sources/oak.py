@@ -1,7 +1,8 @@
 """Luxonis OAK cameras through depthai 3: colour frames with the instant of their exposure (thesis 4.3.1).
 
 The device's clock is kept in step with the host's by the library; a frame's stamp is taken at the middle of
-its exposure. Intrinsics come from the calibration that is burnt into the device.
+its exposure. Intrinsics come from the calibration that is burnt into the device, and a lens that can focus
+stays where it was then.
 """
 
 from __future__ import annotations
@@ -81,6 +82,10 @@ class OakFeed:
             self._pipeline = dai.Pipeline(self._device)
             socket = getattr(dai.CameraBoardSocket, config.socket)
             node = self._pipeline.create(dai.node.Camera).build(socket)
+            calibration = self._device.readCalibration()
+            focus = calibrated_focus(calibration, socket)
+            if focus:
+                node.initialControl.setManualFocus(focus)
             if config.exposure_us is not None:
                 node.initialControl.setManualExposure(config.exposure_us, config.iso)
             output = node.requestOutput(
@@ -92,7 +97,6 @@ class OakFeed:
             self._frames = Frames(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
             self._pipeline.start()
             size = (config.width, config.height)
-            calibration = self._device.readCalibration()
             self.intrinsics, self.no_lens = lens_or_why(
                 lambda: lens(camera, calibration, socket, size, config.rectify)
             )
@@ -133,6 +137,15 @@ class Frames:
         age = self._dai.Clock.now() - exposed
         captured_ns = self._clock.now_ns() - (age // datetime.timedelta(microseconds=1)) * 1000
         return captured_ns, cast(Image, np.ascontiguousarray(frame.getCvFrame()[:, :, ::-1]))
+
+
+def calibrated_focus(calibration: Any, socket: Any) -> int:
+    """Position (1 to 255) of the lens at which the device was calibrated, 0 for one that does not move, or
+    was never calibrated. Wherever else autofocus puts it, its focal length is another."""
+    try:
+        return int(calibration.getLensPosition(socket))
+    except RuntimeError:
+        return 0
 
 
 def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rectified: bool) -> Pinhole:

@@ -43,7 +43,8 @@ class Shape:
         return links(self.arm, joints)[:, 6, :3, 3]
 
     def segments(self, frames: Array) -> tuple[Array, Array]:
-        """Ends (T, 8, 3), (T, 8, 3) of the parts' axes for ``links`` (T, 7, 4, 4), in the order of PARTS."""
+        """Ends (T, 8, 3), (T, 8, 3) of the parts' axes for ``links`` (T, 7, 4, 4) of the arm's ``body``, in
+        the order of PARTS."""
         at, z = frames[:, :, :3, 3], frames[:, :, :3, 2]
         upper, fore = _UPPER_ARM_M * z[:, 1], _FOREARM_M * z[:, 1]
         zero = np.zeros_like(at[:, 0])
@@ -60,8 +61,8 @@ class Shape:
         return np.array([*_RADII_M, self.tool_radius_m])
 
     def clearance(self, frames: Array) -> tuple[Array, Array]:
-        """(T, pairs) metres between the surfaces of PAIRS, negative where they overlap, and (T,) the height
-        of the lowest point of what lies beyond the upper arm."""
+        """Of ``links`` of the arm's ``body``: (T, pairs) metres between the surfaces of PAIRS, negative where
+        they overlap, and (T,) the height of the lowest point of what lies beyond the upper arm."""
         a, b = self.segments(frames)
         first, second = np.array(PAIRS).T
         radii = self.radii

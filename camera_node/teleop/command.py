@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import signal
 import sys
 import threading
@@ -62,12 +63,16 @@ def run(args: argparse.Namespace) -> int:
         # After the question: a keyboard as a stylus takes the terminal's line mode away.
         stylus = open_stylus(args.stylus)
         sink = _sink(args.dry_run, stream, model, clock, config)
-        return _operate(operator, stylus, sink, clock, args.seconds, args.json)
+        status = _operate(operator, stylus, sink, clock, args.seconds, args.json)
     finally:
         if stylus is not None:
             stylus.close()
         if stream is not None:
             stream.stop()
+    if status and stream is not None:
+        sys.stdout.flush()
+        os._exit(status)  # the library's destructor would wait for an arm that may be gone
+    return status
 
 
 def teleop_config(scenario: Scenario, arm: ArmConfig) -> TeleopConfig:

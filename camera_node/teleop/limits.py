@@ -132,7 +132,8 @@ class Limiter:
     def _broken(self, q: Array, v: Array) -> str | None:
         """The limit that stopping from (q, v) would break, if any."""
         path, _ = self.joint_limits.stop(q, v)
-        frames = links(self.shape.arm, np.concatenate([self.q[None], path]))
+        arm = self.shape.arm
+        frames = links(arm, np.concatenate([self.q[None], path]))
         flange = frames[:, 6, :3, 3]
         if np.any(flange[1:] < self._low_m) or np.any(flange[1:] > self._high_m):
             return "box"
@@ -140,7 +141,7 @@ class Limiter:
         most = (self.config.speed_m_s * self.dt_s) ** 2 * (1.0 - _ROUNDING)
         if np.einsum("ij,ij->i", steps, steps).max() > most:
             return "speed"
-        apart, lowest = self.shape.clearance(frames[1:])
+        apart, lowest = self.shape.clearance(frames[1:] if arm.body is arm else links(arm.body, path))
         if lowest.min() < self.config.floor_m + _ROUNDING:
             return "floor"
         return "near" if apart.min() < self.config.margin_m + _ROUNDING else None
@@ -157,15 +158,14 @@ class Limiter:
                 f"joint {joint + 1} stands at {np.degrees(q[joint]):.1f} degrees, within joint_margin_rad of "
                 "its limit: turn it back with the pendant"
             )
-        frames = links(self.shape.arm, q[None])
-        at = frames[0, 6, :3, 3]
+        at = self.shape.flange(q[None])[0]
         if np.any(at < self._low_m) or np.any(at > self._high_m):
             raise TeleopError(
                 f"the flange stands at {np.round(at, 3).tolist()} m, outside the workspace "
                 f"{c.workspace_low_m} to {c.workspace_high_m}: move it inside, or change workspace_low_m and "
                 "workspace_high_m"
             )
-        apart, lowest = self.shape.clearance(frames)
+        apart, lowest = self.shape.clearance(links(self.shape.arm.body, q[None]))
         if lowest[0] < c.floor_m + _ROUNDING:
             raise TeleopError(f"a part of the arm stands {lowest[0]:.3f} m high, below floor_m {c.floor_m:g}")
         if apart.min() < c.margin_m + _ROUNDING:

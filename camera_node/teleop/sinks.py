@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.pose.arm import ArmError, ArmStream
-from camera_node.pose.drive import connect_control
+from camera_node.pose.drive import connect_control, within_reason
 from camera_node.pose.kinematics import ArmModel
 from camera_node.pose.rig import PoseGapError
 from camera_node.teleop.teleoperator import Command
@@ -66,19 +66,22 @@ class ServoSink:
             actual, _ = self._stream.at(self._clock.now_ns())
         except PoseGapError as error:
             raise ArmError(f"{error}: stopped") from None
+        if self._stream.trouble:  # a program that is paused by a stop would go on by a leap when released
+            raise ArmError(f"{self._stream.trouble}: stopped")
         behind = float(np.abs(actual - command.joints).max())
         if behind > _BEHIND_RAD:
             raise ArmError(
                 f"arm at {self._stream.host}: {np.degrees(behind):.0f} degrees behind its target: stopped; "
-                f"{self._stream.trouble or 'is something in its way, or is its speed slider down?'}"
+                "is something in its way, or is its speed slider down?"
             )
         if not self._control.servoJ(command.joints.tolist(), 0.0, 0.0, self._period_s, _LOOKAHEAD_S, _PULL):
-            raise ArmError(
-                f"arm at {self._stream.host}: it refuses to move: {self._stream.trouble or 'see the pendant'}"
-            )
+            raise ArmError(f"arm at {self._stream.host}: it refuses to move: see the pendant")
 
     def close(self) -> None:
         """Stop the arm, and the program on its controller."""
+        within_reason(self._stop)
+
+    def _stop(self) -> None:
         with contextlib.suppress(RuntimeError):
             self._control.servoStop(_STOP_RAD_S2)
             self._control.stopScript()

@@ -174,7 +174,7 @@ def _model(arm: ArmModel, config: TeleopConfig) -> tuple[Any, Any]:
     collisions = pin.GeometryModel()
     data, zero = model.createData(), np.zeros(6)
     pin.forwardKinematics(model, data, zero)
-    a, b = shape.segments(arm.links(zero)[None])
+    a, b = shape.segments(arm.body.links(zero)[None])
     # The joint that moves each part, in the order of capsules.PARTS.
     moved_by = (0, 1, 2, 3, 4, 5, 6, 6)
     for k, (start, end, radius, joint) in enumerate(zip(a[0], b[0], shape.radii, moved_by)):

@@ -83,6 +83,9 @@ def test_dynerf_damage_is_named(tmp_path):
     whole = file.read_bytes()
     file.write_bytes(whole[:-40])
     fails(r"poses_bounds\.npy: cannot be read .* complete", dynerf_files.load_dataset, folder)
+    for of, becomes in ((b"}", b" "), (b"'shape': (3", b"'shape': (9" + b"9" * 10)):
+        file.write_bytes(whole.replace(of, becomes, 1))
+        fails(r"poses_bounds\.npy: cannot be read", dynerf_files.load_dataset, folder)
     np.save(file, np.zeros((3, 15)))
     fails(r"expected numbers of shape \(cameras, 17\), got \(3, 15\)", dynerf_files.load_dataset, folder)
     rows = np.load(io.BytesIO(whole))

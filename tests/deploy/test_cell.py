@@ -79,7 +79,7 @@ def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
     frames = run.report()["frames"]
     assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
     views = {tuple(line.split()) for line in (run.out / "log-driver.txt").read_text().splitlines()}
-    assert ("29", "viewpoints") in views
+    assert ("34", "viewpoints") in views
     # The arm sets out when the field can learn, not while it compiles.
     rows = [json.loads(line) for line in (run.out / "processes.jsonl").read_text().splitlines()]
     assert "driver" in rows[-1] and "driver" not in next(row for row in rows if "node" in row)

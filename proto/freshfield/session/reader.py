@@ -21,6 +21,7 @@ try:
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
     from google.protobuf.message import DecodeError
     from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import McapError
     from mcap.opcode import Opcode
     from mcap.records import Channel, Chunk, Message
     from mcap.stream_reader import get_chunk_data_stream
@@ -55,7 +56,7 @@ class Session:
     """The frames of a recording, by camera, in the order of their arrival. Thread-safe.
 
     messages: complete ones of all topics, counted by topic. cut: what is missing, in one line, or None: for
-    a file that was not closed, or of which chunks are damaged. Raises SessionError, OSError."""
+    a file that was not closed, or of which parts are damaged. Raises SessionError, OSError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -77,7 +78,7 @@ class Session:
             where = f"cut short at byte {end} of {self._size}"
             said.append(where if end < self._size else f"never closed, ends at byte {end}")
         if self._damaged:
-            said.append(f"{self._damaged} damaged chunks left out")
+            said.append(f"{self._damaged} damaged chunks or records left out")
         if said:
             self.cut = f"{path}: {', '.join(said)}: {sum(self.messages.values())} complete messages are used"
 
@@ -86,7 +87,7 @@ class Session:
         body = self._body(frame.place)
         try:
             return bytes(CompressedImage.FromString(_message(body).data).data)
-        except (DecodeError, struct.error, EOFError) as error:
+        except (DecodeError, McapError, struct.error, ValueError, EOFError) as error:
             raise SessionError(f"{self.path}: a message cannot be read again: {error}") from None
 
     def close(self) -> None:
@@ -160,6 +161,12 @@ class Session:
         return stream.read(length)
 
     def _record(self, opcode: int, body: bytes, place: _Place) -> None:
+        try:
+            self._note(opcode, body, place)
+        except (McapError, struct.error, ValueError, EOFError):  # nothing checks what stands outside chunks
+            self._damaged += 1
+
+    def _note(self, opcode: int, body: bytes, place: _Place) -> None:
         if opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(BytesIO(body)))
             self._channels[channel.id] = channel.topic

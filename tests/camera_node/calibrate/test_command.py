@@ -183,6 +183,14 @@ def test_mistakes_are_one_line(tmp_path, capsys, pairs):
     assert "too few poses: 2" in fails("--pairs", tmp_path / "three.json")
 
 
+@pytest.mark.parametrize("option", ["--out", "--plot"])
+def test_an_answer_is_not_lost_with_its_file(option, tmp_path, capsys, pairs):
+    assert hand_eye("--pairs", pairs, "--json", option, tmp_path / "no" / "folder.png") == 2
+    said = capsys.readouterr()
+    assert distance_mm(np.array(json.loads(said.out)["transform"]), X) < 1.5
+    assert said.err.startswith(f"camera-node: {option}: ")
+
+
 @pytest.mark.parametrize("spelling", ["charuco:7x5:30mm:22mm", "apriltag:36h11:0:80mm", "qr:60mm:hello"])
 def test_a_printed_target_is_one(spelling, tmp_path, capsys):
     file = tmp_path / "board.png"

@@ -104,6 +104,9 @@ def test_tracks_need_an_arm_and_motion(tmp_path, capsys):
     options = ["--live", str(scenario(tmp_path)), "--camera", "eye", "--board", BOARD]
     assert main(["calibrate", "hand-eye", *options, "--tracks", str(tmp_path)]) == 2
     assert "--tracks: goes with --moving" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main(["calibrate", "hand-eye", *options, "--moving", "--tracks", str(tmp_path / "file")]) == 2
+    assert "--tracks: " in capsys.readouterr().err, "before the camera is opened"
 
 
 def test_the_cameras_own_stamps_are_kept_with_what_was_seen():

@@ -11,7 +11,11 @@ import sys
 import time
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
+
+from camera_node.sources.on_arm import Truth
+from freshfield.clock import WallClock
 
 _numbers = itertools.count(1)
 
@@ -44,3 +48,12 @@ def simulated_arm(host: str, *options: str) -> Iterator[subprocess.Popen[str]]:
     finally:
         process.kill()
         process.communicate()
+
+
+def wait_until_moving(truth: Truth, process: subprocess.Popen[str]) -> None:
+    """Until the arm has moved visibly; fails where ``process``, which is to move it, ends first."""
+    clock = WallClock()
+    start = truth.joints(clock.now_ns())
+    while np.abs(truth.joints(clock.now_ns()) - start).max() < 0.05:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)

@@ -23,7 +23,7 @@ from camera_node.pose.path import tour
 from camera_node.sources.on_arm import Truth
 from freshfield.clock import WallClock
 from freshfield.scenario import load
-from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm, wait_until_moving
 
 
 @pytest.fixture
@@ -52,14 +52,6 @@ def near(file):
     """--joints of an arm that stands some 30 degrees before the first viewpoint."""
     angles = np.add(np.rad2deg(stops_of(file)[0]), [30, 10, 0, 0, 0, 0])
     return "--joints=" + ",".join(f"{angle:.3f}" for angle in angles)
-
-
-def wait_until_moving(truth, process):
-    clock = WallClock()
-    start = truth.joints(clock.now_ns())
-    while np.abs(truth.joints(clock.now_ns()) - start).max() < 0.05:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
 
 
 def at_rest(truth, within_s=5.0):

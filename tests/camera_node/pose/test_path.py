@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from camera_node.config import PathConfig, source_config
-from camera_node.pose.kinematics import UR3E
+from camera_node.pose.controller.controller import HOME_RAD
+from camera_node.pose.kinematics import UR3E, calibrated
 from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
-from camera_node.pose.path import PathError, tour, viewpoints
+from camera_node.pose.path import PathError, _clear, reached_by_ring, tour, viewpoints
+from camera_node.teleop.capsules import Shape, links
 from freshfield.scenario import ScenarioError, load, parse
+from tests.camera_node.pose.test_kinematics import CALIBRATION
 
 CELL = load("cell")
 ARM = source_config(CELL).arm
@@ -23,12 +26,17 @@ def test_viewpoints_look_at_their_target_from_their_radius():
         to = np.array(path.target_m) - pose[:3, 3]
         assert np.isclose(np.linalg.norm(to), 0.5) and np.allclose(pose[:3, 2], to / 0.5)
     azimuths = [np.arctan2(pose[0, 3] - 0.1, 0.2 - pose[1, 3]) for pose in poses]
-    assert np.isclose(azimuths[6], azimuths[7])  # there and back: no leap from ring to ring
+    heights = [pose[2, 3] for pose in poses]
+    assert heights[0] > heights[1] and np.isclose(azimuths[0], azimuths[1])  # down, and beside that up again
+    assert np.isclose(heights[1], heights[2]) and azimuths[1] < azimuths[2]
 
 
 def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
     stops = tour(UR3E, BASE, MOUNT, ARM.path)
-    assert len(stops) >= 20
+    assert len(stops) >= 34
+    reached = reached_by_ring(stops, UR3E, BASE, MOUNT, ARM.path)
+    assert sum(reached) == len(stops) and min(reached) >= 8
+    shape = Shape(UR3E, 0.08, 0.04)
     eyes = []
     for before, joints in zip([stops[0], *stops], stops):
         camera = BASE @ UR3E.forward(joints) @ MOUNT
@@ -36,9 +44,9 @@ def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
         assert np.isclose(np.linalg.norm(to), ARM.path.radius_m) and camera[:3, 2] @ to > 0
         assert not UR3E.singularities(joints)
         assert np.abs(joints - before).max() <= 2.0
-        for part in np.linspace(0, 1, 5):
-            on_the_way = UR3E.links((1 - part) * before + part * joints)
-            assert min((BASE @ link)[2, 3] for link in on_the_way[2:]) > 0.04
+        on_the_way = links(UR3E, before + np.linspace(0, 1, 40)[:, None] * (joints - before))
+        assert (BASE @ on_the_way)[:, 2:, 2, 3].min() > 0.04
+        assert shape.clearance(on_the_way)[0].min() > 0.0
         eyes.append(camera[:3, 3] - ARM.path.target_m)
     azimuths = np.rad2deg(np.arctan2([e[0] for e in eyes], [-e[1] for e in eyes]))
     assert azimuths.min() < -80 and azimuths.max() > 80
@@ -48,6 +56,34 @@ def test_the_tour_begins_where_it_can_be_begun():
     free = tour(UR3E, BASE, MOUNT, ARM.path)
     again = tour(UR3E, BASE, MOUNT, ARM.path, start=free[0])
     assert np.allclose(again[0], free[0], atol=1e-9)
+
+
+def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
+    """The height of its joints, not of the frames that its calibration puts metres beside them."""
+    file = tmp_path / "calibration.conf"
+    file.write_text(CALIBRATION)
+    arm = calibrated(UR3E, file)
+    shape, free = Shape(UR3E, 0.08, 0.04), 0
+    for joints in np.random.default_rng(6).uniform(-3, 3, (200, 6)):
+        if shape.clearance(links(UR3E, joints[None]))[0].min() < 0.03:
+            continue
+        free += 1
+        lowest_m = (BASE @ UR3E.links(joints))[2:, 2, 3].min()
+        for floor_m in (lowest_m - 0.006, lowest_m + 0.006):
+            assert _clear(arm, BASE, joints, joints, floor_m) == (floor_m < lowest_m)
+    assert free > 50
+
+
+def test_an_arm_is_not_driven_through_itself():
+    """Between two postures that are free the straight way in joint space need not be."""
+    folded = np.array(HOME_RAD)
+    folded[2] = -np.pi + 0.05
+    other = np.array(HOME_RAD)
+    other[2] = -2 * np.pi + np.pi / 2
+    home = np.array(HOME_RAD)
+    assert _clear(UR3E, BASE, home, home, -1.0) and _clear(UR3E, BASE, other, other, -1.0)
+    assert not _clear(UR3E, BASE, folded, folded, -1.0)
+    assert not _clear(UR3E, BASE, home, other, -1.0)
 
 
 def test_a_tour_out_of_reach_says_what_to_change():

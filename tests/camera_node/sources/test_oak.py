@@ -156,6 +156,21 @@ def test_a_device_without_calibration_opens_all_the_same(monkeypatch):
     assert oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock()).intrinsics
 
 
+def test_a_lens_that_can_focus_stays_where_it_was_calibrated(monkeypatch):
+    """Autofocus would change the focal length from picture to picture, and nobody would be told."""
+    device, pipeline = MagicMock(), MagicMock()
+    monkeypatch.setattr(dai, "Device", lambda info: device)
+    monkeypatch.setattr(dai, "Pipeline", pipeline)
+    monkeypatch.setattr(oak, "find", lambda camera, name: None)
+    control = pipeline.return_value.create.return_value.build.return_value.initialControl
+    device.readCalibration.return_value = known = calibration()
+    for position in (0, 131):  # 0: a fixed lens
+        known.setLensPosition(dai.CameraBoardSocket.CAM_A, position)
+        oak.OakFeed("eye", None, source_config(plan()), Fraction(10), WallClock())
+    assert control.setManualFocus.call_args_list == [((131,),)]
+    assert hasattr(dai.CameraControl(), "setManualFocus")
+
+
 def test_without_a_device_one_clear_line_within_three_seconds():
     if dai.Device.getAllAvailableDevices():
         pytest.skip("there is an OAK camera here")

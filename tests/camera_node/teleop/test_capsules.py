@@ -3,12 +3,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.pose.kinematics import UR3E
+from camera_node.pose.kinematics import UR3E, calibrated
+from camera_node.teleop import TeleopError
 from camera_node.teleop.capsules import PAIRS, PARTS, Shape, distance, links
+from camera_node.teleop.limits import Limiter
 from camera_node.teleop.settings import TeleopConfig
+from tests.camera_node.pose.test_kinematics import CALIBRATION
 from tests.camera_node.teleop.checks import HOME
 
 SHAPE = Shape(UR3E, 0.12, 0.04)
+OPEN = TeleopConfig(workspace_low_m=(-1, -1, -1), workspace_high_m=(1, 1, 1), floor_m=-1.0)
 
 
 def test_links_of_many_postures_are_those_of_each():
@@ -48,6 +52,37 @@ def test_clearances_are_those_of_a_collision_library():
         assert np.allclose(theirs[: len(PAIRS)][free], apart[0][free], atol=1e-5)
         floor = theirs[len(PAIRS) :].min() + config.floor_m - config.margin_m
         assert floor == pytest.approx(lowest[0], abs=1e-5)
+
+
+def test_parts_of_a_calibrated_arm_stay_where_they_are(tmp_path):
+    """Its link frames lie metres beside it: neither the limits nor pink may take them for the arm."""
+    file = tmp_path / "calibration.conf"
+    file.write_text(CALIBRATION)
+    arm = calibrated(UR3E, file)
+    assert np.abs(arm.links(HOME) - UR3E.links(HOME)).max() > 2.0
+    shape, met = Shape(UR3E, OPEN.tool_m, OPEN.tool_radius_m), 0
+    for q in np.random.default_rng(4).uniform(-3, 3, (60, 6)):
+        apart_m = shape.clearance(links(UR3E, q[None]))[0].min()
+        if apart_m > OPEN.margin_m + 0.01:
+            Limiter(arm, OPEN, q)
+        elif apart_m < OPEN.margin_m - 0.01:
+            met += 1
+            with pytest.raises(TeleopError, match="mm apart"):
+                Limiter(arm, OPEN, q)
+    assert met > 10
+    pin = pytest.importorskip("pinocchio", reason="needs pinocchio: pip install -e '.[teleop]'")
+    from camera_node.teleop.solver import _model
+
+    for q in np.random.default_rng(4).uniform(-3, 3, (20, 6)):
+        distances = []
+        for each in (UR3E, arm):
+            model, collisions = _model(each, OPEN)
+            found = collisions.createData()
+            pin.computeDistances(model, model.createData(), collisions, found, q)
+            distances.append([pair.min_distance for pair in found.distanceResults])
+        theirs, ours = np.array(distances)
+        both = (theirs > 0) & (ours > 0)
+        assert np.abs(theirs - ours)[both].max() < 0.02
 
 
 def test_a_folded_arm_meets_itself_and_home_does_not():

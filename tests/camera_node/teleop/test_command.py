@@ -3,21 +3,28 @@ from __future__ import annotations
 import csv
 import json
 import math
+import signal
 import socket
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
 from camera_node.cli import main
+from camera_node.pose.arm import ArmError
 from camera_node.pose.kinematics import UR3E
+from camera_node.sources.on_arm import Truth
+from camera_node.teleop import sinks
 from camera_node.teleop.command import teleop_config
 from camera_node.teleop.network import encode
+from camera_node.teleop.teleoperator import Command
+from freshfield.clock import WallClock
 from freshfield.scenario import load
-from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm, wait_until_moving
 from tests.camera_node.teleop.checks import HOME, sample
 from tests.conftest import ROOT
 
@@ -99,6 +106,44 @@ def test_the_real_library_moves_a_simulated_controller(tmp_path, capsys):
             truth.sendall(b"9223372036854775807\n")
             joints = np.array(json.loads(truth.makefile().readline())["q"])
     assert np.abs(joints - HOME).max() > 1e-3, "the arm has moved"
+
+
+@pytest.mark.slow
+def test_an_arm_that_goes_silent_ends_it_with_one_line(tmp_path):
+    require_ur_rtde()
+    host, port = own_address(), free_port()
+    file = cell(tmp_path, host, "solver: dls")
+    file.write_text(file.read_text().replace("simulated: true", "simulated: false"))  # patience as on a bench
+    command = [
+        sys.executable, "-m", "camera_node.cli", "teleop", str(file), "--stylus", f"network:{port}",
+        "--yes", "--json",
+    ]  # fmt: skip
+    with simulated_arm(host) as arm, Sender(port):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        wait_until_moving(Truth(host), process)
+        arm.send_signal(signal.SIGSTOP)
+        try:
+            assert process.wait(30.0) == 1
+        finally:
+            process.kill()
+            arm.send_signal(signal.SIGCONT)
+    out, said = process.communicate()
+    assert f"camera-node: arm at {host}" in said
+    summary = out.splitlines()[-1]  # after what the library has to say
+    assert json.loads(summary)["messages"]["engaged"] >= 1
+
+
+def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
+    control, stream = MagicMock(), MagicMock(host="10.0.0.1", trouble="")
+    stream.at.return_value = HOME, 0
+    monkeypatch.setattr(sinks, "connect_control", lambda host: control)
+    sink, still = sinks.ServoSink(stream, WallClock(), 0.01), Command(HOME, np.zeros(6), "holding")
+    sink.send(0.0, still)
+    assert control.servoJ.call_count == 1
+    stream.trouble = "arm at 10.0.0.1: safety: protective stop"
+    with pytest.raises(ArmError, match="protective stop: stopped"):
+        sink.send(0.01, still)
+    assert control.servoJ.call_count == 1
 
 
 def test_an_arm_that_is_not_there_is_one_line_and_moves_nothing(tmp_path, capsys):
