@@ -33,7 +33,7 @@ from edge_server.offline.training.setting import seeds
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from tests.edge_server.offline.training.small import FIELD, reported
 
-SMALL = {"steps": 3, "decisions": 1, "lead_ms": 800.0, "span_ms": 400.0}
+SMALL = {"steps": 3, "decisions": 1, "lead_ms": 1000.0, "span_ms": 400.0}
 
 
 @pytest.fixture
