@@ -170,7 +170,10 @@ class Updates:
         treated = self._treated(views, earlier, publishes_ns or selection.now_ns)
         if self.keyframes is None:
             return views, self.field.fit(treated, budget)
-        report = self.field.fit(self.keyframes.with_earlier(treated), budget)
+        given = self.keyframes.with_earlier(treated)
+        if self.keyframes.outgrown(len(given)):
+            self.field.reset()
+        report = self.field.fit(given, budget)
         own = {view.camera for view in views}  # what is refused of an earlier viewpoint is no frame's matter
         return views, replace(report, refused=tuple(c for c in report.refused if c in own))
 
@@ -212,13 +215,13 @@ class Updates:
         return publication
 
 
-def open_keyframes(config: KeyframesConfig | None) -> Keyframes | None:
-    """What keeps earlier viewpoints, where a scenario asks for it."""
+def open_keyframes(config: KeyframesConfig | None, resumed: bool = False) -> Keyframes | None:
+    """What keeps earlier viewpoints, where a scenario asks for it. resumed: as in ``Keyframes``."""
     if config is None:
         return None
     from edge_server.keyframes import Keyframes
 
-    return Keyframes(config)
+    return Keyframes(config, resumed)
 
 
 def open_foreground(config: ForegroundConfig | None, scenario: Scenario) -> Foreground | None:

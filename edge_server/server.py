@@ -110,7 +110,7 @@ class EdgeServer:
                 policy = self.lessons.apprentice
             self._embedding = embedding_for(config, policy)
             embedder = open_embedder(self._embedding)
-            keyframes = open_keyframes(config.keyframes)
+            keyframes = open_keyframes(config.keyframes, resumed=options.resume is not None)
             foreground = open_foreground(config.foreground, scenario)
             self.updates = Updates(
                 self.buffer, policy, self.field, self.start_ns, embedder, keyframes, foreground

@@ -104,6 +104,17 @@ def test_the_oldest_gives_way():
     assert len(kept.with_earlier([view("hand", 0, 11)])) == 1
 
 
+def test_a_field_of_few_viewpoints_is_begun_anew_when_they_double_and_a_resumed_one_never():
+    kept = Keyframes(KeyframesConfig())
+    counts = (1, 1, 2, 3, 4, 4, 7, 9, 15, 16, 18, 40)
+    assert [n for n in counts if kept.outgrown(n)] == [2, 4, 9, 18]
+    kept.forget()
+    assert [n for n in (1, 2) if kept.outgrown(n)] == [2]
+    assert not any(Keyframes(KeyframesConfig(), resumed=True).outgrown(n) for n in counts)
+    many = Keyframes(KeyframesConfig())  # a rig of twenty is no beginning
+    assert not any(many.outgrown(n) for n in (20, 40, 80))
+
+
 def test_updates_hand_them_to_the_field_and_report_frames_only():
     policy = make_policy("all", None, np.random.default_rng(0))
     u = Updates(FrameBuffer(["hand"]), policy, tiny_field(), 0, keyframes=Keyframes(KeyframesConfig()))
@@ -117,7 +128,7 @@ def test_updates_hand_them_to_the_field_and_report_frames_only():
     u.field.reset = lambda: given.append("reset") or reset()
     for k in range(3):
         assert names(_update(u, k)) == ["hand"]
-    assert given == [["hand"], ["hand", "hand#0"], ["hand", "hand#0", "hand#1"]]
+    assert given == [["hand"], "reset", ["hand", "hand#0"], ["hand", "hand#0", "hand#1"]]
     u.reset()
     _update(u, 3)
     assert given[-2:] == ["reset", ["hand"]]
