@@ -66,6 +66,19 @@ def as_camera_error(camera: str, error: Exception) -> CameraError:
     return CameraError(f"{camera}: {type(error).__name__}: {' '.join(str(error).split())}")
 
 
+def meant(camera: str, make: str, device: str | None, there: Sequence[str]) -> int:
+    """Which of the devices of a make (their serial numbers, one at least) is meant: the one named, or the
+    only one. Raises CameraError naming those that are there."""
+    names = ", ".join(there)
+    if device is None:
+        if len(there) > 1:
+            raise CameraError(f"{camera}: several {make} cameras, name one in source.devices: {names}")
+        return 0
+    if device not in there:
+        raise CameraError(f"{camera}: no {make} camera {device}; there are {names}")
+    return there.index(device)
+
+
 def opened(camera: str, open_feed: Callable[[], Feed]) -> Feed:
     """Raises CameraError, whatever the driver raises."""
     try:

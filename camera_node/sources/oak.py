@@ -20,7 +20,15 @@ import numpy as np
 from camera_node.config import OakConfig, SourceConfig
 from camera_node.sources import Source
 from camera_node.sources.coefficients import four_coefficients
-from camera_node.sources.live import CameraError, Feed, Image, as_camera_error, lens_or_why, open_live
+from camera_node.sources.live import (
+    CameraError,
+    Feed,
+    Image,
+    as_camera_error,
+    lens_or_why,
+    meant,
+    open_live,
+)
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError
@@ -57,13 +65,7 @@ def find(camera: str, device: str | None) -> Any:
             f"{camera}: no OAK camera found: is it plugged in (USB 3, its own supply), and may this "
             "user open it (udev rule for vendor 03e7, see deploy/lab)?"
         )
-    if device is None:
-        if len(there) > 1:
-            raise CameraError(f"{camera}: several OAK cameras, name one in source.devices: {', '.join(ids)}")
-        return there[0]
-    if device not in ids:
-        raise CameraError(f"{camera}: no OAK camera {device}; there are {', '.join(ids)}")
-    return there[ids.index(device)]
+    return there[meant(camera, "OAK", device, ids)]
 
 
 class OakFeed:

@@ -20,7 +20,15 @@ from camera_node.clocks import ArrivalClock
 from camera_node.config import RealsenseConfig, SourceConfig
 from camera_node.sources import Source
 from camera_node.sources.coefficients import four_coefficients
-from camera_node.sources.live import CameraError, Feed, Image, as_camera_error, lens_or_why, open_live
+from camera_node.sources.live import (
+    CameraError,
+    Feed,
+    Image,
+    as_camera_error,
+    lens_or_why,
+    meant,
+    open_live,
+)
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario
@@ -54,13 +62,7 @@ def find(camera: str, device: str | None) -> str:
             f"{camera}: no RealSense camera found: is it plugged in (USB 3), and may this user open it (udev "
             "rules of librealsense, see deploy/lab)?"
         )
-    if device is None and len(serials) > 1:
-        raise CameraError(
-            f"{camera}: several RealSense cameras, name one in source.devices: {', '.join(serials)}"
-        )
-    if device is not None and device not in serials:
-        raise CameraError(f"{camera}: no RealSense camera {device}; there are {', '.join(serials)}")
-    return serials[0] if device is None else device
+    return serials[meant(camera, "RealSense", device, serials)]
 
 
 class RealsenseFeed:

@@ -15,7 +15,7 @@ from camera_node.build import build_cameras
 from camera_node.config import CameraConfig, source_config
 from camera_node.pose.rig import FixedPose
 from camera_node.sources import camera as opencv_camera
-from camera_node.sources.live import CameraError, LiveSource, open_live
+from camera_node.sources.live import CameraError, LiveSource, meant, open_live
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, Pose
@@ -333,3 +333,11 @@ def test_the_first_frame_decides_whose_stamps_count(monkeypatch, clock, ages_ms,
         else:
             assert (clock.now_ns() - taken[0]) / 1e6 == pytest.approx(age_ms, abs=3.0)
     assert feed.stamped_by == stamped_by
+
+
+def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
+    assert meant("eye", "OAK", None, ["a"]) == 0 and meant("eye", "OAK", "b", ["a", "b"]) == 1
+    with pytest.raises(CameraError, match=r"^eye: several OAK cameras, name one in source.devices: a, b$"):
+        meant("eye", "OAK", None, ["a", "b"])
+    with pytest.raises(CameraError, match=r"^eye: no OAK camera c; there are a, b$"):
+        meant("eye", "OAK", "c", ["a", "b"])
