@@ -58,9 +58,10 @@ class PathConfig:
     """The tour that ``camera-node drive-arm`` makes: viewpoints on rings around a target, looking at it.
 
     target_m: in the world. radius_m: camera to target. elevations_deg: of the rings. azimuths_deg:
-    first and last of each ring, in the order of the tour (0 is on the target's -y side, 90 on its +x side).
-    step_deg: between viewpoints of a ring. speed_rad_s, acceleration_rad_s2: of the fastest joint. floor_m:
-    the middle of no joint beyond the shoulder comes lower, in the world's z.
+    first and last of each ring (0 is on the target's -y side, 90 on its +x side). step_deg: between
+    viewpoints of a ring. rolls_deg: turns about its line of sight that the camera may take at a viewpoint,
+    whichever the arm can get to. speed_rad_s, acceleration_rad_s2: of the fastest joint. floor_m: the middle
+    of no joint beyond the shoulder comes lower, in the world's z.
     """
 
     target_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -68,6 +69,7 @@ class PathConfig:
     elevations_deg: tuple[float, ...] = (45.0, 65.0)
     azimuths_deg: tuple[float, float] = (-90.0, 90.0)
     step_deg: float = 15.0
+    rolls_deg: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0)
     speed_rad_s: float = 0.5
     acceleration_rad_s2: float = 1.0
     floor_m: float = 0.05
@@ -77,6 +79,8 @@ class PathConfig:
             raise ValueError("elevations_deg: expected one or more from -89 to 89")
         if not self.radius_m > 0 or not 1.0 <= self.step_deg <= 120.0:
             raise ValueError("expected radius_m above 0 and step_deg from 1 to 120")
+        if not self.rolls_deg or not all(-360.0 <= turn <= 360.0 for turn in self.rolls_deg):
+            raise ValueError("rolls_deg: expected one or more from -360 to 360")
         if not 0 < self.speed_rad_s <= 3.14 or not 0 < self.acceleration_rad_s2 <= 40.0:
             raise ValueError("expected speed_rad_s from 0 to 3.14 and acceleration_rad_s2 from 0 to 40")
 

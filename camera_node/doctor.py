@@ -32,6 +32,9 @@ LEAST_FREE_GB = 2.0
 _EXCHANGES = 8
 _ANSWER_S = 2.0
 _LISTEN_S = 0.5
+_LISTEN_AT_MOST_S = 3.0  # to a slow camera
+_JUDGED_FRAMES = 5  # of the rate that was asked for; with fewer, chance decides
+_LEAST_RATE = 0.6
 _LEAST_REACHED = 0.6  # of a tour's viewpoints; with fewer, a side of the target stays unseen
 # extra -> (module, distribution)
 _PACKAGES = {
@@ -225,18 +228,20 @@ def _calibration(scenario: Scenario, config: LiveConfig) -> str:
 
 
 def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
-    """Open it, take frames for half a second, close it."""
-    from camera_node.sources.live import calibrations
+    """Open it, take frames until at least five should have come, close it."""
+    from camera_node.sources.live import DEFAULT_FPS, calibrations
 
     module: Any = importlib.import_module(f"camera_node.sources.{config.kind}")
     clock = WallClock()
-    feed = module.opener(camera, config.devices.get(camera), config, rate(config.fps or 15.0), clock)()
+    asked_hz = config.fps or DEFAULT_FPS
+    listen_s = min(max(_LISTEN_S, _JUDGED_FRAMES / asked_hz), _LISTEN_AT_MOST_S)
+    feed = module.opener(camera, config.devices.get(camera), config, rate(asked_hz), clock)()
     try:
         first = feed.grab(config.first_frame_s)
         if first is None:
             raise Wrong(f"it opened, but sent no frame for {config.first_frame_s:g} s")
-        ages_ms, until = [], time.monotonic() + _LISTEN_S
-        while time.monotonic() < until:
+        ages_ms, begin_s = [], time.monotonic()
+        while (spent_s := time.monotonic() - begin_s) < listen_s:
             taken = feed.grab(_LISTEN_S)
             if taken is not None:
                 ages_ms.append((clock.now_ns() - taken[0]) / 1e6)
@@ -250,9 +255,15 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
         raise Wrong(no_lens.removeprefix(f"{camera}: "))
     else:
         known = f"f = {lens.fx:.0f} px"
+    rate_hz = len(ages_ms) / spent_s
+    if rate_hz < _LEAST_RATE * asked_hz and asked_hz * spent_s >= _JUDGED_FRAMES:
+        raise Wrong(
+            f"{width} x {height}, but {rate_hz:.3g} frames a second of the {asked_hz:g} asked: is it too "
+            "dark (more light, or a shorter exposure_us), is it on USB 2 (another port or cable), can it do "
+            "this size so fast (smaller width and height, or fps)?"
+        )
     age = f", {sum(ages_ms) / len(ages_ms):.0f} ms old when they come" if ages_ms else ""
-    rate_hz = len(ages_ms) / _LISTEN_S
-    return f"{width} x {height}, {rate_hz:.0f} frames a second{age}, stamped by {stamped_by}; {known}"
+    return f"{width} x {height}, {rate_hz:.3g} frames a second{age}, stamped by {stamped_by}; {known}"
 
 
 def _hand_eye(scenario: Scenario, arm: ArmConfig) -> str:
@@ -302,22 +313,20 @@ def _arm(scenario: Scenario, arm: ArmConfig) -> str:
 def _path(scenario: Scenario, arm: ArmConfig) -> str:
     from camera_node.pose.mount import EYE_TO_HAND
     from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
-    from camera_node.pose.path import reached_by_ring, tour, viewpoints
+    from camera_node.pose.path import tour, viewpoints
 
     assert arm.path is not None
     carried = [m for m in hand_eyes(scenario, arm, arm.cameras).values() if m.setup != EYE_TO_HAND]
     if not carried:
         raise Wrong("no camera is on the hand: there is nothing to drive")
     model, base, mount = arm_model(scenario, arm), base_matrix(arm), carried[0].transform
-    stops = tour(model, base, mount, arm.path)
+    found = tour(model, base, mount, arm.path)
     count = len(viewpoints(arm.path))
-    said = f"the arm reaches {len(stops)} of {count} viewpoints"
-    if len(stops) >= _LEAST_REACHED * count:
+    said = f"the arm reaches {found.reached} of {count} viewpoints"
+    if found.reached >= _LEAST_REACHED * count:
         return said
     rings = ", ".join(
         f"{elevation_deg:g} degrees {reached} of {count // len(arm.path.elevations_deg)}"
-        for elevation_deg, reached in zip(
-            arm.path.elevations_deg, reached_by_ring(stops, model, base, mount, arm.path)
-        )
+        for elevation_deg, reached in zip(arm.path.elevations_deg, found.reached_by_ring(arm.path))
     )
     raise Wrong(f"{said} ({rings}): change radius_m, elevations_deg, azimuths_deg or where the base stands")

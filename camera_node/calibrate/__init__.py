@@ -8,3 +8,7 @@ from __future__ import annotations
 
 class CalibrationError(ValueError):
     """Data that no calibration can come from; the message says why and what to do."""
+
+
+class ArmStopped(Exception):
+    """An arm that a session moved and that moves no more; the message says why."""

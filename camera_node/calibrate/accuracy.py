@@ -4,7 +4,9 @@
   taking the nearest sample (thesis 4.3.3), a straight line with slerp, or the screw between two; and what a
   pair costs in processor time.
 - ``poses``: error of the hand-eye calibration against the number of poses, by method, beside the Cramer-Rao
-  bound; noise on the arm's side, .5 mm and .002 rad an axis. ``planned``: the refinement, with poses after
+  bound; noise on the arm's side, .5 mm and .002 rad an axis. ``rms_mm_std``, ``rms_deg_std``: standard
+  deviations of the errors over so many trials: an error below its bound is chance, and these say how much of
+  it to expect. ``planned``: the refinement, with poses after
   the first four where the guided session proposes them; its bound is that of its own poses.
 - ``offset``: error of the time offset between arm and camera against the length of the recording and speed.
 """
@@ -114,14 +116,29 @@ def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
                     pass
                 spent[name] += time.process_time() - begun
         for name in methods:
-            deg, mm = np.sqrt(np.mean(np.square(errors[name]), axis=0)) if errors[name] else (np.nan, np.nan)
+            (deg, mm), (deg_std, mm_std) = rms(np.reshape(errors[name], (-1, 2)))
             least = np.sqrt(np.mean(np.square(bounds[name]), axis=0))
             rows.append({
-                "poses": count, "method": name, "rms_mm": float(mm), "rms_deg": float(deg),
-                "bound_mm": float(least[1]), "bound_deg": float(least[0]),
+                "poses": count, "method": name, "trials": trials,
+                "rms_mm": float(mm), "rms_mm_std": float(mm_std), "bound_mm": float(least[1]),
+                "rms_deg": float(deg), "rms_deg_std": float(deg_std), "bound_deg": float(least[0]),
                 "failed": trials - len(errors[name]), "ms": spent[name] / trials * 1e3,
             })  # fmt: skip
     return rows
+
+
+def rms(errors: Array) -> tuple[Array, Array]:
+    """Root mean squares of the columns of (N, K), and their standard deviations from the scatter of the
+    squares; nan where there are too few rows to tell."""
+    squares = np.square(errors)
+    count = len(squares)
+    nothing = np.full(squares.shape[1], np.nan)
+    found = np.sqrt(squares.mean(axis=0)) if count else nothing
+    if count < 2:
+        return found, nothing
+    # d sqrt(m) = dm / (2 sqrt(m)); a mean of N squares deviates by their own deviation / sqrt(N).
+    deviation = squares.std(axis=0, ddof=1) / np.sqrt(count)
+    return found, np.divide(deviation, 2.0 * found, out=np.zeros_like(found), where=found > 0.0)
 
 
 def _seen(hands: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:

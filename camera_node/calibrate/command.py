@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from camera_node import stdout
 from camera_node.calibrate import CalibrationError
 
 if TYPE_CHECKING:
@@ -17,10 +19,12 @@ if TYPE_CHECKING:
 EXAMPLES = """examples:
   camera-node calibrate target charuco:7x5:30mm:22mm --out board.png        print it, measure it, fix it flat
   camera-node calibrate intrinsics pictures/ --board charuco:7x5:30mm:22mm --out lens.json
+  camera-node calibrate intrinsics --live bench.yaml --camera hand --board charuco:7x5:30mm:22mm
   camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
   camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [hand, target] pairs
   camera-node calibrate hand-eye --hand arm.csv --target seen.csv           streams, time offset unknown
   camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
+  camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --drive
   camera-node calibrate accuracy --quick                                    what poses and gaps are worth
 """
 
@@ -34,8 +38,8 @@ from, one of:
   --pairs FILE   JSON list of [end-effector in base, target in camera], 4 x 4 each
   --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, metres); the time offset is estimated too
   --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when it is
-                 enough. The hand's poses are those that the camera's source gives (without hand_eye), or
-                 --hand CSV of them, by seconds since the first frame
+                 enough; with --drive the arm moves by itself. The hand's poses are those that the camera's
+                 source gives (without hand_eye), or --hand CSV of them, by seconds since the first frame
 """
 
 
@@ -44,7 +48,8 @@ MAX_GAP_MS, WANT_MM = 50.0, 0.5
 _GO_WITH = {
     "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
     **dict.fromkeys(
-        ("camera", "data", "want_mm", "moving", "samples", "preview", "seconds", "tracks"), ("live",)
+        ("camera", "data", "want_mm", "moving", "drive", "yes", "samples", "preview", "seconds", "tracks"),
+        ("live",),
     ),
 }  # fmt: skip
 _SPELT = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
@@ -58,13 +63,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                                   epilog=EXAMPLES, formatter_class=raw))  # fmt: skip
     lens = what.add_parser("intrinsics", help="a camera's lens from pictures of a target", epilog=EXAMPLES,
                            formatter_class=raw)  # fmt: skip
-    lens.add_argument("folder", type=Path, help="10 to 20 pictures, the target tilted and in every corner")
+    lens.add_argument(
+        "folder", type=Path, nargs="?", metavar="FOLDER",
+        help="10 to 20 pictures, the target tilted and in every corner",
+    )  # fmt: skip
+    lens.add_argument(
+        "--live", metavar="SCENARIO",
+        help="instead, guided, with its --camera: where to show the target next, and when it is enough",
+    )  # fmt: skip
     _add_board(lens, required=True)
     lens.add_argument("--camera", default="cam00", metavar="ID", help="its name in the file (%(default)s)")
     lens.add_argument(
         "--out", type=Path, metavar="FILE", help="calibration JSON, as the video source reads it"
     )
     lens.add_argument("--json", action="store_true", help="print what --out writes")
+    live = lens.add_argument_group("with --live").add_argument
+    live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    live("--moving", action="store_true", help="take pictures while the target moves too: short exposures")
+    live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
+    live("--seconds", type=float, metavar="S", help="end after so long with what there is")
     target = what.add_parser("target", help="a picture of a target, to print", epilog=EXAMPLES,
                              formatter_class=raw)  # fmt: skip
     target.add_argument("board", metavar="SPEC", help="see hand-eye --board")
@@ -113,6 +130,9 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
          help=f"enough when the standard deviation is below this (default {WANT_MM:g})")
     live("--moving", action="store_true", help="take pictures while the hand moves too; with an arm, the "
          "time offset between its stamps and the camera's is estimated from the motion")
+    live("--drive", action="store_true", help="once it has seen the target, the scenario's arm goes by "
+         "itself where it is wanted, as fast as source.arm.path says and above its floor_m; asks first")
+    live("--yes", action="store_true", help="of --drive: the arm's space is clear: do not ask")
     live("--tracks", type=Path, metavar="DIR",
          help="with --moving and an arm: keeps both streams, hand.csv and target.csv, for --hand, --target")
     live("--samples", type=Path, metavar="FILE",
@@ -131,7 +151,8 @@ def run(args: argparse.Namespace) -> int:
     except ImportError:
         raise CalibrationError("calibration needs scipy (pip install 'freshfield[calibrate]')") from None
     try:
-        return {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "accuracy": _accuracy}[args.what](args)
+        with stdout.only_ours() if args.what == "hand-eye" and args.drive else contextlib.nullcontext():
+            return {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "accuracy": _accuracy}[args.what](args)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
@@ -207,7 +228,17 @@ def _intrinsics(args: argparse.Namespace) -> int:
     from camera_node.calibrate.targets import parse
     from freshfield import files
 
-    lens = calibrate_folder(pictures(args.folder), parse(args.board), _counting("pictures"))
+    if (args.folder is None) == (args.live is None):
+        raise CalibrationError("expected one of FOLDER, --live SCENARIO")
+    if args.folder is not None:
+        for option in ("data", "moving", "preview", "seconds"):
+            if getattr(args, option) not in (None, False):
+                raise CalibrationError(f"--{option}: goes with {_SPELT['live']}")
+        lens = calibrate_folder(pictures(args.folder), parse(args.board), _counting("pictures"))
+    else:
+        from camera_node.calibrate.lens_live import calibrate_live
+
+        lens = calibrate_live(args, parse(args.board))
     data = lens.calibration(args.camera)
     if args.out is not None:
         try:

@@ -19,7 +19,7 @@ from freshfield.geometry import Pinhole
 MIN_VIEWS = 4
 # All of the views flat against the sensor leave focal length and distance one unknown.
 MIN_TILT_DEG = 10.0
-_MIN_CORNERS = 6
+MIN_CORNERS = 6
 _OUTLIER = 4.0
 # Focal lengths over the picture's longer side: 136 and 7 degrees of view. Pictures that determine nothing let
 # the solver run away beyond.
@@ -99,7 +99,7 @@ def calibrate_folder(
 
 def calibrate(views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]) -> Lens:
     """From corners by picture name. Raises CalibrationError where they do not determine a lens."""
-    usable = {n: c for n, c in views.items() if len(c.points) >= _MIN_CORNERS}
+    usable = {n: c for n, c in views.items() if len(c.points) >= MIN_CORNERS}
     dropped = {n: f"only {len(c.points)} corners" for n, c in views.items() if n not in usable}
     unused = {**unused, **dropped}
     if len(usable) < MIN_VIEWS:

@@ -7,6 +7,7 @@ import itertools
 import os
 import secrets
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -18,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.calibrate import CalibrationError
+from camera_node.calibrate import ArmStopped, CalibrationError
 from camera_node.calibrate.folder import pairs_json, read_pairs
 from camera_node.calibrate.handeye import Calibration, calibrate, calibrate_tracks
 from camera_node.calibrate.motions import Array, Samples
@@ -26,6 +27,7 @@ from camera_node.calibrate.session import KEPT, MOVING, Session, Step, preview
 from camera_node.calibrate.targets import Target
 from camera_node.calibrate.tracks import Tracks, follow_arm
 from camera_node.config import ArmConfig, source_config
+from camera_node.pose.mount import EYE_TO_HAND
 from camera_node.pose.pairing import tidy
 from camera_node.pose.rig import PoseProvider, Trajectory, TrajectoryError, read_samples
 from camera_node.sources import Source, open_sources
@@ -34,6 +36,7 @@ from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, se3_inverse
 
 if TYPE_CHECKING:
+    from camera_node.calibrate.drive import Mover
     from camera_node.pose.arm import ArmStream
 
 Image = NDArray[np.uint8]
@@ -52,6 +55,13 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     to_base = None if arm is None or args.hand is not None else _to_base(plan, arm, args.camera)
     if args.tracks is not None and not (args.moving and to_base is not None):
         raise CalibrationError("--tracks: goes with --moving and the poses of a scenario's arm")
+    if args.yes and not args.drive:
+        raise CalibrationError("--yes: goes with --drive")
+    if args.drive and (to_base is None or args.moving or setup == EYE_TO_HAND):
+        raise CalibrationError(
+            "--drive: goes with a scenario's arm, a camera on its hand, and pictures from a hand that stands "
+            "(without --hand, --moving and --eye-to-hand: what a hand holds is not known to be kept clear of)"
+        )
     if args.tracks is not None:
         _make(args.tracks)
     try:
@@ -68,9 +78,9 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
             files.write_json(args.samples, pairs_json(samples))
 
     def show(image: Image, step: Step, session: Session) -> None:
-        _say(step)
+        say(step.outcome, step.line)
         if args.preview is not None:
-            _write_picture(args.preview, preview(image, session.corners, step))
+            write_picture(args.preview, preview(image, session.corners, step))
 
     hands = None
     if args.hand is not None:
@@ -80,25 +90,31 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         except TrajectoryError as error:
             raise CalibrationError(str(error)) from None
     session = Session(board, setup, args.want_mm, args.moving, before, keep)
-    pace = _Pace(float(source.fps), args.seconds)
+    pace = Pace(float(source.fps), args.seconds)
     tracks = Tracks() if args.moving and to_base is not None else None
-    stream = None
+    stream = mover = None
     try:
+        if args.drive and arm is not None:
+            mover = _take_arm(plan, arm, args.yes)
         if tracks is not None and arm is not None:
             stream = _follow(plan, arm, tracks)
         # What never repeats goes by the time of day, as a node's ticks do.
         first = round(WallClock().now_ns() * source.fps / 10**9) if source.contents is None else 0
         guide(
             source, config.codec, lens, session, pace, show, hands,
-            to_base=to_base, tracks=tracks, first=first,
+            move=mover, to_base=to_base, tracks=tracks, first=first,
         )  # fmt: skip
     except KeyboardInterrupt:
         print("\nstopped; what there is:", file=sys.stderr)
+    except ArmStopped as error:
+        print(f"\n{error}; what there is:", file=sys.stderr)
     except OSError as error:
         raise CalibrationError(f"--samples or --preview cannot be written: {error}") from None
     finally:
         if stream is not None:
             stream.stop()
+        if mover is not None:
+            mover.close()
         source.release()
     if tracks is None:
         return calibrate(session.samples(), args.method)
@@ -121,6 +137,21 @@ def _follow(plan: scenario.Scenario, arm: ArmConfig, tracks: Tracks) -> ArmStrea
         return follow_arm(plan, arm, tracks)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
+
+
+def _take_arm(plan: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> Mover:
+    """Whatever ends this process from now on ends a move first. Raises CalibrationError, ScenarioError."""
+    from camera_node.calibrate.drive import Mover
+    from camera_node.pose.arm import ArmError
+
+    try:
+        mover = Mover(plan, arm, agreed_to)
+    except ArmError as error:
+        raise CalibrationError(str(error)) from None
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            signal.signal(number, signal.default_int_handler)
+    return mover
 
 
 def _to_base(plan: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
@@ -199,7 +230,7 @@ def _go_on(session: Session, step: Step, move: Callable[[Array], None]) -> None:
         print(f"\n{error}", file=sys.stderr)
 
 
-class _Pace:
+class Pace:
     """Waits for a tick's instant; ticks that are late are not waited for."""
 
     def __init__(self, fps: float, seconds: float | None) -> None:
@@ -214,15 +245,16 @@ class _Pace:
         return True
 
 
-def _say(step: Step) -> None:
+def say(outcome: str, line: str) -> None:
+    """A step: on a terminal in place, else only what was kept."""
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns - 1
-        print(f"\r{step.line[:width]:{width}}", end="\n" if step.outcome == KEPT else "", file=sys.stderr)
-    elif step.outcome == KEPT:
-        print(step.line, file=sys.stderr)
+        print(f"\r{line[:width]:{width}}", end="\n" if outcome == KEPT else "", file=sys.stderr)
+    elif outcome == KEPT:
+        print(line, file=sys.stderr)
 
 
-def _write_picture(path: Path, picture: Image) -> None:
+def write_picture(path: Path, picture: Image) -> None:
     """Whole whenever somebody looks. Raises OSError."""
     done, data = cv2.imencode(path.suffix or ".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     if not done:

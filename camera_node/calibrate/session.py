@@ -180,14 +180,20 @@ class Session:
 
 def preview(image: NDArray[np.uint8], corners: Corners | None, step: Step) -> NDArray[np.uint8]:
     """The picture (H + 40, W, 3) RGB with the corners that were found, and the step below it."""
-    plain = grey(image)
+    said = f"{step.count} poses", f"{step.outcome}: {step.advice}"
+    return drawn(grey(image), corners, said, step.outcome == KEPT)
+
+
+def drawn(
+    plain: NDArray[np.uint8], corners: Corners | None, said: tuple[str, str], kept: bool
+) -> NDArray[np.uint8]:
+    """A grey picture as (H + 40, W, 3) RGB, its corners circled, two lines below it."""
     out = np.zeros((plain.shape[0] + 40, max(plain.shape[1], 320), 3), dtype=np.uint8)
     out[: plain.shape[0], : plain.shape[1]] = plain[..., None]
     if corners is not None:
         for x, y in corners.pixels:
             cv2.circle(out, (round(x - 0.5), round(y - 0.5)), 4, (0, 158, 115), 1, cv2.LINE_AA)
-    colour = (0, 158, 115) if step.outcome == KEPT else (213, 94, 0)
-    said = f"{step.count} poses", f"{step.outcome}: {step.advice}"
+    colour = (0, 158, 115) if kept else (213, 94, 0)
     for line, text in enumerate(said):
         at = (6, plain.shape[0] + 15 + 17 * line)
         cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)

@@ -31,6 +31,9 @@ def main(host: str, frequency_hz: float) -> int:
         from rtde_receive import RTDEReceiveInterface
     except ImportError:
         return _LIBRARY_MISSING
+    # What the library prints there must not come between the samples.
+    pipe = os.dup(1)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
         arm = RTDEReceiveInterface(host, frequency_hz, VARIABLES)
     except RuntimeError as error:
@@ -49,7 +52,7 @@ def main(host: str, frequency_hz: float) -> int:
             continue
         last = stamp
         try:
-            os.write(1, SAMPLE.pack(stamp, *joints, arm.getRobotMode(), arm.getSafetyMode()))
+            os.write(pipe, SAMPLE.pack(stamp, *joints, arm.getRobotMode(), arm.getSafetyMode()))
         except BrokenPipeError:
             return 0
     return 0

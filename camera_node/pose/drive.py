@@ -8,23 +8,26 @@ comes to rest. Should this process itself vanish, the controller's own watchdog 
 from __future__ import annotations
 
 import argparse
+import itertools
 import logging
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from camera_node.config import ArmConfig, PathConfig
 from camera_node.pose.arm import STALE_S, ArmError, ArmStream, probe
 from camera_node.pose.controller.command import arm_of, read_joints
 from camera_node.pose.mount import EYE_TO_HAND
 from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
-from camera_node.pose.path import FARTHEST_RAD, PathError, tour
+from camera_node.pose.path import PathError, Tour, tour
 from camera_node.pose.rig import PoseGapError
+from camera_node.pose.roadmap import FARTHEST_RAD
 from freshfield.clock import WallClock
 from freshfield.scenario import ScenarioError, load
 
@@ -57,16 +60,15 @@ def run(args: argparse.Namespace) -> int:
     if not carried:
         raise ScenarioError(f"{scenario.path}: source.arm.cameras: none of them is on the hand")
     model, base = arm_model(scenario, config), base_matrix(config)
-    # Where nothing can be hit, a machine too busy to simulate is no reason to stop.
-    patience_s = _SIMULATED_STALE_S if config.simulated else STALE_S
-    stream = ArmStream(config.host, WallClock(), 50.0, max_gap_ms=1e3 * patience_s, stale_s=patience_s)
+    stream = watch(config)
     try:
         start = _start(args, stream)
         try:
-            stops = tour(model, base, carried[0].transform, config.path, start)
+            found = tour(model, base, carried[0].transform, config.path, start)
         except PathError as error:
             raise ScenarioError(f"{scenario.path}: source.arm.path: {error}") from None
-        _print_tour(stops, start)
+        stops = found.stops
+        _print_tour(found, start)
         if args.show:
             return 0
         assert start is not None
@@ -77,12 +79,11 @@ def run(args: argparse.Namespace) -> int:
                 f"degrees, more than {np.rad2deg(FARTHEST_RAD):.0f}: bring it nearer to the first viewpoint "
                 "with the pendant"
             )
-        if not (args.yes or config.simulated or _agreed(config.host)):
+        if not (args.yes or config.simulated or agreed(config.host)):
             return 2
         if np.abs(stream.at(WallClock().now_ns(), 0.0)[0] - start).max() > _MOVED_RAD:
             raise ArmError(f"arm at {config.host}: it has been moved since the tour was printed: start again")
-        pace = _Pace(config.path.speed_rad_s, config.path.acceleration_rad_s2, patience_s)
-        return _drive(stream, stops, pace, args.rounds)
+        return _drive(stream, stops, Pace.of(config, config.path), args.rounds)
     finally:
         stream.stop()
 
@@ -106,9 +107,10 @@ def _start(args: argparse.Namespace, stream: ArmStream) -> np.ndarray | None:
         return None
 
 
-def _print_tour(stops: list[np.ndarray], start: np.ndarray | None) -> None:
+def _print_tour(found: Tour, start: np.ndarray | None) -> None:
     """The number of viewpoints, and joint angles line by line, as they will be driven."""
-    print(f"{len(stops)} viewpoints")
+    stops = found.stops
+    print(f"{found.reached} viewpoints in {len(stops)} stops")
     rows = [(str(k), joints) for k, joints in enumerate(stops, 1)]
     for name, joints in rows if start is None else [("stands at", start), *rows]:
         print(f"{name:>10} " + " ".join(f"{angle:8.2f}" for angle in np.rad2deg(joints)))
@@ -118,46 +120,74 @@ def _print_tour(stops: list[np.ndarray], start: np.ndarray | None) -> None:
     sys.stdout.flush()
 
 
-def _agreed(host: str) -> bool:
+def agreed(host: str, will: str = "move") -> bool:
+    """Ask whether the arm may. Raises ArmError where nobody can be asked."""
     if not sys.stdin.isatty():
         raise ArmError(f"the arm at {host} would move: say that its space is clear with --yes")
-    answer = input(f"The arm at {host} will move. Is its space clear, and a hand on the stop? [y/N] ")
-    return answer.strip().lower() in ("y", "yes")
+    # Not on standard output, which may be for a program.
+    question = f"The arm at {host} will {will}. Is its space clear, and a hand on the stop? [y/N] "
+    print(question, end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 @dataclass(frozen=True)
-class _Pace:
+class Pace:
     """How fast, and how long a controller and this process may hear nothing of each other."""
 
     speed_rad_s: float
     acceleration_rad_s2: float
     patience_s: float
 
+    @classmethod
+    def of(cls, config: ArmConfig, path: PathConfig) -> Pace:
+        return cls(path.speed_rad_s, path.acceleration_rad_s2, _patience_s(config))
 
-def _drive(stream: ArmStream, stops: list[np.ndarray], pace: _Pace, rounds: int) -> int:
+
+def watch(config: ArmConfig) -> ArmStream:
+    """The joint states of the arm that is to be driven, not started yet."""
+    patience_s = _patience_s(config)
+    return ArmStream(config.host, WallClock(), 50.0, max_gap_ms=1e3 * patience_s, stale_s=patience_s)
+
+
+def _patience_s(config: ArmConfig) -> float:
+    """Where nothing can be hit, a machine too busy to simulate is no reason to stop."""
+    return _SIMULATED_STALE_S if config.simulated else STALE_S
+
+
+def _drive(stream: ArmStream, stops: list[np.ndarray], pace: Pace, rounds: int) -> int:
     control = connect_control(stream.host)
     asked = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
             signal.signal(number, lambda *_: asked.set())
-    done = 0
+    # There and back, so that the end of a round is the beginning of the next.
+    each = itertools.count() if rounds == 0 else range(rounds)
+    there_and_back = (joints for k in each for joints in (stops if k % 2 == 0 else stops[::-1]))
+    try:
+        visit(control, stream, there_and_back, pace, asked)
+    except ArmError as error:
+        print(f"camera-node: {error}", file=sys.stderr, flush=True)
+        os._exit(1)  # the library's destructor would wait for an arm that may be gone
+    return 0
+
+
+def visit(
+    control: Any, stream: ArmStream, stops: Iterable[np.ndarray], pace: Pace, asked: threading.Event
+) -> None:
+    """Take the arm to each of ``stops`` in turn until ``asked``, and bring it to rest whatever happens.
+    Raises ArmError."""
     try:
         if not control.setWatchdog(1.0 / pace.patience_s):
             raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_why(stream)}")
-        while not asked.is_set() and (rounds == 0 or done < rounds):
-            # There and back, so that the end of a round is the beginning of the next.
-            for joints in stops if done % 2 == 0 else stops[::-1]:
-                if not control.moveJ(joints.tolist(), pace.speed_rad_s, pace.acceleration_rad_s2, True):
-                    raise ArmError(f"arm at {stream.host}: it refuses to move: {_why(stream)}")
-                if not _arrive(stream, control, joints, asked, pace.patience_s):
-                    break
-            done += 1
-    except ArmError as error:
-        print(f"camera-node: {error}", file=sys.stderr, flush=True)
+        for joints in stops:
+            if asked.is_set():
+                return
+            if not control.moveJ(joints.tolist(), pace.speed_rad_s, pace.acceleration_rad_s2, True):
+                raise ArmError(f"arm at {stream.host}: it refuses to move: {_why(stream)}")
+            if not _arrive(stream, control, joints, asked, pace.patience_s):
+                return
+    finally:
         within_reason(lambda: _stop(control))
-        os._exit(1)  # the library's destructor would wait for an arm that may be gone
-    within_reason(lambda: _stop(control))
-    return 0
 
 
 def _why(stream: ArmStream) -> str:

@@ -14,10 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node import stdout
 from camera_node.config import ArmConfig
 from camera_node.pose.arm import STALE_S, ArmError, ArmStream
 from camera_node.pose.controller.command import arm_of
 from camera_node.pose.controller.controller import HOME_RAD
+from camera_node.pose.drive import agreed
 from camera_node.pose.kinematics import ArmModel
 from camera_node.pose.mounted import arm_model
 from camera_node.teleop import TeleopError
@@ -40,6 +42,11 @@ _LONGEST_STOP_S = 3.0
 def run(args: argparse.Namespace) -> int:
     """Until the operator ends it, Ctrl-C or ``--seconds``. Raises ScenarioError, TeleopError and ArmError
     before anything moves; 1 where it had to be ended."""
+    with stdout.only_ours():
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     logging.basicConfig(
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
     )
@@ -58,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
             stream = _connect(arm_config, clock)
             joints = standing(stream, clock)
         operator = Teleoperator(model, config, joints)
-        if stream is not None and not (args.yes or arm_config.simulated or _agreed(arm_config.host)):
+        asks = stream is not None and not (args.yes or arm_config.simulated)
+        if asks and not agreed(arm_config.host, "follow the stylus"):
             return 2
         # After the question: a keyboard as a stylus takes the terminal's line mode away.
         stylus = open_stylus(args.stylus)
@@ -125,16 +133,6 @@ def _sink(
         return TrajectoryFile(file, model)
     except OSError as error:
         raise TeleopError(f"--dry-run: {file}: {error.strerror}") from None
-
-
-def _agreed(host: str) -> bool:
-    if not sys.stdin.isatty():
-        raise ArmError(f"the arm at {host} would move: say that its space is clear with --yes")
-    print(
-        f"The arm at {host} will follow the stylus. Is its space clear, and a hand on the stop? [y/N] ",
-        end="", flush=True,
-    )  # fmt: skip
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def _operate(

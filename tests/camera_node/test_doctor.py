@@ -49,7 +49,7 @@ def test_an_arm_that_is_well(capsys, tmp_path):
         _, parts = examined(capsys, cell_at(tmp_path, host, frequency_hz=10))
     assert parts["arm"] == (True, parts["arm"][1]) and "running" in parts["arm"][1]
     assert parts["package ur"][0] and parts["hand-eye"][1].endswith("hand eye-in-hand, 65 mm away")
-    assert parts["arm's path"][0] and "of 45 viewpoints" in parts["arm's path"][1]
+    assert parts["arm's path"][0] and "of 51 viewpoints" in parts["arm's path"][1]
 
 
 def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path):
@@ -58,9 +58,9 @@ def test_a_tour_that_leaves_a_side_out_is_wrong(capsys, tmp_path):
     code, parts = examined(capsys, cell_at(tmp_path, own_address(), path=path))
     ok, said = parts["arm's path"]
     assert code == 1 and ok is False
-    reached = int(re.search(r"reaches (\d+) of 45", said)[1])
-    rings = re.search(r"\(40 degrees (\d+) of 15, 60 degrees (\d+) of 15, 78 degrees (\d+) of 15\)", said)
-    assert 3 <= reached < 27 and sum(map(int, rings.groups())) == reached
+    reached = int(re.search(r"reaches (\d+) of 51", said)[1])
+    rings = re.search(r"\(30 degrees (\d+) of 17, 52 degrees (\d+) of 17, 75 degrees (\d+) of 17\)", said)
+    assert 3 <= reached < 0.6 * 51 and sum(map(int, rings.groups())) == reached
 
 
 def test_the_examples_calibration_is_not_a_benchs(capsys, tmp_path):
@@ -96,18 +96,25 @@ def test_a_scenario_that_is_wrong_is_said_like_everything_else(capsys, tmp_path)
     assert code == 1 and parts["scenario"][0] is False and "did you mean 'socket'" in parts["scenario"][1]
 
 
-def test_a_camera_is_opened_and_watched(capsys, tmp_path):
-    camera = NetworkCamera(WallClock())
-    (tmp_path / "calibration.json").write_text(json.dumps(CALIBRATION))
+def bench_with(folder: Path, camera: NetworkCamera, **source) -> str:
+    """A scenario with one calibrated network camera, eye."""
+    (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
     source = {
         "kind": "camera",
         "devices": {"eye": camera.address},
         "calibration": "calibration.json",
         "first_frame_s": 10,
+        **source,
     }
-    file = tmp_path / "bench.yaml"
+    file = folder / "bench.yaml"
     file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
-    _, parts = examined(capsys, str(file))
+    return str(file)
+
+
+def test_a_camera_is_opened_and_watched(capsys, tmp_path):
+    camera = NetworkCamera(WallClock())
+    file = bench_with(tmp_path, camera, fps=15)
+    _, parts = examined(capsys, file)
     camera.close()
     assert parts["camera eye"][0] and parts["camera eye"][1].startswith("64 x 48, ")
     assert parts["camera eye"][1].endswith(
@@ -116,9 +123,22 @@ def test_a_camera_is_opened_and_watched(capsys, tmp_path):
     assert parts["calibration"] == (True, "calibration.json: 1 cameras")
     assert "network" in parts
     (tmp_path / "calibration.json").write_text(json.dumps({"other": CALIBRATION["eye"]}))
-    _, parts = examined(capsys, str(file))
+    _, parts = examined(capsys, file)
     assert parts["calibration"] == (False, "calibration.json: it lacks eye")
     assert parts["camera eye"][0] is False and "no camera at http" in parts["camera eye"][1]
+
+
+@pytest.mark.parametrize("asked, ok", [(40, False), (10, True), (4, True)])
+def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, tmp_path, asked, ok):
+    camera = NetworkCamera(WallClock(), fps=12.0)
+    _, parts = examined(capsys, bench_with(tmp_path, camera, fps=asked))
+    camera.close()
+    found, said = parts["camera eye"]
+    assert found is ok
+    rate_hz = float(re.search(r"([\d.]+) frames a second", said)[1])
+    assert 2.0 < rate_hz < 16.0
+    if not ok:
+        assert f"of the {asked} asked: is it too dark" in said and "USB 2" in said
 
 
 def test_a_missing_package_says_what_to_install(monkeypatch):

@@ -263,6 +263,7 @@ def test_the_study_prints_its_tables(tmp_path, capsys):
     assert of[100.0, "nearest"]["mm_p95"] > 5 * of[8.0, "nearest"]["mm_p95"]
     by = {(r["poses"], r["method"]): r for r in tables["poses"]}
     assert by[15, "refined"]["bound_mm"] < by[6, "refined"]["bound_mm"]
+    assert all(r["trials"] == 2 and r["rms_mm_std"] > 0 and r["rms_deg_std"] > 0 for r in tables["poses"])
     assert all(r["error_ms"] < 1.0 and not r["failed"] for r in tables["offset"])
     for name, rows in tables.items():
         accuracy.write(name, rows, tmp_path / "out")
@@ -270,3 +271,16 @@ def test_the_study_prints_its_tables(tmp_path, capsys):
     accuracy.draw(tables, tmp_path / "out" / "accuracy.png")
     assert (tmp_path / "out" / "pairing.csv").read_text().count("\n") == 7
     assert cv2.imread(str(tmp_path / "out" / "accuracy.png")) is not None
+
+
+def test_the_deviation_of_an_rms_is_what_it_deviates_by():
+    from camera_node.calibrate.accuracy import rms
+
+    rng = np.random.default_rng(4)
+    errors = np.linalg.norm(rng.normal(size=(500, 20, 2, 3)), axis=-1) * [1.0, 5.0]
+    found, deviations = map(np.array, zip(*map(rms, errors)))
+    np.testing.assert_allclose(found.mean(axis=0), np.sqrt(3) * np.array([1.0, 5.0]), rtol=0.02)
+    np.testing.assert_allclose(deviations.mean(axis=0), found.std(axis=0), rtol=0.1)
+    few, unknown = rms(np.array([[3.0, 4.0]]))
+    assert few.tolist() == [3.0, 4.0] and np.isnan(unknown).all()
+    assert np.isnan(rms(np.zeros((0, 2)))).all() and np.array_equal(rms(np.zeros((3, 2))), np.zeros((2, 2)))

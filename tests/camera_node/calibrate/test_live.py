@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
 import dataclasses
+import io
 import json
 import subprocess
 import sys
+import threading
+import time
 from fractions import Fraction
 
 import cv2
@@ -13,8 +17,9 @@ import numpy as np
 import pytest
 import yaml
 
-from camera_node.calibrate import live, simulate
+from camera_node.calibrate import ArmStopped, live, simulate
 from camera_node.calibrate.accuracy import streams
+from camera_node.calibrate.drive import Mover
 from camera_node.calibrate.folder import read_track
 from camera_node.calibrate.handeye import angle_deg, calibrate_tracks, distance_mm
 from camera_node.calibrate.motions import inverse
@@ -26,6 +31,8 @@ from camera_node.config import source_config
 from camera_node.pose.kinematics import UR3E
 from camera_node.pose.mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.pose.mounted import base_matrix, camera_poses
+from camera_node.pose.path import PathError
+from camera_node.pose.roadmap import clear
 from camera_node.sources import Shot
 from camera_node.sources.on_arm import Truth
 from freshfield.clock import WallClock
@@ -191,19 +198,133 @@ class OnArm:
         self._truth.close()
 
 
+def bench(folder, host, **arm):
+    """A scenario whose arm stands at ``host``, in the middle of the world; its file."""
+    data = yaml.safe_load(scenario(folder).read_text())
+    data["source"]["arm"] |= {"host": host, "base_m": [0.0, 0.0, 0.0], "base_yaw_deg": 0.0, **arm}
+    file = folder / "bench.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return file
+
+
+def looking():
+    """--joints of an arm whose camera sees the board."""
+    hands = simulate.random_hands(60, np.random.default_rng(9), 30.0)
+    postures = (p.joints for hand in hands for p in UR3E.inverse(hand) if not p.singular)
+    begin = next(joints for joints in postures if clear(UR3E, np.eye(4), joints, joints, 0.05).all())
+    return begin, "--joints=" + ",".join(f"{a:.4f}" for a in np.rad2deg(begin))
+
+
+@pytest.mark.slow
+def test_the_arm_goes_by_itself_where_it_is_wanted(tmp_path, monkeypatch, capsys):
+    """The real client library moves a simulated arm, from one look at the board to the answer."""
+    require_ur_rtde()
+    host = own_address()
+    path = {"speed_rad_s": 3.0, "acceleration_rad_s2": 20.0, "floor_m": 0.02}
+    file = bench(tmp_path, host, path=path)
+    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
+    samples = tmp_path / "samples.json"
+    with simulated_arm(host, looking()[1]):
+        arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--drive", "--json"]
+        limits = ["--seconds", "100", "--want-mm", "1", "--samples", str(samples)]
+        assert main(["calibrate", "hand-eye", *arguments, *limits]) == 0
+    said = capsys.readouterr()
+    assert distance_mm(np.array(json.loads(said.out)["transform"]), X) < 2.0
+    hands = np.array([hand for hand, _ in json.loads(samples.read_text())])
+    assert len(hands) >= 10 and "enough" in said.err
+    assert np.linalg.norm(np.ptp(hands[:, :3, 3], axis=0)) > 0.1  # nobody else has moved it
+
+
+def test_a_pose_that_the_arm_cannot_have_is_refused_and_an_arm_that_is_lost_ends_the_session(tmp_path):
+    require_ur_rtde()
+    host = own_address()
+    plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 3.0, "floor_m": 0.02})))
+    begin, joints = looking()
+    with simulated_arm(host, joints) as process:
+        mover = Mover(plan, source_config(plan).arm, agreed_to=False)
+        try:
+            hand = UR3E.forward(begin)
+            for down_m, why in ((2.0, "at all"), (hand[2, 3] - 0.01, "the floor")):
+                lower = hand.copy()
+                lower[2, 3] -= down_m
+                with pytest.raises(PathError, match=why):
+                    mover(lower)
+            process.kill()
+            process.wait()
+            with pytest.raises(ArmStopped, match=host):
+                mover(hand)
+        finally:
+            mover.close()
+
+
+def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path):
+    require_ur_rtde()
+    host = own_address()
+    plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 0.2, "floor_m": 0.02})))
+    begin, joints = looking()
+    goal = begin + np.array([0.8, 0, 0, 0, 0, 0])  # four seconds away
+    with simulated_arm(host, joints):
+        truth, clock = Truth(host), WallClock()
+        mover = Mover(plan, source_config(plan).arm, agreed_to=False)
+
+        def press() -> None:
+            watched = Truth(host)
+            while np.abs(watched.joints(clock.now_ns()) - begin).max() < 0.05:
+                time.sleep(0.01)
+            _thread.interrupt_main()
+
+        thread = threading.Thread(target=press, daemon=True)
+        thread.start()
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                mover(UR3E.forward(goal))
+            stopped = truth.joints(clock.now_ns())
+            time.sleep(0.3)
+            # On its way it would have turned by .06.
+            np.testing.assert_allclose(truth.joints(clock.now_ns()), stopped, atol=1e-4)
+            assert 0.05 < np.abs(stopped - begin).max() < 0.6
+        finally:
+            thread.join()
+            mover.close()
+
+
+def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, capsys):
+    require_ur_rtde()
+    host = own_address()
+    file = bench(tmp_path, host, simulated=False)
+    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
+    begin, joints = looking()
+    words = ["calibrate", "hand-eye", "--live", str(file), "--camera", "eye", "--board", BOARD, "--drive"]
+    with simulated_arm(host, joints):
+        assert main(words) == 2
+        assert "say that its space is clear with --yes" in capsys.readouterr().err
+        terminal = io.StringIO("n\n")
+        terminal.isatty = lambda: True
+        monkeypatch.setattr("sys.stdin", terminal)
+        assert main([*words, "--json"]) == 2
+        said = capsys.readouterr()
+        assert "Is its space clear" in said.err and "nothing was moved" in said.err and not said.out
+        np.testing.assert_allclose(Truth(host).joints(WallClock().now_ns()), begin, atol=1e-5)
+
+
+@pytest.mark.parametrize("more", [["--moving"], ["--eye-to-hand"], ["--hand", "hand.csv"]])
+def test_an_arm_is_driven_only_where_its_surroundings_are_known(tmp_path, capsys, more):
+    words = ["--live", str(scenario(tmp_path)), "--camera", "eye", "--board", BOARD]
+    assert main(["calibrate", "hand-eye", *words, "--drive", *more]) == 2
+    assert "--drive: goes with" in capsys.readouterr().err
+    assert main(["calibrate", "hand-eye", *words, "--yes"]) == 2
+    assert "--yes: goes with --drive" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkeypatch, capsys):
     """A simulated controller with the real client library, and a camera whose stamps are 60 ms late."""
     require_ur_rtde()
     host = own_address()
-    data = yaml.safe_load(scenario(tmp_path).read_text())
-    data["source"]["arm"] |= {"host": host, "base_m": [0.0, 0.0, 0.0], "base_yaw_deg": 0.0}
-    file = tmp_path / "bench.yaml"
-    file.write_text(yaml.safe_dump(data))
+    file = bench(tmp_path, host)
     monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 60_000_000)})
-    hands = simulate.random_hands(60, np.random.default_rng(9), 30.0)
-    begin = next(posture.joints for hand in hands for posture in UR3E.inverse(hand))
-    with simulated_arm(host, "--joints=" + ",".join(f"{a:.4f}" for a in np.rad2deg(begin))):
+    begin, joints = looking()
+    with simulated_arm(host, joints):
         moving = subprocess.Popen([sys.executable, "-c", MOVES, host, str(begin.tolist())])
         try:
             arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--moving", "--json",

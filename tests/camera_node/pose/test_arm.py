@@ -10,17 +10,14 @@ import time
 
 import numpy as np
 import pytest
-import yaml
 
 from camera_node.clocks import ArrivalClock
 from camera_node.pose.arm import ArmError, ArmStream, HandPoses, probe
 from camera_node.pose.controller.controller import HOME_RAD
 from camera_node.pose.kinematics import UR3E
-from camera_node.pose.measure import measure
 from camera_node.pose.rig import PoseGapError
 from camera_node.sources.on_arm import Truth
 from freshfield.clock import WallClock
-from freshfield.scenario import load
 from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm
 
 WITHIN_S = 20.0  # of a busy machine; what is waited for takes a fraction of it
@@ -185,21 +182,6 @@ def test_stamps_that_go_back_or_stand_still_break_nothing():
     assert clock.ours_ns(5_000, 2_000_000) == 1_000_000
     assert clock.ours_ns(1_000, 3_000_000) == 996_000
     assert clock.ours_ns(10_000_000_000, 10_003_000_000) <= 10_003_000_000
-
-
-@pytest.mark.slow
-def test_measuring_against_the_truth_tells_pairing_from_pairing(tmp_path):
-    """A standing arm has no error whatever the pairing; the table has a row for each."""
-    host = own_address()
-    data = yaml.safe_load(load("cell").path.read_text())
-    data["source"]["arm"] |= {"host": host, "cameras": {"hand": None}}
-    file = tmp_path / "cell.yaml"
-    file.write_text(yaml.safe_dump(data))
-    with simulated_arm(host):
-        found = measure(str(file), 0.6)
-    assert found.pop("speed")["most_m_per_s"] == 0.0
-    assert "interpolated at 125 Hz" in found and "nearest at 20 Hz" in found
-    assert all(row["p95_mm"] < 1e-9 and row["instants"] >= 1 for row in found.values())
 
 
 @pytest.mark.parametrize(

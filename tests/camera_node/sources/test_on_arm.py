@@ -23,7 +23,7 @@ from freshfield.scenario import Scenario, ScenarioError, load
 from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm
 
 CELL = load("cell")
-LOOKING = (-33.81, -65.27, 99.37, -96.35, -133.43, 127.42)  # degrees, from a viewpoint of the cell's tour
+LOOKING = (-95.90, 9.29, -109.38, 0.72, 262.47, 38.48)  # degrees, from a viewpoint of the cell's tour
 
 
 def at(host: str, **source: object) -> Scenario:

@@ -1,0 +1,38 @@
+"""Standard output is a command's own, also where a library prints."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from camera_node import stdout
+
+SPEAKS = """
+import ctypes, os, sys, threading
+from camera_node import stdout
+
+libc = ctypes.CDLL(None)
+print("before")
+with stdout.only_ours():
+    os.write(1, b"from a library\\n")
+    libc.printf(b"held back by one\\n")
+    print("the answer")
+    os.system("echo from a child")
+print("after")
+os.write(1, b"as ever\\n")
+"""
+
+
+def test_only_what_python_prints_comes_out():
+    done = subprocess.run([sys.executable, "-c", SPEAKS], capture_output=True, text=True, check=True)
+    assert sorted(done.stdout.split("\n")) == sorted(["before", "the answer", "after", "as ever", ""])
+    assert sorted(done.stderr.split("\n")) == sorted(
+        ["from a library", "held back by one", "from a child", ""]
+    )
+
+
+def test_what_stands_in_for_standard_output_is_left_alone(capsys):
+    with stdout.only_ours():
+        print("the answer")
+    print("after")
+    assert capsys.readouterr().out == "the answer\nafter\n"
