@@ -9,6 +9,7 @@ from typing import Any
 from freshfield.scenario import Scenario
 from launch.commands import MissingCommand, program
 from launch.processes import Child
+from launch.status import number, read_json
 
 FIGURES = "mesh.json"
 
@@ -26,6 +27,11 @@ def check(scenario: Scenario) -> None:
             f"{scenario.path}: edge.export: a mesh needs scikit-image: pip install 'freshfield[surface]', or "
             "take the key out"
         )
+
+
+def possible(out: Path) -> bool:
+    """Whether the field of the run in ``out`` has made an update: before, there is nothing to export."""
+    return bool(number(read_json(out / "edge.json"), "updates", "count"))
 
 
 def child(scenario: Scenario, out: Path) -> Child | None:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import http.client
+import os
 import socket
+
+# Children are started by fork and exec. gRPC would first bring its own threads to rest, and now and then that
+# never ends: the launcher hangs between two processes. What execs needs nothing of it.
+os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
 
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc

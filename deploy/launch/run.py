@@ -217,6 +217,9 @@ class Run:
         export = mesh.child(self.scenario, self.options.out)
         if export is None or self._dead:
             return
+        if not mesh.possible(self.options.out):
+            self._display.say("no mesh: nothing to export yet, the field has made no update")
+            return
         self._display.say(f"making the mesh (Ctrl-C leaves it out); see {export.log}")
         signals, begin_s = len(self._signals), time.monotonic()
         export.start()

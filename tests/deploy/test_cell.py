@@ -60,6 +60,17 @@ def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: P
     mesh.check(load("tile"))
 
 
+@pytest.mark.parametrize(
+    "status, possible",
+    [('{"updates": {"count": 3}}', True), ('{"updates": {"count": 0}}', False), ("", False)],
+)
+def test_there_is_a_mesh_from_the_first_update_on(tmp_path: Path, status: str, possible: bool) -> None:
+    from launch import mesh
+
+    (tmp_path / "edge.json").write_text(status)
+    assert mesh.possible(tmp_path) == possible
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
@@ -78,8 +89,7 @@ def test_the_cell_runs_from_one_command(tmp_path: Path) -> None:
         run.process.kill()
     frames = run.report()["frames"]
     assert frames["closes"] and frames["by_camera"]["hand"]["delivered"] > 5
-    views = {tuple(line.split()) for line in (run.out / "log-driver.txt").read_text().splitlines()}
-    assert ("34", "viewpoints") in views
+    assert "45 viewpoints in 52 stops\n" in (run.out / "log-driver.txt").read_text()
     # The arm sets out when the field can learn, not while it compiles.
     rows = [json.loads(line) for line in (run.out / "processes.jsonl").read_text().splitlines()]
     assert "driver" in rows[-1] and "driver" not in next(row for row in rows if "node" in row)

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -97,3 +98,26 @@ def test_the_tail_of_a_large_log_has_whole_lines_only(tmp_path: Path) -> None:
     lines = processes.tail(log, 5)
     assert lines == [f"line {i} äöü" for i in range(19_995, 20_000)]
     assert processes.tail(tmp_path / "missing", 5) == []
+
+
+def test_starting_a_process_is_no_business_of_grpc(tmp_path: Path) -> None:
+    """With its handlers of fork at work, the launcher hung now and then between two processes."""
+    code = """
+        import subprocess, sys
+        from concurrent import futures
+        from launch import net
+        import grpc
+        server = grpc.server(futures.ThreadPoolExecutor(1))
+        port = server.add_insecure_port("127.0.0.1:0")
+        server.start()
+        net.is_serving(f"127.0.0.1:{port}")
+        for _ in range(3):
+            subprocess.run([sys.executable, "-c", ""], preexec_fn=lambda: None)
+        server.stop(0)
+    """
+    found = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert found.returncode == 0 and "fork" not in found.stderr, found.stderr

@@ -162,6 +162,19 @@ def test_ctrl_c_ends_a_run_with_its_report(up: Callable[..., Up]) -> None:
     assert not leftovers(run.out)
 
 
+def test_ctrl_c_before_the_first_update_makes_no_mesh_and_is_no_failure(tmp_path: Path) -> None:
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    scenario = SMALL.replace("lpips: none", "lpips: none, export: {mesh: room.ply}")
+    run = Up(tmp_path, "--for", "0", scenario=scenario)
+    try:
+        run.wait_until(lambda: "logs and results" in run.output)
+        run.process.send_signal(signal.SIGINT)
+        assert run.end() == 0, run.output
+    finally:
+        run.process.kill()
+    assert "no mesh: nothing to export yet" in run.output and "making the mesh" not in run.output
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["node", "emulator", "edge"])
 def test_with_restart_a_run_survives_the_death_of_any_process(up: Callable[..., Up], name: str) -> None:
