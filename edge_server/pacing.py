@@ -89,7 +89,7 @@ class Point:
     """One measured way to spend an update, and the fidelity at the present it led to.
 
     options: of the field (its effort). update_ms: from decision to publication. psnr_db: whole image;
-    psnr_moving_db: where the scene moves.
+    psnr_moving_db: where the scene moves. error_db: standard error of their mean, at most; 0 of one seed.
     """
 
     effort: str
@@ -98,6 +98,7 @@ class Point:
     update_ms: float
     psnr_db: float
     psnr_moving_db: float
+    error_db: float = 0.0
 
     @property
     def worth_db(self) -> float:
@@ -120,6 +121,7 @@ def read_points(path: Path | None, representation: str) -> list[Point]:
                 update_ms=float(row["update_s"]) * 1e3,
                 psnr_db=float(row["psnr_db"]),
                 psnr_moving_db=float(row["psnr_moving_db"]),
+                error_db=0.5 * sum(row.get(f"{k}_error") or 0.0 for k in ("psnr_db", "psnr_moving_db")),
             )
             for row in rows
             if row["field"] == representation and row["psnr_moving_db"] is not None
@@ -136,7 +138,8 @@ def read_points(path: Path | None, representation: str) -> list[Point]:
 
 def choose(points: Sequence[Point], deadline_ms: float, speed_m_per_s: float) -> Point:
     """The best point that fits the deadline, measured at the speed nearest to the scene's; the quickest one
-    where none fits. More time is not always better: what moves grows old meanwhile."""
+    where none fits. More time is not always better: what moves grows old meanwhile. Of points that cannot be
+    told from the best one by their seeds, the quickest."""
 
     def off(p: Point) -> float:
         return abs(math.log(max(p.speed_m_per_s, 1e-3) / max(speed_m_per_s, 1e-3)))
@@ -144,4 +147,7 @@ def choose(points: Sequence[Point], deadline_ms: float, speed_m_per_s: float) ->
     nearest = min(off(p) for p in points)
     here = [p for p in points if off(p) == nearest]
     fitting = [p for p in here if p.update_ms <= deadline_ms]
-    return max(fitting, key=lambda p: p.worth_db) if fitting else min(here, key=lambda p: p.update_ms)
+    if fitting:
+        best = max(fitting, key=lambda p: p.worth_db)
+        here = [p for p in fitting if best.worth_db - p.worth_db <= math.hypot(best.error_db, p.error_db)]
+    return min(here, key=lambda p: (p.update_ms, -p.worth_db))

@@ -115,7 +115,9 @@ class Field(Renderer, Protocol):
         """Everything needed to go on as if nothing had happened: plain arrays, no pickle."""
         ...
 
-    def load_state(self, state: dict[str, NDArray]) -> None: ...
+    def load_state(self, state: dict[str, NDArray]) -> None:
+        """Go on where ``state`` was taken. ValueError where this field cannot; it then stays as it was."""
+        ...
 
     def reset(self) -> None:
         """Forget the scene (4.4.4's manual reset); keep the settings and the compiled kernels."""

@@ -15,6 +15,7 @@ class NerfactoSettings(NgpSettings):
 
     name = "nerfacto"
 
+    rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
     samples: int = option(24, "samples of a ray, drawn where the proposal says")
     samples_start: int = option(24, "the same at first")
     samples_ramp: int = option(200, "steps after which ``samples`` is reached")

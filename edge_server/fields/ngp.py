@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields import Field
+from edge_server.fields.gpu import driver_present
 from edge_server.fields.kernels.grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.pool import Pool
@@ -63,7 +64,7 @@ class NgpField(TrainedField):
 def make(options: dict[str, Any], seed: int = 0) -> Field:
     """A field from plain options (``ngp_settings``), for the device they ask for."""
     settings = make_settings(options, seed)
-    if settings.device == "cpu":
+    if settings.device == "cpu" or (settings.device == "auto" and not driver_present()):
         return NgpField(settings)
     from edge_server.fields.ngp_torch_field import (  # torch, only where it may be used
         NgpTorchField,

@@ -24,21 +24,24 @@ EMPTY = 0.5  # density per scene unit that counts as nothing: a step of it dims 
 
 
 class Occupancy:
-    """density: float32 (cells^3,), x fastest; seen: uint16, cameras that look at each cell."""
+    """density: float32 (cells^3,), x fastest; seen: uint16, cameras that look at each cell. unknown: the
+    density of what was never looked at; with ``EMPTY`` the first look decides."""
 
-    def __init__(self, cells: int, contracted: bool, near: float, min_views: int) -> None:
+    def __init__(
+        self, cells: int, contracted: bool, near: float, min_views: int, unknown: float = EMPTY
+    ) -> None:
         self.cells, self.contracted, self.near, self.min_views = cells, contracted, near, min_views
-        self.density = np.full(cells**3, 2.0 * EMPTY, np.float32)  # unknown: to be looked at
+        self.density = np.full(cells**3, unknown, np.float32)
         self.seen = np.zeros(cells**3, np.uint16)
         self.occupied = np.zeros(cells**3, np.uint8)
         self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
         self.needed = 1
 
     @classmethod
-    def for_box(cls, settings: TrainerSettings, box: SceneBox | None) -> Occupancy:
+    def for_box(cls, settings: TrainerSettings, box: SceneBox | None, unknown: float = EMPTY) -> Occupancy:
         """An occupancy that knows nothing yet of the scene in ``box``."""
         near = box.near_m / box.radius_m if box else 0.1
-        return cls(settings.cells, box.contracted if box else False, near, settings.min_views)
+        return cls(settings.cells, box.contracted if box else False, near, settings.min_views, unknown)
 
     def space(self, step: float) -> Space:
         """The grid as the kernels read it: a view on the living arrays."""

@@ -169,14 +169,19 @@ class Rig:
         return arrays
 
     def load(self, meta: dict[str, Any], arrays: Arrays) -> None:
-        """Undo ``meta`` and ``arrays``."""
+        """Undo ``meta`` and ``arrays``, for a rig that has seen nothing. ValueError, KeyError or TypeError
+        where they are not what those made; the rig is then of no use."""
         self._packed, self.memory = None, {}
         self._box_cameras = int(meta["box_cameras"])
         self.plain = bool(meta.get("plain", False))
         self.left_out = set(meta.get("left_out", ()))
         box = meta["box"]
         self.box = SceneBox(**{**box, "centre_m": tuple(box["centre_m"])}) if box else None
+        if self.box is not None:
+            _check_box(self.box)
         self.behind = np.array(arrays["behind"], dtype=np.float32)
+        if self.behind.shape != (3,) or not np.isfinite(self.behind).all():
+            raise ValueError(f"the state's background must be a colour, not {self.behind.tolist()}")
         for k, entry in enumerate(meta["cameras"]):
             known = dict(entry)
             camera, generated_ns = known.pop("camera"), known.pop("generated_ns")
@@ -187,7 +192,11 @@ class Rig:
                 camera, arrays[f"image_{k}"], arrays[f"pose_{k}"], Pinhole(**known), generated_ns,
                 carried_to_ns=carried_to_ns,
             )  # fmt: skip
-            self.memory[camera] = CameraMemory(view, arrays.get(f"moved_{k}"), credit)
+            check_view(view)
+            moved = arrays.get(f"moved_{k}")
+            if moved is not None and (moved.dtype != np.bool_ or moved.shape != view.image.shape[:2]):
+                raise ValueError(f"camera {camera}: the pixels that moved are not those of its image")
+            self.memory[camera] = CameraMemory(view, moved, credit)
 
 
 def same_views(a: Sequence[View], b: Sequence[View]) -> bool:
@@ -205,6 +214,13 @@ def _behind(views: Sequence[View]) -> tuple[NDArray[np.float32], bool]:
     if plain is not None:
         return plain, True
     return np.mean([v.image.mean(axis=(0, 1)) / 255.0 for v in views], axis=0).astype(np.float32), False
+
+
+def _check_box(box: SceneBox) -> None:
+    """ValueError for one that no rig has."""
+    lengths = (box.radius_m, box.distance_m, box.pixel_m)
+    if not np.isfinite([*box.centre_m, *lengths, box.near_m]).all() or min(lengths) <= 0 or box.near_m < 0:
+        raise ValueError(f"the state's scene box is none: {box}")
 
 
 def _alike(a: SceneBox, b: SceneBox) -> bool:

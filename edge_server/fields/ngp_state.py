@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
@@ -37,6 +39,27 @@ def unpack_meta(settings: Any, state: Arrays, name: str, shape: tuple[str, ...])
                 f"the state was made with {option} = {theirs.get(option)}, this field has {mine}"
             )
     return meta
+
+
+@contextmanager
+def all_or_nothing(field: Any) -> Iterator[None]:
+    """Around the loading of a state: where that fails, ``field`` stays as it was. ValueError where the state
+    lacks something, or holds something else. New arrays and objects must take the place of the old ones:
+    what is written into these is not undone.
+    """
+    before = dict(vars(field))
+    try:
+        yield
+    except BaseException as error:
+        # Nothing is missing meanwhile: others may ask the field for a picture, and wait for their turn.
+        vars(field).update(before)
+        for name in vars(field).keys() - before.keys():
+            delattr(field, name)
+        if isinstance(error, KeyError):
+            raise ValueError(f"the state lacks {error}") from None
+        if isinstance(error, (TypeError, AttributeError, IndexError, ArithmeticError)):
+            raise ValueError(f"the state is damaged: {error}") from None
+        raise
 
 
 def fill(wanted: Arrays, state: Arrays) -> None:

@@ -6,6 +6,7 @@ Same settings and the same state as ``NgpField``: a checkpoint of one loads into
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -24,17 +25,18 @@ from edge_server.fields.ngp_layout import make_grid, make_net
 from edge_server.fields.ngp_occupancy import EVERY, FADE, Occupancy
 from edge_server.fields.ngp_rig import Arrays, Rig
 from edge_server.fields.ngp_schedule import (
-    BETA1,
+    BETA1_FIELD,
     BETA2,
     NOMINAL_RAYS,
     Pace,
+    Usual,
     active_levels,
     step_key,
     step_length,
 )
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.ngp_snapshot import surface_points
-from edge_server.fields.ngp_state import fill, pack, unpack_meta
+from edge_server.fields.ngp_state import all_or_nothing, fill, pack, unpack_meta
 from edge_server.fields.ngp_torch import TorchGrid, encode, mlp, ray_losses, shade, to_torch, weights_of
 from edge_server.fields.scene_box import NOWHERE, SceneBox
 from freshfield.geometry import Pinhole
@@ -169,6 +171,7 @@ class NgpTorchField:
             raise ValueError("ngp: device cuda was asked for, but torch finds none here; use cpu or auto")
         self.pool = shared_pool(self.settings.threads, self.settings.nice)
         self._lock = threading.RLock()
+        self.now = time.perf_counter  # the clock of budgets in seconds
         self.reset()
 
     def reset(self) -> None:
@@ -179,7 +182,7 @@ class NgpTorchField:
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace, losses, samples, dropped = Pace(budget), [0.0], 0, 0
+        pace, losses, samples, dropped = Pace(budget, self.now), [0.0], 0, 0
         with self._lock:
             intake = self.rig.take_in(views)
             if intake.new_box:
@@ -187,7 +190,7 @@ class NgpTorchField:
             if intake.look:
                 self._occupancy.look(self.pool, self.rig)
             data = self.rig.trusted(views, intake, self.step, self._model())
-        while (progress := pace.begin()) is not None:
+        while (progress := pace.begin(self._usual)) is not None:
             with self._lock:
                 loss, used, bad = self._one_step(data, progress)
             losses, samples, dropped = [*losses[-31:], loss], samples + used, dropped + bad
@@ -221,7 +224,7 @@ class NgpTorchField:
             return pack(NgpField.name, self.settings, self.rig, counters, self._arrays())
 
     def load_state(self, state: Arrays) -> None:
-        with self._lock:
+        with self._lock, all_or_nothing(self):
             meta = unpack_meta(self.settings, state, NgpField.name, NgpField.shape)
             self.rig = Rig(self.settings)
             self.rig.load(meta, state)
@@ -250,6 +253,7 @@ class NgpTorchField:
     def _forget_parameters(self) -> None:
         rng = np.random.default_rng(np.random.SeedSequence(self.settings.seed))
         self.step = self._updates = 0
+        self._usual = Usual()
         self._grid = to_torch(make_grid(self.settings, self.rig.box, rng), self.device)
         net = make_net(self.settings, rng)
         self._widths = net.widths.tolist()
@@ -310,10 +314,10 @@ class NgpTorchField:
         finite = torch.isfinite(g)
         use = finite & (g != 0)
         g = torch.where(use, g, torch.zeros_like(g)).clamp(-GRADIENT_LIMIT, GRADIENT_LIMIT)
-        m.copy_(torch.where(use, BETA1 * m + (1 - BETA1) * g, m))
+        m.copy_(torch.where(use, BETA1_FIELD * m + (1 - BETA1_FIELD) * g, m))
         v.copy_(torch.where(use, BETA2 * v + (1 - BETA2) * g * g, v))
         root = (v / (1 - BETA2**self._updates)).sqrt() + self.settings.epsilon
-        new = p - rate * (m / (1 - BETA1**self._updates) / root + decay * p)
+        new = p - rate * (m / (1 - BETA1_FIELD**self._updates) / root + decay * p)
         new = torch.where(use, new, p).nan_to_num(0.0, 0.0, 0.0)
         p.copy_(new.clamp(-PARAMETER_LIMIT, PARAMETER_LIMIT))
         return int((~finite).sum())

@@ -24,7 +24,8 @@ from edge_server.fields.kernels.splat_project import BASE, BLOCK, COLOR, OPACITY
 from edge_server.fields.kernels.splat_raster import Loss, train_tiles
 from edge_server.fields.kernels.splat_update import Rule, bound_all, update
 from edge_server.fields.ngp_rig import Arrays, Rig, same_views
-from edge_server.fields.ngp_schedule import BETA1, BETA2, Pace, step_key
+from edge_server.fields.ngp_schedule import BETA1, BETA2, Pace, Usual, step_key
+from edge_server.fields.ngp_state import all_or_nothing
 from edge_server.fields.scene_box import NOWHERE
 from edge_server.fields.splat_growth import Cloud, grow_and_prune
 from edge_server.fields.splat_motion import (
@@ -67,7 +68,7 @@ class SplatField:
         corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), calm], axis=-1)
         self._corrections = corrections.astype(np.float32)
         self._turn = Turn()
-        self._carry_s = 0.0  # a carrying step of the last update, for budgets in seconds
+        self.now = time.perf_counter  # the clock of budgets in seconds
         self._now_ns: int | None = None  # the instant that the Gaussians stand for
         self._snapshot: SplatSnapshot | None = None
         self._given: tuple[View, ...] = ()  # the last fit's views, known again after ``load_state``
@@ -87,19 +88,20 @@ class SplatField:
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Train on ``views`` from the present Gaussians. Raises ValueError for a view that cannot be one.
 
-        A budget in seconds (0.1 at least makes sense) is kept within 10 per cent, whatever the load; the
-        learning rates fall over the budget, so every fit ends with a settled field.
+        In a budget in seconds, no step begins that would end too late as steps usually go. New pictures are
+        taken in first, however short it is, and Gaussians begin anew where something moved. Learning rates
+        fall over the budget, so every fit ends with a settled field.
         """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace = Pace(budget)
+        pace = Pace(budget, self.now)
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
         with self._turn.mine():
             motion = self._take_in(views)
         if motion is not None:
             rays, samples = self._follow(motion, pace, self._carries(budget))
-        while (progress := pace.begin()) is not None:
+        while (progress := pace.begin(self._usual)) is not None:
             with self._turn.mine():
                 loss, seen, pairs, lost = self._one_step(progress)
             losses.append(loss)
@@ -186,8 +188,9 @@ class SplatField:
 
     def load_state(self, state: Arrays) -> None:
         """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        meta, cloud = _unpack(self.settings, state)
-        with self._turn.mine():
+        with self._turn.mine(), all_or_nothing(self):
+            meta, cloud = _unpack(self.settings, state)
+            self.rig = Rig(self.settings)
             self.rig.load(meta, state)
             self._forget_gaussians()
             self.cloud = cloud
@@ -201,6 +204,7 @@ class SplatField:
     def _forget_gaussians(self) -> None:
         self.step = 0
         self._grown = 0  # step of the last splitting and pruning
+        self._usual, self._usual_carrying, self._usual_renewal = Usual(), Usual(), Usual()
         self.cloud = Cloud.empty(self.settings)
         self._passes, self._follower, self._looker = (Passes(self.pool) for _ in range(3))
         self._now_ns = None
@@ -257,7 +261,8 @@ class SplatField:
         if budget.steps is not None:
             return min(most, int(CARRY_SHARE * budget.steps))
         assert budget.seconds is not None
-        return min(most, int(CARRY_SHARE * budget.seconds / self._carry_s)) if self._carry_s else most
+        usual_s = self._usual_carrying.seconds
+        return min(most, int(CARRY_SHARE * budget.seconds / usual_s)) if usual_s else most
 
     def _doubt(self, views: Sequence[View], news: set[str]) -> None:
         """Refuse the views that contradict what is known. What a camera's next one seems to show to have
@@ -272,19 +277,19 @@ class SplatField:
         s, rays, samples = self.settings, 0, 0
         with self._turn.mine():
             going = carry(s, self._follower, self.cloud, motion, carries)
-        began = pace.seconds()
-        while pace.begin() is not None:
+        while pace.begin(self._usual_carrying, then_s=self._usual_renewal.seconds) is not None:
             with self._turn.mine():
                 done = next(going, None)
             if done is None:
                 break
             rays, samples = rays + done[1], samples + done[2]
             pace.end()
-            self._carry_s = (pace.seconds() - began) / pace.steps
+        began = pace.seconds()
         with self._turn.mine():
             leave_behind(s, self.pool, self.cloud, motion, self._before)
             renew(s, self._follower, self.cloud, motion, self._rng(2))
             self._snapshot = None
+        self._usual_renewal.took(pace.seconds() - began)
         return rays, samples
 
     def _choose(self) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from edge_server.fields.trainer_settings import TRUST_BOUNDS, shared_option
+from edge_server.fields.trainer_settings import COMMON_BOUNDS, MOST_THREADS, shared_option
 from edge_server.fields.trainer_settings import option as _option
 
 
@@ -69,18 +69,20 @@ class SplatSettings:
     def __post_init__(self) -> None:
         for name, low, high in (
             ("gaussians", 1, 1 << 20), ("start", 1, 1 << 20), ("views_a_step", 1, 64), ("seed_cells", 0, 256),
-            ("min_views", 0, 1000), ("densify_every", 1, 1 << 30), ("opacity_reset", 0, 1 << 30),
+            ("densify_every", 1, 1 << 30), ("opacity_reset", 0, 1 << 30),
             ("follow", 0, 1000), ("settle_after", 1.0, 1e9), ("rate_settled", 0.0, 1.0),
             ("tile_share", 0.01, 1.0), ("dssim", 0.0, 1e3), ("seed_scale", 0.01, 100.0),
-            ("seed_opacity", 0.001, 0.99), ("rate_end", 1e-4, 1.0), ("epsilon", 0.0, 1e3), ("fade", 0.0, 1e3),
+            ("seed_opacity", 0.001, 0.99), ("fade", 0.0, 1e3),
             ("grow", 0.0, 1.0), ("prune", 0.0, 0.9), ("largest", 1e-3, 50.0), ("widest", 1e-3, 1e3),
-            ("aspect", 1.0, 1e4), ("changed_share", 0.0, 1.0), ("reseed", 0.0, 1.0),
+            ("aspect", 1.0, 1e4), ("reseed", 0.0, 1.0),
             ("rate_position", 0.0, 100.0), ("rate_scale", 0.0, 10.0), ("rate_rotation", 0.0, 10.0),
             ("rate_opacity", 0.0, 10.0), ("rate_color", 0.0, 10.0), ("flatten", 0.0, 1.0),
-            ("align", 0.0, 1.0), ("align_every", 1, 1 << 30), *TRUST_BOUNDS,
+            ("align", 0.0, 1.0), ("align_every", 1, 1 << 30), *COMMON_BOUNDS,
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"splat: {name} must be in {low}..{high}, not {getattr(self, name)}")
+        if self.threads is not None and not 1 <= self.threads <= MOST_THREADS:
+            raise ValueError(f"splat: threads must be in 1..{MOST_THREADS}, not {self.threads}")
         for name, allowed in (
             ("harmonics", (1, 4, 9)), ("loss", ("mse", "l1")), ("device", ("auto", "cpu", "cuda")),
         ):  # fmt: skip

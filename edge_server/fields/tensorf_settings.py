@@ -33,6 +33,10 @@ class TensorfSettings(TrainerSettings):
             ("color_rank", 8, 64),
             ("resolution_start", 4, 1024),
             ("first", 1e-4, 1.0),
+            ("rate", 0.0, 10.0),
+            ("decay", 0.0, 1e3),
+            ("smooth", 0.0, 1e3),
+            ("sparse", 0.0, 1e3),
         )
         for rank in ("density_rank", "color_rank"):
             if getattr(self, rank) % 8:

@@ -28,15 +28,25 @@ from edge_server.fields.kernels.rays import Space, Views
 from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
 from edge_server.fields.ngp_occupancy import EVERY, Occupancy
 from edge_server.fields.ngp_rig import Arrays, Rig
-from edge_server.fields.ngp_schedule import BETA1, BETA2, NOMINAL_RAYS, Pace, step_key, step_length
+from edge_server.fields.ngp_schedule import (
+    BETA1_FIELD,
+    BETA2,
+    NOMINAL_RAYS,
+    Pace,
+    Usual,
+    step_key,
+    step_length,
+)
 from edge_server.fields.ngp_snapshot import NgpSnapshot
-from edge_server.fields.ngp_state import fill, pack, unpack_meta
+from edge_server.fields.ngp_state import all_or_nothing, fill, pack, unpack_meta
 from edge_server.fields.refinement import CameraErrors
 from edge_server.fields.scene_box import NOWHERE
+from edge_server.fields.trainer_settings import BATCH
 from edge_server.fields.turn import Turn
 from freshfield.geometry import Pinhole
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
+assert BATCH == CHUNK, "settings and kernels must mean the same by a chunk"
 DIRTY = 32  # parameters that one dirty flag stands for: what ``adam`` calls a segment, times its width
 
 
@@ -59,6 +69,7 @@ class TrainedField:
         self.settings = settings
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         self._turn = Turn()
+        self.now = time.perf_counter  # the clock of budgets in seconds
         self.reset()
 
     # --- the protocol -------------------------------------------------------------------------
@@ -74,12 +85,13 @@ class TrainedField:
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Train on ``views`` from the present parameters. Raises ValueError for a view that cannot be one.
 
-        A budget in seconds (0.1 at least makes sense) is kept within 10 per cent, whatever the load; the
-        learning rate falls over the budget, so every fit ends with a settled field.
+        In a budget in seconds, no step begins that would end too late as steps usually go. New pictures are
+        taken in first, however short it is. The learning rate falls over the budget, so every
+        fit ends with a settled field.
         """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace = Pace(budget)
+        pace = Pace(budget, self.now)
         with self._turn.mine():
             intake = self.rig.take_in(views)
             if intake.new_box:
@@ -97,7 +109,7 @@ class TrainedField:
             self._batch = self._batch._replace(exposure=sums)
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
-        while (progress := pace.begin()) is not None:
+        while (progress := pace.begin(self._usual)) is not None:
             with self._turn.mine():
                 losses.append(self._one_step(data, progress))
                 data = cameras.learn(views, data, box, self.step, self.settings.seed, sums, self._live)
@@ -184,7 +196,7 @@ class TrainedField:
 
     def load_state(self, state: Arrays) -> None:
         """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        with self._turn.mine():
+        with self._turn.mine(), all_or_nothing(self):
             meta = unpack_meta(self.settings, state, self.name, self.shape)
             self.rig = Rig(self.settings)
             self.rig.load(meta, state)
@@ -252,6 +264,7 @@ class TrainedField:
         self.step = 0
         self._snapshot = None  # it is known by its step alone
         self._updates = 0  # optimiser steps that Adam's bias correction counts
+        self._usual = Usual()
         self._encoding, self._net = self._make(rng)
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
@@ -319,12 +332,12 @@ class TrainedField:
         fall = s.rate_end**progress
         rule = Rule(
             rate=np.float32(s.rate * fall),
-            beta1=np.float32(BETA1),
+            beta1=np.float32(BETA1_FIELD),
             beta2=np.float32(BETA2),
             epsilon=np.float32(s.epsilon),
             scale=np.float32(NOMINAL_RAYS / rays),
             decay=np.float32(s.decay),
-            correct1=np.float32(1.0 / (1.0 - BETA1**self._updates)),
+            correct1=np.float32(1.0 / (1.0 - BETA1_FIELD**self._updates)),
             correct2=np.float32(1.0 / (1.0 - BETA2**self._updates)),
         )
         rule_net = rule._replace(rate=np.float32(s.rate_net * fall), decay=np.float32(0.0))

@@ -20,6 +20,18 @@ TRUST_BOUNDS = (
     ("mask_grow_px_s", 0.0, 1e6),
     ("refuse_beyond", 0.0, 1e6),
 )
+# The same of options that ``splat`` has, too. Adam divides by epsilon where there is no gradient to speak of.
+COMMON_BOUNDS = (
+    ("min_views", 0, 1000),
+    ("rate_end", 1e-4, 1.0),
+    ("epsilon", 1e-10, 1e3),
+    ("changed_share", 0.0, 1.0),
+    ("seed", 0, (1 << 63) - 1),
+    ("nice", 0, 19),
+    *TRUST_BOUNDS,
+)
+MOST_THREADS = 1024
+BATCH = 2048  # samples of a chunk of ``kernels.train``, which is not imported for a number
 
 
 @dataclass(frozen=True)
@@ -32,7 +44,7 @@ class TrainerSettings:
     hidden_layers: int = option(1, "hidden layers of the network")
     harmonics: int = option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
     rays: int = option(4096, "rays of one step at most")
-    batch_samples: int = option(16384, "samples of one step at most, in chunks of 2048")
+    batch_samples: int = option(16384, "samples of one step at most, a multiple of 2048")
     samples: int = option(192, "steps across the scene's box, corner to corner")
     samples_start: int = option(64, "the same at first: fog is cheaper to see through in long steps")
     samples_ramp: int = option(600, "steps after which ``samples`` is reached")
@@ -76,16 +88,23 @@ class TrainerSettings:
             ("hidden", 4, 256),
             ("hidden_layers", 1, 4),
             ("rays", 1, 1 << 20),
-            ("batch_samples", 2048, 1 << 22),
+            ("batch_samples", BATCH, 1 << 22),
             ("samples", 8, 2048),
             ("samples_start", 8, 2048),
             ("samples_ramp", 0, 1 << 30),
             ("cells", 8, 256),
-            ("min_views", 0, 1000),
-            *TRUST_BOUNDS,
+            ("rate_net", 0.0, 10.0),
+            ("distortion", 0.0, 1e3),
+            ("sparsity", 0.0, 1e3),
+            ("near_fade", 0.0, 10.0),
+            *COMMON_BOUNDS,
             ("refine_m", 0.0, 1.0),
             ("refine_deg", 0.0, 20.0),
         )
+        if self.threads is not None:
+            self._within(("threads", 1, MOST_THREADS))
+        if self.batch_samples % BATCH:
+            raise ValueError(f"{name}: batch_samples must be a multiple of {BATCH}, not {self.batch_samples}")
         if self.hidden % 4 or self.cells % 4:
             raise ValueError(
                 f"{name}: hidden ({self.hidden}) and cells ({self.cells}) must be multiples of 4"

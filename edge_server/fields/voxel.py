@@ -32,10 +32,10 @@ from edge_server.fields.kernels.voxel_update import (
     refine,
     voxel_adam,
 )
-from edge_server.fields.ngp_occupancy import FADE, Occupancy
+from edge_server.fields.ngp_occupancy import EMPTY, Occupancy
 from edge_server.fields.ngp_rig import Arrays, Rig
-from edge_server.fields.ngp_schedule import Pace, step_key
-from edge_server.fields.ngp_state import fill, pack, unpack_meta
+from edge_server.fields.ngp_schedule import Pace, Usual, step_key
+from edge_server.fields.ngp_state import all_or_nothing, fill, pack, unpack_meta
 from edge_server.fields.scene_box import NOWHERE, PLAIN
 from edge_server.fields.turn import Turn
 from edge_server.fields.voxel_settings import VoxelSettings, make_settings, sizes_of
@@ -44,6 +44,7 @@ from freshfield.geometry import Pinhole
 
 PHASES = 4  # looks until every cell has been looked at
 EVERY = 5  # steps between looks at where there is density
+FADE = 0.75  # of a cell's density per look
 BETA2 = 0.95  # Adam's memory in steps that touch a vertex: a fit has a hundred of them, not thousands
 WARM = 1.5  # of the steps until the grid has its last size: from then on a fit is a warm start
 TOLERANCE = PLAIN  # of 255, within which a pixel is taken for the plain background
@@ -61,6 +62,7 @@ class VoxelField:
         self.settings = settings or VoxelSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         self._turn = Turn()
+        self.now = time.perf_counter  # the clock of budgets in seconds
         self.reset()
 
     # --- the protocol -------------------------------------------------------------------------
@@ -76,11 +78,12 @@ class VoxelField:
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         """Train on ``views`` from the present grid. Raises ValueError for a view that cannot be one.
 
-        A budget in seconds is kept within 10 per cent; the learning rate falls over the budget.
+        In a budget in seconds, no step begins that would end too late as steps usually go. New pictures are
+        taken in first, however short it is. The learning rate falls over the budget.
         """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace, s = Pace(budget), self.settings
+        pace, s = Pace(budget, self.now), self.settings
         with self._turn.mine():
             intake = self.rig.take_in(views)
             if intake.new_box:
@@ -93,11 +96,14 @@ class VoxelField:
             data = self._outlined(self.rig.trusted(views, intake, self.step, self._live()))
             # Once the grid is fine, most of what a fit meets is known: full rates would undo it.
             share = s.warm if self.step >= WARM * max(s.refine_at, default=s.prune_from) else 1.0
+            # Steps at full rates: a grid that meets the same pixels over and over learns them by heart.
+            full = s.settle * (len(data.drawn) or len(data.pixels)) / s.rays or np.inf
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
-        while (progress := pace.begin()) is not None:
+        while (progress := pace.begin(self._usual)) is not None:
             with self._turn.mine():
-                losses.append(self._one_step(data, share * s.rate_end**progress))
+                fall = s.rate_end**progress * min(full / max(pace.steps, 1), 1.0)
+                losses.append(self._one_step(data, share * fall))
                 rays += self.settings.rays
                 samples += int(self._samples.sum())
                 dropped += int(self._bad_rays.sum() + self._bad_gradients.sum())
@@ -171,7 +177,7 @@ class VoxelField:
 
     def load_state(self, state: Arrays) -> None:
         """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        with self._turn.mine():
+        with self._turn.mine(), all_or_nothing(self):
             meta = unpack_meta(self.settings, state, "voxel", SHAPE)
             self.rig = Rig(self.settings)
             self.rig.load(meta, state)
@@ -199,12 +205,13 @@ class VoxelField:
         self._snapshot = None  # it is known by its step alone
         self._outlines: tuple[Views, Views] | None = None  # of the views last seen, before and after
         self._updates = 0  # optimiser steps that Adam's bias correction counts
+        self._usual = Usual()
         s = self.settings
         self._sizes = sizes_of(s, self.rig.box)
         table = _room_for(self._sizes[0])
         table[:] = (s.first, 0.5, 0.5, 0.5)
         self._take(self._sizes[0], table)
-        self._occupancy = Occupancy.for_box(s, self.rig.box)
+        self._occupancy = Occupancy.for_box(s, self.rig.box, unknown=2.0 * EMPTY)
         self._away = np.zeros(s.cells**3, np.uint8)
         self._memory = make_trace(self.pool.threads)
         self._samples, self._bad_rays = np.zeros(s.parts, np.int64), np.zeros(s.parts, np.int64)

@@ -28,6 +28,9 @@ class VoxelSettings(TrainerSettings):
     rays: int = option(8192, "rays of one step")
     rate: float = option(0.05, "learning rate of density at the start of a fit")
     rate_color: float = option(0.06, "learning rate of colour at the start of a fit")
+    settle: float = option(
+        3.0, "passes over all pixels, after which a fit's rates fall as 1 / steps; 0: never"
+    )
     warm: float = option(0.3, "share of the rates in a fit that starts from a grid of its last size")
     soften: float = option(0.2, "largest optical depth of one step left where something moved")
     growth: float = option(20.0, "how much faster density is learnt where there is some: times 1 + growth x")
@@ -47,11 +50,13 @@ class VoxelSettings(TrainerSettings):
             ("first", 0.0, 4.0),
             ("rate", 0.0, 10.0),
             ("rate_color", 0.0, 10.0),
+            ("settle", 0.0, 1e6),
             ("warm", 0.0, 1.0),
             ("growth", 0.0, 1e3),
             ("l1", 0.0, 1e2),
             ("outline", 0.0, 1e2),
             ("prune", 0.0, 4.0),
+            ("prune_from", 0, 1 << 30),
             ("soften", 0.0, 4.0),
         )
         at = list(self.refine_at)

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
 from edge_server.offline.fitting import evaluate
-from edge_server.offline.kept import Kept
+from edge_server.offline.kept import Kept, settled
 from edge_server.offline.still import Still, open_still, smallest_angle_deg, synthetic
 from edge_server.offline.usage import Usage, peak_rss_mb
 from freshfield.geometry import Pinhole
@@ -73,18 +73,26 @@ def measure(
     scorer_lpips, missing = open_lpips(lpips)
     kept.put("lpips_missing", missing)
     for name in names:
-        kept.get("start", name, measure=partial(_start_up, name, quick, folder / name))
+        start = partial(_start_up, name, quick, folder / name)
+        kept.get("start", name, measure=start, settings={"cold": not quick, "defaults": settled(name)})
     for scene in ("tile", "room"):
         still = synthetic(scene, cameras=VIEWS + 1, size=SIZE)
         _describe(kept, scene, still)
         for name in names:
-            kept.get(scene, name, measure=partial(_of_ours, name, still, effort, scorer_lpips))
+            ours = partial(_of_ours, name, still, effort, scorer_lpips)
+            kept.get(scene, name, measure=ours, settings=_as_json(effort, name, scorer_lpips))
     for scene, still in _recorded_scenes():
         _describe(kept, scene, still)
         for name in names:
             curve = partial(_curve, name, still, effort.recorded_s, 1, scorer_lpips)
-            kept.get(scene, name, measure=curve)
+            kept.get(scene, name, measure=curve, settings=_as_json(effort, name, scorer_lpips))
     return kept.figures
+
+
+def _as_json(effort: Effort, name: str, lpips: Any) -> dict[str, Any]:
+    """The settings that a row is kept with."""
+    values = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(effort).items()}
+    return {**values, "lpips": lpips is not None, "defaults": settled(name)}
 
 
 def _describe(kept: Kept, scene: str, still: Still) -> None:

@@ -22,7 +22,7 @@ from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
 from edge_server.offline.choices import CHOICES, MOVING, SCENES, Scene, missing
 from edge_server.offline.fitting import evaluate
-from edge_server.offline.kept import Kept
+from edge_server.offline.kept import Kept, settled
 from edge_server.offline.progress import Progress
 from edge_server.offline.usage import BenchError, Usage
 
@@ -74,7 +74,6 @@ def measure(
         raise BenchError(f"no option is called {', '.join(unknown)}: {', '.join(c.name for c in CHOICES)}")
     choices = [c for c in CHOICES if not only or c.name in only]
     absent = missing({s for c in choices for s in c.scenes})
-    settings = _as_json(effort)
     todo: list[tuple[str, str, str, Mapping[str, Any]]] = []  # name, scene, settings as text, as given
     for name in names:
         points: dict[tuple[str, str], Mapping[str, Any]] = {}
@@ -91,7 +90,7 @@ def measure(
         todo += [
             (name, scene, text, options)
             for (scene, text), options in points.items()
-            if not kept.has("points", scene, name, text, settings=settings)
+            if not kept.has("points", scene, name, text, settings=_as_json(effort, name))
         ]
     progress = Progress(sum(effort.work(scene in MOVING) for _, scene, *_ in todo))
     make = cache(lambda scene: SCENES[scene][1]())
@@ -99,6 +98,7 @@ def measure(
     try:
         for name, scene, text, options in todo:
             point = partial(_point, name, make, scene, options, effort)
+            settings = _as_json(effort, name)
             found = kept.get("points", scene, name, text, settings=settings, measure=point)
             progress.did(effort.work(scene in MOVING))
             told = ", ".join(f"{run.replace('_', ' ')} {_db(db)} dB" for run, db in found["psnr_db"].items())
@@ -108,9 +108,10 @@ def measure(
     return kept.figures
 
 
-def _as_json(effort: Effort) -> dict[str, Any]:
-    values = dataclasses.asdict(effort)
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
+def _as_json(effort: Effort, name: str) -> dict[str, Any]:
+    """The settings that a point is kept with; what differs from the defaults is in its name."""
+    values = {key: list(v) if isinstance(v, tuple) else v for key, v in dataclasses.asdict(effort).items()}
+    return {**values, "defaults": settled(name)}
 
 
 def label(name: str, options: Mapping[str, Any]) -> str:

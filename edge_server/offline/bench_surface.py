@@ -2,7 +2,8 @@
 
 A field is fitted to a scan of ``tile`` from 0.3 m (``offline.scan``); after each of some seconds its depth is
 compared with the exact one, and meshes are made of it: from the depth as it is, from depth sharpened by the
-pictures, with truncated signed distances at several voxel sizes and with a fitted distance function. Row
+pictures, from voxels carved anew and then sharpened (``surface.carve``), with truncated signed distances at
+several voxel sizes and with a fitted distance function. Row
 ``exact`` fuses the exact depth instead: what pictures of this size and these cameras allow at best.
 """
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
-from edge_server.offline.kept import Kept
+from edge_server.offline.kept import Kept, settled
 from edge_server.offline.progress import Progress
 from edge_server.offline.scan import DISTANCE_M, Scan, exact_depth, scan, truth_of
 from edge_server.offline.usage import BenchError, Usage
@@ -44,6 +45,12 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "splat, planar": ("splat", {"flatten": 0.02, "align": 0.3}),
     "ngp": ("ngp", {}),
     "voxel": ("voxel", {}),
+}
+# Depth that meshes are made from, and what makes it.
+DEPTHS = {
+    "of the field": MeshSettings(sharpen=False),
+    "sharpened": MeshSettings(carve=False),
+    "carved": MeshSettings(),
 }
 TARGET = (
     f"chamfer at most {TARGET_CHAMFER_MM:g} mm, completeness at least {100 * TARGET_COMPLETE:g} % at "
@@ -83,6 +90,7 @@ def measure(
     names = [n for n in (effort.cases if not fields else CASES) if not fields or CASES[n][0] in fields]
     settings = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(effort).items()}
     settings.pop("cases")
+    settings["depths"] = list(DEPTHS)  # figures of other stages are measured anew
     close = scan(effort.size)
     truth = truth_of(close)
     kept.put("scan", {
@@ -94,7 +102,8 @@ def measure(
     progress = Progress(len(names) * effort.fit_s[-1])
     for name in names:
         case = partial(_of_case, name, effort, close, exact, truth, progress)
-        kept.get("cases", name, settings=settings, measure=case)
+        made_with = {**settings, "defaults": settled(*CASES[name])}
+        kept.get("cases", name, settings=made_with, measure=case)
     return kept.figures
 
 
@@ -127,18 +136,19 @@ def _of_case(
         fit: dict[str, Any] = {"fit_s": until, "steps": steps, "meshes": []}
         snapshot = field.snapshot()
         middle = effort.voxels_mm[len(effort.voxels_mm) // 2]
-        for sharpen, wanted in (
-            (False, [("tsdf", middle)]),
-            (True, [*[("tsdf", mm) for mm in effort.voxels_mm], ("sdf", middle)]),
+        every = [("tsdf", mm) for mm in effort.voxels_mm]
+        for depth, wanted in (
+            ("of the field", [("tsdf", middle)]),
+            ("sharpened", [*every, ("sdf", middle)]),
+            ("carved", every),
         ):
-            depth = "sharpened" if sharpen else "of the field"
             seconds: dict[str, float] = {}
             began = time.perf_counter()
 
             def say(what: str, share: float, seconds=seconds, began=began) -> None:
                 seconds[what] = time.perf_counter() - began - sum(v for k, v in seconds.items() if k != what)
 
-            maps = maps_of(snapshot, close.views, MeshSettings(sharpen=sharpen), say)
+            maps = maps_of(snapshot, close.views, DEPTHS[depth], say)
             fit[depth] = {**_depth_error(maps, exact), **{f"{k}_s": v for k, v in seconds.items()}}
             fit["meshes"] += [_mesh(maps, method, depth, mm, truth) for method, mm in wanted]
         fits.append(fit)
@@ -180,7 +190,7 @@ def table(figures: dict[str, Any]) -> str:
     ]
     for name, case in figures.get("cases", {}).items():
         for fit in case["fits"]:
-            for depth in ("of the field", "sharpened"):
+            for depth in DEPTHS:
                 d = fit[depth]
                 seconds = ", ".join(f"{k[:-2]} {v:.1f}" for k, v in d.items() if k.endswith("_s"))
                 lines.append(

@@ -27,7 +27,7 @@ from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
 from edge_server.offline.film import Film, recorded_film, synthetic_film
-from edge_server.offline.kept import Interrupted, Kept
+from edge_server.offline.kept import Interrupted, Kept, settled
 from edge_server.offline.progress import Progress
 from edge_server.offline.usage import BenchError, Usage
 
@@ -99,7 +99,7 @@ def measure(
     plan, kept = replace(QUICK if quick else FULL, **given), kept or Kept()
     names = tuple(fields) or field_names()
     films = dict(_films(plan, scenes))
-    todo = [(s, n) for s in films for n in names if not kept.has(s, n, settings=_as_json(plan))]
+    todo = [(s, n) for s in films for n in names if not kept.has(s, n, settings=_as_json(plan, n))]
     progress = Progress(plan.amount() * len(todo))
     for scene, film in films.items():
         kept.get(scene, "baseline", measure=lambda film=film: _baseline(film))  # type: ignore[misc]
@@ -108,7 +108,7 @@ def measure(
             kept.get(
                 scene,
                 name,
-                settings=_as_json(plan),
+                settings=_as_json(plan, name),
                 measure=lambda name=name, film=film: _follow(name, film, plan, progress),  # type: ignore[misc]
             )
     return kept.figures
@@ -245,8 +245,10 @@ def _row(score: Score) -> dict[str, Any]:
     return {"psnr_db": score.psnr_db, "psnr_moving_db": score.psnr_moving_db}
 
 
-def _as_json(plan: Plan) -> dict[str, Any]:
-    return {**asdict(plan), "update_s": list(plan.update_s), "options": dict(plan.options or {})}
+def _as_json(plan: Plan, name: str) -> dict[str, Any]:
+    """The settings that a representation's row is kept with."""
+    values = {**asdict(plan), "update_s": list(plan.update_s), "options": dict(plan.options or {})}
+    return {**values, "defaults": settled(name, plan.options)}
 
 
 def _baseline(film: Film) -> dict[str, Any]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from types import FrameType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +69,7 @@ def fit_in_slices(
         began = time.perf_counter()
         report: FitReport | None = None
         # Interrupted, the parameters are those of the last step: good enough to be scored and saved.
-        with suppress(KeyboardInterrupt):
+        with _ctrl_c() as pressed, suppress(KeyboardInterrupt):
             report = field.fit(training, Budget(seconds=mark - seconds))
         slice_s = time.perf_counter() - began
         seconds += slice_s
@@ -74,6 +77,26 @@ def fit_in_slices(
         on_scored(
             Scored(seconds, slice_s, steps if report else None, report.loss if report else None, score())
         )
-        if report is None:
+        if report is None or pressed.is_set():
             return False
     return True
+
+
+@contextmanager
+def _ctrl_c() -> Iterator[threading.Event]:
+    """Whether Ctrl-C was pressed meanwhile, also where Python cannot raise it: in a callback of the collector
+    it is printed and forgotten."""
+    pressed, before = threading.Event(), signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield pressed
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        pressed.set()
+        before(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -19,10 +19,11 @@ from camera_node.sources.records import DatasetError
 from camera_node.world.scene import SCENES, SceneError
 from edge_server.fidelity.lpips import Lpips
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fields.registry import field_names, make_field, settings_of
+from edge_server.fields.registry import field_names, make_field
 from edge_server.offline import sweep, update_time
 from edge_server.offline.fit import FitError, parse_options
 from edge_server.offline.frontier_output import write_output
+from edge_server.offline.kept import settled
 from edge_server.offline.still import Still, open_still
 from edge_server.offline.virtual import Compute
 from edge_server.report.machine import machine, versions
@@ -97,12 +98,23 @@ FULL = Plan(
     moving=update_time.Moving(cameras=19, size=128),
 )
 
+# What is shipped for scenarios that name no frontier of their own. Unlike --quick, it charges steps what they
+# cost on views as many and as large as those they are made with.
+SHIPPED = replace(
+    FULL,
+    knobs=False,
+    planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
+    update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 1.0, 2.0),
+    run_s=8.0,
+    efforts=("low", "medium"),
+)
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
     try:
-        job = _job(args, QUICK if args.quick else FULL)
+        job = _job(args, QUICK if args.quick else SHIPPED if args.shipped else FULL)
     except (DatasetError, SceneError, FitError, ScenarioError, ValueError) as error:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
@@ -118,7 +130,9 @@ def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server frontier", description=DESCRIPTION, formatter_class=raw)
     add = parser.add_argument
-    add("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
+    plan = parser.add_mutually_exclusive_group().add_argument
+    plan("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
+    plan("--shipped", action="store_true", help="the points to ship, with --field ngp,splat --points FILE")
     add("--scene", default="room", metavar="NAME|DATA", help="room, tile or a data set [%(default)s]")
     add("--holdout", default="8", metavar="K|NAME,...", help="of a data set, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="of a data set, as in fit [%(default)g]")
@@ -249,8 +263,9 @@ class Frontier:
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
                 "figure": 1, "scene": self.still.describe(), "field": effort.field,
-                "options": effort.options, "divided": effort.divided, "defaults": _settled(effort),
-                "seconds": planned_s, "seed": seed, "lpips": self.lpips is not None,
+                "options": effort.options, "divided": effort.divided,
+                "defaults": settled(effort.field, effort.options), "seconds": planned_s,
+                "seed": seed, "lpips": self.lpips is not None,
             }  # fmt: skip
             measure = partial(sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
             point, new = self.store.get(settings, measure)
@@ -319,17 +334,11 @@ class Frontier:
         steps = update_time.steps_for(update_s, compute)
         settings: Row = {
             "figure": 2, **asdict(plan.moving), "speed_m_per_s": speed, "field": effort.field,
-            "options": effort.options, "defaults": _settled(effort), "warm_steps": plan.warm_steps,
-            "steps": steps, "seed": seed,
-            "seconds": seconds, "compute": asdict(compute), "lpips": self.lpips is not None,
+            "options": effort.options, "defaults": settled(effort.field, effort.options),
+            "warm_steps": plan.warm_steps, "steps": steps, "seed": seed, "seconds": seconds,
+            "compute": asdict(compute), "lpips": self.lpips is not None,
         }  # fmt: skip
         return settings, lambda: stage().run(steps, compute, seconds, self.lpips)
-
-
-def _settled(effort: sweep.Effort) -> str:
-    """What the options of an effort come to, as a digest: with another default, a point is another one."""
-    settings = settings_of(effort.field, effort.options)
-    return hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
 
 
 def _why_still(scene: str) -> str:

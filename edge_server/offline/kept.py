@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
+
+from edge_server.fields.registry import settings_of
 
 
 class Interrupted(KeyboardInterrupt):
@@ -13,6 +16,12 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, figures: dict[str, Any]) -> None:
         super().__init__()
         self.figures = figures
+
+
+def settled(name: str, options: Mapping[str, Any] | None = None) -> str:
+    """What options of a representation come to, as a digest: with another default, another thing was
+    measured, so figures are kept with it. ValueError as ``make_field``."""
+    return hashlib.sha256(repr(settings_of(name, options)).encode()).hexdigest()[:16]
 
 
 def _nowhere() -> None:

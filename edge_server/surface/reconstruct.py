@@ -11,9 +11,10 @@ import numpy as np
 from edge_server.fields import Renderer, View
 from edge_server.fields.kernels.pool import Pool
 from edge_server.surface import SurfaceError
+from edge_server.surface.carve import STEPS, box_of, carved, completed
 from edge_server.surface.depth import SOLID, STEEPEST_DEG, DepthMap, rendered
 from edge_server.surface.mesh import KEEP_SHARE, Mesh, cleaned, extracted
-from edge_server.surface.sharpen import sharpened
+from edge_server.surface.sharpen import PASSES, sharpened
 from edge_server.surface.volume import TRUNCATION, Grid, bounds_of, fused
 
 METHODS = ("tsdf", "sdf")
@@ -29,10 +30,14 @@ class MeshSettings:
     truncation: voxels. bounds: lower and upper corner, metres; None: of what cameras see. watertight: close
     the surface where nothing was seen. min_weight: voxels of no more weight (a camera that looks straight on
     counts 1) are not known. solid, steepest_deg: which pixels count. keep_share, most: which components stay.
-    memory_mb: of the volume. sharpen: move depth to where the pictures agree (``sharpen``)."""
+    memory_mb: of the volume. sharpen: move depth to where the pictures agree (``sharpen``). carve: with
+    sharpen, of a scene that ends at its field's box and has enough pictures: start from voxels fitted for it
+    in ``carve_steps`` steps, and keep their depth where pictures do not tell (``carve``)."""
 
     method: str = "tsdf"
     sharpen: bool = True
+    carve: bool = True
+    carve_steps: int = STEPS
     voxel_m: float | None = None
     truncation: float = TRUNCATION
     bounds: tuple[Corner, Corner] | None = None
@@ -50,6 +55,7 @@ class MeshSettings:
         for name, low, high in (
             ("truncation", 1.0, 100.0), ("min_weight", 0.0, 1e6), ("solid", 0.01, 1.0),
             ("steepest_deg", 1.0, 89.9), ("keep_share", 0.0, 1.0), ("memory_mb", 1.0, 1e6),
+            ("carve_steps", 1, 1e6),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise SurfaceError(f"{name} must be in {low:g}..{high:g}, not {getattr(self, name):g}")
@@ -83,6 +89,12 @@ def maps_of(
     if not views:
         raise SurfaceError("the field knows no cameras yet: fit it first")
     cameras = [(v.camera_to_world, v.intrinsics) for v in views]
+    box = box_of(renderer, views) if settings.sharpen and settings.carve else None
+    if box is not None:
+        say("carve", 0.0)
+        behind = getattr(renderer, "background", None)
+        renderer = carved(box, behind, views, settings.carve_steps, pool)
+        say("carve", 1.0)
     # Where the pictures decide, a translucent first guess will do.
     solid = min(settings.solid, GUESS) if settings.sharpen else settings.solid
     maps = list(
@@ -92,7 +104,10 @@ def maps_of(
     )
     if not settings.sharpen or len(maps) < 2:
         return maps
-    return sharpened(maps, [v.image for v in views], pool=pool, on_map=lambda share: say("sharpen", share))
+    # What was carved is near enough to do without the widest search, which may go astray.
+    passes = PASSES if box is None else PASSES[1:]
+    sharp = sharpened(maps, [v.image for v in views], passes, pool, lambda share: say("sharpen", share))
+    return sharp if box is None else completed(sharp, maps)
 
 
 def mesh_of_maps(

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.fields import ngp_settings
 from edge_server.offline import bench_field, bench_peer
 from edge_server.offline.bench_ingest import CAMERAS, TARGET_P99_MS
 from tests.conftest import data_dir
@@ -109,6 +110,32 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
     before = more["fidelity"]
     assert edge_server(["bench", *words]) == 0
     assert json.loads(path.read_text())["fidelity"] == before
+
+
+def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch):
+    """And of another effort; everything else is taken for known."""
+    monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+    asked = []
+    monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: asked.append(name) or _curve(name, *rest))
+    monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: {})
+    monkeypatch.setattr(bench_field, "_start_up", lambda name, *_: asked.append(f"start {name}") or {})
+    monkeypatch.setattr(bench_field, "table", lambda figures: "")
+    monkeypatch.setattr(bench_field, "draw", lambda figures, path: None)
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(2, (0.5, 1.0), (), 1))
+    words = ("--resume", "--field", "ngp,voxel")
+    bench("field", tmp_path / "bench.json", *words)
+    everything = ["start ngp", "start voxel", "ngp", "voxel", "ngp", "voxel"]
+    assert asked == everything
+    asked.clear()
+    bench("field", tmp_path / "bench.json", *words)
+    assert asked == []
+    monkeypatch.setitem(ngp_settings.EFFORTS, "medium", {"levels": 7})
+    bench("field", tmp_path / "bench.json", *words)
+    assert asked == ["start ngp", "ngp", "ngp"]
+    asked.clear()
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(3, (0.5, 1.0), (), 1))
+    bench("field", tmp_path / "bench.json", *words)
+    assert asked == [name for name in everything if not name.startswith("start")]
 
 
 def test_a_part_that_cannot_be_measured_does_not_stop_the_others(tmp_path, monkeypatch, capsys):

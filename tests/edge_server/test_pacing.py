@@ -6,6 +6,7 @@ import json
 import math
 import multiprocessing
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,14 @@ def test_the_best_point_that_fits_is_chosen():
     assert choose(POINTS, 9000.0, 1.0) == POINTS[2]  # longer updates show an older world
     assert choose(POINTS, 500.0, 3.0) == POINTS[4]  # a faster scene: the speed nearest in ratio
     assert choose(POINTS, 30.0, 1.0) == POINTS[0]  # nothing is as short: the quickest
+
+
+def test_of_points_that_seeds_cannot_tell_apart_the_quickest_is_chosen():
+    unsure = [replace(p, error_db=1.0) for p in POINTS]  # the best leads by 1.5, of which 1.4 may be chance
+    assert choose(unsure, 500.0, 1.0) == unsure[2]
+    unsure = [replace(p, error_db=1.2) for p in POINTS]
+    assert choose(unsure, 500.0, 1.0) == unsure[0]
+    assert choose(unsure, 500.0, 3.0) == unsure[4]
 
 
 def test_points_are_read_and_errors_say_what_to_do(tmp_path):

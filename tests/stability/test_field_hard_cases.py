@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.nerfacto import NerfactoField
-from edge_server.fields.ngp import NgpField
-from edge_server.fields.tensorf import TensorfField
 from edge_server.fields.voxel import VoxelField
 from freshfield.geometry import look_at
-from tests.edge_server.fields.scenes import mean_psnr
-from tests.stability import test_field_nerfacto, test_field_ngp, test_field_tensorf, test_field_voxel
-from tests.stability.test_field_ngp import VIEWS
+from tests.edge_server.fields.scenes import mean_psnr, picture, ring
+from tests.stability import test_field_voxel
+from tests.stability import test_fields_with_networks as with_networks
+from tests.stability.test_fields_with_networks import VIEWS
 
 
 class Case(NamedTuple):
@@ -32,10 +30,10 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "ngp": Case(NgpField, test_field_ngp.TINY, test_field_ngp._healthy),
-    "tensorf": Case(TensorfField, test_field_tensorf.TINY, test_field_tensorf._healthy),
+    "ngp": Case(*with_networks.TINY["ngp"], with_networks.healthy),
+    "tensorf": Case(*with_networks.TINY["tensorf"], with_networks.healthy),
     "voxel": Case(VoxelField, test_field_voxel.TINY, test_field_voxel._healthy),
-    "nerfacto": Case(NerfactoField, test_field_nerfacto.TINY, test_field_nerfacto._healthy),
+    "nerfacto": Case(*with_networks.TINY["nerfacto"], with_networks.healthy),
 }
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 
@@ -112,3 +110,39 @@ def test_views_that_contradict_each_other(case: Case) -> None:
     case.healthy(field, VIEWS)
     field.fit(VIEWS, Budget(steps=150))  # and it recovers
     assert mean_psnr(field, VIEWS) > 16.0
+
+
+@every
+def test_a_thousand_updates_do_not_drift_or_grow(case: Case) -> None:
+    """A moving ball, a new selection of views each time, warm starts only."""
+    rng = np.random.default_rng(1)
+    still = ring(9, size=24)
+    places = [np.array([0.3 * np.sin(a), 0.3 * np.cos(a), 0.5]) for a in np.linspace(0, 2 * np.pi, 12)]
+    frames = [[replace(v, image=picture(v.intrinsics, v.camera_to_world, p)) for v in still] for p in places]
+    field, scores, sizes = case.kind(case.tiny), [], []
+    for update in range(1000):
+        frame = frames[update % 12]
+        field.fit([frame[k] for k in rng.choice(9, 6, replace=False)], Budget(steps=2))
+        if update % 100 >= 88:
+            scores.append(mean_psnr(field, frame[::4]))
+            sizes.append(np.abs(field.state()["table"]).mean())
+    case.healthy(field, VIEWS)
+    first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
+    assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
+    assert last > 15.0
+    assert np.mean(sizes[-12:]) < 3.0 * np.mean(sizes[12:24]), "parameters grow"
+    assert len(field.rig.memory) == 9
+
+
+@every
+def test_cameras_that_move_at_every_update(case: Case) -> None:
+    field = case.kind(case.tiny)
+    for update in range(30):
+        views = []
+        for view in VIEWS[:4]:
+            eye = view.camera_to_world[:3, 3] + 0.05 * update * np.array([0.0, 0.0, 1.0])
+            pose = look_at(eye, (0.0, 0.0, 0.4))
+            views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
+        field.fit(views, Budget(steps=5))
+    case.healthy(field, views)
+    assert mean_psnr(field, views) > 15.0

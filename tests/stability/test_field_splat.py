@@ -228,7 +228,10 @@ def test_cameras_that_move_at_every_update() -> None:
 def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""
     code = """
-from tests.stability.test_field_splat import TINY, VIEWS, SplatField, Budget, replace, np
+from dataclasses import replace
+import numpy as np
+from edge_server.fields import Budget
+from tests.stability.test_field_splat import TINY, VIEWS, SplatField
 bent = [replace(v, intrinsics=replace(v.intrinsics, distortion=(-.1, .01, .002, .001))) for v in VIEWS]
 for extra, views in (({}, VIEWS), ({"harmonics": 9, "contracted": True, "dssim": 0.1}, bent),
                      ({"views_a_step": 3, "tile_share": 0.4, "loss": "l1"}, VIEWS)):

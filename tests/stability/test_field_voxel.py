@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,8 @@ from edge_server.fields import Budget, View
 from edge_server.fields.kernels.voxel_update import DENSEST
 from edge_server.fields.voxel import VoxelField
 from edge_server.fields.voxel_settings import VoxelSettings
-from freshfield.geometry import look_at
 from tests.edge_server.fields.bounds import run_with_bounds_checks
-from tests.edge_server.fields.scenes import mean_psnr, picture, ring
+from tests.edge_server.fields.scenes import mean_psnr, ring
 
 TINY = VoxelSettings(sizes=(12, 20, 32), refine_at=(10, 25), rays=512, cells=16, threads=2)
 VIEWS = ring(9, size=24)
@@ -87,45 +85,14 @@ def test_density_that_overflows_stays_finite(damage: Callable[[VoxelField], None
     assert mean_psnr(field, VIEWS) > 15.0
 
 
-def test_a_thousand_updates_do_not_drift_or_grow() -> None:
-    """A moving ball, a new selection of views each time, warm starts only."""
-    rng = np.random.default_rng(1)
-    still = ring(9, size=24)
-    places = [np.array([0.3 * np.sin(a), 0.3 * np.cos(a), 0.5]) for a in np.linspace(0, 2 * np.pi, 12)]
-    frames = [[replace(v, image=picture(v.intrinsics, v.camera_to_world, p)) for v in still] for p in places]
-    field, scores, sizes = VoxelField(TINY), [], []
-    for update in range(1000):
-        frame = frames[update % 12]
-        field.fit([frame[k] for k in rng.choice(9, 6, replace=False)], Budget(steps=2))
-        if update % 100 >= 88:
-            scores.append(mean_psnr(field, frame[::4]))
-            sizes.append(np.abs(field._voxels.table).mean())
-    _healthy(field)
-    first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
-    assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
-    assert last > 15.0
-    assert np.mean(sizes[-12:]) < 3.0 * np.mean(sizes[12:24]), "parameters grow"
-    assert len(field.rig.memory) == 9
-
-
-def test_cameras_that_move_at_every_update() -> None:
-    field = VoxelField(TINY)
-    for update in range(30):
-        views = []
-        for view in VIEWS[:4]:
-            eye = view.camera_to_world[:3, 3] + 0.05 * update * np.array([0.0, 0.0, 1.0])
-            pose = look_at(eye, (0.0, 0.0, 0.4))
-            views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
-        field.fit(views, Budget(steps=5))
-    _healthy(field, views)
-    assert mean_psnr(field, views) > 15.0
-
-
 @pytest.mark.slow
 def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""
     code = """
-from tests.stability.test_field_voxel import TINY, VIEWS, VoxelField, Budget, replace, np
+from dataclasses import replace
+import numpy as np
+from edge_server.fields import Budget
+from tests.stability.test_field_voxel import TINY, VIEWS, VoxelField
 for extra in ({}, {"contracted": True, "radius_m": 0.5}, {"parts": 7, "rays": 9, "background": "random"}):
     field = VoxelField(replace(TINY, **extra))
     field.fit(VIEWS, Budget(steps=20))

@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge_server.fields import View
+from edge_server.fields.scene_box import SceneBox
 from edge_server.surface import SurfaceError
+from edge_server.surface.carve import carved, completed
 from edge_server.surface.depth import DepthMap, depth_map, rendered
 from edge_server.surface.mesh import cleaned, extracted
 from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
@@ -150,3 +153,28 @@ def test_a_volume_of_one_block():
     tiny = Grid((0.09, -0.02, -0.02), (0.11, 0.02, 0.02), 0.005, 0.01)
     mesh = cleaned(extracted(fused(tiny, ball_maps(20))))
     assert len(mesh.faces) and np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS_M).max() < 0.003
+
+
+@pytest.mark.parametrize("kind", ["black", "plain", "noise", "contradictory"])
+def test_voxels_carved_from_pictures_of_nothing(kind):
+    """Bounded depth or none, and never NaN: nothing that was carved lies nearer than the box allows."""
+    pictures = {
+        "black": lambda k: np.zeros((64, 64, 3), np.uint8),
+        "plain": lambda k: GREY,
+        "noise": lambda k: RNG.integers(0, 255, (64, 64, 3), dtype=np.uint8),
+        "contradictory": lambda k: np.full((64, 64, 3), 255 * (k % 2), np.uint8),
+    }
+    views = [View(f"c{k}", pictures[kind](k), pose, LENS) for k, pose in enumerate(around(6))]
+    box = SceneBox((0.0, 0.0, 0.0), 0.15, 0.1, False, 0.4, 0.005)
+    field = carved(box, (0.35, 0.35, 0.35), views, 30, None)
+    maps = list(rendered(field, [(v.camera_to_world, v.intrinsics) for v in views], 0.5))
+    found = completed(sharpened(maps, [v.image for v in views]), maps)
+    for m in found:
+        assert np.isfinite(m.trust).all() and not np.isnan(m.depth).any() and np.isfinite(m.cosine).all()
+        # Within the box, but for what a sweep of all passes may move it.
+        assert (m.depth[m.seen] > 0.86 * 0.1).all() and (m.depth[m.seen] < 1.14 * (0.4 + 0.15 * 3**0.5)).all()
+    volume = fused(GRID, found)
+    assert np.isfinite(volume.blocks.distance).all() and np.isfinite(volume.blocks.color).all()
+    assert np.abs(volume.blocks.distance).max(initial=0.0) <= GRID.band_m + 1e-6
+    if kind == "plain":
+        assert not any(m.seen.any() for m in found)  # pictures of the background alone hold no surface

@@ -10,20 +10,12 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.nerfacto import NerfactoField
-from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_torch_field import NgpTorchField
 from edge_server.fields.splat import SplatField
-from edge_server.fields.tensorf import TensorfField
 from edge_server.fields.voxel import VoxelField
 from tests.edge_server.fields.scenes import mean_psnr, ring
-from tests.stability import (
-    test_field_nerfacto,
-    test_field_ngp,
-    test_field_splat,
-    test_field_tensorf,
-    test_field_voxel,
-)
+from tests.stability import test_field_splat, test_field_voxel
+from tests.stability import test_fields_with_networks as with_networks
 
 VIEWS = ring(7, size=24)
 
@@ -34,11 +26,11 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "ngp": Case(NgpField, test_field_ngp.TINY),
-    "ngp-torch": Case(lambda settings: NgpTorchField(settings, "cpu"), test_field_ngp.TINY),
-    "tensorf": Case(TensorfField, test_field_tensorf.TINY),
+    "ngp": Case(*with_networks.TINY["ngp"]),
+    "ngp-torch": Case(lambda settings: NgpTorchField(settings, "cpu"), with_networks.TINY["ngp"][1]),
+    "tensorf": Case(*with_networks.TINY["tensorf"]),
     "voxel": Case(VoxelField, test_field_voxel.TINY),
-    "nerfacto": Case(NerfactoField, test_field_nerfacto.TINY),
+    "nerfacto": Case(*with_networks.TINY["nerfacto"]),
     "splat": Case(SplatField, test_field_splat.TINY),
 }
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)

@@ -43,7 +43,7 @@ class Pool:
                 raise ValueError(f"{THREADS_VARIABLE}: expected a number of threads, got {given!r}")
             threads = int(given)
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.threads = int(threads or available)
+        self.threads = available if threads is None else int(threads)
         if self.threads < 1:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice

@@ -177,3 +177,14 @@ def test_nothing_asked_for_is_an_error(run, capsys):
     with pytest.raises(SystemExit):
         export(run)
     assert "say what to write" in capsys.readouterr().err
+
+
+def test_voxels_are_carved_for_a_mesh_and_only_unless_told_otherwise():
+    from edge_server.offline.export import Export, _parser
+
+    def carves(*words: str) -> bool:
+        return Export(_parser().parse_args(["run", *words]))._settings().carve
+
+    assert carves("--mesh", "m.ply")
+    assert not carves("--mesh", "m.ply", "--no-carve")
+    assert not carves("--points", "p.ply")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes.util
+import re
 import subprocess
 import sys
+from functools import partial
+from pathlib import Path
 
 import pytest
 
 from edge_server.fields import Budget
+from edge_server.fields.gpu import driver_present
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_settings import EFFORTS, NgpSettings, help_text, make_settings
 from edge_server.fields.registry import field_names, make_field, option_help
@@ -58,6 +63,29 @@ def test_options_of_another_type_are_refused(name: str, option: dict, text: str)
         make_field(name, option)
 
 
+@pytest.mark.parametrize("name", field_names())
+@pytest.mark.parametrize(
+    ("option", "value", "text"),
+    [
+        ("rate", -1.0, "in 0.0..10.0"), ("rate_net", -1.0, "in 0.0..10.0"),
+        ("rate_color", -1.0, "in 0.0..10.0"), ("rate_end", 0.0, "in 0.0001..1.0"),
+        ("rate_end", -0.1, "in 0.0001..1.0"),
+        ("epsilon", 0.0, "in 1e-10..1000.0"), ("epsilon", -1.0, "in 1e-10..1000.0"),
+        ("changed_share", 7.0, "in 0.0..1.0"), ("distortion", -5.0, "in 0.0..1000.0"),
+        ("sparsity", -1.0, "in 0.0..1000.0"), ("sparse", -1.0, "in 0.0..1000.0"),
+        ("near_fade", -1.0, "in 0.0..10.0"), ("decay", -1.0, "in 0.0..1000.0"),
+        ("smooth", -1.0, "in 0.0..1000.0"), ("levels_start", 0, "in 1..24"),
+        ("prune_from", -1, "in 0..1073741824"), ("batch_samples", 2049, "a multiple of 2048"),
+        ("threads", 0, "in 1..1024"), ("nice", -1, "in 0..19"), ("seed", -1, "in 0..9223372036854775807"),
+    ],
+)  # fmt: skip
+def test_what_no_field_can_work_with_is_refused(name: str, option: str, value: float, text: str) -> None:
+    if option not in option_help(name):
+        pytest.skip(f"{name} has no {option}")
+    with pytest.raises(ValueError, match=re.escape(f"{name}: {option} must be {text}, not {value}")):
+        make_field(name, {option: value})
+
+
 @pytest.mark.parametrize("wrong", [{"seconds": float("nan")}, {"seconds": float("inf")}, {"steps": -1}, {}])
 def test_a_budget_without_an_end_is_refused(wrong: dict) -> None:
     with pytest.raises(ValueError, match="a budget is"):
@@ -86,9 +114,42 @@ def test_the_registry_imports_no_representation_by_itself() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def imports_torch(device: str) -> bool:
     code = (
         "import sys; from edge_server.fields.registry import make_field;"
-        "make_field('ngp', {'device': 'cpu'}); print('torch' in sys.modules)"
+        f"make_field('ngp', {{'device': '{device}'}}); print('torch' in sys.modules)"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "False"
+    return out.stdout.strip() == "True"
+
+
+def test_the_cpu_needs_no_torch() -> None:
+    assert not imports_torch("cpu")
+
+
+@pytest.mark.skipif(driver_present(), reason="a GPU's driver is installed here")
+def test_where_no_gpu_can_be_auto_needs_no_torch() -> None:
+    assert not imports_torch("auto")
+
+
+def test_a_driver_is_known_by_its_devices_or_its_library(tmp_path: Path) -> None:
+    none, some = "lib-that-nobody-has.so.1", ctypes.util.find_library("c")
+    assert not driver_present(tmp_path, none) and some is not None
+    assert driver_present(tmp_path, some)
+    for name in ("nvidiactl", "kfd"):
+        (tmp_path / name).touch()
+        assert driver_present(tmp_path, none)
+        (tmp_path / name).unlink()
+
+
+def test_where_a_gpu_can_be_torch_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    from edge_server.fields import ngp, ngp_torch_field
+
+    in_torch = ngp_torch_field.NgpTorchField
+    monkeypatch.setattr(ngp_torch_field, "NgpTorchField", partial(in_torch, device="cpu"))
+    monkeypatch.setattr(ngp, "driver_present", lambda: True)
+    for cuda, kind in ((True, in_torch), (False, NgpField)):
+        monkeypatch.setattr(ngp_torch_field, "cuda_present", lambda cuda=cuda: cuda)
+        assert type(make_field("ngp", {"log2_table": 9})) is kind

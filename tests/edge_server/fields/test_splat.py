@@ -152,11 +152,11 @@ def test_reset_forgets_everything() -> None:
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("seconds", [0.3, 1.0])
-def test_a_budget_in_seconds_is_kept(trained: SplatField, seconds: float) -> None:
-    report = trained.fit(SEEN, Budget(seconds=seconds))
-    # The lower bound is the promise; the upper one allows for one step that the machine held up.
-    assert 0.85 * seconds <= report.seconds <= 1.1 * seconds + 0.15 and report.steps > 3
+def test_a_budget_in_seconds_is_kept(trained: SplatField) -> None:
+    trained.fit(SEEN, Budget(seconds=0.3))  # by then it is known how long a step takes here
+    reports = [trained.fit(SEEN, Budget(seconds=0.3)) for _ in range(5)]
+    spent = np.median([r.seconds for r in reports])
+    assert 0.85 * 0.3 <= spent <= 1.1 * 0.3 and all(r.steps > 3 for r in reports)
 
 
 @pytest.mark.alone

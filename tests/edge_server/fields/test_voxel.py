@@ -14,7 +14,7 @@ from edge_server.fields.ngp import NgpField
 from edge_server.fields.registry import make_field
 from edge_server.fields.voxel import VoxelField
 from edge_server.fields.voxel_settings import EFFORTS, VoxelSettings, help_text, make_settings
-from tests.edge_server.fields.scenes import picture, psnr, ring
+from tests.edge_server.fields.scenes import mean_psnr, picture, psnr, ring
 from tests.edge_server.fields.test_ngp import SMALL as SMALL_NGP
 
 SMALL = VoxelSettings(sizes=(16, 32, 48), refine_at=(20, 60), rays=1024, cells=32, threads=2)
@@ -40,6 +40,17 @@ def trained() -> VoxelField:
 
 def test_it_learns_a_view_it_has_not_seen(trained: VoxelField) -> None:
     assert _score(trained) > 20.0  # the mean colour: below 16
+
+
+def test_a_long_fit_is_no_worse_than_a_short_one() -> None:
+    few, others = SEEN[::2], SEEN[1::2]  # few views are soon known by heart
+    gains = []
+    for settle in (SMALL.settle, 0.0):
+        short, long = (VoxelField(replace(SMALL, settle=settle)) for _ in range(2))
+        short.fit(few, Budget(steps=150))
+        long.fit(few, Budget(steps=1200))
+        gains.append(mean_psnr(long, others) - mean_psnr(short, others))
+    assert gains[0] > -0.25 and gains[1] < -0.5
 
 
 def test_points_lie_on_surfaces(trained: VoxelField) -> None:
@@ -131,10 +142,11 @@ def test_reset_forgets_everything() -> None:
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("seconds", [0.3, 1.0])
-def test_a_budget_in_seconds_is_kept(trained: VoxelField, seconds: float) -> None:
-    report = trained.fit(SEEN, Budget(seconds=seconds))
-    assert 0.85 * seconds <= report.seconds <= 1.1 * seconds + 0.15 and report.steps > 3
+def test_a_budget_in_seconds_is_kept(trained: VoxelField) -> None:
+    trained.fit(SEEN, Budget(seconds=0.3))  # by then it is known how long a step takes here
+    reports = [trained.fit(SEEN, Budget(seconds=0.3)) for _ in range(5)]
+    spent = np.median([r.seconds for r in reports])
+    assert 0.85 * 0.3 <= spent <= 1.1 * 0.3 and all(r.steps > 3 for r in reports)
 
 
 def test_others_render_while_it_trains() -> None:

@@ -7,11 +7,13 @@ import os
 import signal
 import sys
 import threading
+import time
+from contextlib import suppress
 
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.fields import checkpoint
+from edge_server.fields import FitReport, checkpoint
 from edge_server.offline.fitting import fit_in_slices, marks_s
 from tests.edge_server.offline.sets import SMALL_WORDS, write_photos, write_recording
 
@@ -67,6 +69,26 @@ def test_resume_goes_on_where_it_stopped(tmp_path, capsys):
     assert before[-1]["t_s"] < after[-1]["t_s"] == pytest.approx(2.0, rel=0.25)
     assert fit(tmp_path / "set", out, "--seconds", "2", "--resume") == 2
     assert "give more --seconds" in capsys.readouterr().err
+
+
+def test_ctrl_c_where_python_cannot_raise_it_is_not_lost():
+    class Deaf:
+        """A field whose fits swallow it, as a callback of the garbage collector does."""
+
+        fits = 0
+
+        def fit(self, views, budget):
+            self.fits += 1
+            with suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.2)
+            return FitReport(1, 0.2, 0.0, 1, 1)
+
+    field, scored, before = Deaf(), [], signal.getsignal(signal.SIGINT)
+    score = object()
+    assert fit_in_slices(field, [], lambda: score, (1.0, 2.0, 9.0), scored.append) is False
+    assert field.fits == len(scored) == 1 and scored[0].score is score
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_ctrl_c_ends_early_with_the_report_written(tmp_path, capsys):

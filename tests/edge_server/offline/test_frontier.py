@@ -162,6 +162,14 @@ def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch
     assert len(measured) == 2
 
 
+def test_what_is_shipped_charges_steps_for_the_views_they_are_made_with():
+    """By several seeds, and from below the shortest deadline worth setting."""
+    plan, still = frontier.SHIPPED, synthetic("room", size=frontier.SHIPPED.size)
+    assert len(still.training) == plan.moving.cameras - len(still.held_out)
+    assert still.training[0].image.shape[:2] == (plan.moving.size, plan.moving.size)
+    assert plan.seeds >= 3 and plan.update_s[0] <= 0.05
+
+
 def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_plan):
     write_photos(tmp_path / "set", 5)
     words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]

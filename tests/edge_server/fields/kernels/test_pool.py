@@ -12,7 +12,7 @@ from numba import njit
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, uniform
 from edge_server.fields.kernels.jit import FAST, SOURCES
 from edge_server.fields.kernels.mlp import forward
-from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
+from edge_server.fields.kernels.pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
 
 
 @njit(nogil=True)
@@ -41,6 +41,14 @@ def test_an_error_reaches_the_caller_and_the_pool_lives_on() -> None:
         pool.run(fails)
     pool.run(_count, done)
     assert (done == 1).all()
+
+
+def test_no_threads_are_not_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="at least one thread, not 0"):
+        Pool(0)
+    monkeypatch.setenv(THREADS_VARIABLE, "0")
+    with pytest.raises(ValueError, match="at least one thread, not 0"):
+        Pool()
 
 
 def test_several_python_threads_may_run_kernels_at_once() -> None:

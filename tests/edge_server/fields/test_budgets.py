@@ -1,0 +1,155 @@
+"""Budgets in seconds, by clocks that show work done: what is promised is kept, however busy the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, View
+from edge_server.fields.kernels.pool import CallerPool
+from edge_server.fields.nerfacto import NerfactoField
+from edge_server.fields.ngp import NgpField
+from edge_server.fields.ngp_schedule import Pace, Usual
+from edge_server.fields.splat import SplatField
+from edge_server.fields.tensorf import TensorfField
+from edge_server.fields.voxel import VoxelField
+from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.test_nerfacto import SMALL as NERFACTO
+from tests.edge_server.fields.test_ngp import SMALL as NGP
+from tests.edge_server.fields.test_splat import SMALL as SPLAT
+from tests.edge_server.fields.test_tensorf import SMALL as TENSORF
+from tests.edge_server.fields.test_voxel import SMALL as VOXEL
+
+
+class Fits:
+    """Fits on a clock of its own. step_s: what a step takes; usual: what is known of it."""
+
+    def __init__(self) -> None:
+        self.clock_s, self.step_s, self.usual = 0.0, 1.0, Usual()
+
+    def fit(self, budget_s: float, first_s: float = 0.0, then_s: float = 0.0) -> tuple[int, float]:
+        """first_s: taken before the first step. Returns steps and seconds."""
+        pace = Pace(Budget(seconds=budget_s), lambda: self.clock_s)
+        self.clock_s += first_s
+        while (progress := pace.begin(self.usual, then_s)) is not None:
+            assert 0.0 <= progress <= 1.0
+            self.clock_s += self.step_s
+            pace.end()
+        return pace.steps, pace.seconds()
+
+
+@pytest.mark.parametrize("first_s", [0.0, 0.7])
+def test_a_budget_is_used_up_and_never_exceeded_once_a_step_is_known(first_s: float) -> None:
+    fits = Fits()
+    fits.fit(5.0)
+    for budget_s in np.arange(0.75, 6.0, 0.25):
+        if budget_s >= first_s + fits.step_s:
+            steps, seconds = fits.fit(budget_s, first_s)
+            assert steps >= 1 and budget_s - fits.step_s < seconds <= budget_s
+        else:
+            assert fits.fit(budget_s, first_s) == (0, pytest.approx(first_s))
+            fits.fit(5.0)
+
+
+def test_a_single_step_may_be_a_tenth_late_but_no_second_one() -> None:
+    fits = Fits()
+    fits.fit(5.0)
+    assert fits.fit(0.92) == (1, 1.0) and fits.fit(1.95) == (1, 1.0)
+    assert fits.fit(0.9) == (0, 0.0)
+
+
+def test_one_hiccup_changes_nothing() -> None:
+    fits = Fits()
+    fits.fit(5.0)
+    fits.step_s = 40.0
+    assert fits.fit(5.0) == (1, 40.0)
+    fits.step_s = 1.0
+    assert [fits.fit(5.0) for _ in range(3)] == [(5, 5.0)] * 3
+
+
+def test_load_that_stays_is_known_after_three_steps() -> None:
+    fits = Fits()
+    fits.fit(8.0)
+    fits.step_s = 3.0
+    assert fits.fit(8.0) == (3, 9.0)
+    assert [fits.fit(8.0) for _ in range(3)] == [(2, 6.0)] * 3
+    fits.step_s = 1.0
+    assert fits.fit(8.0) == (8, 8.0)
+
+
+def test_fits_too_short_for_a_step_make_one_now_and_then() -> None:
+    """None at all, and the field would never learn again, nor that the load is gone."""
+    fits = Fits()
+    fits.fit(8.0)
+    made = [fits.fit(0.5)[0] for _ in range(40)]
+    assert set(made) == {0, 1} and 10 <= sum(made) <= 20
+    fits.step_s = 0.1
+    assert sum(fits.fit(0.5)[0] for _ in range(8)) >= 20
+
+
+def test_what_must_follow_finds_room() -> None:
+    fits = Fits()
+    fits.fit(5.0)
+    assert fits.fit(5.0, then_s=2.5) == (2, 2.0)
+    assert fits.fit(5.0, then_s=9.0) == (0, 0.0)
+
+
+def test_budgets_in_steps_ask_no_clock() -> None:
+    pace, usual, said = Pace(Budget(steps=4), lambda: 0.0), Usual(), []
+    while (progress := pace.begin(usual, then_s=1e9)) is not None:
+        said.append(progress)
+        pace.end()
+    assert said == [0.0, 0.25, 0.5, 0.75]
+
+
+# --- whole fields ---------------------------------------------------------------------------------
+
+
+class Work(CallerPool):
+    """Runs kernels in the calling thread; ``seconds`` goes on by ``each_s`` with every one of them."""
+
+    seconds, each_s = 0.0, 0.01
+
+    def run(self, kernel: Callable[..., Any], *args: Any) -> None:
+        super().run(kernel, *args)
+        self.seconds += self.each_s
+
+
+FIELDS: dict[str, Callable[[Work], Any]] = {
+    "ngp": lambda work: NgpField(NGP, work),
+    "nerfacto": lambda work: NerfactoField(NERFACTO, work),
+    "tensorf": lambda work: TensorfField(TENSORF, work),
+    "splat": lambda work: SplatField(SPLAT, work),
+    "voxel": lambda work: VoxelField(VOXEL, work),
+}
+
+
+def _moving(frame: int) -> list[View]:
+    ball = np.array([0.05 * frame - 0.3, 0.0, 0.5])
+    return [replace(v, generated_ns=frame * 10**8) for v in ring(7, size=32, ball_m=ball)]
+
+
+@pytest.mark.parametrize("each_s", [0.01, 0.04])
+@pytest.mark.parametrize("name", FIELDS)
+def test_updates_of_a_moving_scene_keep_their_budget(name: str, each_s: float) -> None:
+    """The second time, on a machine that got busy after a calm beginning."""
+    work = Work()
+    field = FIELDS[name](work)
+    field.now = lambda: work.seconds
+    field.fit(_moving(0), Budget(steps=130))  # voxel's grid has its last size by then
+    field.fit(_moving(1), Budget(seconds=1.0))
+    work.each_s = each_s
+    for frame in (2, 3):  # by then it is known what each part of an update takes
+        long = field.fit(_moving(frame), Budget(seconds=100.0 * each_s))
+    first_s = field.fit(_moving(4), Budget(seconds=0.0)).seconds  # what comes before the first step
+    step_s = (long.seconds - first_s) / long.steps
+    for frame, steps in enumerate((0.2, 1.6, 4.6, 0.2, 2.2, 8.6), start=5):
+        budget_s = first_s + steps * step_s
+        report = field.fit(_moving(frame), Budget(seconds=budget_s))
+        # Now and then, a step has one kernel more.
+        assert budget_s - 2.0 * step_s < report.seconds <= budget_s + 1.01 * each_s
+    assert report.steps > 5

@@ -1,0 +1,118 @@
+"""A state that is refused leaves the field as it was, bit for bit, and the refusal is one line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, Field
+from edge_server.fields.nerfacto import NerfactoField
+from edge_server.fields.ngp import NgpField
+from edge_server.fields.splat import SplatField
+from edge_server.fields.tensorf import TensorfField
+from edge_server.fields.voxel import VoxelField
+from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.test_nerfacto import SMALL as NERFACTO
+from tests.edge_server.fields.test_ngp import SMALL as NGP
+from tests.edge_server.fields.test_splat import SMALL as SPLAT
+from tests.edge_server.fields.test_tensorf import SMALL as TENSORF
+from tests.edge_server.fields.test_voxel import SMALL as VOXEL
+
+VIEWS = ring(5, size=24)
+State = dict[str, Any]
+
+
+def _torch() -> Field:
+    pytest.importorskip("torch", reason="torch is not installed")
+    from edge_server.fields.ngp_torch_field import NgpTorchField
+
+    return NgpTorchField(replace(NGP, rays=64), device="cpu")
+
+
+MAKERS: dict[str, Callable[[], Field]] = {
+    "ngp": lambda: NgpField(NGP),
+    "ngp in torch": _torch,
+    "nerfacto": lambda: NerfactoField(NERFACTO),
+    "tensorf": lambda: TensorfField(TENSORF),
+    "splat": lambda: SplatField(SPLAT),
+    "voxel": lambda: VoxelField(VOXEL),
+}
+
+
+def _without(name: str) -> Callable[[State], None]:
+    return lambda state: state.pop(name)
+
+
+def _said(change: Callable[[dict[str, Any]], Any]) -> Callable[[State], None]:
+    def spoil(state: State) -> None:
+        meta = json.loads(str(state["meta"]))
+        change(meta)
+        state["meta"] = np.array(json.dumps(meta))
+
+    return spoil
+
+
+def _last_array_cut(state: State) -> None:
+    """Of what is learnt: what comes before it is right."""
+    name = [n for n in state if n not in ("meta", "behind") and not n.startswith(("image", "pose", "moved"))][
+        -1
+    ]
+    state[name] = state[name][:-1]
+
+
+def _image_cut(state: State) -> None:
+    state["image_0"] = state["image_0"][:-1]
+
+
+def _pose_lost(state: State) -> None:
+    state["pose_1"] = np.full((4, 4), np.nan)
+
+
+DAMAGE: dict[str, Callable[[State], Any]] = {
+    "no background": _without("behind"),
+    "a background of one number": lambda state: state.update(behind=np.zeros(1, np.float32)),
+    "no picture of a camera": _without("image_4"),
+    "a picture that is too small": _image_cut,
+    "a pose that is none": _pose_lost,
+    "an array that is too short": _last_array_cut,
+    "no step count": _said(lambda meta: meta.pop("step")),
+    "a step count that is none": _said(lambda meta: meta.update(step=None)),
+    "no cameras": _said(lambda meta: meta.pop("cameras")),
+    "cameras without a lens": _said(lambda meta: meta["cameras"][0].pop("fx")),
+    "another box": _said(lambda meta: meta["box"].update(side_m=1.0)),
+    "a box without a size": _said(lambda meta: meta["box"].update(radius_m=0.0)),
+    "facts that are no facts": lambda state: state.update(meta=np.array("[1, 2]")),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
+    field, other = MAKERS[name](), MAKERS[name]()
+    field.fit(VIEWS, Budget(steps=3))
+    other.fit(VIEWS[:4], Budget(steps=1))
+    other.fit([replace(v, image=255 - v.image) for v in VIEWS], Budget(steps=1))
+    before, good = field.state(), other.state()
+    shown = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
+    for damage, spoil in DAMAGE.items():
+        bad = dict(good)
+        spoil(bad)
+        with pytest.raises(ValueError, match=r"state|camera") as caught:
+            field.load_state(bad)
+        assert "\n" not in str(caught.value), damage
+        after = field.state()
+        assert after.keys() == before.keys(), damage
+        assert all(np.array_equal(after[key], before[key]) for key in before), damage
+    np.testing.assert_array_equal(shown, field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color)
+    twin = MAKERS[name]()
+    twin.load_state(before)
+    for either in (field, twin):  # nothing that a state does not hold was lost or gained either
+        either.fit(VIEWS, Budget(steps=2))
+    one, two = field.state(), twin.state()
+    assert all(np.array_equal(one[key], two[key]) for key in one)
+    field.load_state(good)
+    assert all(np.array_equal(field.state()[key], good[key]) for key in good)

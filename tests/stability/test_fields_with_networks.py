@@ -1,0 +1,185 @@
+"""Hard cases for fields with a network: whatever comes, they stay finite, bounded and useful afterwards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, View
+from edge_server.fields.kernels.adam import PARAMETER_LIMIT
+from edge_server.fields.nerfacto import NerfactoField
+from edge_server.fields.nerfacto_settings import NerfactoSettings
+from edge_server.fields.ngp import NgpField
+from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.tensorf import TensorfField
+from edge_server.fields.tensorf_settings import TensorfSettings
+from edge_server.fields.trained_field import TrainedField
+from tests.edge_server.fields.bounds import run_with_bounds_checks
+from tests.edge_server.fields.scenes import mean_psnr, ring
+
+TINY: dict[str, tuple[type[TrainedField], Any]] = {
+    "ngp": (NgpField, NgpSettings(
+        levels=4, levels_every=10, log2_table=11, finest_resolution=32, hidden=16, rays=512,
+        batch_samples=4096, samples=48, samples_ramp=100, cells=16, threads=2,
+    )),
+    "tensorf": (TensorfField, TensorfSettings(
+        color_rank=8, resolution_start=12, resolution=32, upsample=(10, 25), hidden=16, rays=512,
+        batch_samples=4096, samples=48, samples_ramp=100, cells=16, threads=2,
+    )),
+    "nerfacto": (NerfactoField, NerfactoSettings(
+        levels=5, log2_table=11, base_resolution=8, finest_resolution=48, hidden=16, rays=512,
+        batch_samples=4096, samples=12, samples_start=16, bins=48, cells=16, proposal_cells=16, anneal=40,
+        threads=2,
+    )),
+}  # fmt: skip
+VIEWS = ring(9, size=24)
+
+# Of each kind, what goes through all of its kernels.
+THROUGH_ALL = {
+    "ngp": """
+trust = {"age_tau_ms": 1e-5, "mask_stale_ms": 2e-6, "mask_grow_px_s": 1e6}  # views are nanoseconds apart
+wide = {"smooth": 0.1, "harmonics": 4, "contracted": False, "radius_m": 1.0}
+for extra in ({}, wide, {"batch_samples": 8192, "rays": 9}, trust):
+    field = make("ngp", **extra)
+    field.fit(VIEWS, Budget(steps=20))
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    field.points(50)
+    assert np.isfinite(out.color).all()
+moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
+field.fit(moved, Budget(steps=20))
+""",
+    "tensorf": """
+regular = {"smooth": 1e-3, "sparse": 1e-4, "contracted": False, "radius_m": 1.0}
+cameras = {"exposure": True, "refine_m": 0.05, "refine_deg": 2.0}
+for extra in ({}, {"harmonics": 4, **regular}, cameras, {"batch_samples": 8192, "rays": 9}):
+    field = make("tensorf", **extra)
+    field.fit(VIEWS, Budget(steps=50))
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    field.points(50)
+    assert np.isfinite(out.color).all()
+moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
+field.fit(moved, Budget(steps=20))
+""",
+    "nerfacto": """
+plain = {"contracted": False, "radius_m": 1.0}
+poses = {"refine_m": 0.05, "refine_deg": 2.0}
+few = {"batch_samples": 8192, "rays": 9, "contracted": True, "radius_m": 0.5}
+for extra in ({"exposure": True, **poses}, {"harmonics": 4, **plain}, {"appearance": 3, **poses}, few):
+    field = make("nerfacto", **extra)
+    field.fit(VIEWS, Budget(steps=50))
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    field.points(50)
+    assert np.isfinite(out.color).all()
+moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
+field.fit(moved, Budget(steps=20))
+field = make("nerfacto", age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0)
+for later in range(3):
+    field.fit([replace(v, image=np.roll(v.image, 3 * later, axis=0), generated_ns=later * 10**8 + k * 10**7)
+               for k, v in enumerate(VIEWS)], Budget(steps=10))
+assert (field.rig._packed[1].weight > 0).any() and field.rig._packed[1].drawn.size, "nothing is masked"
+""",
+}
+
+
+def make(kind: str, **changed: Any) -> TrainedField:
+    """A small field of that kind."""
+    field, settings = TINY[kind]
+    return field(replace(settings, **changed))
+
+
+def healthy(field: TrainedField, views: list[View] = VIEWS) -> None:
+    state = field.state()
+    for name in ("table", "net", "density", "behind"):
+        assert np.isfinite(state[name]).all(), f"{name} is not finite"
+    assert abs(state["table"]).max() <= PARAMETER_LIMIT
+    for view in (views[0], views[-1]):
+        out = field.render(view.camera_to_world, view.intrinsics)
+        for part in (out.color, out.depth, out.opacity):
+            assert np.isfinite(part).all()
+        assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
+        assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
+
+
+def _poison_table(field: TrainedField) -> None:
+    field._encoding.table[::7] = np.nan
+
+
+def _poison_proposal(field: TrainedField) -> None:
+    assert isinstance(field, NerfactoField)
+    field._encoding.table[field._encoding.first[-1] :] = np.nan
+
+
+def _poison_net(field: TrainedField) -> None:
+    field._net.params[3] = np.nan
+
+
+def _poison_moments(field: TrainedField) -> None:
+    field._table_m[::5] = np.inf
+    field._net_v[::3] = np.nan
+
+
+def _poison_gradient(field: TrainedField) -> None:
+    field._table_g[::3] = np.nan
+    field._dirty[:] = True
+
+
+def _overflow(field: TrainedField) -> None:
+    field._encoding.table[:] = 1e30
+
+
+def _saturate(field: TrainedField) -> None:
+    field._encoding.table[:] = PARAMETER_LIMIT
+    field._net.params[:] = PARAMETER_LIMIT
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage"),
+    [*product(TINY, (_poison_table, _poison_net, _poison_moments, _poison_gradient)),
+     ("nerfacto", _poison_proposal)],
+)  # fmt: skip
+def test_damage_is_counted_and_healed(kind: str, damage: Callable[[TrainedField], None]) -> None:
+    field = make(kind)
+    field.fit(VIEWS, Budget(steps=30))
+    damage(field)
+    field._snapshot = None
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
+    report = field.fit(VIEWS, Budget(steps=40))
+    assert field.dropped == report.dropped and (report.dropped > 0) == (damage is not _poison_moments)
+    assert field.fit(VIEWS, Budget(steps=200)).dropped == 0, "still not finite 40 steps later"
+    healthy(field)
+    assert mean_psnr(field, VIEWS) > 15.0
+
+
+@pytest.mark.parametrize("kind", TINY)
+@pytest.mark.parametrize("damage", [_overflow, _saturate])
+def test_density_that_overflows_stays_finite(kind: str, damage: Callable[[TrainedField], None]) -> None:
+    """Opaque everywhere: no gradient leads out of that, but a reset does, and nothing becomes NaN."""
+    field = make(kind)
+    field.fit(VIEWS, Budget(steps=30))
+    damage(field)
+    field.fit(VIEWS, Budget(steps=20))
+    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all() and out.color.max() <= 1.0
+    assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
+    field.reset()
+    field.fit(VIEWS, Budget(steps=200))
+    healthy(field)
+    assert mean_psnr(field, VIEWS) > 15.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", TINY)
+def test_bounds_are_kept_in_every_kernel(kind: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """A whole fit and rendering with numba's bounds checks, in a process of its own."""
+    needs = (
+        "from dataclasses import replace\nimport numpy as np\nfrom edge_server.fields import Budget\n"
+        "from tests.stability.test_fields_with_networks import VIEWS, make\n"
+    )
+    run_with_bounds_checks(f'{needs}{THROUGH_ALL[kind]}print("kept")\n', tmp_path, request)
