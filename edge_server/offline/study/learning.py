@@ -24,8 +24,7 @@ from edge_server.offline.study.engine import source_digest
 from edge_server.offline.study.statistics import Interval, crossed, interval
 from edge_server.offline.study.trial import Trial
 from edge_server.offline.train_scheduler import reward_of
-from edge_server.offline.training.choosing import Maker
-from edge_server.offline.training.contest import Contest, PerSeed, hold
+from edge_server.offline.training.contest import Contest, PerSeed, Rival, hold
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.report import draw_curve, span
 from edge_server.offline.training.setting import Setting, seeds
@@ -175,7 +174,7 @@ class School:
     def contest(
         self,
         setting: Setting,
-        everybody: Mapping[str, Maker | Actor],
+        everybody: Mapping[str, Rival],
         reward: Reward,
         count: int,
         seed: int = 0,
@@ -187,7 +186,7 @@ class School:
     def contest_as_rewarded(
         self,
         setting: Setting,
-        everybody: Mapping[str, Maker | Actor],
+        everybody: Mapping[str, Rival],
         reward: Reward,
         count: int,
         seed: int = 0,
@@ -243,6 +242,8 @@ def over(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
     ours, theirs = _runs(mine), _runs(other)
     if len(theirs) == 1:
         theirs = list(theirs) * len(ours)
+    if len(ours) == 1:
+        ours = list(ours) * len(theirs)
     differences: list[PerSeed] = [
         {s: None if (x := a[s]) is None or (y := b.get(s)) is None else x - y for s in a}
         for a, b in zip(ours, theirs, strict=True)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict
+from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
 from edge_server.offline.study.engine import StudyError
 from edge_server.offline.study.learning import (
     School,
@@ -17,10 +17,11 @@ from edge_server.offline.study.learning import (
     room,
     runs_of,
 )
+from edge_server.offline.study.sight import Sees, Sight, telling
 from edge_server.offline.study.statistics import interval
 from edge_server.offline.train_scheduler import OMEGAS_MS, layout_of
 from edge_server.offline.training.contest import RIVALS, Contest, rivals, rows, write_rows
-from edge_server.offline.training.setting import Setting
+from edge_server.offline.training.setting import Setting, seeds
 from edge_server.offline.training.trainer import Course
 from edge_server.scheduler.learned.spec import Spec
 
@@ -35,6 +36,8 @@ REWARDING, JUDGING = ("cam00", "cam11"), ("cam13", "cam08")
 PRICE = 0.002
 # An update a second: what has moved since the last one is worth a view.
 STEPS, REFRESH_MS = 40, 900.0
+# So many cameras are used by those that know which of them see what moves.
+KNOWING = (1, 2, 3, 4)
 
 
 class Semantics:
@@ -65,9 +68,16 @@ class Semantics:
                 everybody: dict[str, Any] = {
                     **rivals(OMEGAS_MS["threshold"], ["threshold"], RIVALS), **mine
                 }  # fmt: skip
-                contest = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
+                count = len(ask.repeats(10, 100))
+                sight = Sight(setting)
+                if speed:
+                    everybody |= {f"sees:{k}": Sees(sight, k) for k in KNOWING}
+                contest = school.contest(setting, everybody, reward, count)
                 written += rows(contest, scene=scene)
                 found += judge(scene, contest, on == "moving")
+                if speed:
+                    moments = [m for e in school.crew.draw(setting, seeds(0, "test", count)) for m in e]
+                    found += why(scene, contest, telling(sight, moments))
         write_rows(ask.out / f"{self.name}.csv", written)
         return found
 
@@ -96,10 +106,26 @@ def judge(scene: str, contest: Contest, moves: bool) -> list[Verdict]:
     else:
         claim = "semantics cost no more than 1 % where nothing moves."
         found = [no_worse(about, claim, seeing, blind)]
-    fixed = [n for n in contest.outcomes if not n.startswith(("with", "random"))]
+    fixed = [n for n in contest.outcomes if not n.startswith(("with", "random", "sees"))]
     best = max(fixed, key=lambda n: interval(list(contest.rewards(n).values())).mean)
     return found + [
         better(f"{about}, {name} semantics", "better than the best of all that does not learn.", runs,
                contest.rewards(best), f"{best}, known from the very seeds; ")
         for name, runs in (("with", seeing), ("without", blind))
+    ]  # fmt: skip
+
+
+def why(scene: str, contest: Contest, told: tuple[float, float]) -> list[Verdict]:
+    """Whether the embedding tells what is to be known, and whether who knows it could use it. told: as
+    ``telling`` has it."""
+    about, (embedding, camera) = f"tower, ch5, {scene}", told
+    knowing = [n for n in contest.outcomes if n.startswith("sees")]
+    best = max(knowing, key=lambda n: interval(list(contest.rewards(n).values())).mean)
+    return [
+        Verdict(about, "the embedding tells which cameras see what moves (better than which camera it is).",
+                f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "
+                f"to; {camera:.2f} from which camera it is.", by_bool(embedding > camera)),
+        better(about, "who knows which cameras see what moves does better than what is learnt blindly.",
+               contest.rewards(best), runs_of(contest, "without"),
+               f"{best}, the best number of them known from the very seeds; "),
     ]  # fmt: skip

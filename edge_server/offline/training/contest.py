@@ -11,14 +11,14 @@ import dataclasses
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from edge_server.offline.study.statistics import Interval, at_its_best, interval, paired, share_closed
 from edge_server.offline.training.choosing import Maker, choices, named, of_action
 from edge_server.offline.training.crew import Asked, Crew
-from edge_server.offline.training.episode import Outcome
+from edge_server.offline.training.episode import Choice, Moment, Outcome
 from edge_server.offline.training.setting import Setting
 from edge_server.scheduler.learned.decide import Actor
 from edge_server.scheduler.learned.rewards import Reward
@@ -130,11 +130,20 @@ class Contest:
         return found, best
 
 
+class Knowing(Protocol):
+    """A rival that may look at more of a decision than a policy sees."""
+
+    def choice(self, moment: Moment) -> Choice: ...
+
+
+Rival = Maker | Actor | Knowing
+
+
 def hold(
     setting: Setting,
     crew: Crew,
     seeds: Sequence[int],
-    rivals: Mapping[str, Maker | Actor],
+    rivals: Mapping[str, Rival],
     reward: Reward,
     say: Any = None,
 ) -> Contest:
@@ -149,8 +158,10 @@ def hold(
             if isinstance(rival, Actor):
                 acts, _ = rival.act([m.state for m in moments])
                 chosen = [of_action(rival.spec, a, m) for a, m in zip(acts, moments)]
-            else:
+            elif callable(rival):
                 chosen = choices(rival, moments, place)
+            else:
+                chosen = [rival.choice(m) for m in moments]
             asked += [(name, (m.seed, m.number, c)) for m, c in zip(moments, chosen)]
     fits = [
         (contest.outcomes, setting),

@@ -237,9 +237,18 @@ class Browser:
         self.click(*self._input(label)[:2])
         query = f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() == {option!r})"
         self.wait_for(lambda: self.evaluate(f"!!{query}"), f"the option {option!r}")
-        time.sleep(0.3)  # the list slides in: a click on its way would miss
-        box = self.evaluate(f"(() => {{const r = {query}.getBoundingClientRect();"
-                            "return [r.x + r.width / 2, r.y + r.height / 2]})()")  # fmt: skip
+        middle = (f"(() => {{const r = {query}.getBoundingClientRect();"
+                  "return [r.x + r.width / 2, r.y + r.height / 2]})()")  # fmt: skip
+        box: list[float] = []
+
+        def rests() -> bool:
+            """The list slides in, and is moved on a slow machine: a click on its way would miss."""
+            nonlocal box
+            before, box = box, self.evaluate(middle)
+            return before == box
+
+        time.sleep(0.3)
+        self.wait_for(rests, f"the rest of the list with {option!r}")
         self.click(*box)
 
     def type_number(self, label: str, text: str) -> None:

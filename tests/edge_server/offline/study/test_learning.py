@@ -149,6 +149,14 @@ def test_semantics_hold_if_and_only_if_who_looks_does_better(gap, said):
     assert answers(semantics.judge("x", low, True)[1:]) == {DOES_NOT_HOLD}
 
 
+@pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_why_semantics_do_not_help_is_told_apart(gap, said):
+    found = contest_of({**FIXED, "sees:1": 0.0, "sees:2": 3.0 + gap, **runs("without", 3.0)})
+    tells, useful = semantics.why("x", found, (0.9, 0.8))
+    assert tells.verdict == HOLDS and useful.verdict == said and "sees:2" in useful.found
+    assert semantics.why("x", found, (0.7, 0.8))[0].verdict == DOES_NOT_HOLD
+
+
 @pytest.mark.parametrize(("gap", "said"), [(1.0, HOLDS), (-1.0, DOES_NOT_HOLD)])
 def test_weights_matter_if_and_only_if_other_weights_teach_worse(gap, said):
     levels = {**FIXED, **runs("learnt a", 3.0), **runs("learnt b", 3.0 - gap)}

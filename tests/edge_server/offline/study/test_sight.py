@@ -1,0 +1,68 @@
+"""What cameras see of what moves, as the scene has it, and whether an embedding tells it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from edge_server.offline.study.semantics import workshop
+from edge_server.offline.study.sight import SEES, Sees, Sight, area, telling
+from edge_server.offline.study.trial import Folders
+from edge_server.offline.training.crew import Crew
+from edge_server.offline.training.setting import seeds
+from edge_server.scheduler.learned.state import State
+
+CART = {"cam01", "cam07", "cam09", "cam10"}
+PERSON = {"cam04", "cam05", "cam12", "cam14", "cam17"}
+
+
+def test_the_area_is_the_share_of_pairs_in_the_right_order():
+    scores = np.array([3.0, 1.0, 2.0, 0.0])
+    assert area(scores, np.array([True, True, False, False])) == 0.75
+    assert area(-scores, np.array([True, True, False, False])) == 0.25
+    assert area(np.ones(4), np.array([True, True, False, False])) == 0.5
+    assert np.isnan(area(scores, np.ones(4, bool)))
+
+
+@pytest.fixture(scope="module")
+def moments():
+    setting = dataclasses.replace(workshop(1.0), parts=("age", "pose"))
+    with Crew(Folders()) as crew:
+        return setting, [m for e in crew.draw(setting, seeds(3, "test", 6)[2:]) for m in e]
+
+
+def test_cameras_of_one_side_see_it_and_no_others(moments):
+    setting, drawn = moments
+    sight, sides = Sight(setting), set()
+    for moment in drawn:
+        shares = sight.shares(moment)
+        seeing = {c for c, share in shares.items() if share > SEES}
+        assert seeing <= CART or seeing <= PERSON, "both sides at once"
+        sides.add("cart" if seeing & CART else "person" if seeing & PERSON else "nobody")
+        chosen = Sees(sight, 2).choice(moment)
+        assert len(chosen.cameras) == 2 and chosen.at_ns == moment.now_ns
+        assert len(seeing) < 2 or set(chosen.cameras) <= {c for c, share in shares.items() if share > 0.0}
+    assert {"cart", "person"} <= sides  # neither is there always
+
+
+def test_an_embedding_that_tells_is_told_from_one_that_does_not(moments):
+    setting, drawn = moments
+    sight, rng = Sight(setting), np.random.default_rng(0)
+
+    def seen_as(signal: float) -> list:
+        found = []
+        for m in drawn:
+            shares = sight.shares(m)
+            knows = np.array([shares.get(c, 0.0) > SEES for c in m.cameras], float)
+            noise = rng.normal(size=(len(m.cameras), 4)).astype(np.float32)
+            noise[:, 0] += np.float32(signal) * knows.astype(np.float32)
+            s = m.state
+            state = State(s.ages_ms, s.poses, noise, s.reported, s.cameras)
+            found.append(dataclasses.replace(m, state=state))
+        return found
+
+    tells, camera = telling(sight, seen_as(6.0))
+    nothing, same = telling(sight, seen_as(0.0))
+    assert tells > 0.98 and nothing < 0.75 and camera == same
