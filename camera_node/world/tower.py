@@ -1,7 +1,8 @@
 """Scene ``tower``: cameras on a mast look outward into a workshop of 10 x 10 x 4 m (Eyeful-like).
 
 Every camera sees another part of the surroundings, and few see the same. A person walks on one side and a
-loaded cart drives on the other. cam00 is held out and more than 15 degrees from every other.
+loaded cart drives on the other; or a person walks on one of four sides, and which cannot be known beforehand.
+cam00 is held out and more than 15 degrees from every other.
 """
 
 from __future__ import annotations
@@ -31,28 +32,36 @@ _ANGLES_DEG = [(0.0, 3.0)] + [
 _HALF_M, _HEIGHT_M = 5.0, 4.0
 _WALK_CENTRE, _WALK_RADII_M = (0.2, -2.75), (1.35, 0.75)
 _DRIVE_CENTRE, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
+# Where a person may walk, alone: the sides that cameras tell apart, in the order south, east, north, west.
+_SIDES = ((0.0, -2.9), (2.6, 0.0), (0.0, 2.9), (-2.6, 0.0))
+_SIDE_RADII_M = (0.5, 0.25)  # between the pillars
 _WHO = 5  # stream of who is there
 _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
 @dataclass(frozen=True)
 class Params(MovingParams):
-    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``, or
-    only ``one`` of them is there, which one the motion's seed draws: where something moves is then not known
-    from where cameras stand, but can be seen."""
+    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``; or
+    only ``one`` of them is there; or ``person``, alone and on any of four sides. Which one, and on which side,
+    the motion's seed draws: where something moves is then not known from where cameras stand, but can be
+    seen."""
 
     horizontal_fov_deg: float = 90.0
     movers: str = "both"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.movers not in ("both", "one"):
-            raise ValueError(f"movers: expected both or one, got {self.movers!r}")
+        if self.movers not in ("both", "one", "person"):
+            raise ValueError(f"movers: expected both, one or person, got {self.movers!r}")
 
 
 def build(params: Params) -> Scene:
     """The workshop as a scene."""
-    walk = walk_at(_WALK_CENTRE, _WALK_RADII_M, params.speed_m_per_s, params.motion_seed)
+    # A stream of its own: the walk's phase is the same wherever it is.
+    drawn = float(np.random.default_rng([_WHO, params.motion_seed or 0]).random())
+    alone = params.movers == "person"
+    centre, radii = (_SIDES[int(4 * drawn)], _SIDE_RADII_M) if alone else (_WALK_CENTRE, _WALK_RADII_M)
+    walk = walk_at(centre, radii, params.speed_m_per_s, params.motion_seed)
     grid = np.stack(np.meshgrid([-2.6, 0.0, 2.6], [-2.6, 0.0, 2.6], [3.9]), axis=-1).reshape(-1, 3)
     light = Light(
         points=grid, strength=0.85, reach_m=4.5, low=(0.30, 0.30, 0.31), high=(0.50, 0.52, 0.55),
@@ -65,7 +74,7 @@ def build(params: Params) -> Scene:
         target=_MAST,
         world=World(
             (*_shell(), *_mast(), *_workshop()),
-            _movers(params, walk),
+            _movers(params, walk, drawn),
             light,
         ),
         bounds=np.array([[-_HALF_M, -_HALF_M, 0.0], [_HALF_M, _HALF_M, _HEIGHT_M]]),
@@ -74,13 +83,15 @@ def build(params: Params) -> Scene:
     )
 
 
-def _movers(params: Params, walk: Walk) -> tuple[Mover, ...]:
-    person, cart = walking_person(walk), _cart(walk, params.speed_m_per_s)
+def _movers(params: Params, walk: Walk, drawn: float) -> tuple[Mover, ...]:
+    """drawn: in [0, 1), says which of them is alone."""
+    person = walking_person(walk)
+    if params.movers == "person":
+        return (person,)
+    cart = _cart(walk, params.speed_m_per_s)
     if params.movers == "both":
         return person, cart
-    # A stream of its own: the walk is the same whoever else is there.
-    drawn = np.random.default_rng([_WHO, params.motion_seed or 0]).random() < 0.5
-    return (person,) if drawn else (cart,)
+    return (person,) if drawn < 0.5 else (cart,)
 
 
 def _cart(walk: Walk, speed_m_per_s: float) -> Mover:

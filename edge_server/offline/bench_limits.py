@@ -1,9 +1,10 @@
-"""How far the field's kernels are from what this machine allows: its limits, then each kernel against them.
+"""How far the fields' kernels are from what this machine allows: its limits, then each kernel against them.
 
 The limits are measured, not looked up: random reads and writes of one vertex (two float32, as the hash
-tables hold them) in tables of several sizes, and multiply-adds of BLAS on one large and one narrow matrix.
-A kernel's floor is the time in which the machine could do its reads, writes and multiply-adds alone, one
-after the other; what it takes beyond that goes into addresses, drawing, marching, compositing and waiting.
+tables hold them) in tables of several sizes, multiply-adds of BLAS on one large and one narrow matrix,
+divisions, and copies within a core's own cache. A kernel's floor is the time in which all cores together
+could do its reads, writes and arithmetic alone, one after the other; what it takes beyond that goes into
+addresses, drawing, marching, branches and waiting. Of ``ngp`` and ``splat``: the default and the fastest.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -19,18 +20,49 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.fields import Budget
+from edge_server.fields import Budget, FitReport, View
 from edge_server.fields.kernels.grid import FEATURES
 from edge_server.fields.kernels.pool import Pool
-from edge_server.fields.kernels.probe import PER_TASK, TASKS, random_adds, random_reads
+from edge_server.fields.kernels.probe import (
+    PER_TASK,
+    ROUNDS,
+    TASKS,
+    copies,
+    divisions,
+    random_adds,
+    random_reads,
+)
+from edge_server.fields.kernels.splat_project import BASE
+from edge_server.fields.kernels.splat_raster import KEPT, PIXELS, SUMS
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_schedule import active_levels
 from edge_server.fields.ngp_settings import NgpSettings
+from edge_server.fields.splat import SplatField
+from edge_server.fields.splat_settings import SplatSettings
 from edge_server.offline.still import synthetic
 from edge_server.offline.usage import Usage
 
 TABLES_MB = (1, 4, 64)
 CORNERS = 8  # of a cell, each read once a level and sample, and written once by its gradient
+WARM_STEPS = 600
+LEAST_SHARE = 0.01  # of a step: what takes less has no row in the table
+LIMITS = {
+    **{f"reads_{mb}mb_m_per_s": f"million random reads a second from {mb} MB" for mb in TABLES_MB},
+    **{f"adds_{mb}mb_m_per_s": f"million random additions a second to {mb} MB a core" for mb in TABLES_MB},
+    "gemm_g_per_s": "billion multiply-adds a second, 2048 x 2048 x 2048",
+    "narrow_gemm_g_per_s": "billion multiply-adds a second, 65536 x 32 x 32",
+    "divisions_g_per_s": "billion divisions a second",
+    "copies_gb_per_s": "GB copied a second within a core's cache",
+}
+
+# Operations of the Gaussians' kernels, counted in their sources: additions, multiplications, comparisons and
+# conversions, a multiplication with the addition that follows it as one. Of a pixel and a pair, forward (an
+# exponential is 20 of them) and back:
+BLENDING, UNBLENDING = 41, 23
+# Of a Gaussian: projected; its pairs' sums led back through the projection, and a step of Adam.
+PROJECTING, UPDATING = 300, 680
+# Of a Gaussian that is sorted: three passes, each counts and moves it. Of a pair: counted, owned, listed.
+SORTING, DEALING = 6, 3
 
 
 class TimedPool(Pool):
@@ -48,15 +80,18 @@ class TimedPool(Pool):
 
 
 def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
-    """The machine's limits and, for the default field on ``tile`` and ``room``, each kernel's share of a
+    """The machine's limits and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each kernel's share of a
     step, its milliseconds a step and the share of them that its floor explains."""
     del folder, lpips
     pool = TimedPool()
     usage = Usage("bench")
     limits = machine_limits(pool, repeats=5 if quick else 15)
     figures: dict[str, Any] = {"machine": limits}
+    steps = 60 if quick else 300
     for name in ("tile", "room"):
-        figures[name] = _kernels(name, pool, limits, steps=60 if quick else 300)
+        views = synthetic(name, cameras=19, size=128).training
+        figures[f"ngp on {name}"] = _of_ngp(views, pool, limits, steps)
+        figures[f"splat on {name}"] = _of_splat(views, pool, limits, steps)
     pool.close()
     figures["outside_cores"] = usage.outside(usage.row(0.0))
     return figures
@@ -64,7 +99,8 @@ def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, A
 
 def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
     """Millions of random vertex reads and of random vertex additions a second, all workers together, by
-    table size; billions of float32 multiply-adds a second of BLAS (2048 x 2048; 65536 x 32 x 32)."""
+    table size; billions of float32 multiply-adds a second of BLAS (2048 x 2048; 65536 x 32 x 32), of
+    divisions, and of bytes copied from 256 kB to 256 kB."""
     limits: dict[str, float] = {}
     rng = np.random.default_rng(0)
     for megabytes in TABLES_MB:
@@ -81,6 +117,13 @@ def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
     for name, (m, k, n) in {"gemm": (2048, 2048, 2048), "narrow_gemm": (65536, 32, 32)}.items():
         a, b = rng.random((m, k), np.float32), rng.random((k, n), np.float32)
         limits[f"{name}_g_per_s"] = m * k * n / _median_s(repeats, partial(np.matmul, a, b)) / 1e9
+    x, y = rng.random((2, 2048), np.float32) + np.float32(1.0)
+    out = np.zeros((pool.threads, x.size), np.float32)
+    memory = np.zeros((pool.threads, 2 * PER_TASK), np.float32)
+    divide_s = _median_s(repeats, partial(pool.run, divisions, x, y, out))
+    copy_s = _median_s(repeats, partial(pool.run, copies, memory))
+    limits["divisions_g_per_s"] = TASKS * ROUNDS * x.size / divide_s / 1e9
+    limits["copies_gb_per_s"] = TASKS * PER_TASK * 4 / copy_s / 1e9
     return limits
 
 
@@ -94,21 +137,49 @@ def _median_s(repeats: int, work: Callable[[], Any]) -> float:
     return statistics.median(spent)
 
 
-def _kernels(scene: str, pool: TimedPool, limits: dict[str, float], steps: int) -> dict[str, Any]:
-    still = synthetic(scene, cameras=19, size=128)
+def _of_ngp(views: Sequence[View], pool: TimedPool, limits: dict[str, float], steps: int) -> dict[str, Any]:
     settings = NgpSettings(device="cpu")
     field = NgpField(settings, pool)
-    field.fit(still.training, Budget(steps=600))  # all levels on, most of space known to be empty
+    field.fit(views, Budget(steps=WARM_STEPS))  # all levels on, most of space known to be empty
     pool.seconds.clear()
-    report = field.fit(still.training, Budget(steps=steps))
-    state = field.state()
-    floors = _floors_ms(
+    report = field.fit(views, Budget(steps=steps))
+    floors = _floors_of_ngp(
         samples=report.samples / report.steps,
         levels=active_levels(settings, field.step),
         widths=[int(w) for w in field._net.widths],
-        table_mb=state["table"].nbytes / settings.levels / 2**20,
+        table_mb=field.state()["table"].nbytes / settings.levels / 2**20,
         limits=limits,
     )
+    return _against(floors, report, pool)
+
+
+def _of_splat(views: Sequence[View], pool: TimedPool, limits: dict[str, float], steps: int) -> dict[str, Any]:
+    field = SplatField(SplatSettings(), pool)
+    field.fit(views, Budget(steps=WARM_STEPS))  # grown to what it holds at most
+    pool.seconds.clear()
+    report = field.fit(views, Budget(steps=steps))
+    spent = dict(pool.seconds)  # how much there is to do is counted without the clock
+    counts = []
+    for _ in range(len(views)):
+        field.fit(views, Budget(steps=1))
+        counts.append(_counted(field))
+    pool.seconds.clear()
+    pool.seconds.update(spent)
+    gaussians, seen, pairs, touching = np.mean(counts, axis=0)
+    return _against(_floors_of_splat(gaussians, seen, pairs, touching, limits), report, pool)
+
+
+def _counted(field: SplatField) -> tuple[int, int, int, int]:
+    """Of a field's last step, of one picture: Gaussians, those in the picture, pairs of one with a tile, and
+    pairs that changed a pixel: the others are hidden or beside it, and a better list would leave them out."""
+    passes, count = field._passes, len(field.cloud)
+    pairs = int(passes.lists.needed[0])
+    used = int((passes.sums[0, :pairs] != 0.0).any(axis=-1).sum())
+    return count, int((passes.lists.own_count[0, :count] > 0).sum()), pairs, used
+
+
+def _against(floors: dict[str, dict[str, float]], report: FitReport, pool: TimedPool) -> dict[str, Any]:
+    """What each kernel took in the steps reported, beside its floor's parts in milliseconds a step."""
     spent_ms = {name: s / report.steps * 1e3 for name, s in sorted(pool.seconds.items(), key=lambda i: -i[1])}
     kernels: dict[str, Any] = {}
     for name, ms in spent_ms.items():
@@ -117,7 +188,7 @@ def _kernels(scene: str, pool: TimedPool, limits: dict[str, float], steps: int) 
             kernels[name] |= {
                 "floor_ms": sum(floors[name].values()),
                 "floor_share": sum(floors[name].values()) / ms,
-                **{f"floor_{part}_ms": value for part, value in floors[name].items()},
+                "floor_parts_ms": floors[name],
             }
     return {
         "ms_a_step": report.seconds / report.steps * 1e3,
@@ -128,7 +199,7 @@ def _kernels(scene: str, pool: TimedPool, limits: dict[str, float], steps: int) 
     }
 
 
-def _floors_ms(
+def _floors_of_ngp(
     samples: float, levels: int, widths: list[int], table_mb: float, limits: dict[str, float]
 ) -> dict[str, dict[str, float]]:
     """For the two kernels that do nearly everything: milliseconds a step of reads, additions and
@@ -148,3 +219,64 @@ def _floors_ms(
         },
         "scatter": {"adds": vertices / limits[f"adds_{size}mb_m_per_s"] / 1e3},
     }
+
+
+def _floors_of_splat(
+    gaussians: float, seen: float, pairs: float, touching: float, limits: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
+
+    gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; touching: of which change a
+    pixel. An operation counts as one of BLAS's multiply-adds, as if all were vectorised: ``project`` and
+    ``update`` go through Gaussians one by one, ``deal`` sorts them on one core."""
+    operations, divisions_ms = limits["gemm_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
+    copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
+    parameters = BASE
+    return {
+        "train_tiles": {
+            "arithmetic": touching * PIXELS * (BLENDING + UNBLENDING) / operations,
+            "divisions": touching * PIXELS / divisions_ms,
+            "copies": touching * KEPT * 4 / copied,  # kept of a pair: written once, read once
+        },
+        "project": {"arithmetic": gaussians * PROJECTING / operations},
+        "deal": {"moves": (seen * SORTING + pairs * DEALING) / added},
+        "update": {
+            "arithmetic": (seen * UPDATING + pairs * SUMS) / operations,
+            "divisions": seen * 2 * parameters / divisions_ms,  # roots take as long
+            "copies": pairs * SUMS * 4 / 2 / copied,
+        },
+    }
+
+
+def table(figures: dict[str, Any]) -> str:
+    """Markdown: the machine's limits, then a row a kernel."""
+    rows = ["| limit of this machine, all cores | |", "|---|---|"]
+    for name, value in figures["machine"].items():
+        rows.append(
+            f"| {LIMITS[name]} | {value:,.0f} |" if value >= 100 else f"| {LIMITS[name]} | {value:.1f} |"
+        )
+    rows += [
+        "",
+        "| field, scene | kernel | ms a step | of the step | explained by limits | by which, ms |",
+        "|---|---|---|---|---|---|",
+    ]
+    for about, found in figures.items():
+        if isinstance(found, dict) and "kernels" in found:
+            rows += _rows(about, found)
+    return "\n".join(rows)
+
+
+def _rows(about: str, found: dict[str, Any]) -> list[str]:
+    rows = []
+    for name, kernel in found["kernels"].items():
+        if kernel["share"] >= LEAST_SHARE:
+            parts = kernel.get("floor_parts_ms", {})
+            told = ", ".join(f"{part.replace('_', '-')} {ms:.2f}" for part, ms in parts.items())
+            explained = f"{kernel['floor_share']:.0%}" if parts else "-"
+            took = f"{kernel['ms_a_step']:.2f} | {kernel['share']:.0%}"
+            rows.append(f"| {about} | {name} | {took} | {explained} | {told} |")
+    outside = found["outside_kernels_share"]
+    return [
+        *rows,
+        f"| {about} | outside kernels | {found['ms_a_step'] * outside:.2f} | {outside:.0%} | - | |",
+    ]

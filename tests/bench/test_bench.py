@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 
 import pytest
 
@@ -161,12 +162,18 @@ def test_limits(tmp_path):
     limits = found["machine"]
     assert limits["reads_1mb_m_per_s"] > limits["reads_64mb_m_per_s"] > 0.0
     assert limits["gemm_g_per_s"] > 1.0
-    for scene in ("tile", "room"):
-        kernels = found[scene]["kernels"]
+    assert limits["divisions_g_per_s"] < limits["gemm_g_per_s"]
+    of = {"ngp": ("train_chunks",), "splat": ("train_tiles", "project", "deal", "update")}
+    table = (tmp_path / "bench.md").read_text()
+    for field, scene in product(of, ("tile", "room")):
+        about = found[f"{field} on {scene}"]
+        kernels = about["kernels"]
         assert sum(k["share"] for k in kernels.values()) == pytest.approx(
-            1.0 - found[scene]["outside_kernels_share"]
+            1.0 - about["outside_kernels_share"]
         )
-        assert 0.0 < kernels["train_chunks"]["floor_share"] < 1.0  # faster than possible: a wrong count
+        for name in of[field]:
+            assert 0.0 < kernels[name]["floor_share"] < 1.0  # faster than possible: a wrong count
+            assert f"| {field} on {scene} | {name} | {kernels[name]['ms_a_step']:.2f} |" in table
 
 
 @pytest.mark.slow

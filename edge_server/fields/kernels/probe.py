@@ -1,4 +1,5 @@
-"""What a machine can do at most: random reads of, and additions to, vertices of two float32."""
+"""What a machine can do at most: random reads of, and additions to, vertices of two float32, divisions, and
+copies within a core's own cache."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from edge_server.fields.kernels.intrinsics import fetch_add
 from edge_server.fields.kernels.jit import kernel
 
 TASKS, PER_TASK = 64, 1 << 16
+ROUNDS = 64  # of short loops in one task: drawing its number would be what is measured
 
 
 @kernel
@@ -29,3 +31,23 @@ def random_adds(counter, worker, tables, rows):
         for i in range(rows.size):
             table[rows[i], 0] += one
             table[rows[i], 1] += one
+
+
+@kernel
+def divisions(counter, worker, x, y, out):
+    """Divide x (N,) by y (N,) and add the quotients to out (workers, N), float32, TASKS * ROUNDS times."""
+    mine = out[worker]
+    while fetch_add(counter, 1) < TASKS:
+        for _ in range(ROUNDS):
+            for i in range(x.size):
+                mine[i] += x[i] / y[i]
+
+
+@kernel
+def copies(counter, worker, memory):
+    """Copy the first half of the worker's memory (workers, 2 N), float32, to its second, TASKS times over."""
+    mine = memory[worker]
+    half = mine.size // 2
+    while fetch_add(counter, 1) < TASKS:
+        for i in range(half):
+            mine[half + i] = mine[i] + np.float32(1.0)

@@ -50,7 +50,7 @@ class Ablation:
             mine: dict[str, Any] = {}
             for name, used in variants.items():
                 spec = Spec("select", layout_of(setting, used))
-                course = Course(spec, reward, EPISODES[ask.quick])
+                course = Course(spec, reward, ask.taught(EPISODES))
                 learnt = school.teach_all(f"{self.name}-{name}", setting, course)
                 mine |= named_runs(f"learnt {name}", learnt)
             everybody: dict[str, Any] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -33,8 +33,9 @@ Curve = dict[float, dict[int, float | None]]
 
 @dataclass(frozen=True)
 class Ask:
-    """What was asked for. seeds: repetitions of every point; None takes the study's own. scenes: None takes
-    the study's own, those whose data are here. jobs: processes, for studies that train."""
+    """What was asked for; None, or no case, takes the study's own. seeds: repetitions of every point. scenes:
+    of those whose data are here. Of studies that train, jobs: processes; cases: words in the names of those
+    that are wanted; episodes: of one training."""
 
     quick: bool
     out: Path
@@ -42,6 +43,23 @@ class Ask:
     seeds: int | None = None
     scenes: tuple[str, ...] | None = None
     jobs: int = 1
+    cases: tuple[str, ...] = ()
+    episodes: int | None = None
+
+    def chosen(self, cases: Sequence[str], quick: Sequence[str]) -> list[str]:
+        """Of a study's ``cases``, those that were asked for; of a quick pass that asked for none, ``quick``.
+        StudyError for one that there is not."""
+        if not self.cases:
+            return list(quick if self.quick else cases)
+        if unknown := [word for word in self.cases if not any(word in case for case in cases)]:
+            raise StudyError(
+                f"--case: none has {', '.join(map(repr, unknown))} in its name; there are: {'; '.join(cases)}"
+            )
+        return [case for case in cases if any(word in case for word in self.cases)]
+
+    def taught(self, episodes: Mapping[bool, int]) -> int:
+        """Episodes of one training. episodes: the study's own, by whether it is a quick pass."""
+        return self.episodes or episodes[self.quick]
 
     def repeats(self, quick: int, full: int) -> range:
         return range(self.seeds or (quick if self.quick else full))

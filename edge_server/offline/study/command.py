@@ -16,6 +16,7 @@ from edge_server.fidelity.lpips_weights import weights_folder
 from edge_server.offline.study.base import Ask, Verdict, run_study
 from edge_server.offline.study.engine import Engine, StudyError
 from edge_server.offline.study.trial import SCENARIOS, Folders
+from edge_server.offline.training.setting import SEEDS_A_PURPOSE
 from edge_server.offline.training.trainer import TrainingError
 from freshfield.files import write_json
 from freshfield.scenario import ScenarioError
@@ -39,6 +40,8 @@ STUDIES = {
     "semantics": ("semantics", "Semantics"),
     "reward-cost": ("reward_cost", "RewardCost"),
 }
+# Those of them that are made of cases, of which some can be asked for.
+CASED = ("ppo-select", "ppo-wait", "drift", "semantics", "reward-cost")
 # Trainings, which go through no heap of trials: they take long, and are not part of "all".
 LEARNING = (
     "ppo-select", "ppo-wait", "ablation", "weights", "drift", "transfer", "semantics", "reward-cost"
@@ -71,7 +74,10 @@ with 95 % intervals over seeds, and whether it holds.
   reward-cost       what is learnt against the time it takes, by the effort of a fit and the embedding
 
 Studies of what learns, ppo-select and below, take half an hour to an hour each with --quick on two cores,
-with one training an arm; without it, with three and more episodes, most of a day and more.
+with one training an arm; without it, with three and more episodes, most of a day and more. In between:
+
+  edge-server study ppo-select --quick --case priced --episodes 600
+  edge-server study drift --quick --case bursts --case dies
 
 Everything runs in virtual time from seeds: a trial gives the same figures bit for bit wherever it runs.
 Results are kept in OUT/trials by content; after Ctrl-C the same command goes on with what is missing.
@@ -84,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
     folders = Folders(base, weights_folder(args.lpips, base))
     scenes = tuple(args.scene.split(",")) if args.scene else None
-    ask = Ask(args.quick, args.out, folders, args.seeds, scenes, args.jobs)
+    ask = Ask(args.quick, args.out, folders, args.seeds, scenes, args.jobs, tuple(args.case), args.episodes)
     names = [n for n in STUDIES if n not in LEARNING] if args.study == "all" else [args.study]
     if args.study == "learning":
         names = list(LEARNING)
@@ -93,6 +99,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         _check(ask, args.jobs)
         if set(names) <= set(LEARNING) and (scenes or args.ray):
             raise StudyError("--scene and --ray: studies that learn have scenes of their own and train here")
+        if args.case and not set(names) <= set(CASED):
+            raise StudyError(f"--case is for {', '.join(CASED)}")
+        if args.episodes is not None and not set(names) <= set(LEARNING):
+            raise StudyError(f"--episodes is for {', '.join(LEARNING)}")
         for name in names:
             _run(name, ask, engine)
     except (ScenarioError, DatasetError, StudyError, TrainingError) as error:
@@ -130,6 +140,8 @@ def _run(name: str, ask: Ask, engine: Engine) -> list[Verdict]:
 def _check(ask: Ask, jobs: int) -> None:
     if ask.seeds is not None and not 1 <= ask.seeds <= 10_000:
         raise StudyError(f"--seeds: expected 1 to 10000, got {ask.seeds}")
+    if ask.episodes is not None and not 1 <= ask.episodes <= SEEDS_A_PURPOSE:
+        raise StudyError(f"--episodes: expected 1 to {SEEDS_A_PURPOSE}, got {ask.episodes}")
     if jobs < 1:
         raise StudyError(f"--jobs: expected at least 1, got {jobs}")
     for scene in ask.scenes or ():
@@ -152,6 +164,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--seeds", type=int, metavar="N", help="repetitions of every point [the study's own]")
     add("--jobs", type=int, default=cores, metavar="J", help="processes [%(default)s]")
+    add(
+        "--case",
+        action="append",
+        default=[],
+        metavar="WORDS",
+        help=f"of {', '.join(CASED)}: only cases with these words in their name; words that no name has list "
+        "them all",
+    )
+    add("--episodes", type=int, metavar="N", help="of one training, where there is one [the study's own]")
     add("--ray", metavar="ADDRESS", help="run on a Ray cluster instead: auto, local, or host:port")
     add("--scene", metavar="NAME,...", help=f"{', '.join(SCENARIOS)} [the study's own]")
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")

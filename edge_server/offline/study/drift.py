@@ -65,12 +65,14 @@ class Drift:
         written: list[dict[str, Any]] = []
         with School(ask) as school:
             reward = dataclasses.replace(school.reward("corrected"), age=AGE)
-            for name, (before, after, gone) in list(changes().items())[: 1 if ask.quick else None]:
+            known = changes()
+            for name in ask.chosen(list(known), list(known)[:1]):
+                before, after, gone = known[name]
                 settings = room(before), room(after, silent=(gone,) if gone else ())
                 trainings = RUNS[ask.quick]
                 each = max(1, len(ask.repeats(3, 9)) // trainings)
                 runs = [
-                    [_one_run(school, name, *settings, reward, training, training * each + k, ask.quick)
+                    [_one_run(school, name, *settings, reward, training, training * each + k)
                      for k in range(each)]
                     for training in range(trainings)
                 ]  # fmt: skip
@@ -94,11 +96,10 @@ def _one_run(
     reward: Reward,
     training: int,
     run: int,
-    quick: bool,
 ) -> Rewards:
     """Rewards of every decision as the reporting cameras have them, by policy: the same decisions for all."""
     spec = Spec("threshold", StateLayout(("age", "pose")), OMEGAS_MS["threshold"])
-    course = Course(spec, reward, EPISODES[quick], tries=3, seed=training)
+    course = Course(spec, reward, school.ask.taught(EPISODES), tries=3, seed=training)
     home = school.teach(Lesson(f"drift-before-{training}", before, course))
     there = school.teach(Lesson(f"drift-{name.replace(' ', '-')}-{training}", after, course))
     chosen = school.contest(before, rivals(spec.omegas_ms, ["threshold"], ("random",)), reward, 6, seed=7)

@@ -44,6 +44,8 @@ CASES = (
     ("moving", "one viewpoint", False, 0.0), ("whole", "four viewpoints", False, 0.0),
     ("whole", "four viewpoints", False, 0.003),
 )  # fmt: skip
+# By whether updates begin with nothing.
+FIELDS = {True: "from nothing", False: "warm"}
 # So many cameras about the held-out one: is what is learnt more than from where the field is looked at?
 NEAREST = (6, 9, 12)
 # Of one training; by whether it is a quick pass.
@@ -63,16 +65,17 @@ class PpoSelect:
         written: list[dict[str, Any]] = []
         count = len(ask.repeats(10, 100))
         with School(ask) as school:
-            for on, viewpoints, scratch, price in CASES:
+            cases = {_called(*case): case for case in CASES}
+            for case in ask.chosen(list(cases), list(cases)):
+                on, viewpoints, scratch, price = cases[case]
                 held_out = VIEWPOINTS[viewpoints]
-                field = "from nothing" if scratch else "warm"
-                priced = f", {price:g} a view" if price else ""
+                field = FIELDS[scratch]
                 setting = room("ch5", held_out=held_out, scratch=scratch)
                 reward, spec = school.reward("set", on), Spec("select", StateLayout(("age", "pose")))
                 reward = dataclasses.replace(reward, views=-price)
                 name = f"{self.name}-{on}-{len(held_out)}-{field.replace(' ', '-')}{'-priced' * bool(price)}"
-                learnt = school.teach_all(name, setting, Course(spec, reward, EPISODES[ask.quick]))
-                mine, about = named_runs("learnt", learnt), f"room, ch5, {on}, {viewpoints}, {field}{priced}"
+                learnt = school.teach_all(name, setting, Course(spec, reward, ask.taught(EPISODES)))
+                mine, about = named_runs("learnt", learnt), f"room, ch5, {case}"
                 contest = school.contest(setting, {**_rivals(setting), **mine}, reward, count)
                 verdicts += [*judge(about, contest), _time(about, learnt)]
                 labels = {"fidelity": on, "reward_from": viewpoints, "field": field, "price": price}
@@ -85,6 +88,10 @@ class PpoSelect:
                 draw_curve(ask.out / f"{learnt[0].lesson.name}.png", learnt[0].rows, level)
         write_rows(ask.out / f"{self.name}.csv", written)
         return verdicts
+
+
+def _called(on: str, viewpoints: str, scratch: bool, price: float) -> str:
+    return f"{on}, {viewpoints}, {FIELDS[scratch]}{f', priced, {price:g} a view' if price else ''}"
 
 
 def _rivals(setting: Setting) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 """What accuracy costs in time when it is the reward's: a cheap noisy reward often or an exact slow one; and
-what a larger embedding is worth."""
+what a larger embedding is worth where it can matter to look."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from edge_server.offline.study.learning import (
     runs_of,
 )
 from edge_server.offline.study.statistics import crossed
+from edge_server.offline.study.workshop import PARTS, priced, workshop
 from edge_server.offline.train_scheduler import OMEGAS_MS, layout_of
 from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
 from edge_server.offline.training.report import span
@@ -37,6 +38,8 @@ JUDGED_STEPS = 100
 # Shares of a training after which what has been learnt is judged.
 STAGES = (0.05, 0.1, 0.25, 0.5, 1.0)
 DIMS = (0, 4, 32)
+# An embedding is learnt to be used more slowly than an age.
+EPISODES_BY_DIM = {True: 300, False: 1200}
 
 
 class RewardCost:
@@ -48,32 +51,38 @@ class RewardCost:
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table
-        budgets = QUICK_BUDGETS if ask.quick else BUDGETS
-        judged = room("ch5", steps=JUDGED_STEPS)
+        parts = {"fit budget": _by_budget, "embedding size": _by_dim}
+        written: list[dict[str, Any]] = []
+        found: list[Verdict] = []
         with School(ask) as school:
-            reward = school.reward("set")
-            course = Course(Spec("select", StateLayout(("age", "pose"))), reward, EPISODES[ask.quick])
-            course = dataclasses.replace(course, stages=stages(course.batches))
-            learnt = {steps: school.teach_all(f"{self.name}-{steps}", room("ch5", steps=steps), course)
-                      for steps in budgets}  # fmt: skip
-            everybody: dict[str, Any] = {
-                **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")),
-            }
-            for steps, stage in itertools.product(budgets, course.stages):
-                then = [_then(one, stage) for one in learnt[steps]]
-                everybody |= named_runs(_called(steps, stage), then)
-            # Everything at every stage of every training, by dear fits: fewer seeds than elsewhere.
-            contest = school.contest(judged, everybody, reward, len(ask.repeats(8, 40)))
-            spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in course.stages]
-                     for steps, runs in learnt.items()}  # fmt: skip
-            written = rows(contest, what="fit budget")
-            found = judge(contest, course.stages, spent)
-            _draw(ask, contest, course.stages, spent)
-            if not ask.quick:
-                sized, more = _by_dim(school, ask, reward)
-                written, found = written + sized, found + more
+            for part in ask.chosen(list(parts), list(parts)):
+                more, verdicts = parts[part](school, ask)
+                written, found = written + more, found + verdicts
         write_rows(ask.out / f"{self.name}.csv", written)
         return found
+
+
+def _by_budget(school: School, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
+    """Reward against the time of training, by the steps of a fit."""
+    budgets = QUICK_BUDGETS if ask.quick else BUDGETS
+    reward = school.reward("set")
+    course = Course(Spec("select", StateLayout(("age", "pose"))), reward, ask.taught(EPISODES))
+    course = dataclasses.replace(course, stages=stages(course.batches))
+    learnt = {steps: school.teach_all(f"reward-cost-{steps}", room("ch5", steps=steps), course)
+              for steps in budgets}  # fmt: skip
+    everybody: dict[str, Any] = {
+        **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")),
+    }
+    for steps, stage in itertools.product(budgets, course.stages):
+        then = [_then(one, stage) for one in learnt[steps]]
+        everybody |= named_runs(_called(steps, stage), then)
+    # Everything at every stage of every training, by dear fits: fewer seeds than elsewhere.
+    judged = room("ch5", steps=JUDGED_STEPS)
+    contest = school.contest(judged, everybody, reward, len(ask.repeats(8, 40)))
+    spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in course.stages]
+             for steps, runs in learnt.items()}  # fmt: skip
+    _draw(ask, contest, course.stages, spent)
+    return rows(contest, what="fit budget"), judge(contest, course.stages, spent)
 
 
 def stages(batches: int) -> tuple[int, ...]:
@@ -130,28 +139,30 @@ def _then(learnt: Learnt, batches: int) -> Actor:
     return Actor.load(stage_file(learnt.folder, batches))
 
 
-def _by_dim(school: School, ask: Ask, reward: Any) -> tuple[list[dict[str, Any]], list[Verdict]]:
+def _by_dim(school: School, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
     """Reward against the width of the embedding; nothing where there are no embeddings."""
     if missing := embeddings_missing():
         print(f"  embedding sizes are left out: {missing}")
         return [], []
-    setting = room("ch5", parts=("semantics", "age", "pose"))
+    usual = workshop(1.0)
     contests: dict[str, Contest] = {}
     for dim in DIMS:
-        with_dim = setting if not dim else room("ch5", parts=setting.parts, embedding={"dim": dim})
-        layout = layout_of(with_dim, ("semantics", "age", "pose") if dim else ("age", "pose"))
-        learnt = school.teach_all(
-            f"reward-cost-d{dim}", with_dim, Course(Spec("select", layout), reward, EPISODES[False])
-        )
+        edge = {**usual.scenario.edge, "embedding": {"dim": dim or DIMS[-1]}}
+        setting = dataclasses.replace(usual, scenario=dataclasses.replace(usual.scenario, edge=edge))
+        layout = layout_of(setting, PARTS if dim else PARTS[1:])
+        reward = priced(school, "moving")
+        course = Course(Spec("select", layout), reward, ask.taught(EPISODES_BY_DIM))
+        learnt = school.teach_all(f"reward-cost-d{dim}", setting, course)
         everybody: dict[str, Any] = {**rivals((), (), ("random",)), **named_runs(f"d = {dim}", learnt)}
-        contests[f"d = {dim}"] = school.contest(with_dim, everybody, reward, len(ask.repeats(8, 100)))
+        contests[f"d = {dim}"] = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
+    _draw_dims(ask, contests)
     return [row for name, c in contests.items() for row in rows(c, what=name)], judge_dims(contests)
 
 
 def judge_dims(contests: dict[str, Contest]) -> list[Verdict]:
     """Whether each embedding is worth more than none, ``d = 0``."""
     runs = {name: runs_of(contest, name) for name, contest in contests.items()}
-    return [better("room, ch5", f"{name} is better than none.", values, runs["d = 0"])
+    return [better("tower, ch5, somebody moves", f"{name} is better than none.", values, runs["d = 0"])
             for name, values in runs.items() if name != "d = 0"]  # fmt: skip
 
 
@@ -163,3 +174,13 @@ def _draw(ask: Ask, contest: Contest, stages: Sequence[int], spent: dict[int, li
                             label=f"{steps} steps a fit")  # fmt: skip
         label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of processor time",
                     "What a reward costs")  # fmt: skip
+
+
+def _draw_dims(ask: Ask, contests: dict[str, Contest]) -> None:
+    """What is learnt against the width of the embedding, with 95 % intervals."""
+    with figure(ask.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):
+        found = [crossed(runs_of(contest, name)) for name, contest in contests.items()]
+        means = [one.mean for one in found]
+        off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
+        axes[0, 0].errorbar([str(dim) for dim in DIMS], means, off, marker="o", color=CYCLE[0], capsize=3)
+        label_lines(axes[0, 0], "reward", "numbers of an embedding", "What a larger embedding is worth")

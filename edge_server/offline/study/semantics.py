@@ -3,7 +3,8 @@ cost nothing where nothing does?"""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
@@ -12,32 +13,34 @@ from edge_server.offline.study.learning import (
     School,
     better,
     embeddings_missing,
+    mean_of,
     named_runs,
     no_worse,
-    room,
     runs_of,
 )
 from edge_server.offline.study.sight import Sees, Sight, telling
 from edge_server.offline.study.statistics import interval
+from edge_server.offline.study.workshop import PARTS, priced, workshop
 from edge_server.offline.train_scheduler import OMEGAS_MS, layout_of
 from edge_server.offline.training.contest import RIVALS, Contest, rivals, rows, write_rows
-from edge_server.offline.training.setting import Setting, seeds
+from edge_server.offline.training.report import span
+from edge_server.offline.training.setting import seeds
 from edge_server.offline.training.trainer import Course
+from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler.learned.spec import Spec
 
 EPISODES = {True: 300, False: 1200}
-PARTS = ("semantics", "age", "pose")
-# scene -> (speed, PSNR of what). Cameras look outward; a person walks on one side or a cart drives on the
-# other, which of both there is nobody knows without looking. Or what is there stands still.
+# scene -> (speed, PSNR of what). A person walks on one of four sides of the workshop, or stands there.
 SCENES = {"somebody moves": (1.0, "moving"), "nothing moves": (0.0, "whole")}
-# One camera for each side, of those that reward and of those that judge.
-REWARDING, JUDGING = ("cam00", "cam11"), ("cam13", "cam08")
-# Of the reward, a view: with views for nothing there is nothing to choose, since no view ever harms.
-PRICE = 0.002
-# An update a second: what has moved since the last one is worth a view.
-STEPS, REFRESH_MS = 40, 900.0
 # So many cameras are used by those that know which of them see what moves.
 KNOWING = (1, 2, 3, 4)
+
+# In the figure: name of a family of policies -> how their names begin.
+LEARNT = ("with-", "without-")
+FAMILIES = {
+    "learnt with semantics": LEARNT[0], "learnt without": LEARNT[1], "knows who sees it": "sees:",
+    "thresholds": "threshold:", "freshest k": "freshest-k:", "random": "random",
+}  # fmt: skip
 
 
 class Semantics:
@@ -54,15 +57,16 @@ class Semantics:
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
         with School(ask) as school:
-            for scene, (speed, on) in SCENES.items():
+            for scene in ask.chosen(list(SCENES), list(SCENES)):
+                speed, on = SCENES[scene]
                 setting = workshop(speed)
-                reward = dataclasses.replace(school.reward("set", on), views=-PRICE)
+                reward = priced(school, on)
                 mine: dict[str, Any] = {}
                 for name, layout in (
                     ("with", layout_of(setting, PARTS)),
                     ("without", layout_of(setting, PARTS[1:])),
                 ):
-                    course = Course(Spec("select", layout), reward, EPISODES[ask.quick])
+                    course = Course(Spec("select", layout), reward, ask.taught(EPISODES))
                     lesson = f"{self.name}-{scene.replace(' ', '-')}-{name}"
                     mine |= named_runs(name, school.teach_all(lesson, setting, course))
                 everybody: dict[str, Any] = {
@@ -79,27 +83,18 @@ class Semantics:
                     moments = [m for e in school.crew.draw(setting, seeds(0, "test", count)) for m in e]
                     found += why(scene, contest, telling(sight, moments))
         write_rows(ask.out / f"{self.name}.csv", written)
+        draw(ask.out / f"{self.name}.png", written)
         return found
-
-
-def workshop(speed_m_per_s: float) -> Setting:
-    """The scene and how it is updated."""
-    setting = room(
-        "ch5", scene="tower", speed_m_per_s=speed_m_per_s, held_out=REWARDING, report=JUDGING, parts=PARTS,
-        steps=STEPS, refresh_ms=REFRESH_MS,
-    )  # fmt: skip
-    scenario = setting.scenario
-    params = {**scenario.source.get("params", {}), "movers": "one"}
-    source = {**scenario.source, "params": params}
-    return dataclasses.replace(setting, scenario=dataclasses.replace(scenario, source=source))
 
 
 def judge(scene: str, contest: Contest, moves: bool) -> list[Verdict]:
     """Whether who looks at the pictures does better than who does not; or, where nothing moves, no worse.
     And whether either is better than the best of what does not learn."""
     about, seeing, blind = f"tower, ch5, {scene}", runs_of(contest, "with"), runs_of(contest, "without")
-    views = {name: contest.term(f"{name}-0", "views").mean for name in ("with", "without")}
-    told = f"{views['with']:.1f} views with, {views['without']:.1f} without; "
+    told = ""
+    for name, runs in (("with", seeing), ("without", blind)):
+        views, won = contest.term(f"{name}-0", "views").mean, contest.share(mean_of(runs))
+        told += f"{name}: {views:.1f} views, {span(won, 2)} of the way from random to hindsight; "
     if moves:
         claim = "semantics help where something important moves."
         found = [better(about, claim, seeing, blind, told)]
@@ -129,3 +124,23 @@ def why(scene: str, contest: Contest, told: tuple[float, float]) -> list[Verdict
                contest.rewards(best), runs_of(contest, "without"),
                f"{best}, the best number of them known from the very seeds; "),
     ]  # fmt: skip
+
+
+def draw(path: Path, written: Sequence[Mapping[str, Any]]) -> None:
+    """Mean reward against views used, a panel a scene: families of policies as lines, what was learnt as
+    diamonds. No intervals: what counts are paired differences, which the verdicts have. written: rows of the
+    contests, as the table has them."""
+    scenes = list(dict.fromkeys(row["scene"] for row in written))
+    with figure(path, 1, len(scenes), height_inch=3.4) as (_, axes):
+        for at, scene in zip(axes[0], scenes):
+            known = [row for row in written if row["scene"] == scene and row.get("views")]
+            for k, (label, prefix) in enumerate(FAMILIES.items()):
+                some = sorted(
+                    (float(row["views"]), float(row["reward"]))
+                    for row in known if row["policy"].startswith(prefix)
+                )  # fmt: skip
+                style = "D" if prefix in LEARNT else ".-"
+                at.plot([v for v, _ in some], [r for _, r in some], style, color=CYCLE[k], label=label)
+            label_lines(at, "reward", "views used", scene)
+        for at in axes[0][:-1]:
+            at.get_legend().remove()

@@ -49,7 +49,7 @@ class Transfer:
         with School(ask) as school:
             reward = dataclasses.replace(school.reward("corrected"), age=AGE)
             places = settings(ask.quick)
-            course = Course(spec, reward, EPISODES[ask.quick], tries=3)
+            course = Course(spec, reward, ask.taught(EPISODES), tries=3)
             learnt = {
                 place: school.teach_all(
                     f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",

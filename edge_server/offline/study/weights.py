@@ -33,7 +33,7 @@ class Weights:
             rewards = variants(school)
             everybody: dict[str, Any] = {**rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all"))}
             for name, reward in rewards.items():
-                course = Course(spec, reward, EPISODES[ask.quick], tries=3)
+                course = Course(spec, reward, ask.taught(EPISODES), tries=3)
                 learnt = school.teach_all(f"{self.name}-{name}", setting, course)
                 everybody |= named_runs(f"learnt {name}", learnt)
             contest = school.contest(setting, everybody, rewards["corrected"], len(ask.repeats(8, 100)))

@@ -58,6 +58,10 @@ class Contest:
             return _by_seed(self._top(list(self.outcomes))[0], self._nobodys())
         return _by_seed(self._values(name), self._nobodys())
 
+    def decisions(self, name: str) -> dict[At, float | None]:
+        """Reward at every decision, mean of its fits; None where a term is missing."""
+        return self._values(name)
+
     def seeds(self, name: str) -> tuple[int, int]:
         """How many seeds there are, and how many have a value."""
         found = self.rewards(name)

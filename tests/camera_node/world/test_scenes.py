@@ -139,8 +139,32 @@ def test_which_of_two_moves_in_the_tower_is_drawn_and_only_it_is_there():
     both, alone = make_scene("tower", {**SMALL, "motion_seed": 0}), known[0].world.movers[0]
     like = [mover for mover in both.world.movers if len(mover.parts) == len(alone.parts)]
     assert [np.allclose(mover.matrices(0.7), alone.matrices(0.7)) for mover in like] == [True]
-    with pytest.raises(ValueError, match="both or one"):
+    with pytest.raises(ValueError, match="both, one or person"):
         make_scene("tower", {"movers": "none"})
+
+
+def test_a_person_alone_in_the_tower_walks_on_any_of_four_sides_clear_of_all_that_stands_there():
+    sides = set()
+    for seed in range(24):
+        scene = make_scene("tower", {**SMALL, "supersample": 1, "movers": "person", "motion_seed": seed})
+        (person,) = scene.world.movers
+        path = np.stack(
+            [person.matrices(t)[:, :3, 3].mean(axis=0) for t in np.linspace(0, scene.period_s, 25)]
+        )
+        angle = np.rad2deg(np.arctan2(*path[:, 1::-1].T))
+        side = round(float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(angle)).mean())) / 90.0)) % 4
+        sides.add(side)
+        away = np.abs(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(angle - 90.0 * side)))))
+        assert away.max() < 25.0, "it stays on its side"
+        boxes = [part for part in scene.world.statics if isinstance(part.shape, Box)]
+        for t in np.linspace(0, scene.period_s, 9):
+            for part, m in zip(person.parts, person.matrices(t)):
+                at = m[:3, :3] @ part.shape.bounding_sphere()[0] + m[:3, 3]
+                for box in boxes:
+                    local = np.linalg.inv(box.matrix) @ np.append(at, 1.0)
+                    outside = np.maximum(np.abs(local[:3]) - box.shape.half, 0.0)
+                    assert np.linalg.norm(outside) > 0.1, "nothing is walked through"
+    assert sides == {0, 1, 2, 3}
 
 
 def test_the_share_of_moving_pixels_of_the_tower():

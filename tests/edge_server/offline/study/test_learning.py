@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from edge_server.offline.study import (
     ablation,
+    command,
     drift,
     learning,
     ppo_select,
@@ -49,8 +51,11 @@ def small(monkeypatch):
     monkeypatch.setattr(learning, "FIELD_OPTIONS", FIELD)
     for name in LEARNING:
         module = f"edge_server.offline.study.{name.replace('-', '_')}"
-        monkeypatch.setattr(f"{module}.room", room)
+        if name != "semantics":
+            monkeypatch.setattr(f"{module}.room", room)
         monkeypatch.setattr(f"{module}.EPISODES", {True: 3, False: 3})
+    monkeypatch.setattr("edge_server.offline.study.workshop.room", room)
+    monkeypatch.setattr("edge_server.offline.study.reward_cost.EPISODES_BY_DIM", {True: 3, False: 3})
     monkeypatch.setattr("edge_server.offline.study.drift.BEFORE", 2)
     monkeypatch.setattr("edge_server.offline.study.drift.AFTER", 22)
 
@@ -71,6 +76,30 @@ def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, 
     assert [(v.about, v.claim, v.verdict) for v in again] == [(v.about, v.claim, v.verdict) for v in first]
     assert (tmp_path / "training/evaluations.jsonl").read_text().count("\n") == lines
     capsys.readouterr()
+
+
+@pytest.mark.slow
+def test_one_case_of_a_study_is_run_with_as_many_episodes_as_asked_for(small, tmp_path: Path):
+    ask = Ask(True, tmp_path, Folders(), seeds=2, cases=("ch6, age -0.003",), episodes=4)
+    verdicts = make_study("ppo-wait").report(ask, None)
+    assert all(v.about.startswith("room, ch6, age -0.003/ms") for v in verdicts)
+    logs = list((tmp_path / "training").glob("ppo-wait-ch6-0.003-*/training.jsonl"))
+    assert len(logs) == 4 and all(
+        json.loads(log.read_text().splitlines()[-1])["episodes"] == 4 for log in logs
+    )
+
+
+def test_a_case_that_there_is_not_is_refused_with_those_there_are(tmp_path: Path, capsys):
+    words = ["ppo-wait", "--quick", "--out", str(tmp_path), "--case", "ch7"]
+    assert command.main(words) == 2
+    told = capsys.readouterr().err
+    assert "none has 'ch7' in its name" in told and "ch6-slow, age -0.015/ms" in told
+    assert command.main(["mat", "--quick", "--out", str(tmp_path), "--case", "room"]) == 2
+    assert "--case is for ppo-select" in capsys.readouterr().err
+    assert command.main(["mat", "--quick", "--out", str(tmp_path), "--episodes", "3"]) == 2
+    assert "--episodes is for ppo-select" in capsys.readouterr().err
+    assert command.main(["ppo-wait", "--quick", "--out", str(tmp_path), "--episodes", "0"]) == 2
+    assert "--episodes: expected 1" in capsys.readouterr().err
 
 
 def contest_of(levels: dict[str, float], seeds: int = 12) -> Contest:
