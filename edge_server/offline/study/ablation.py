@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict
+from edge_server.offline.study.base import Ask, Table, Verdict
 from edge_server.offline.study.learning import (
     FOUR_VIEWPOINTS,
     School,
+    Taught,
     better,
     embeddings_missing,
     fixed_of,
@@ -29,12 +30,9 @@ VARIANTS = {
 }  # fmt: skip
 
 
-class Ablation:
+class Ablation(Taught):
     name = "ablation"
     title = "What each part of the state is worth: age, pose, semantics (6.33)"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table

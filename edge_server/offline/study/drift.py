@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict
-from edge_server.offline.study.learning import RUNS, Lesson, School, better, room
+from edge_server.offline.study.base import Ask, Table, Verdict
+from edge_server.offline.study.learning import RUNS, Lesson, School, Taught, better, room
 from edge_server.offline.train_scheduler import OMEGAS_MS
 from edge_server.offline.training.choosing import choose, named
 from edge_server.offline.training.contest import PerSeed, rivals, write_rows
@@ -52,12 +52,9 @@ def changes() -> dict[str, tuple[dict[str, Any], dict[str, Any], str | None]]:
     }
 
 
-class Drift:
+class Drift(Taught):
     name = "drift"
     title = "The channel changes during use: fixed, learnt, and still learning"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table

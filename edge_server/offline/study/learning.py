@@ -19,7 +19,7 @@ import numpy as np
 
 from camera_node.config import WorldConfig, source_config
 from edge_server.offline.deployment import exact_scene
-from edge_server.offline.study.base import Ask, Verdict, by_bool
+from edge_server.offline.study.base import Ask, Point, Verdict, by_bool
 from edge_server.offline.study.engine import source_digest
 from edge_server.offline.study.statistics import Interval, crossed, interval
 from edge_server.offline.study.trial import Trial
@@ -45,6 +45,14 @@ RUNS = {True: 1, False: 3}
 
 Runs = Sequence[PerSeed]
 """Rewards by seed of each of several trainings of the same lesson."""
+
+
+class Taught:
+    """A study that trains: what it does is no heap of trials."""
+
+    def points(self, ask: Ask) -> list[Point]:
+        """None."""
+        return []
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,14 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
+from edge_server.offline.study.base import Ask, Table, Verdict, by_bool
 from edge_server.offline.study.learning import (
     FOUR_VIEWPOINTS,
     Learnt,
     Nearest,
     Runs,
     School,
+    Taught,
     better,
     mean_of,
     named_runs,
@@ -52,12 +53,9 @@ NEAREST = (6, 9, 12)
 EPISODES = {True: 120, False: 600}
 
 
-class PpoSelect:
+class PpoSelect(Taught):
     name = "ppo-select"
     title = "A scheduler that learns which views to use (figure 5.9)"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table

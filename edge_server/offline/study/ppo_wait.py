@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
+from edge_server.offline.study.base import Ask, Table, Verdict, by_bool
 from edge_server.offline.study.foreseen import by_ages
 from edge_server.offline.study.learning import (
     School,
+    Taught,
     better,
     mean_of,
     named_runs,
@@ -40,12 +41,9 @@ THESIS_PERCENT = 6
 EPISODES = {True: 90, False: 600}
 
 
-class PpoWait:
+class PpoWait(Taught):
     name = "ppo-wait"
     title = "A scheduler that learns how long to wait, or how old is too old (figure 6.8)"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table

@@ -8,10 +8,11 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
+from edge_server.offline.study.base import Ask, Table, Verdict, by_bool
 from edge_server.offline.study.learning import (
     Learnt,
     School,
+    Taught,
     better,
     embeddings_missing,
     named_runs,
@@ -42,12 +43,9 @@ DIMS = (0, 4, 32)
 EPISODES_BY_DIM = {True: 300, False: 1200}
 
 
-class RewardCost:
+class RewardCost(Taught):
     name = "reward-cost"
     title = "Reward against the time of training, by the effort of a fit; and against embedding size"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table

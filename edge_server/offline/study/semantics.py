@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
+from edge_server.offline.study.base import Ask, Table, Verdict, by_bool
 from edge_server.offline.study.engine import StudyError
 from edge_server.offline.study.learning import (
     School,
+    Taught,
     better,
     embeddings_missing,
     mean_of,
@@ -43,12 +44,9 @@ FAMILIES = {
 }  # fmt: skip
 
 
-class Semantics:
+class Semantics(Taught):
     name = "semantics"
     title = "Where semantics help, and whether they cost anything where they do not (6.31-6.33)"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict
+from edge_server.offline.study.base import Ask, Table, Verdict
 from edge_server.offline.study.learning import (
     School,
+    Taught,
     better,
     fixed_of,
     named_runs,
@@ -34,12 +35,9 @@ def settings(quick: bool) -> dict[str, Setting]:
     return found if quick else found | more
 
 
-class Transfer:
+class Transfer(Taught):
     name = "transfer"
     title = "Trained on one scene and channel, used on another"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table

@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from edge_server.offline.study.base import Ask, Point, Table, Verdict, by_bool
-from edge_server.offline.study.learning import School, better, named_runs, over, room, runs_of
+from edge_server.offline.study.base import Ask, Table, Verdict, by_bool
+from edge_server.offline.study.learning import School, Taught, better, named_runs, over, room, runs_of
 from edge_server.offline.train_scheduler import OMEGAS_MS
 from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
 from edge_server.offline.training.report import span
@@ -19,12 +19,9 @@ from edge_server.scheduler.learned.state import StateLayout
 EPISODES = {True: 40, False: 600}
 
 
-class Weights:
+class Weights(Taught):
     name = "weights"
     title = "Sensitivity to the weights of the reward (6.36-6.38)"
-
-    def points(self, ask: Ask) -> list[Point]:
-        return []
 
     def report(self, ask: Ask, table: Table) -> list[Verdict]:
         del table
