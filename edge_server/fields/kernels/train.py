@@ -26,6 +26,9 @@ CHUNK = 2048  # samples a chunk has room for; its activations stay in the second
 CHUNK_RAYS = 512
 
 GUESS = 20.0  # optical depth of the grid's densities at which a ray is taken to be opaque: twice enough
+# Where that was too little, so much more of it, up to a depth that no grid is wrong about. (To the ray's end
+# at once: in a room, where two guesses of five are wrong, six times as many samples as are kept.)
+AGAIN, SURE = np.float32(4.0), np.float32(1000.0)
 
 _F0, _F1, _BYTE = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 255.0)
 
@@ -153,14 +156,15 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
     Only samples that can be seen are kept: what lies behind an opaque one would cost a backward pass for
     a gradient of nothing. The room they leave is filled with further rays, so that the number of rays
     follows the number of samples they need and every step costs about the same. Where a ray will be opaque
-    is guessed from the occupancy grid's densities; where the guess was wrong, the ray is marched to its end
-    in the next round.
+    is guessed from the occupancy grid's densities; where the guess was wrong, the ray is marched farther in
+    the next round.
     """
     ts, dts = line[0], line[1]
     out = acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
     number, doubtful = np.empty(limit, np.int64), np.empty(limit, np.bool_)  # of the rays of one round
-    again = np.empty(limit, np.int64)
+    depths = np.empty(limit, np.float32)  # that they are marched to
+    again, deeper = np.empty(limit, np.int64), np.empty(limit, np.float32)
     # Typed, since numba would compile the callees once more for every literal.
     n, rays, room = np.int64(0), np.int64(0), np.int64(CHUNK)
     fresh, waiting = 0, 0
@@ -170,7 +174,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
         while drawn < limit and (taken < waiting or fresh < limit):
             index, most = chunk * CHUNK_RAYS + fresh, np.float32(GUESS)
             if taken < waiting:
-                index, most = again[taken], NEVER
+                index, most = again[taken], deeper[taken]
             view = draw(views, recipe, index, ray[drawn])
             o = views.origin[view]
             ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
@@ -185,14 +189,14 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
                 taken += 1
             else:
                 fresh += 1
-            number[drawn] = index
+            number[drawn], depths[drawn] = index, most
             end = more
             drawn += 1
             ray_first[drawn] = end
         if drawn == rays:
             break
         for k in range(taken, waiting):
-            again[k - taken] = again[k]
+            again[k - taken], deeper[k - taken] = again[k], deeper[k]
         waiting -= taken
         query_density(encoding, recipe.levels, net, x, n, end, acts)
         activate_density(out, n, end)
@@ -202,6 +206,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray_fi
             kept, opaque = seen_samples(out, dts, begin, stop)
             if doubtful[r] and not opaque:
                 again[waiting] = number[r]
+                deeper[waiting] = AGAIN * depths[r] if AGAIN * depths[r] < SURE else NEVER
                 waiting += 1
             else:
                 if n < begin:
