@@ -26,7 +26,7 @@ from edge_server.offline.train_scheduler import OMEGAS_MS, layout_of
 from edge_server.offline.training.contest import Contest, rivals, rows, write_rows
 from edge_server.offline.training.report import span
 from edge_server.offline.training.trainer import Course, Row, stage_file
-from edge_server.report.style import CYCLE, figure, label_lines
+from edge_server.report.style import CYCLE, GREY, figure, label_lines
 from edge_server.scheduler.learned.decide import Actor
 from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
@@ -38,7 +38,7 @@ QUICK_BUDGETS = (10, 50)
 JUDGED_STEPS = 100
 # Shares of a training after which what has been learnt is judged.
 STAGES = (0.05, 0.1, 0.25, 0.5, 1.0)
-DIMS = (0, 4, 32)
+DIMS = (0, 4, 32)  # the first: without semantics
 # An embedding is learnt to be used more slowly than an age.
 EPISODES_BY_DIM = {True: 300, False: 1200}
 
@@ -175,10 +175,14 @@ def _draw(ask: Ask, contest: Contest, stages: Sequence[int], spent: dict[int, li
 
 
 def _draw_dims(ask: Ask, contests: dict[str, Contest]) -> None:
-    """What is learnt against the width of the embedding, with 95 % intervals."""
+    """What is learnt over what is learnt without, against the width of the embedding: paired differences with
+    their intervals."""
+    runs = [runs_of(contest, name) for name, contest in contests.items()]
+    found = [over(mine, runs[0]) for mine in runs[1:]]
+    off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
     with figure(ask.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):
-        found = [crossed(runs_of(contest, name)) for name, contest in contests.items()]
-        means = [one.mean for one in found]
-        off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
-        axes[0, 0].errorbar([str(dim) for dim in DIMS], means, off, marker="o", color=CYCLE[0], capsize=3)
-        label_lines(axes[0, 0], "reward", "numbers of an embedding", "What a larger embedding is worth")
+        axes[0, 0].axhline(0.0, color=GREY, linewidth=1.0)
+        axes[0, 0].errorbar([str(dim) for dim in DIMS[1:]], [one.mean for one in found], off, fmt="o",
+                            color=CYCLE[0], capsize=3)  # fmt: skip
+        label_lines(axes[0, 0], "reward over none", "numbers of an embedding",
+                    "What a larger embedding is worth")  # fmt: skip
