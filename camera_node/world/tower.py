@@ -42,9 +42,8 @@ _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 @dataclass(frozen=True)
 class Params(MovingParams):
     """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``; or
-    only ``one`` of them is there; or ``person``, alone and on any of four sides. Which one, and on which side,
-    the motion's seed draws: where something moves is then not known from where cameras stand, but can be
-    seen."""
+    only ``one`` of them is there; or ``person``, alone and on any of four sides. The motion's seed draws
+    which: where something moves is then not known from where cameras stand, but can be seen."""
 
     horizontal_fov_deg: float = 90.0
     movers: str = "both"
