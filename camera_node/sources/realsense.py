@@ -40,9 +40,14 @@ def library() -> Any:
     """The module pyrealsense2. Raises CameraError saying what to install."""
     try:
         import pyrealsense2
-    except ImportError:
+    except ModuleNotFoundError:
         raise CameraError(
             "RealSense cameras need the package pyrealsense2: pip install 'freshfield[realsense]'"
+        ) from None
+    except ImportError as error:  # it is there, and lacks a library of the system's
+        raise CameraError(
+            f"RealSense cameras: pyrealsense2 cannot be loaded: {error}; on Debian and Ubuntu: "
+            "apt install libusb-1.0-0"
         ) from None
     return pyrealsense2
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from fractions import Fraction
 from pathlib import Path
@@ -16,7 +17,10 @@ from camera_node.sources.live import CameraError
 from freshfield.clock import WallClock
 from freshfield.scenario import parse
 
-rs = pytest.importorskip("pyrealsense2", reason="needs pyrealsense2: pip install -e '.[realsense]'")
+rs = pytest.importorskip(
+    "pyrealsense2", exc_type=ImportError,
+    reason="needs pyrealsense2, pip install -e '.[realsense]', and libusb-1.0, apt install libusb-1.0-0",
+)  # fmt: skip
 
 from camera_node.sources import realsense  # noqa: E402
 
@@ -125,3 +129,16 @@ def test_without_a_device_one_clear_line_within_three_seconds():
     with pytest.raises(CameraError, match="eye: no RealSense camera found: is it plugged in"):
         build_cameras(scenario, source_config(scenario), ["eye"])
     assert time.monotonic() - begin < 3.0
+
+
+def test_a_library_that_cannot_be_loaded_is_told_from_one_that_is_not_there(tmp_path, monkeypatch):
+    (tmp_path / "pyrealsense2.py").write_text(
+        "raise ImportError('libusb-1.0.so.0: cannot open shared object file')"
+    )
+    monkeypatch.delitem(sys.modules, "pyrealsense2")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(CameraError, match=r"libusb-1\.0\.so\.0.*apt install libusb-1\.0-0"):
+        realsense.library()
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    with pytest.raises(CameraError, match=r"pip install 'freshfield\[realsense\]'"):
+        realsense.library()

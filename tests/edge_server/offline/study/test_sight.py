@@ -7,15 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from edge_server.offline.study.semantics import workshop
 from edge_server.offline.study.sight import SEES, Sees, Sight, area, telling
 from edge_server.offline.study.trial import Folders
+from edge_server.offline.study.workshop import workshop
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.setting import seeds
 from edge_server.scheduler.learned.state import State
 
-CART = {"cam01", "cam07", "cam09", "cam10"}
-PERSON = {"cam04", "cam05", "cam12", "cam14", "cam17"}
+SIDES = {
+    "south": {"cam04", "cam05", "cam12", "cam13", "cam17"}, "east": {"cam02", "cam04", "cam09"},
+    "north": {"cam01", "cam09", "cam10", "cam18"}, "west": {"cam03", "cam05", "cam10"},
+}  # fmt: skip
 
 
 def test_the_area_is_the_share_of_pairs_in_the_right_order():
@@ -39,12 +41,13 @@ def test_cameras_of_one_side_see_it_and_no_others(moments):
     for moment in drawn:
         shares = sight.shares(moment)
         seeing = {c for c, share in shares.items() if share > SEES}
-        assert seeing <= CART or seeing <= PERSON, "both sides at once"
-        sides.add("cart" if seeing & CART else "person" if seeing & PERSON else "nobody")
+        on = [side for side, cameras in SIDES.items() if seeing and seeing <= cameras]
+        assert on or not seeing, "two sides at once"
+        sides |= set(on[:1])
         chosen = Sees(sight, 2).choice(moment)
         assert len(chosen.cameras) == 2 and chosen.at_ns == moment.now_ns
         assert len(seeing) < 2 or set(chosen.cameras) <= {c for c, share in shares.items() if share > 0.0}
-    assert {"cart", "person"} <= sides  # neither is there always
+    assert len(sides) > 1  # it is on another side in another episode
 
 
 def test_an_embedding_that_tells_is_told_from_one_that_does_not(moments):
