@@ -77,7 +77,12 @@ def shown(text):
 
 def drive(file, *options):
     command = [sys.executable, "-m", "camera_node.cli", "drive-arm", str(file), *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # Under nohup a hang-up is ignored, and whoever is started ignores it, too.
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def stops_of(file):
