@@ -18,6 +18,7 @@ from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 from tests.stability import test_field_voxel
 from tests.stability import test_fields_with_networks as with_networks
+from tests.stability.damage import follows_cameras_that_move
 from tests.stability.test_fields_with_networks import VIEWS
 
 
@@ -136,13 +137,4 @@ def test_a_thousand_updates_do_not_drift_or_grow(case: Case) -> None:
 
 @every
 def test_cameras_that_move_at_every_update(case: Case) -> None:
-    field = case.kind(case.tiny)
-    for update in range(30):
-        views = []
-        for view in VIEWS[:4]:
-            eye = view.camera_to_world[:3, 3] + 0.05 * update * np.array([0.0, 0.0, 1.0])
-            pose = look_at(eye, (0.0, 0.0, 0.4))
-            views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
-        field.fit(views, Budget(steps=5))
-    case.healthy(field, views)
-    assert mean_psnr(field, views) > 15.0
+    follows_cameras_that_move(case.kind(case.tiny), VIEWS, case.healthy)

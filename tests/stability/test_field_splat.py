@@ -17,6 +17,7 @@ from edge_server.fields.splat_settings import SplatSettings
 from freshfield.geometry import look_at
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring
+from tests.stability.damage import follows_cameras_that_move
 
 TINY = SplatSettings(gaussians=400, start=250, seed_cells=16, densify_every=10, threads=2)
 VIEWS = ring(9, size=24)
@@ -212,16 +213,7 @@ def test_a_thousand_updates_do_not_drift_or_grow() -> None:
 
 
 def test_cameras_that_move_at_every_update() -> None:
-    field = SplatField(TINY)
-    for update in range(30):
-        views = []
-        for view in VIEWS[:4]:
-            eye = view.camera_to_world[:3, 3] + 0.05 * update * np.array([0.0, 0.0, 1.0])
-            pose = look_at(eye, (0.0, 0.0, 0.4))
-            views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
-        field.fit(views, Budget(steps=5))
-    _healthy(field, views)
-    assert mean_psnr(field, views) > 15.0
+    follows_cameras_that_move(SplatField(TINY), VIEWS, _healthy)
 
 
 @pytest.mark.slow

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget, View
+from edge_server.fields import View
 from edge_server.fields.kernels.voxel_update import DENSEST
 from edge_server.fields.voxel import VoxelField
 from edge_server.fields.voxel_settings import VoxelSettings
 from tests.edge_server.fields.bounds import run_with_bounds_checks
-from tests.edge_server.fields.scenes import mean_psnr, ring
+from tests.edge_server.fields.scenes import ring
+from tests.stability.damage import counts_and_heals, overflows_and_begins_anew
 
 TINY = VoxelSettings(sizes=(12, 20, 32), refine_at=(10, 25), rays=512, cells=16, threads=2)
 VIEWS = ring(9, size=24)
@@ -56,33 +57,12 @@ def _saturate(field: VoxelField) -> None:
 
 @pytest.mark.parametrize("damage", [_poison_table, _poison_moments, _poison_gradient])
 def test_damage_is_counted_and_healed(damage: Callable[[VoxelField], None]) -> None:
-    field = VoxelField(TINY)
-    field.fit(VIEWS, Budget(steps=30))
-    damage(field)
-    field._snapshot = None
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
-    report = field.fit(VIEWS, Budget(steps=40))
-    assert field.dropped == report.dropped and (report.dropped > 0) == (damage is not _poison_moments)
-    assert field.fit(VIEWS, Budget(steps=200)).dropped == 0, "still not finite 40 steps later"
-    _healthy(field)
-    assert mean_psnr(field, VIEWS) > 15.0
+    counts_and_heals(VoxelField(TINY), VIEWS, damage, _healthy, damage is not _poison_moments)
 
 
 @pytest.mark.parametrize("damage", [_overflow, _saturate])
 def test_density_that_overflows_stays_finite(damage: Callable[[VoxelField], None]) -> None:
-    """Opaque everywhere: no gradient leads out of that, but a reset does, and nothing becomes NaN."""
-    field = VoxelField(TINY)
-    field.fit(VIEWS, Budget(steps=30))
-    damage(field)
-    field.fit(VIEWS, Budget(steps=20))
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all() and out.color.max() <= 1.0
-    assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
-    field.reset()
-    field.fit(VIEWS, Budget(steps=200))
-    _healthy(field)
-    assert mean_psnr(field, VIEWS) > 15.0
+    overflows_and_begins_anew(VoxelField(TINY), VIEWS, damage, _healthy)
 
 
 @pytest.mark.slow

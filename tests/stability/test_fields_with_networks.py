@@ -21,7 +21,8 @@ from edge_server.fields.tensorf import TensorfField
 from edge_server.fields.tensorf_settings import TensorfSettings
 from edge_server.fields.trained_field import TrainedField
 from tests.edge_server.fields.bounds import run_with_bounds_checks
-from tests.edge_server.fields.scenes import mean_psnr, ring
+from tests.edge_server.fields.scenes import ring
+from tests.stability.damage import counts_and_heals, overflows_and_begins_anew
 
 TINY: dict[str, tuple[type[TrainedField], Any]] = {
     "ngp": (NgpField, NgpSettings(
@@ -40,51 +41,47 @@ TINY: dict[str, tuple[type[TrainedField], Any]] = {
 }  # fmt: skip
 VIEWS = ring(9, size=24)
 
-# Of each kind, what goes through all of its kernels.
-THROUGH_ALL = {
-    "ngp": """
-trust = {"age_tau_ms": 1e-5, "mask_stale_ms": 2e-6, "mask_grow_px_s": 1e6}  # views are nanoseconds apart
-wide = {"smooth": 0.1, "harmonics": 4, "contracted": False, "radius_m": 1.0}
-for extra in ({}, wide, {"batch_samples": 8192, "rays": 9}, trust):
-    field = make("ngp", **extra)
-    field.fit(VIEWS, Budget(steps=20))
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-    field.points(50)
-    assert np.isfinite(out.color).all()
-moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
-field.fit(moved, Budget(steps=20))
-""",
-    "tensorf": """
-regular = {"smooth": 1e-3, "sparse": 1e-4, "contracted": False, "radius_m": 1.0}
-cameras = {"exposure": True, "refine_m": 0.05, "refine_deg": 2.0}
-for extra in ({}, {"harmonics": 4, **regular}, cameras, {"batch_samples": 8192, "rays": 9}):
-    field = make("tensorf", **extra)
-    field.fit(VIEWS, Budget(steps=50))
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-    field.points(50)
-    assert np.isfinite(out.color).all()
-moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
-field.fit(moved, Budget(steps=20))
-""",
-    "nerfacto": """
-plain = {"contracted": False, "radius_m": 1.0}
-poses = {"refine_m": 0.05, "refine_deg": 2.0}
-few = {"batch_samples": 8192, "rays": 9, "contracted": True, "radius_m": 0.5}
-for extra in ({"exposure": True, **poses}, {"harmonics": 4, **plain}, {"appearance": 3, **poses}, few):
-    field = make("nerfacto", **extra)
-    field.fit(VIEWS, Budget(steps=50))
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-    field.points(50)
-    assert np.isfinite(out.color).all()
-moved = [replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS]
-field.fit(moved, Budget(steps=20))
-field = make("nerfacto", age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0)
-for later in range(3):
-    field.fit([replace(v, image=np.roll(v.image, 3 * later, axis=0), generated_ns=later * 10**8 + k * 10**7)
-               for k, v in enumerate(VIEWS)], Budget(steps=10))
-assert (field.rig._packed[1].weight > 0).any() and field.rig._packed[1].drawn.size, "nothing is masked"
-""",
-}
+_PLAIN = {"contracted": False, "radius_m": 1.0}
+_POSES = {"refine_m": 0.05, "refine_deg": 2.0}
+_FEW = {"batch_samples": 8192, "rays": 9}
+# Of each kind, settings that together go through all of its kernels, and steps of each fit.
+THROUGH_ALL: dict[str, tuple[int, tuple[dict[str, Any], ...]]] = {
+    "ngp": (20, (
+        {}, {"smooth": 0.1, "harmonics": 4, **_PLAIN}, _FEW,
+        # Views are nanoseconds apart.
+        {"age_tau_ms": 1e-5, "mask_stale_ms": 2e-6, "mask_grow_px_s": 1e6},
+    )),
+    "tensorf": (50, (
+        {}, {"harmonics": 4, "smooth": 1e-3, "sparse": 1e-4, **_PLAIN}, {"exposure": True, **_POSES}, _FEW,
+    )),
+    "nerfacto": (50, (
+        {"exposure": True, **_POSES}, {"harmonics": 4, **_PLAIN}, {"appearance": 3, **_POSES},
+        {**_FEW, "contracted": True, "radius_m": 0.5},
+    )),
+}  # fmt: skip
+
+
+def go_through_all(kind: str) -> None:
+    """Fits, renderings and an update with every one of the settings; and what is stale is masked."""
+    steps, settings = THROUGH_ALL[kind]
+    for extra in settings:
+        field = make(kind, **extra)
+        field.fit(VIEWS, Budget(steps=steps))
+        out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
+        field.points(50)
+        assert np.isfinite(out.color).all()
+    field.fit([replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS], Budget(steps=20))
+    field = make(kind, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0)
+    for later in range(3):
+        rolled = [np.roll(v.image, 3 * later, axis=0) for v in VIEWS]
+        field.fit(
+            [replace(v, image=image, generated_ns=later * 10**8 + k * 10**7)
+             for k, (v, image) in enumerate(zip(VIEWS, rolled))],
+            Budget(steps=10),
+        )  # fmt: skip
+    packed = field.rig._packed
+    assert packed is not None
+    assert (packed[1].weight > 0).any() and packed[1].drawn.size, "nothing is masked"
 
 
 def make(kind: str, **changed: Any) -> TrainedField:
@@ -144,42 +141,18 @@ def _saturate(field: TrainedField) -> None:
      ("nerfacto", _poison_proposal)],
 )  # fmt: skip
 def test_damage_is_counted_and_healed(kind: str, damage: Callable[[TrainedField], None]) -> None:
-    field = make(kind)
-    field.fit(VIEWS, Budget(steps=30))
-    damage(field)
-    field._snapshot = None
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all()
-    report = field.fit(VIEWS, Budget(steps=40))
-    assert field.dropped == report.dropped and (report.dropped > 0) == (damage is not _poison_moments)
-    assert field.fit(VIEWS, Budget(steps=200)).dropped == 0, "still not finite 40 steps later"
-    healthy(field)
-    assert mean_psnr(field, VIEWS) > 15.0
+    counts_and_heals(make(kind), VIEWS, damage, healthy, damage is not _poison_moments)
 
 
 @pytest.mark.parametrize("kind", TINY)
 @pytest.mark.parametrize("damage", [_overflow, _saturate])
 def test_density_that_overflows_stays_finite(kind: str, damage: Callable[[TrainedField], None]) -> None:
-    """Opaque everywhere: no gradient leads out of that, but a reset does, and nothing becomes NaN."""
-    field = make(kind)
-    field.fit(VIEWS, Budget(steps=30))
-    damage(field)
-    field.fit(VIEWS, Budget(steps=20))
-    out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
-    assert np.isfinite(out.color).all() and np.isfinite(out.depth).all() and out.color.max() <= 1.0
-    assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
-    field.reset()
-    field.fit(VIEWS, Budget(steps=200))
-    healthy(field)
-    assert mean_psnr(field, VIEWS) > 15.0
+    overflows_and_begins_anew(make(kind), VIEWS, damage, healthy)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", TINY)
 def test_bounds_are_kept_in_every_kernel(kind: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""
-    needs = (
-        "from dataclasses import replace\nimport numpy as np\nfrom edge_server.fields import Budget\n"
-        "from tests.stability.test_fields_with_networks import VIEWS, make\n"
-    )
-    run_with_bounds_checks(f'{needs}{THROUGH_ALL[kind]}print("kept")\n', tmp_path, request)
+    code = f"from {__name__} import go_through_all\ngo_through_all({kind!r})\nprint('kept')\n"
+    run_with_bounds_checks(code, tmp_path, request)
