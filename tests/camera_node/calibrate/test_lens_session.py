@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -16,8 +14,8 @@ from camera_node.calibrate.targets import parse
 from camera_node.cli import main
 from camera_node.sources.calibration import load_calibration
 from freshfield.clock import WallClock
-from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, so3_exp
-from tests.camera_node.calibrate.pictures import BOARD
+from freshfield.geometry import Pinhole, so3_exp
+from tests.camera_node.calibrate.pictures import BOARD, as_scenario
 from tests.camera_node.sources.mjpeg import NetworkCamera
 
 LENS = Pinhole.from_fov(640, 480, 65.0)
@@ -74,16 +72,7 @@ def test_what_moves_and_what_was_shown_before_is_not_kept(board):
 
 
 def test_live_from_the_command_line(board, tmp_path, capsys):
-    pictures, poses = board
-    frames = []
-    for k, (picture, pose) in enumerate(zip(pictures, poses)):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
-        frames.append({"file_path": f"{k}.png", "transform_matrix": (pose @ OPENGL_TO_OPENCV).tolist()})
-    lens = {"w": LENS.width, "h": LENS.height, "fl_x": LENS.fx, "fl_y": LENS.fy, "cx": LENS.cx, "cy": LENS.cy}
-    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
-    file, out, seen = tmp_path / "bench.yaml", tmp_path / "lens.json", tmp_path / "seen.png"
-    source = {"kind": "transforms", "data": str(tmp_path / "transforms.json"), "fps": 500, "codec": "png"}
-    file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
+    file, out, seen = as_scenario(tmp_path, LENS, *board), tmp_path / "lens.json", tmp_path / "seen.png"
     words = ["calibrate", "intrinsics", "--board", BOARD, "--camera", "eye"]
     live = ["--live", str(file), "--moving", "--preview", str(seen), "--out", str(out)]
     assert main([*words, *live]) == 0

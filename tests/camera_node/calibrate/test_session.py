@@ -8,7 +8,6 @@ from fractions import Fraction
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from camera_node.calibrate import CalibrationError, simulate
 from camera_node.calibrate.folder import read_lens, read_pairs, read_visp_pose
@@ -19,8 +18,8 @@ from camera_node.calibrate.targets import parse
 from camera_node.cli import main
 from camera_node.pose.mount import EYE_IN_HAND, read_hand_eye
 from camera_node.sources import Shot
-from freshfield.geometry import OPENGL_TO_OPENCV, Pose
-from tests.camera_node.calibrate.pictures import BOARD, LENS, taken
+from freshfield.geometry import Pose
+from tests.camera_node.calibrate.pictures import BOARD, LENS, as_scenario, taken
 from tests.conftest import data_dir
 
 X = simulate.CAMERA_IN_HAND
@@ -135,17 +134,7 @@ def test_it_moves_a_hand_by_itself_from_one_look_at_the_target(reach_m):
 @pytest.fixture
 def scenario(tmp_path):
     """A recorded camera whose poses are the hand's: photos with transforms.json."""
-    pictures, hands = taken()
-    frames = []
-    for k, (picture, hand) in enumerate(zip(pictures, hands)):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
-        frames.append({"file_path": f"{k}.png", "transform_matrix": (hand @ OPENGL_TO_OPENCV).tolist()})
-    lens = {"w": LENS.width, "h": LENS.height, "fl_x": LENS.fx, "fl_y": LENS.fy, "cx": LENS.cx, "cy": LENS.cy}
-    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
-    file = tmp_path / "bench.yaml"
-    source = {"kind": "transforms", "data": str(tmp_path / "transforms.json"), "fps": 500, "codec": "png"}
-    file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
-    return file
+    return as_scenario(tmp_path, LENS, *taken())
 
 
 def test_live_from_the_command_line(scenario, tmp_path, capsys):
