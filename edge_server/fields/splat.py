@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Field, FitReport, Rendering, View
-from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
+from edge_server.fields.kernels.ahead import compile_ahead
+from edge_server.fields.kernels.pool import Pool, shared_pool
 from edge_server.fields.kernels.splat_project import BASE, BLOCK, COLOR, OPACITY, QUATERNION, SCALE, TILE
 from edge_server.fields.kernels.splat_raster import Loss, train_tiles
 from edge_server.fields.kernels.splat_update import Rule, bound_all, update
@@ -153,23 +154,25 @@ class SplatField:
     def warm_up(self) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
 
-        Works on a small field of its own, in the calling thread and at its priority: the workers' low one
+        Works on small fields of its own, in the calling thread and at its priority: the workers' low one
         would make compiling on a busy machine take minutes. This field's state is not touched.
         """
-        start = time.perf_counter()
+        return compile_ahead(self._tour)
+
+    def _tour(self, pool: Pool) -> None:
+        """Go through every kernel once."""
         tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
         camera = Pinhole.from_fov(32, 32, 60.0)
         pose = np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
-            field = SplatField(tiny, CallerPool())
+            field = SplatField(tiny, pool)
             for k in range(3):  # something moves: it is found, then carried along
                 image = np.full((32, 32, channels), 128, np.uint8)
                 image[8:16, 8 + 2 * k : 16 + 2 * k, :3] = 255
                 field.fit([View("warm-up", image, pose, camera, k * 10**8)], Budget(steps=8))
             field.render(pose, camera)
             field._live().colors_at(field.rig.views, [np.full((1, 2), 0.5)])  # as ``trust`` asks
-        return time.perf_counter() - start
 
     # --- state --------------------------------------------------------------------------------
 

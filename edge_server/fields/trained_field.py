@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget, FitReport, Rendering, View
 from edge_server.fields.kernels.adam import PART, Rule, adam
+from edge_server.fields.kernels.ahead import compile_ahead
 from edge_server.fields.kernels.composite import Weights
 from edge_server.fields.kernels.mlp import Net
-from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
+from edge_server.fields.kernels.pool import Pool, shared_pool
 from edge_server.fields.kernels.rays import Space, Views
 from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
 from edge_server.fields.ngp_occupancy import EVERY, Occupancy
@@ -165,20 +166,22 @@ class TrainedField:
     def warm_up(self) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
 
-        Works on a small field of its own, in the calling thread and at its priority: the workers' low one
+        Works on small fields of its own, in the calling thread and at its priority: the workers' low one
         would make compiling on a busy machine take minutes. This field's state is not touched.
         """
-        start = time.perf_counter()
+        return compile_ahead(self._tour)
+
+    def _tour(self, pool: Pool) -> None:
+        """Go through every kernel once."""
         tiny = self._tiny()
         camera = Pinhole.from_fov(8, 8, 60.0)
         pose = np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
-            field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), CallerPool())
+            field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), pool)
             image = np.full((8, 8, channels), 128, np.uint8)
             field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
             field.render(pose, camera)
-        return time.perf_counter() - start
 
     # --- state --------------------------------------------------------------------------------
 

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Field, FitReport, Rendering, View
-from edge_server.fields.kernels.pool import CallerPool, Pool, shared_pool
+from edge_server.fields.kernels.ahead import compile_ahead
+from edge_server.fields.kernels.pool import Pool, shared_pool
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.kernels.train import Recipe
 from edge_server.fields.kernels.voxel import SEGMENT, Clearing, Voxels, train_rays
@@ -147,8 +148,14 @@ class VoxelField:
 
     def warm_up(self) -> float:
         """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
-        This field's state is not touched."""
-        start = time.perf_counter()
+
+        Works on small fields of its own, in the calling thread and at its priority: the workers' low one
+        would make compiling on a busy machine take minutes. This field's state is not touched.
+        """
+        return compile_ahead(self._tour)
+
+    def _tour(self, pool: Pool) -> None:
+        """Go through every kernel once."""
         tiny = replace(
             self.settings, rays=64, cells=16, sizes=(8, 12), refine_at=(1,), prune_from=0, min_views=1
         )
@@ -156,11 +163,10 @@ class VoxelField:
         pose = np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
-            field = VoxelField(replace(tiny, contracted=channels == 3), CallerPool())
+            field = VoxelField(replace(tiny, contracted=channels == 3), pool)
             image = np.full((8, 8, channels), 128, np.uint8)
             field.fit([View("warm-up", image, pose, camera)], Budget(steps=2))
             field.render(pose, camera)
-        return time.perf_counter() - start
 
     # --- state --------------------------------------------------------------------------------
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from edge_server.fields.kernels.grid import SEGMENT
 from edge_server.fields.kernels.intrinsics import fetch_add, is_finite
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 
 PART = 512  # segments a task
 GRADIENT_LIMIT = 1e3  # a hundred times what healthy scenes show; keeps the second moment finite
@@ -32,7 +31,7 @@ class Rule(NamedTuple):
     correct2: np.float32
 
 
-@njit(inline="always")
+@part
 def _update(rule, p, g, m, v):
     """One step on equal-length float32 arrays; clears g. Returns how many gradients were not finite.
 

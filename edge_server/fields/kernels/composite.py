@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from edge_server.fields.kernels.intrinsics import exp32, is_finite
 from edge_server.fields.kernels.jit import part
@@ -36,7 +35,7 @@ class Weights(NamedTuple):
     near: np.float32
 
 
-@njit(inline="always")
+@part
 def harmonic(k, x, y, z):
     """Real spherical harmonics 1 to 8 of a unit direction, float32; harmonic 0 is the colour itself."""
     if k == 1:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import overload
 from numpy.typing import NDArray
 
@@ -37,7 +36,7 @@ class Grid(NamedTuple):
     table: NDArray[np.float32]
 
 
-@njit(inline="always")
+@part
 def _corner(x, res):
     """Lower vertex (uint32) and fraction of coordinate x in [0, 1] on a grid of res cells."""
     scaled = x * np.float32(res)
@@ -45,7 +44,7 @@ def _corner(x, res):
     return np.uint32(i), scaled - np.float32(i)
 
 
-@njit(inline="always")
+@part
 def _corners(level_dense, res, mask, ix, iy, iz):
     """The eight vertices' places in the level's table, x fastest, as uint32."""
     one = np.uint32(1)
@@ -73,7 +72,7 @@ def _corners(level_dense, res, mask, ix, iy, iz):
     )
 
 
-@njit(inline="always")
+@part
 def _weights(fx, fy, fz):
     one = np.float32(1.0)
     gx, gy, gz = one - fx, one - fy, one - fz
@@ -81,7 +80,7 @@ def _weights(fx, fy, fz):
     return gx * a, fx * a, gx * b, fx * b, gx * c, fx * c, gx * d, fx * d
 
 
-@njit(inline="always")
+@part
 def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
     for s in range(out0.size):
         ix, fx = _corner(x[s], res)
@@ -112,7 +111,7 @@ def encode(grid, levels, x, a, b, features):
             _encode_level(False, res, mask, x[0, a:b], x[1, a:b], x[2, a:b], table, out0, out1)
 
 
-@njit(inline="always")
+@part
 def _mark(dirty, i, j):
     """Flag the segments of two vertices that are neighbours along x, and so mostly share one."""
     a, b = i >> np.uint32(4), j >> np.uint32(4)
@@ -121,7 +120,7 @@ def _mark(dirty, i, j):
         dirty[b] = True
 
 
-@njit(inline="always")
+@part
 def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
     zero = np.float32(0.0)
     for s in range(d0.size):

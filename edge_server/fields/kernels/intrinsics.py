@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from edge_server.fields.kernels.jit import part
 
 
 @intrinsic
@@ -93,7 +95,7 @@ _P3, _P4, _P5 = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1)
 _HALF, _ONE, _LOWEST, _HIGHEST = _F(0.5), _F(1.0), _F(-87.0), _F(88.0)
 
 
-@njit(inline="always")
+@part
 def exp32(x):
     """exp in float32, argument clamped to [-87, 88], relative error below 2e-7; NaN stays NaN.
 
@@ -108,13 +110,13 @@ def exp32(x):
     return p * power if x == x else x
 
 
-@njit(inline="always")
+@part
 def is_finite(x):
     """Whether float x is a number. np.isfinite subtracts x from itself, which fast mathematics folds to 0."""
     return abs(x) <= np.float32(3.4e38)
 
 
-@njit(inline="always")
+@part
 def random_bits(key, n):
     """64 random bits: the n-th output (uint64) of the splitmix64 stream ``key`` (uint64)."""
     z = np.uint64(key + np.uint64(n) * np.uint64(0x9E3779B97F4A7C15))
@@ -123,7 +125,7 @@ def random_bits(key, n):
     return np.uint64(z ^ (z >> np.uint64(31)))
 
 
-@njit(inline="always")
+@part
 def uniform(key, n):
     """A float32 in [0, 1): the n-th number of stream ``key``."""
     return np.float32(random_bits(key, n) >> np.uint64(40)) * np.float32(5.9604645e-08)

@@ -48,3 +48,12 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     file = dispatcher._cache._cache_file
     file._source_stamp = (*file._source_stamp, SOURCES)
     return dispatcher
+
+
+def is_stored(dispatcher: Any, types: tuple[Any, ...]) -> bool:
+    """Whether a kernel need not be compiled for arguments of these numba types: it was, here or on disk."""
+    if types in dispatcher.overloads:
+        return True
+    cache, target = dispatcher._cache, dispatcher.targetctx
+    target.refresh()
+    return cache._index_key(types, target.codegen()) in cache._cache_file._load_index()

@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.jit import part
@@ -31,7 +30,7 @@ def param_count(widths: NDArray[np.int64]) -> int:
     return int(sum(o * i + o for i, o in pairwise(widths)))
 
 
-@njit(inline="always")
+@part
 def _combine(w, first, out_stride, in_stride, n_out, n_in, x, x_row, y, y_row, a, b):
     """y[y_row + o] += sum_i w[first + o out_stride + i in_stride] x[x_row + i], samples a to b."""
     for o in range(n_out):
@@ -46,7 +45,7 @@ def _combine(w, first, out_stride, in_stride, n_out, n_in, x, x_row, y, y_row, a
                 out[s] += w0 * x0[s] + w1 * x1[s] + w2 * x2[s] + w3 * x3[s]
 
 
-@njit(inline="always")
+@part
 def _weight_gradient(d_w, first, n_out, n_in, d_y, y_row, x, x_row, a, b):
     """d_w[o, i] += sum_s d_y[o, s] x[i, s], four by two dot products at a time."""
     zero = np.float32(0.0)

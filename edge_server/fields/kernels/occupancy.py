@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from edge_server.fields.kernels.composite import RAW_HIGH, RAW_LOW
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.model import query_density
 from edge_server.fields.kernels.rays import COARSE
 
 CELLS_A_TASK = 2048  # at most train.CHUNK: they share its scratch
 
 
-@njit(inline="always")
+@part
 def cell_centre(index, cells, contracted):
     """Centre of a cell in scene units (contraction undone) and how much longer a step is there."""
     i, j, k = index % cells, (index // cells) % cells, index // (cells * cells)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
@@ -130,7 +130,7 @@ def add_factors(typingctx: Any, table: Any, rows: Any, weights: Any, d: Any, at:
     return types.void(table, rows, weights, d, types.uint32, gradient), codegen
 
 
-@njit(inline="always")
+@part
 def _place(x, size):
     """Lower vertex (uint32) and fraction of coordinate x in [0, 1] among ``size`` vertices."""
     scaled = x * np.float32(size - 1)
@@ -138,7 +138,7 @@ def _place(x, size):
     return np.uint32(i), scaled - np.float32(i)
 
 
-@njit(inline="always")
+@part
 def _neighbours(size, u, v, w):
     """Rows within a group and weights: the plane's four vertices around (u, v), the line's two around w."""
     one = np.uint32(1)
@@ -154,7 +154,7 @@ def _neighbours(size, u, v, w):
     return rows, (gu * gv, fu * gv, gu * fv, fu * fv, _F1 - fw, fw)
 
 
-@njit(inline="always")
+@part
 def _axes(x, group):
     """The coordinates of a group's plane, first and second axis, and of its line."""
     mode = group % MODES
@@ -211,7 +211,7 @@ def components(planes, x, start, end, acts):
                     row[s] = tile[s, c]
 
 
-@njit(inline="always")
+@part
 def _mark(dirty, a, b):
     """Flag the segments of two neighbouring vertices."""
     i, j = a >> np.uint32(2), b >> np.uint32(2)

@@ -18,6 +18,17 @@ import numpy as np
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
 
 
+def cores() -> int:
+    """How many threads or processes may compute side by side here. ValueError where the environment's
+    FRESHFIELD_THREADS is no number."""
+    given = os.environ.get(THREADS_VARIABLE, "")
+    if given:
+        if not given.isdigit():
+            raise ValueError(f"{THREADS_VARIABLE}: expected a number of threads, got {given!r}")
+        return int(given)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class _Job:
     def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...]) -> None:
         self.kernel, self.args = kernel, args
@@ -37,13 +48,7 @@ class Pool:
     """
 
     def __init__(self, threads: int | None = None, nice: int = 10) -> None:
-        given = os.environ.get(THREADS_VARIABLE, "")
-        if threads is None and given:
-            if not given.isdigit():
-                raise ValueError(f"{THREADS_VARIABLE}: expected a number of threads, got {given!r}")
-            threads = int(given)
-        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self.threads = available if threads is None else int(threads)
+        self.threads = cores() if threads is None else int(threads)
         if self.threads < 1:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import overload
 from numpy.typing import NDArray
 
@@ -57,7 +56,7 @@ class Plan(NamedTuple):
     decay: np.float32
 
 
-@njit(inline="always")
+@part
 def unit_cube(contracted, px, py, pz):
     """Scene units -> the encoding's unit cube, [0, 1)."""
     scale, top = _HALF, np.float32(0.9999999)
@@ -74,13 +73,13 @@ def unit_cube(contracted, px, py, pz):
     )
 
 
-@njit(inline="always")
+@part
 def proposal_of(encoding):
     """The proposal's cells, flat."""
     return encoding.table[encoding.first[encoding.first.size - 1] :].reshape(-1)
 
 
-@njit(inline="always")
+@part
 def _cell(cells, ux, uy, uz):
     f, n = np.float32(cells), np.int32(cells)
     return np.int32(np.int32(ux * f) + n * np.int32(np.int32(uy * f) + n * np.int32(uz * f)))
@@ -104,7 +103,7 @@ def warp(contracted, ox, oy, oz, dx, dy, dz, enter, leave):
     return knee, slope, knee + (_F1 - _F1 / (_F1 + (leave - knee) * slope)) / slope
 
 
-@njit(inline="always")
+@part
 def unwarp(u, knee, slope):
     """Distance along the ray of warped distance u."""
     return u if u <= knee else knee + (_F1 / (_F1 - (u - knee) * slope) - _F1) / slope
@@ -206,7 +205,7 @@ def deal(weight, first, count, samples, even, shift, group, share):
     return g + (1 if pending > _F0 else 0)
 
 
-@njit(inline="always")
+@part
 def _dilated(weight, k, first, end):
     w = weight[k]
     left, right = weight[max(k - 1, first)], weight[min(k + 1, end - 1)]
@@ -310,7 +309,7 @@ def scatter_proposal(counter, worker, encoding, cell, grad, counts, gradient, di
                     flags[place // width] = True
 
 
-@njit(inline="always")
+@part
 def _grid(e):
     return Grid(e.resolution, e.first, e.dense, e.table)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.jit import part
@@ -57,7 +56,7 @@ class Views(NamedTuple):
     drawn: NDArray[np.int64] = np.zeros(0, np.int64)
 
 
-@njit(inline="always")
+@part
 def pixel_direction(lens, rotation, u, v):
     """Unit direction in world axes of image point (u, v): ``Pinhole.rays``, rotated, for one pixel."""
     x0, y0 = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
@@ -79,7 +78,7 @@ def pixel_direction(lens, rotation, u, v):
     )
 
 
-@njit(inline="always")
+@part
 def slab(o, d, half, enter, leave):
     if abs(d) < np.float32(1e-9):
         return (enter, leave) if abs(o) <= half else (enter, np.float32(-1.0))
@@ -87,7 +86,7 @@ def slab(o, d, half, enter, leave):
     return max(enter, min(a, b)), min(leave, max(a, b))
 
 
-@njit(inline="always")
+@part
 def interval(space, ox, oy, oz, dx, dy, dz):
     """Where a ray enters and leaves the scene; leave <= enter where it misses it, or is no ray at all: the
     undistortion of a lens that no glass has diverges, and NaN must not become the number of a cell."""
@@ -101,7 +100,7 @@ def interval(space, ox, oy, oz, dx, dy, dz):
     return slab(oz, dz, half, enter, leave)
 
 
-@njit(inline="always")
+@part
 def _exit(u, d, blocks):
     """Distance, in units of u, to the far side of u's block along one axis."""
     i = np.floor(u * blocks)

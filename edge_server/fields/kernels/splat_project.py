@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.composite import harmonic
@@ -49,7 +48,7 @@ class Gaussians(NamedTuple):
     velocity: NDArray[np.float32]
 
 
-@njit(inline="always")
+@part
 def _bent(cams, b, x, y):
     """Distorted normalised coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
     its derivatives xxx, xxy, xyy, yyy."""
@@ -70,7 +69,7 @@ def _bent(cams, b, x, y):
     return u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy
 
 
-@njit(inline="always")
+@part
 def _unit_quaternion(params, i):
     """The quaternion's direction and 1 / length; (1, 0, 0, 0) and 0 where it has none."""
     w, x = params[i, QUATERNION], params[i, QUATERNION + 1]
@@ -82,7 +81,7 @@ def _unit_quaternion(params, i):
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
-@njit(inline="always")
+@part
 def _rotation(w, x, y, z):
     return (
         _F1 - _F2 * (y * y + z * z), _F2 * (x * y - w * z), _F2 * (x * z + w * y),
@@ -91,12 +90,12 @@ def _rotation(w, x, y, z):
     )  # fmt: skip
 
 
-@njit(inline="always")
+@part
 def _scale(params, i, k):
     return exp32(min(max(params[i, SCALE + k], np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
 
 
-@njit(inline="always")
+@part
 def _camera_point(cams, b, params, velocity, i):
     t = cams[b, TIME]
     x = params[i, 0] + t * velocity[i, 0] - cams[b, ORIGIN]
@@ -109,7 +108,7 @@ def _camera_point(cams, b, params, velocity, i):
     )
 
 
-@njit(inline="always")
+@part
 def _flattener(cams, b, x, y, z):
     """What takes world axes to pixels at a camera point: mean (u, v), the rows of J W (2 x 3), and what its
     gradient needs. The ratios x / z and y / z are held to 1.3 of the field of view, where J is taken."""
@@ -124,7 +123,7 @@ def _flattener(cams, b, x, y, z):
     return a, c, ta, tc, u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse
 
 
-@njit(inline="always")
+@part
 def _times(cams, b, j0, j1, j2):
     """A row of camera axes -> of world axes."""
     return (
@@ -198,7 +197,7 @@ def project_one(cams, b, params, velocity, harmonics, i, projected, tiles):
         tiles[b, i, 1] = tiles[b, i, 0]
 
 
-@njit(inline="always")
+@part
 def _harmonic_slope(h, x, y, z):
     """Derivatives of harmonic h by x, y and z."""
     a, b, c = np.float32(0.4886025), np.float32(1.0925485), np.float32(0.3153916)

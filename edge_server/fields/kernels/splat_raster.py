@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
@@ -56,7 +55,7 @@ class Loss(NamedTuple):
     key: np.uint64
 
 
-@njit(inline="always")
+@part
 def _begin(s, x0, y0):
     for k in range(PIXELS):
         s[_X + k] = np.float32(x0 + k % TILE) + _HALF
@@ -152,7 +151,7 @@ def dissimilarity(s, row, error_row, target, count, weight):
     return _HALF * weight * np.float32(count) * (_F1 - ssim)
 
 
-@njit(inline="always")
+@part
 def _target(views, view, x0, y0, loss, task, target, back):
     """Fill target (3, PIXELS), -1 outside the picture; back (3,). Returns how many pixels are inside."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
@@ -175,7 +174,7 @@ def _target(views, view, x0, y0, loss, task, target, back):
     return count
 
 
-@njit(inline="always")
+@part
 def _trust(views, view, x0, y0, target, share):
     """Fill share (PIXELS,) with the pixels' weights; those of none count as outside the picture, -1 in
     target. Returns how many are left, and their mean weight."""
@@ -193,7 +192,7 @@ def _trust(views, view, x0, y0, target, share):
     return count, total / np.float32(max(count, 1))
 
 
-@njit(inline="always")
+@part
 def _weigh(s, target, share, absolute):
     """Multiply the error rows of ``s`` by the pixels' shares; returns loss and squared error, so weighed."""
     total, square = _F0, _F0

@@ -4,10 +4,9 @@ pixel the best of the cells its ray passes (plane sweep by votes, after Seitz an
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from edge_server.fields.kernels.intrinsics import fetch_add
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.rays import HORIZON, pixel_direction
 from edge_server.fields.kernels.splat_project import LENS, NEAR, ORIGIN, _bent
 
@@ -18,7 +17,7 @@ _EMPTY_VIEWS = 2  # that see plain background through a cell suffice to empty it
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
-@njit(inline="always")
+@part
 def _spread(u):
     """A coordinate of contracted space [-2, 2] whose largest is m -> factor to scene units."""
     return _F1 / ((np.float32(2.0) - u) * u) if u > _F1 else _F1

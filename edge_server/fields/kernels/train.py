@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.composite import (
@@ -80,7 +79,7 @@ class Recipe(NamedTuple):
     random_background: bool
 
 
-@njit(inline="always")
+@part
 def _view_of(first, pixel):
     """The last k with first[k] <= pixel. (np.searchsorted would compile seconds of string handling.)"""
     low, high = 0, first.size - 1
@@ -93,7 +92,7 @@ def _view_of(first, pixel):
     return low
 
 
-@njit(inline="always")
+@part
 def draw(views, recipe, n, ray):
     """Choose the n-th ray of the step: fills ray (11,), returns its view's number."""
     key, k = recipe.key, np.uint64(n) * np.uint64(8)
@@ -109,7 +108,7 @@ def draw(views, recipe, n, ray):
     return take_pixel(views, recipe, pixel, n, ray)
 
 
-@njit(inline="always")
+@part
 def take_pixel(views, recipe, pixel, n, ray):
     """Fill ray (11,), the step's n-th, from a pixel: direction, target, background, view, weight (the last
     two only where ``Views`` has exposures and weights). Returns the view's number."""
@@ -139,7 +138,7 @@ def take_pixel(views, recipe, pixel, n, ray):
     return view
 
 
-@njit(inline="always")
+@part
 def keep(rows, a, b, to):
     """Move columns a to b of every row to ``to`` <= a."""
     for k in range(rows.shape[0]):

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
@@ -144,7 +143,7 @@ def spread(row, line, n, size, d_r, d_g, d_b, total, d_solid, gradient, dirty):
         dirty[(z + size + 1) // SEGMENT] = 1
 
 
-@njit(inline="always")
+@part
 def choose(views, recipe, n, rays, shift):
     """The pixel of the n-th of ``rays`` rays: one at random of the n-th of as many equal runs of pixels,
     so that neighbouring rays meet the same voxels while these are in the cache. The first rays are drawn

@@ -1,0 +1,118 @@
+"""Compiling before the first fit, on every core: numba compiles one function at a time in a process, so other
+processes compile the rest and leave it in the cache on disk."""
+
+from __future__ import annotations
+
+import base64
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numba import typeof
+from numba.core.dispatcher import Dispatcher
+
+from edge_server.fields.kernels.jit import is_stored
+from edge_server.fields.kernels.pool import CallerPool, Pool, cores
+
+HELPERS = 3  # at most: the largest kernel takes as long as a quarter of all
+_HELPER = "from edge_server.fields.kernels.ahead import _serve; _serve()"
+
+Call = tuple[Dispatcher, tuple[Any, ...]]  # a kernel and the numba types of its arguments
+
+
+def compile_ahead(tour: Callable[[Pool], None]) -> float:
+    """Compile, or load from numba's cache, the kernels that ``tour`` runs through the pool that it is given;
+    returns the seconds that took.
+
+    ``tour`` is gone through twice: first nothing is run and it is noted what would be, then all of it is.
+    What the first pass misses, because it depends on what a kernel computes, the second compiles.
+    """
+    start = time.perf_counter()
+    listing = _Listing()
+    with np.errstate(all="ignore"):  # of memory that nobody filled
+        tour(listing)
+    missing = [call for call in listing.calls if not is_stored(*call)]
+    if len(missing) > 1:
+        _compile_together(missing, min(cores() - 1, HELPERS, len(missing) - 1))
+    tour(CallerPool())
+    return time.perf_counter() - start
+
+
+class _Listing(CallerPool):
+    """Runs nothing and notes what would be called, each once, in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: dict[Call, None] = {}
+
+    def run(self, kernel: Callable[..., Any], *args: Any) -> None:
+        assert isinstance(kernel, Dispatcher)
+        types = tuple(typeof(value) for value in (np.zeros(1, np.int64), 0, *args))
+        self.calls[kernel, types] = None
+
+
+def _compile_together(calls: list[Call], helpers: int) -> None:
+    """Compile the kernels here and in ``helpers`` other processes, the largest first. Whatever goes wrong
+    there is compiled here when it is needed."""
+    waiting = deque(sorted(calls, key=lambda call: -_size(call[0].py_func)))
+    threads = [threading.Thread(target=_delegate, args=(waiting,), daemon=True) for _ in range(helpers)]
+    for thread in threads:
+        thread.start()
+    for kernel, types in _drawn(waiting):
+        kernel.compile(types)
+    for thread in threads:
+        thread.join()
+
+
+def _drawn(waiting: deque[Call]) -> Iterator[Call]:
+    while waiting:
+        try:
+            yield waiting.popleft()
+        except IndexError:  # another thread was faster
+            return
+
+
+def _delegate(waiting: deque[Call]) -> None:
+    """Have a process of its own compile kernels until none are left."""
+    try:
+        with subprocess.Popen(
+            [sys.executable, "-c", _HELPER],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        ) as helper:  # fmt: skip
+            assert helper.stdin and helper.stdout
+            for kernel, types in _drawn(waiting):
+                order = (kernel.py_func.__module__, kernel.py_func.__qualname__, types)
+                helper.stdin.write(base64.b64encode(pickle.dumps(order)) + b"\n")
+                helper.stdin.flush()
+                if not helper.stdout.readline():
+                    return
+    except OSError:
+        return
+
+
+def _serve() -> None:
+    """In a helper: compile what the lines of stdin ask for, answer each with a line, end where they end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends who asked, and with it stdin
+    for line in sys.stdin.buffer:
+        module, name, types = pickle.loads(base64.b64decode(line))
+        getattr(import_module(module), name).compile(types)
+        sys.stdout.buffer.write(b"\n")
+        sys.stdout.buffer.flush()
+
+
+def _size(function: Callable[..., Any], inside: frozenset[Any] = frozenset()) -> int:
+    """How much there is to compile: bytes of code, of its parts and theirs."""
+    inside |= {function}  # names are attributes', too: what looks like a call may be none, and lead back
+    named = (function.__globals__.get(name) for name in function.__code__.co_names)
+    parts = {value.py_func for value in named if isinstance(value, Dispatcher)} - inside
+    return len(function.__code__.co_code) + sum(_size(part, inside) for part in parts)

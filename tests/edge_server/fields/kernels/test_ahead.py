@@ -1,0 +1,125 @@
+"""Compiling ahead: which kernels, by whom, and that a helper that fails costs nothing but time."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.fields.kernels.ahead import _Listing, _size, compile_ahead
+from edge_server.fields.kernels.jit import kernel, part
+from edge_server.fields.kernels.pool import THREADS_VARIABLE, CallerPool, Pool
+from edge_server.fields.registry import field_names, make_field
+
+
+@part
+def _twice(x):
+    return x + x
+
+
+@kernel
+def double(counter, worker, values):
+    for i in range(values.size):
+        values[i] = _twice(_twice(values[i])) / np.float32(2.0)
+
+
+@kernel
+def total(counter, worker, values, out):
+    for i in range(values.size):
+        out[0] += values[i]
+
+
+@kernel
+def only_after(counter, worker, out):
+    out[1] = np.float64(worker) + 1.0
+
+
+def tour(pool: Pool) -> None:
+    values, out = np.full(3, 2.0, np.float32), np.zeros(2)
+    pool.run(double, values)
+    pool.run(total, values, out)
+    if out[0] == 12.0:
+        pool.run(only_after, out)
+
+
+# Who compiled what, told by numba's own count: a kernel compiled by a helper is a hit in the cache here.
+TOLD = """
+import sys
+from edge_server.fields.kernels.ahead import compile_ahead
+from tests.edge_server.fields.kernels.test_ahead import double, only_after, total, tour
+if sys.argv[1:]:
+    sys.executable = sys.argv[1]
+compile_ahead(tour)
+for k in (double, total, only_after):
+    print("loaded" if k.stats.cache_hits else "compiled", len(k.signatures))
+"""
+
+
+def _who(cache: Path, *executable: str, threads: int = 2) -> list[str]:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), THREADS_VARIABLE: str(threads)}
+    done = subprocess.run(
+        [sys.executable, "-c", TOLD, *executable],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    return done.stdout.split("\n")[:-1]
+
+
+def test_a_helper_compiles_beside_and_what_it_cannot_know_of_is_compiled_here(tmp_path: Path) -> None:
+    # The larger one here, the other in the helper; the third is known only once the first two have run.
+    assert _who(tmp_path) == ["compiled 1", "loaded 1", "compiled 1"]
+    assert _who(tmp_path) == ["loaded 1"] * 3, "the second time all of it comes from the disk"
+
+
+@pytest.mark.parametrize("executable", ["/bin/false", "/does/not/exist"])
+def test_without_its_helpers_everything_is_compiled_here(executable: str, tmp_path: Path) -> None:
+    assert _who(tmp_path, executable) == ["compiled 1"] * 3
+
+
+def test_one_thread_asks_nobody(tmp_path: Path) -> None:
+    assert _who(tmp_path, threads=1) == ["compiled 1"] * 3
+
+
+def test_an_error_of_the_tour_is_the_callers() -> None:
+    def fails(pool: Pool) -> None:
+        raise RuntimeError("no such scene")
+
+    with pytest.raises(RuntimeError, match="no such scene"):
+        compile_ahead(fails)
+
+
+def test_what_is_inlined_counts() -> None:
+    assert _size(double.py_func) > _size(_twice.py_func) + len(double.py_func.__code__.co_code) - 1
+    assert _size(total.py_func) == len(total.py_func.__code__.co_code)
+
+
+class _Noting(CallerPool):
+    def __init__(self) -> None:
+        super().__init__()
+        self.kernels: set[Any] = set()
+
+    def run(self, kernel: Callable[..., Any], *args: Any) -> None:
+        self.kernels.add(kernel)
+        super().run(kernel, *args)
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_every_field_lists_its_large_kernels_without_running_them(name: str) -> None:
+    field, listing, run = make_field(name), _Listing(), _Noting()
+    with np.errstate(all="ignore"):
+        field._tour(listing)
+    field._tour(run)
+    listed = {kernel for kernel, _ in listing.calls}
+    assert listed <= run.kernels, "compiled for nothing"
+    wanted = {k for k in run.kernels if k.py_func.__name__.startswith(("train_", "render_"))}
+    assert wanted and wanted <= listed
+    assert 2 * len(listed) > len(run.kernels), "most of it must be known before anything is run"
