@@ -4,6 +4,7 @@ processes compile the rest and leave it in the cache on disk."""
 from __future__ import annotations
 
 import base64
+import logging
 import os
 import pickle
 import signal
@@ -24,7 +25,10 @@ from edge_server.fields.kernels.jit import is_stored
 from edge_server.fields.kernels.pool import CallerPool, Pool, cores
 
 HELPERS = 3  # at most: the largest kernel takes as long as a quarter of all
+PATIENCE_S = 60.0  # with a helper, after everything else is compiled; then its kernel is compiled here
 _HELPER = "from edge_server.fields.kernels.ahead import _serve; _serve()"
+
+log = logging.getLogger(__name__)
 
 Call = tuple[Dispatcher, tuple[Any, ...]]  # a kernel and the numba types of its arguments
 
@@ -64,13 +68,19 @@ def _compile_together(calls: list[Call], helpers: int) -> None:
     """Compile the kernels here and in ``helpers`` other processes, the largest first. Whatever goes wrong
     there is compiled here when it is needed."""
     waiting = deque(sorted(calls, key=lambda call: -_size(call[0].py_func)))
-    threads = [threading.Thread(target=_delegate, args=(waiting,), daemon=True) for _ in range(helpers)]
-    for thread in threads:
-        thread.start()
-    for kernel, types in _drawn(waiting):
-        kernel.compile(types)
-    for thread in threads:
-        thread.join()
+    # The largest here: a helper has to be started first.
+    mine = waiting.popleft()
+    running = [_Helper(waiting) for _ in range(helpers)]
+    try:
+        mine[0].compile(mine[1])
+        for kernel, types in _drawn(waiting):
+            kernel.compile(types)
+        for helper in running:
+            helper.join(PATIENCE_S)
+    finally:
+        waiting.clear()
+        for helper in running:
+            helper.end()
 
 
 def _drawn(waiting: deque[Call]) -> Iterator[Call]:
@@ -81,23 +91,52 @@ def _drawn(waiting: deque[Call]) -> Iterator[Call]:
             return
 
 
-def _delegate(waiting: deque[Call]) -> None:
-    """Have a process of its own compile kernels until none are left."""
-    try:
-        with subprocess.Popen(
-            [sys.executable, "-c", _HELPER],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        ) as helper:  # fmt: skip
-            assert helper.stdin and helper.stdout
-            for kernel, types in _drawn(waiting):
+class _Helper(threading.Thread):
+    """Has a process of its own compile kernels until none are left."""
+
+    def __init__(self, waiting: deque[Call]) -> None:
+        super().__init__(name="compiles-ahead", daemon=True)
+        self._waiting = waiting
+        self._process: subprocess.Popen[bytes] | None = None
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _HELPER],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            )  # fmt: skip
+        except OSError as error:
+            log.info("no process to compile kernels beside this one: %s", error)
+        else:
+            self.start()
+
+    def run(self) -> None:
+        assert self._process and self._process.stdin and self._process.stdout
+        try:
+            for kernel, types in _drawn(self._waiting):
                 order = (kernel.py_func.__module__, kernel.py_func.__qualname__, types)
-                helper.stdin.write(base64.b64encode(pickle.dumps(order)) + b"\n")
-                helper.stdin.flush()
-                if not helper.stdout.readline():
+                self._process.stdin.write(base64.b64encode(pickle.dumps(order)) + b"\n")
+                self._process.stdin.flush()
+                if not self._process.stdout.readline():
+                    log.info("a process that compiled kernels ended early: %s is compiled here", order[1])
                     return
-    except OSError:
-        return
+        except (OSError, ValueError):  # it has ended, or ``end`` has closed its pipes
+            return
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait for the kernel that is being compiled, if the process could be started."""
+        if self._process is not None:
+            super().join(timeout)
+
+    def end(self) -> None:
+        """End the process, whatever it does."""
+        if self._process is None:
+            return
+        self._process.kill()
+        self._process.wait()
+        super().join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
 
 
 def _serve() -> None:

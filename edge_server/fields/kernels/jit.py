@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from numba import njit
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
 
 # No "nnan"/"ninf": the kernels test for non-finite numbers, which those flags would optimise away.
 FAST = {"contract", "reassoc", "arcp", "nsz"}
@@ -47,7 +53,18 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     dispatcher.enable_caching()
     file = dispatcher._cache._cache_file
     file._source_stamp = (*file._source_stamp, SOURCES)
+    file.save = partial(_save_alone, Path(file._cache_path), file.save)
     return dispatcher
+
+
+def _save_alone(folder: Path, save: Callable[..., None], key: Any, data: Any) -> None:
+    """``save``, one process at a time: numba reads a function's index, changes and writes it, and two that
+    compile the same function for other types would each name the other's code."""
+    if fcntl is None:
+        return save(key, data)
+    with open(folder / ".lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return save(key, data)
 
 
 def is_stored(dispatcher: Any, types: tuple[Any, ...]) -> bool:

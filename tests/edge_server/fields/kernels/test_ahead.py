@@ -51,10 +51,12 @@ def tour(pool: Pool) -> None:
 # Who compiled what, told by numba's own count: a kernel compiled by a helper is a hit in the cache here.
 TOLD = """
 import sys
+from edge_server.fields.kernels import ahead
 from edge_server.fields.kernels.ahead import compile_ahead
 from tests.edge_server.fields.kernels.test_ahead import double, only_after, total, tour
 if sys.argv[1:]:
     sys.executable = sys.argv[1]
+    ahead.PATIENCE_S = 1.0
 compile_ahead(tour)
 for k in (double, total, only_after):
     print("loaded" if k.stats.cache_hits else "compiled", len(k.signatures))
@@ -80,9 +82,17 @@ def test_a_helper_compiles_beside_and_what_it_cannot_know_of_is_compiled_here(tm
     assert _who(tmp_path) == ["loaded 1"] * 3, "the second time all of it comes from the disk"
 
 
-@pytest.mark.parametrize("executable", ["/bin/false", "/does/not/exist"])
-def test_without_its_helpers_everything_is_compiled_here(executable: str, tmp_path: Path) -> None:
-    assert _who(tmp_path, executable) == ["compiled 1"] * 3
+@pytest.mark.parametrize("body", ["exit 1", "exec sleep 1000", "head -n 1; echo; exit"], ids=str.split)
+def test_without_its_helpers_everything_is_compiled_here(body: str, tmp_path: Path) -> None:
+    helper = tmp_path / "helper"
+    helper.write_text(f"#!/bin/sh\n{body}\n")
+    helper.chmod(0o755)
+    assert _who(tmp_path, str(helper)) == ["compiled 1"] * 3
+    assert not subprocess.run(["pgrep", "-f", str(helper)], capture_output=True).stdout, "it was left behind"
+
+
+def test_without_a_program_to_start_everything_is_compiled_here(tmp_path: Path) -> None:
+    assert _who(tmp_path, "/does/not/exist") == ["compiled 1"] * 3
 
 
 def test_one_thread_asks_nobody(tmp_path: Path) -> None:
@@ -95,6 +105,39 @@ def test_an_error_of_the_tour_is_the_callers() -> None:
 
     with pytest.raises(RuntimeError, match="no such scene"):
         compile_ahead(fails)
+
+
+def test_processes_that_store_at_once_lose_nothing(tmp_path: Path) -> None:
+    """Eight, each with code of its own for one function: numba alone mixes them up."""
+    (tmp_path / "one.py").write_text(
+        "from edge_server.fields.kernels.jit import kernel\n@kernel\ndef one(x):\n    return x\n"
+    )
+    kinds = ["int8", "int16", "int32", "int64", "float32", "float64", "uint8", "uint16"]
+    path = os.pathsep.join((str(tmp_path), *filter(None, sys.path)))
+    environment = {**os.environ, "PYTHONPATH": path, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    all_of_them = [subprocess.Popen([sys.executable, "-c", COMPILE, kind], env=environment) for kind in kinds]
+    assert [p.wait(60) for p in all_of_them] == [0] * len(kinds)
+    stored = subprocess.run(
+        [sys.executable, "-c", STORED, *kinds], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert stored.stdout.split() == ["True"] * len(kinds), stored.stderr
+
+
+COMPILE = """
+import sys
+from numba import types
+from one import one
+one.compile((getattr(types, sys.argv[1]),))
+"""
+STORED = """
+import sys
+from numba import types
+from edge_server.fields.kernels.jit import is_stored
+from one import one
+for kind in sys.argv[1:]:
+    of = getattr(types, kind)
+    print(is_stored(one, (of,)) and one.compile((of,)) and one.stats.cache_hits[(of,)] == 1)
+"""
 
 
 def test_what_is_inlined_counts() -> None:

@@ -155,6 +155,13 @@ def test_wait_holds_if_and_only_if_what_was_learnt_is_better(channel, level, sai
     assert answers(verdicts, "waiting beats thresholds") == {DOES_NOT_HOLD}
 
 
+def test_cases_of_waiting_are_told_apart_by_their_names():
+    names = [ppo_wait.named(*case) for case in ppo_wait.CASES]
+    assert len(set(names)) == len(names)
+    assert [n for n in names if n.startswith("swing, age -0.003")] == ["swing, age -0.003/ms"]
+    assert "swing, where it moves, age -0.003/ms" in names
+
+
 @pytest.mark.parametrize(("step", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
 def test_ablation_holds_if_and_only_if_more_of_the_state_is_better(step, said):
     levels: dict[str, float] = dict(FIXED)
