@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         decided = found.decided
         told = explain(decided.actor, decided.state, decided.action)
         camera = _camera(args.camera, found, told)
-        regions = None if camera is None else _regions(found, camera)
+        regions = None if camera is None else _regions_or_why(found, camera, asked=args.camera is not None)
         picture = args.picture or args.run / f"decision-{decided.number:06d}.png"
         draw(told, picture, camera, found.images.get(camera or ""), regions)
         if args.json is not None:
@@ -72,6 +72,19 @@ def _camera(asked: str | None, found: Recorded, told: Explanation) -> str | None
     return max(found.images, key=lambda camera: share.get(camera, 0.0))
 
 
+def _regions_or_why(found: Recorded, camera: str, asked: bool) -> NDArray[np.float64] | None:
+    """What moved the decision in a picture. Where frames cannot be embedded again (the model's file is gone,
+    the extra is not installed) the rest of the explanation stands: None, said why, unless it was asked
+    for."""
+    try:
+        return _regions(found, camera)
+    except ValueError as error:
+        if asked:
+            raise
+        print(f"edge-server explain: no regions of a picture: {error}", file=sys.stderr)
+        return None
+
+
 def _regions(found: Recorded, camera: str) -> NDArray[np.float64]:
     decided = found.decided
     number = decided.state.cameras.index(camera)
@@ -84,7 +97,11 @@ def _embedder(found: Recorded) -> Embed:
         raise ValueError("the run does not say what embedded its frames: regions cannot be found")
     from edge_server.embed import EmbeddingConfig, make_embedder
 
-    return make_embedder(EmbeddingConfig(**found.embedding)).embed
+    try:
+        config = EmbeddingConfig(**found.embedding)
+    except TypeError as error:
+        raise ValueError(f"the run's embedding is of another version: {error}") from None
+    return make_embedder(config).embed
 
 
 def as_text(

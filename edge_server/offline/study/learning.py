@@ -24,7 +24,7 @@ from edge_server.offline.study.engine import source_digest
 from edge_server.offline.study.statistics import Interval, crossed, interval
 from edge_server.offline.study.trial import Trial
 from edge_server.offline.train_scheduler import reward_of
-from edge_server.offline.training.contest import Contest, PerSeed, Rival, hold
+from edge_server.offline.training.contest import HINDSIGHT, Contest, PerSeed, Rival, hold
 from edge_server.offline.training.crew import Crew
 from edge_server.offline.training.report import draw_curve, span
 from edge_server.offline.training.setting import Setting, seeds
@@ -280,15 +280,20 @@ def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, 
 
 
 def no_worse(
-    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, share: float = 0.01
+    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, contest: Contest, share: float = 0.01
 ) -> Verdict:
-    """Whether ``mine`` loses no more than ``share`` of the size of ``other``'s mean reward."""
-    difference, base = over(mine, other), crossed(_runs(other)).mean
-    told = _told_of(difference, len(_runs(mine)))
-    return Verdict(
-        about, claim, f"{told} at {base:.4f}, that is {100 * difference.mean / abs(base):+.2f} %.",
-        by_bool(difference.above(-share * abs(base))),
-    )  # fmt: skip
+    """Whether ``mine`` loses no more than ``share`` of the size of ``other``'s mean reward, and what part
+    that is of all that could be won in the contest: a reward's zero is arbitrary, its differences are not.
+    No answer where the reward is too near its zero for a percentage."""
+    difference, base = over(mine, other), crossed(_runs(other))
+    told = f"{_told_of(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
+    if base.low <= 0.0 <= base.high:
+        return Verdict(about, claim, f"{told}no percentage: too near zero.", by_bool(None))
+    told += f"{100 * difference.mean / abs(base.mean):+.2f} %"
+    limit = over(contest.rewards(HINDSIGHT), contest.rewards("random"))
+    if limit.above(0.0):
+        told += f", and {100 * difference.mean / limit.mean:+.0f} % of the way from random to hindsight"
+    return Verdict(about, claim, f"{told}.", by_bool(difference.above(-share * abs(base.mean))))
 
 
 def _digest(lesson: Lesson) -> str:

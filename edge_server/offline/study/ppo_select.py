@@ -144,9 +144,17 @@ def _as_rewarded(about: str, contest: Contest) -> list[Verdict]:
     """What was learnt from a viewpoint's reward, judged from the same viewpoint: what training itself could
     see, beside what was asked for."""
     mine, (best, name) = runs_of(contest, "learnt"), contest.best_fixed("threshold")
+    random = contest.rewards("random")
     about = f"{about}, judged from the cameras that rewarded"
     return [
-        better(about, "better than random there.", mine, contest.rewards("random")),
+        better(
+            about,
+            f"better than random there (the thesis: by {THESIS_PERCENT} %).",
+            mine,
+            random,
+            f"{percent(mean_of(mine), random)}; ",
+        ),
+        better(about, "better than using all there.", mine, contest.rewards("all")),
         better(about, "better than every fixed threshold there.", mine, best, f"the best is {name}; "),
     ]
 
@@ -174,8 +182,8 @@ def _share(about: str, contest: Contest, mine: Runs, best: PerSeed) -> Verdict:
 def _time(about: str, learnt: Sequence[Learnt]) -> Verdict:
     one = learnt[0]
     fits, carried_out = (sum(row[n] for row in one.rows) for n in ("fits", "carried_out"))
-    if one.jobs > 2:
-        told = f"trained with {one.jobs} processes, which tell nothing of 2 cores: --jobs 2."
+    if one.jobs != 2:
+        told = f"trained with {one.jobs} process{'es' if one.jobs > 1 else ''}: --jobs 2 tells of two cores."
         return Verdict(about, "training is quick on 2 cores.", told, by_bool(None))
     if carried_out < fits / 2:  # known from another training: how long it would have taken is not measured
         return Verdict(about, "training is quick.", "most of its fits were known already.", by_bool(None))

@@ -99,7 +99,7 @@ def judge(case: str, channel: str, contest: Contest) -> list[Verdict]:
             found.append(better(about, claim, mine, best, told))
         else:
             claim = "no worse than its best fixed omega by 1 %, where nothing can be foreseen."
-            found.append(no_worse(about, claim, mine, best))
+            found.append(no_worse(about, claim, mine, best, contest))
         found.append(
             better(about, "better than a uniformly random set.", mine, contest.rewards("random"),
                    f"{percent(mean_of(mine), contest.rewards('random'))}; ")

@@ -114,7 +114,7 @@ def judge(contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]
         by_bool(same.above(-0.01)),
     )
     claim = f"in the same time {cheap} steps a fit teach more than {dear}."
-    theirs = _as_long(spent[cheap][-1], spent[dear])
+    theirs = _in_the_same_time(spent[cheap][-1], spent[dear])
     return [
         number,
         better(about, claim, curves[cheap][-1], curves[dear][theirs],
@@ -122,10 +122,10 @@ def judge(contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]
     ]  # fmt: skip
 
 
-def _as_long(limit_s: float, dear: Sequence[float]) -> int:
-    """The first stage of the dear one that took at least as long as the cheap one, or its last: the dear one
-    is given the benefit of the difference."""
-    return next((k for k, seconds in enumerate(dear) if seconds >= limit_s), len(dear) - 1)
+def _in_the_same_time(limit_s: float, dear: Sequence[float]) -> int:
+    """The last stage of the dear one that took no longer than the cheap one; its first, if none did. (Not the
+    next that took longer: what is learnt may be lost again, and a loss that came later would count.)"""
+    return max((k for k, seconds in enumerate(dear) if seconds <= limit_s), default=0)
 
 
 def _called(steps: int, stage: int) -> str:

@@ -98,7 +98,7 @@ def judge(scene: str, contest: Contest, moves: bool) -> list[Verdict]:
         found = [better(about, claim, seeing, blind, told)]
     else:
         claim = "semantics cost no more than 1 % where nothing moves."
-        found = [no_worse(about, claim, seeing, blind)]
+        found = [no_worse(about, claim, seeing, blind, contest)]
     fixed = [n for n in contest.outcomes if not n.startswith(("with", "random", "sees"))]
     best = max(fixed, key=lambda n: interval(list(contest.rewards(n).values())).mean)
     return found + [

@@ -75,5 +75,5 @@ def judge(place: str, contest: Contest) -> list[Verdict]:
                     f"against {told}; ")]  # fmt: skip
     if place != HOME:
         claim = f"learnt in {HOME}, it loses no more than 5 % to what is learnt here."
-        found.append(no_worse(place, claim, home, here, 0.05))
+        found.append(no_worse(place, claim, home, here, contest, 0.05))
     return found

@@ -8,7 +8,8 @@ with Crew(folders) as crew:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Any
 
 from edge_server.offline.training.choosing import of_action
@@ -18,6 +19,8 @@ from edge_server.offline.training.setting import SEEDS_A_PURPOSE, Setting, seeds
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import State
+
+KEPT = 16  # episodes whose frames stay in memory, of those drawn last
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,17 @@ class FitProblem:
     reward: Reward
     crew: Crew
     run: int = 0
+    _drawn: deque[int] = field(
+        default_factory=lambda: deque(maxlen=KEPT), init=False, repr=False, compare=False
+    )
 
     def draw(self, seed: int) -> FitDecision:
         episode, number = divmod(seed, self.setting.decisions)
         (of,) = seeds(self.run, "train", 1, episode % SEEDS_A_PURPOSE)
+        if of not in self._drawn:
+            if len(self._drawn) == KEPT:
+                self.crew.forget(self.setting, [self._drawn[0]])
+            self._drawn.append(of)
         return FitDecision(self, self.crew.draw(self.setting, [of])[0][number])
 
 

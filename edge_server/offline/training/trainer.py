@@ -225,8 +225,13 @@ class _Kept:
             raise TrainingError(
                 f"{self.out} holds a training with other settings: choose another --out, or delete it"
             )
-        lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
-        return Learner.load(self.out / name), [json.loads(line) for line in lines]
+        try:
+            lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
+            return Learner.load(self.out / name), [json.loads(line) for line in lines]
+        except (OSError, ValueError) as error:
+            raise TrainingError(
+                f"{self.out}: cannot go on: {error}: choose another --out, or delete it"
+            ) from None
 
     def save(self, learner: Learner, rows: list[Row]) -> None:
         name = f"weights-{len(rows):05d}.npz"

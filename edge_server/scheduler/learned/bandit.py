@@ -85,8 +85,9 @@ class Bandit:
     def _decide(self, epoch: Epoch) -> NDArray[Any]:
         if epoch.state is None:
             raise ValueError(f"{self.name} needs to see more than ages, which is not offered here")
-        state = epoch.state(self.actor.spec.layout.parts)
-        actions, logps = self.actor.act([state], self._rng if self.explore else None)
+        actor = self.actor  # one that learns is replaced while it decides
+        state = epoch.state(actor.spec.layout.parts)
+        actions, logps = actor.act([state], self._rng if self.explore else None)
         action = np.asarray(actions[0])
-        self.last = Decided(epoch.number, epoch.now_ns, state, action, float(logps[0]), self.actor)
+        self.last = Decided(epoch.number, epoch.now_ns, state, action, float(logps[0]), actor)
         return action

@@ -28,7 +28,8 @@ class BanditEnvironment(gymnasium.Env):
     """``problem`` with ``cameras`` cameras, seen and acted on as ``spec`` says.
 
     An empty set cannot be carried out (K_t >= 1): the youngest camera is used instead, and ``info`` says
-    ``forced``. What ``reset(seed)`` draws is decided by the seed; without one, episodes follow each other.
+    ``forced``. What ``reset(seed)`` draws is decided by the seed; without one, the next decision follows, so
+    that all decisions of a simulated episode are used before another is simulated.
     Where no reward could be had, learners that cannot take NaN get the mean of those so far (0 before the
     first), which says neither good nor bad of the action, and ``info`` says ``missing``.
     """
@@ -48,13 +49,17 @@ class BanditEnvironment(gymnasium.Env):
             else gymnasium.spaces.Discrete(len(spec.omegas_ms))
         )
         self._decision: Decision | None = None
+        self._next: int | None = None
         self._known, self._mean = 0, 0.0  # of the rewards so far
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, Any]]:
         super().reset(seed=seed)
-        self._decision = self._problem.draw(int(self.np_random.integers(2**31)))
+        if seed is not None or self._next is None:
+            self._next = int(self.np_random.integers(2**31))
+        self._decision = self._problem.draw(self._next)
+        self._next += 1
         return self._spec.layout.features(self._decision.state), {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:

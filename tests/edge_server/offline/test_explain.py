@@ -55,6 +55,28 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("embedding", "says"),
+    [
+        ({"model": "/nowhere/d.onnx", "dim": 3, "provider": "cpu"}, "no such file"),
+        ({"model": "d.onnx", "shutter": "rolling"}, "of another version"),
+        (None, "does not say what embedded its frames"),
+    ],
+)
+def test_where_frames_cannot_be_embedded_again_the_rest_is_told(embedding, says, tmp_path, capsys):
+    pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
+    pytest.importorskip("onnx", reason="the extra embed is not installed")
+    DecisionRecord(tmp_path, embedding).write(decided(2))
+    assert main([str(tmp_path), "--json", str(tmp_path / "e.json")]) == 0
+    told = capsys.readouterr()
+    assert "by part of the state" in told.out and "in the picture" not in told.out
+    assert says in told.err and told.err.count("\n") == 1
+    assert json.loads((tmp_path / "e.json").read_text())["regions"] is None
+    # Whoever asks for a picture is refused.
+    assert main([str(tmp_path), "--camera", "cam01"]) == 2
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("words", "says"),
     [
         (["--decision", "9"], "decision 9 is not recorded"),

@@ -221,6 +221,9 @@ def test_a_cheap_reward_wins_if_and_only_if_it_taught_more_in_the_same_time(gap,
     # Of the same number of decisions the dear one taught more; in the time that they take it had not begun.
     assert number.verdict == (DOES_NOT_HOLD if gap > 0 else HOLDS) and time.verdict == said
     assert "after 20.0 and 30.0 s" in time.found
+    # What happens to the dear one after the cheap one has ended does not count.
+    (_, time) = reward_cost.judge(contest_of(levels), (1, 10), {10: [2.0, 20.0], 50: [15.0, 21.0]})
+    assert time.verdict == said and "after 20.0 and 15.0 s" in time.found
     (dim,) = reward_cost.judge_dims(
         {f"d = {d}": contest_of({"random": 0.0, **runs(f"d = {d}", d * gap)}) for d in (0, 4)}
     )
@@ -305,9 +308,15 @@ def test_verdicts_follow_from_the_paired_differences():
     assert [better("a", "b", x, base).verdict for x in (up, down, same)] == [
         "holds", "does not hold", "undecided"
     ]  # fmt: skip
-    assert [no_worse("a", "b", x, base).verdict for x in (up, down, same)] == [
+    contest = contest_of({"random": 0.5, "all": 1.5})
+    assert [no_worse("a", "b", x, base, contest).verdict for x in (up, down, same)] == [
         "holds", "does not hold", "holds"
     ]  # fmt: skip
+    assert "-20 % of the way from random to hindsight" in no_worse("a", "b", down, base, contest).found
+    # A hundredth of next to nothing is no limit.
+    near_zero = {s: 0.01 * (-1) ** s for s in base}
+    found = no_worse("a", "b", near_zero, near_zero, contest)
+    assert found.verdict == UNDECIDED and "too near zero" in found.found
     # Who does the same at every decision is no better, and that is known.
     alike = better("a", "b", [base, base], base)
     assert alike.verdict == DOES_NOT_HOLD and "the very same" in alike.found
@@ -328,7 +337,7 @@ def test_a_percentage_is_told_only_where_the_rewards_zero_is_far_away(mine, base
     assert percent(dict.fromkeys(values, mine), values).startswith(told)
 
 
-@pytest.mark.parametrize(("jobs", "said"), [(1, HOLDS), (2, HOLDS), (8, UNDECIDED)])
+@pytest.mark.parametrize(("jobs", "said"), [(1, UNDECIDED), (2, HOLDS), (8, UNDECIDED)])
 def test_only_two_processes_tell_how_long_two_cores_take(jobs, said, tmp_path: Path):
     rows = [{"fits": 100, "carried_out": 100, "decisions": 50}]
     found = ppo_select._time("x", [learning.Learnt(None, None, rows, 10.0, jobs, tmp_path)])  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ from edge_server.offline.train_scheduler import main, reward_of
 from edge_server.offline.training.choosing import choices, named
 from edge_server.offline.training.contest import HINDSIGHT, hold, rivals, rows, write_rows
 from edge_server.offline.training.crew import Crew
-from edge_server.offline.training.problem import FitProblem
+from edge_server.offline.training.problem import KEPT, FitProblem
 from edge_server.offline.training.report import draw_curve, lines, summary
 from edge_server.offline.training.setting import seeds
 from edge_server.offline.training.trainer import (
@@ -81,6 +81,20 @@ def test_a_stopped_course_goes_on_bit_for_bit(tmp_path: Path):
     assert len(list((tmp_path / "parts").glob("weights-*.npz"))) == 1
     with Crew(NOTHING) as crew, pytest.raises(TrainingError, match="other settings"):
         train(setting(steps=5), COURSE, crew, tmp_path / "parts", quiet)
+
+
+@pytest.mark.parametrize("damage", ["weights-*.npz", "training.jsonl"])
+@pytest.mark.parametrize("what", ["gone", "half"])
+def test_a_course_whose_files_are_damaged_is_refused_in_one_line(damage: str, what: str, tmp_path: Path):
+    with Crew(NOTHING) as crew:
+        train(setting(), COURSE, crew, tmp_path, quiet)
+    (path,) = tmp_path.glob(damage)
+    if what == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match="choose another --out, or delete it"):
+        train(setting(), COURSE, crew, tmp_path, quiet)
 
 
 def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
@@ -373,7 +387,21 @@ class SeenSeeds:
 
     def __init__(self, drawn: list[int]) -> None:
         self.drawn = drawn
+        self.forgotten: list[int] = []
 
     def draw(self, setting, seeds):
         self.drawn += seeds
         return [(None,) * setting.decisions]
+
+    def forget(self, setting, seeds):
+        self.forgotten += seeds
+
+
+def test_other_learners_do_not_fill_the_memory_with_episodes():
+    crew = SeenSeeds([])
+    problem = FitProblem(setting(), COURSE.spec, REWARD, crew)
+    for number in (*range(2 * (KEPT + 3)), 0):
+        problem.draw(number)
+    kept = [seed for seed in dict.fromkeys(crew.drawn) if seed not in crew.forgotten]
+    assert len(dict.fromkeys(crew.drawn)) == KEPT + 3 and len(crew.forgotten) == 4 and len(kept) == KEPT - 1
+    assert seeds(0, "train", 1, 0)[0] == crew.drawn[-1] == crew.forgotten[0], "drawn, forgotten, drawn again"

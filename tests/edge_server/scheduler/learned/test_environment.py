@@ -45,6 +45,21 @@ def test_episodes_follow_each_other_where_no_seed_is_given():
     assert not np.array_equal(first, second)
 
 
+def test_decisions_are_drawn_one_after_the_other_from_where_the_seed_says():
+    drawn = []
+
+    class Noting(Waits):
+        def draw(self, seed: int):
+            drawn.append(seed)
+            return super().draw(seed)
+
+    environment = BanditEnvironment(Noting(), WAIT, 6)
+    for seed in (3, None, None, 3, None, 4):
+        environment.reset(seed=seed)
+    a, b, c, again, after, other = drawn
+    assert (b, c) == (a + 1, a + 2) and (again, after) == (a, a + 1) and other not in (a, b, c)
+
+
 def test_an_empty_set_becomes_the_youngest_camera():
     environment = BanditEnvironment(FreshOnes(silent=2), SELECT, 6)
     seen, _ = environment.reset(seed=1)
