@@ -41,8 +41,9 @@ What accuracy costs in time, in two figures.
 1. From scratch: effort levels of the field against seconds of fitting, on a camera that was held out: PSNR,
    SSIM and LPIPS, the Pareto front marked. What a step costs on this machine is measured on the way.
 2. Live: the scene moves, the network delays, and an update that takes longer shows an older world. The whole
-   deployment runs in virtual time, one that charges every step what figure 1 measured, so the second figure
-   is the same bit for bit for one seed. It says how long an update should take at each speed.
+   deployment runs in virtual time, one that charges what updates of the moving scene were measured to take
+   here (a step, and everything else), so the second figure is the same bit for bit for one seed and one such
+   measurement. It says how long an update should take at each speed.
 
 A scenario with a deadline_ms chooses the effort and the time of its updates from figure 2: of the file it
 names (frontier: OUT/frontier.json), else of one that was measured once and is shipped.
@@ -226,9 +227,10 @@ class Frontier:
         print(f"{self.still.describe()}, {len(self.still.held_out)} held out", flush=True)
         rows = sweep.medians(self._from_scratch())
         sweep.mark_front(rows)
-        costs = sweep.costs(rows)
+        charged: dict[str, Compute] = {}
         if self.scene == "room":
-            updates = self._updates(costs)
+            charged = self._charged()
+            updates = self._updates(charged)
         else:
             updates = []
             print(f"figure 2 left out: {_why_still(self.scene)}", flush=True)
@@ -241,8 +243,8 @@ class Frontier:
             lpips_missing=self.lpips_missing,
             machine=machine(),
             versions=versions(),
-            ms_per_step={name: cost["ms_per_step"] for name, cost in costs.items()},
-            ms_per_update={name: cost["ms_per_update"] for name, cost in costs.items()},
+            ms_per_step=sweep.costs(rows),
+            charged={label: asdict(compute) for label, compute in charged.items()},
             from_scratch=rows,
             updates=updates,
         )
@@ -277,17 +279,36 @@ class Frontier:
             )
         return points
 
-    def _updates(self, costs: dict[str, dict[str, float]]) -> list[Row]:
-        efforts = [e for e in self.levels if e.live and e.name in (*self.plan.efforts, "default")]
-        rows: list[Row] = []
-        total = len(efforts) * len(self.plan.speeds) * len(self._seeds) * len(self.plan.update_s)
-        for effort in efforts:
-            compute = Compute(**{name: round(value, 3) for name, value in costs[effort.label].items()})
+    @property
+    def _live(self) -> list[sweep.Effort]:
+        return [e for e in self.levels if e.live and e.name in (*self.plan.efforts, "default")]
+
+    def _charged(self) -> dict[str, Compute]:
+        """What virtual time charges the updates of each effort: what they take here, of pictures as many as
+        the moving scene's and as large as figure 1's."""
+        plan, found = self.plan, {}
+        moving, speed = replace(plan.moving, size=plan.size), plan.speeds[len(plan.speeds) // 2]
+        for effort in self._live:
+            settings: Row = {
+                "figure": "charged", **asdict(moving), "speed_m_per_s": speed, "field": effort.field,
+                "options": effort.options, "defaults": settled(effort.field, effort.options),
+                "warm_steps": plan.warm_steps,
+            }  # fmt: skip
+            measure = partial(_charges, moving, speed, effort, plan.warm_steps)
+            row, new = self.store.get(settings, measure)
+            compute = found[effort.label] = Compute(row["ms_per_step"], row["ms_per_update"])
             print(
-                f"moving scene in virtual time, {effort.label}: a step is charged "
-                f"{compute.ms_per_step:.1f} ms, an update {compute.ms_per_update:.1f} ms",
+                f"updates of a moving scene, {effort.label}: {compute.ms_per_step:.1f} ms a step, "
+                f"{compute.ms_per_update:.1f} ms for everything else{_known(new)}",
                 flush=True,
             )
+        return found
+
+    def _updates(self, charged: dict[str, Compute]) -> list[Row]:
+        rows: list[Row] = []
+        total = len(charged) * len(self.plan.speeds) * len(self._seeds) * len(self.plan.update_s)
+        for effort in self._live:
+            compute = charged[effort.label]
             for speed in self.plan.speeds:
                 for seed in self._seeds:
                     rows += self._moving(effort, compute, speed, seed, len(rows), total)
@@ -339,6 +360,11 @@ class Frontier:
             "compute": asdict(compute), "lpips": self.lpips is not None,
         }  # fmt: skip
         return settings, lambda: stage().run(steps, compute, seconds, self.lpips)
+
+
+def _charges(moving: update_time.Moving, speed: float, effort: sweep.Effort, warm_steps: int) -> Row:
+    compute = update_time.charges(moving, speed, effort.field, effort.options, warm_steps)
+    return {"ms_per_step": compute.ms_per_step, "ms_per_update": compute.ms_per_update}
 
 
 def _why_still(scene: str) -> str:

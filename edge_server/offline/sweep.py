@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import statistics
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,7 +12,7 @@ import cv2
 import numpy as np
 
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
-from edge_server.fields import Budget, Field, View
+from edge_server.fields import Budget, View
 from edge_server.offline.fitting import evaluate
 from edge_server.offline.still import Still
 from edge_server.offline.usage import Usage
@@ -95,11 +94,7 @@ def shrunk(views: Sequence[View], divided: float) -> tuple[View, ...]:
 def fit_from_scratch(
     effort: Effort, still: Still, seconds: float, seed: int, lpips: PerceptualMetric | None
 ) -> dict[str, Any]:
-    """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost.
-
-    ms_per_step and ms_per_update are what virtual time charges: a step, and an update's fixed part (taking
-    in new images, handing out a snapshot).
-    """
+    """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost."""
     from edge_server.fields.registry import make_field
 
     model = make_field(effort.field, effort.options, seed=seed)
@@ -117,7 +112,6 @@ def fit_from_scratch(
         "seconds": report.seconds,
         "steps": report.steps,
         "ms_per_step": ms_per_step,
-        "ms_per_update": max(0.0, _update_ms(model, still) - ms_per_step),
         "rays_per_s": report.rays / max(report.seconds, 1e-9),
         "samples_per_s": report.samples / max(report.seconds, 1e-9),
         "psnr_db": score.psnr_db,
@@ -127,27 +121,12 @@ def fit_from_scratch(
     }
 
 
-def _update_ms(model: Field, still: Still, repeats: int = 3) -> float:
-    """Median milliseconds of the shortest update there is: new images, one step, a snapshot."""
-    spent = []
-    for _ in range(repeats):
-        # New objects with images of their own, as decoding makes them: nothing can be found known already.
-        views = [replace(v, image=v.image.copy()) for v in still.training]
-        began = time.perf_counter()
-        model.fit(views, Budget(steps=1))
-        snapshot = getattr(model, "snapshot", None)
-        if snapshot is not None:
-            snapshot()
-        spent.append((time.perf_counter() - began) * 1e3)
-    return statistics.median(spent)
-
-
 def medians(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Points of the same effort and planned seconds (``planned_s``) over seeds, as their medians."""
     groups: dict[tuple[str, float], list[dict[str, Any]]] = {}
     for point in points:
         groups.setdefault((point["effort"], point["planned_s"]), []).append(point)
-    names = ("seconds", "steps", "ms_per_step", "ms_per_update", "rays_per_s", "samples_per_s", "psnr_db",
+    names = ("seconds", "steps", "ms_per_step", "rays_per_s", "samples_per_s", "psnr_db",
              "ssim", "lpips", "outside_cores")  # fmt: skip
     rows = []
     for (effort, planned_s), group in groups.items():
@@ -167,13 +146,7 @@ def mark_front(rows: Sequence[dict[str, Any]]) -> None:
         best = max(best, row["psnr_db"])
 
 
-def costs(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """What virtual time charges, by effort: medians over all points of the effort."""
-    names = list(dict.fromkeys(row["effort"] for row in rows))
-    return {
-        name: {
-            key: statistics.median(row[key] for row in rows if row["effort"] == name)
-            for key in ("ms_per_step", "ms_per_update")
-        }
-        for name in names
-    }
+def costs(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Milliseconds of a step from scratch by effort: medians over all points of the effort."""
+    names = dict.fromkeys(row["effort"] for row in rows)
+    return {name: statistics.median(r["ms_per_step"] for r in rows if r["effort"] == name) for name in names}

@@ -6,6 +6,8 @@ update fits the views it was given better; meanwhile they age, and so does every
 
 from __future__ import annotations
 
+import statistics
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,8 @@ from freshfield.scenario import Scenario, parse
 SEEN_EVERY_S = 0.25
 # Publications of the first part of a run show the start more than the update time.
 _SETTLED_SHARE = 0.25
+# What updates cost is measured on so many short and long ones, their pictures so far apart.
+_FEW, _MANY, _UPDATES, _BETWEEN_NS = 4, 20, 5, 250_000_000
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
 SEEN = ("seen_psnr_db", "seen_psnr_moving_db")
 
@@ -106,6 +110,27 @@ class Stage:
         }
 
 
+def charges(moving: Moving, speed: float, field: str, options: dict[str, Any], warm_steps: int) -> Compute:
+    """What updates of a warm field take on this machine where the scene moves and every picture is new, as
+    virtual time charges them: ms_per_step a step, ms_per_update everything else (taking in the pictures,
+    finding and carrying along what moved, a snapshot). Medians of ``_UPDATES`` short and as many long
+    updates."""
+    stage = Stage(moving, speed, field, options, 0, warm_steps)
+    stage.field.warm_up()
+    taken: dict[int, list[float]] = {_FEW: [], _MANY: []}
+    for number in range(1, 2 * _UPDATES + 3):
+        views = [_view(camera, number * _BETWEEN_NS) for camera in stage.cameras]
+        steps = (_FEW, _MANY)[number % 2]
+        began = time.perf_counter()
+        stage.field.fit(views, Budget(steps=steps))
+        stage.field.snapshot()
+        if number > 2:  # the first of each know no motion yet
+            taken[steps].append(1e3 * (time.perf_counter() - began))
+    few, many = (statistics.median(taken[steps]) for steps in (_FEW, _MANY))
+    ms_per_step = max((many - few) / (_MANY - _FEW), 0.01)
+    return Compute(round(ms_per_step, 3), round(max(few - _FEW * ms_per_step, 0.0), 3))
+
+
 class Seen:
     """What a viewer saw at evenly spaced instants: the newest publication, up to an update old by then."""
 
@@ -168,11 +193,11 @@ def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return means
 
 
-def _view(camera: Camera) -> View:
-    shot = camera.capture(0)
+def _view(camera: Camera, at_ns: int = 0) -> View:
+    shot = camera.capture(at_ns)
     k = shot.intrinsics
     image = payload.decode(shot.payload, camera.codec, k.width, k.height)
-    return View(camera.name, image, shot.pose.matrix(), k)
+    return View(camera.name, image, shot.pose.matrix(), k, at_ns)
 
 
 def _mean(values: list[float | None]) -> float | None:

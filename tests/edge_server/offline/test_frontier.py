@@ -14,7 +14,7 @@ from edge_server.fields import voxel_settings
 from edge_server.offline import frontier, sweep
 from edge_server.offline.frontier_output import conclusion
 from edge_server.offline.still import synthetic
-from edge_server.offline.update_time import Moving, Stage, mean_over_seeds, steps_for
+from edge_server.offline.update_time import Moving, Stage, charges, mean_over_seeds, steps_for
 from edge_server.offline.virtual import Compute
 from edge_server.pacing import read_points
 from tests.edge_server.offline.sets import SMALL, SMALL_WORDS, write_photos
@@ -31,6 +31,33 @@ def test_an_update_time_point_is_the_same_bit_for_bit():
     assert points[0] == points[1]
     assert points[0]["update_s"] == 0.1 and 5 <= points[0]["updates"] <= 9
     assert points[0]["psnr_db"] is not None and points[0]["psnr_moving_db"] is not None
+
+
+def test_updates_are_charged_what_they_take_where_everything_is_new(monkeypatch):
+    """A field that takes 60 ms for new pictures, 30 for a snapshot and 5 a step, by a clock of its own."""
+    seen, clock = [], [0.0]
+
+    class Slow:
+        def warm_up(self):
+            clock[0] += 9.0
+
+        def state(self):
+            return {}
+
+        def fit(self, views, budget):
+            seen.append(views)
+            clock[0] += 0.060 + 0.005 * budget.steps
+
+        def snapshot(self):
+            clock[0] += 0.030
+
+    monkeypatch.setattr("edge_server.fields.registry.make_field", lambda *args, **more: Slow())
+    monkeypatch.setattr("edge_server.offline.update_time.time.perf_counter", lambda: clock[0])
+    found = charges(TINY, 1.0, "ngp", {}, warm_steps=5)
+    assert found.ms_per_step == pytest.approx(5.0) and found.ms_per_update == pytest.approx(90.0)
+    stamps = [{v.generated_ns for v in views} for views in seen]
+    assert all(len(s) == 1 for s in stamps) and len(set().union(*stamps)) == len(seen)
+    assert not np.array_equal(seen[1][0].image, seen[-1][0].image), "nothing moved: nothing was new"
 
 
 def test_every_point_of_a_stage_starts_from_the_same_warm_field():
