@@ -10,6 +10,7 @@ from camera_node.world import SCENES, bench, make_scene
 from camera_node.world.effects import NAMES
 
 
+@pytest.mark.alone
 def test_the_table_names_every_scene_and_effect(tmp_path, capsys):
     out = tmp_path / "bench.json"
     bench.main(["--size", "16", "24x8", "--frames", "2", "--within", "0.2", "--json", str(out)])
