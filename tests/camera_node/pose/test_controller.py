@@ -61,9 +61,19 @@ def test_the_pose_it_reports_is_our_forward_kinematics(receive):
     assert np.allclose(so3_exp(turn), flange[:3, :3], atol=1e-12)
 
 
+def _await_next_state(receive) -> None:
+    """Return when two states have been received that were sent after the call."""
+    for _ in range(2):
+        stamp, deadline = receive.getTimestamp(), time.monotonic() + 5.0
+        while receive.getTimestamp() == stamp:
+            assert time.monotonic() < deadline, "no state for five seconds"
+            time.sleep(0.001)
+
+
 def test_the_library_moves_the_arm(control, receive):
     goal = np.add(HOME_RAD, [0.2, 0.1, -0.1, 0.1, 0.0, 0.3])
     assert control.moveJ(goal.tolist(), 2.0, 8.0)
+    _await_next_state(receive)  # the arm has arrived; what was received last may be from just before
     assert np.allclose(receive.getActualQ(), goal, atol=1e-9)
     assert control.moveJ(list(HOME_RAD), 1.0, 4.0, True)  # does not wait
     assert not np.allclose(receive.getActualQ(), HOME_RAD, atol=1e-3)
