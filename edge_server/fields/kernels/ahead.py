@@ -133,8 +133,8 @@ class _Helper(threading.Thread):
             return
         self._process.kill()
         self._process.wait()
-        super().join()
-        for pipe in (self._process.stdin, self._process.stdout):
+        super().join(1.0)
+        for pipe in () if self.is_alive() else (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()
 
