@@ -85,16 +85,42 @@ def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, A
     del folder, lpips
     pool = TimedPool()
     usage = Usage("bench")
-    limits = machine_limits(pool, repeats=5 if quick else 15)
-    figures: dict[str, Any] = {"machine": limits}
+    limits = Limits(repeats=5 if quick else 15)
+    figures: dict[str, Any] = {}
     steps = 60 if quick else 300
     for name in ("tile", "room"):
         views = synthetic(name, cameras=19, size=128).training
         figures[f"ngp on {name}"] = _of_ngp(views, pool, limits, steps)
         figures[f"splat on {name}"] = _of_splat(views, pool, limits, steps)
+    figures["machine"] = limits.highest
+    limits.pool.close()
     pool.close()
     figures["outside_cores"] = usage.outside(usage.row(0.0))
     return figures
+
+
+class Limits:
+    """The machine's limits, measured again after each fit that is held against them: a shared machine gets
+    slower and faster within a minute, and a kernel is not faster than its limits because they were measured
+    in a slow one.
+
+    highest: of each limit, over all measurements."""
+
+    def __init__(self, repeats: int) -> None:
+        self.pool = Pool(nice=0)
+        self._repeats = repeats
+        self._last = machine_limits(self.pool, repeats)
+        self.highest = self._last
+
+    def around(self) -> dict[str, float]:
+        """Of what was done since the measurement before: the higher of that and of a new one."""
+        before, self._last = self._last, machine_limits(self.pool, self._repeats)
+        self.highest = _higher(self.highest, self._last)
+        return _higher(before, self._last)
+
+
+def _higher(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
+    return {name: max(limit, b[name]) for name, limit in a.items()}
 
 
 def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
@@ -137,7 +163,7 @@ def _median_s(repeats: int, work: Callable[[], Any]) -> float:
     return statistics.median(spent)
 
 
-def _of_ngp(views: Sequence[View], pool: TimedPool, limits: dict[str, float], steps: int) -> dict[str, Any]:
+def _of_ngp(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) -> dict[str, Any]:
     settings = NgpSettings(device="cpu")
     field = NgpField(settings, pool)
     field.fit(views, Budget(steps=WARM_STEPS))  # all levels on, most of space known to be empty
@@ -148,12 +174,12 @@ def _of_ngp(views: Sequence[View], pool: TimedPool, limits: dict[str, float], st
         levels=active_levels(settings, field.step),
         widths=[int(w) for w in field._net.widths],
         table_mb=field.state()["table"].nbytes / settings.levels / 2**20,
-        limits=limits,
+        limits=limits.around(),
     )
     return _against(floors, report, pool)
 
 
-def _of_splat(views: Sequence[View], pool: TimedPool, limits: dict[str, float], steps: int) -> dict[str, Any]:
+def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) -> dict[str, Any]:
     field = SplatField(SplatSettings(), pool)
     field.fit(views, Budget(steps=WARM_STEPS))  # grown to what it holds at most
     pool.seconds.clear()
@@ -166,7 +192,7 @@ def _of_splat(views: Sequence[View], pool: TimedPool, limits: dict[str, float], 
     pool.seconds.clear()
     pool.seconds.update(spent)
     gaussians, seen, pairs, touching = np.mean(counts, axis=0)
-    return _against(_floors_of_splat(gaussians, seen, pairs, touching, limits), report, pool)
+    return _against(_floors_of_splat(gaussians, seen, pairs, touching, limits.around()), report, pool)
 
 
 def _counted(field: SplatField) -> tuple[int, int, int, int]:

@@ -317,6 +317,7 @@ def test_an_arm_is_driven_only_where_its_surroundings_are_known(tmp_path, capsys
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkeypatch, capsys):
     """A simulated controller with the real client library, and a camera whose stamps are 60 ms late."""
     require_ur_rtde()
