@@ -12,7 +12,7 @@ from edge_server.fields import View
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.kernels.splat_project import BASE, COLOR, OPACITY, QUATERNION, SCALE
-from edge_server.fields.kernels.splat_seed import MOST_VIEWS, score_cells, sweep_rays
+from edge_server.fields.kernels.splat_seed import MOST_VIEWS, SEES, UNMARKED, score_cells, sweep_rays
 from edge_server.fields.kernels.splat_update import bound_all
 from edge_server.fields.scene_box import SceneBox, plain_background
 from edge_server.fields.splat_passes import camera_rows
@@ -114,21 +114,26 @@ def _score(settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[V
     ))  # fmt: skip
     channels = max(v.image.shape[2] for v in some)
     blurred = np.full((int(data.first[-1]), channels), 255, np.uint8)
-    marks = np.zeros(0 if moved is None else len(blurred), np.uint8)
+    says = np.zeros(0 if moved is None else len(blurred) + 1, np.int32)
     for k, view in enumerate(some):
         footprint = (4.0 if box.contracted else 2.0) * box.radius_m / cells / box.distance_m
         size = 2 * (max(int(0.5 * footprint * view.intrinsics.fx), 1) // 2) + 1
         a, b = data.first[k], data.first[k + 1]
         image = cv2.blur(view.image, (size, size)) if size > 1 else view.image
         blurred[a:b, : image.shape[2]] = image.reshape(int(b - a), -1)
-        mask = moved[chosen[k]] if moved is not None else None
+        if moved is None:
+            continue
+        says[a:b] = SEES + UNMARKED
+        mask = moved[chosen[k]]
         if mask is not None:  # a cell is as wide as so many pixels
             wide = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
-            marks[a:b] = wide.reshape(-1)
+            says[a:b][wide.reshape(-1) > 0] = SEES
+        if data.weight.size:
+            says[a:b][data.weight[a:b] <= 0] = 0
     plain = _empty_color(settings, some)
     needed = min(settings.min_views, len(some))
     pool.run(
-        score_cells, cams, data, blurred, marks, plain is not None,
+        score_cells, cams, data, blurred, says, plain is not None,
         plain if plain is not None else np.zeros(3, np.float32), np.float32(TOLERANCE), box.contracted, cells,
         needed, scores,
     )  # fmt: skip

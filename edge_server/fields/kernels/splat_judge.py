@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import fetch_add
 from edge_server.fields.kernels.jit import kernel
-from edge_server.fields.kernels.splat_project import BLOCK, COLOR, LENS, NEAR, _camera_point, _flattener
+from edge_server.fields.kernels.splat_project import BLOCK, COLOR, LENS, NEAR, camera_point, flattener, held
 
 MOST_OFF = 0.5  # no pixel counts more against a colour: it may be hidden there
 _CUT_AWAY = 128  # of 255: less alpha shows nothing
@@ -46,12 +46,13 @@ def judge(counter, worker, cams, views, marks, gaussians, allowed, verdicts):
         for i in range(base, min(base + BLOCK, count)):
             sees, marked, wrong, total = 0, 0, 0, _F0
             for v in range(cams.shape[0]):
-                x, y, z = _camera_point(cams, v, params, gaussians.velocity, i)
-                if not z > cams[v, NEAR]:
+                cam = held(cams, v)
+                x, y, z = camera_point(cam, params, gaussians.velocity, i)
+                if not z > cam[NEAR]:
                     continue
-                _, _, _, _, a, b, _, _, _, _, _, _, _, _ = _flattener(cams, v, x, y, z)
-                px = cams[v, LENS] * a + cams[v, LENS + 2]
-                py = cams[v, LENS + 1] * b + cams[v, LENS + 3]
+                _, _, _, _, a, b, _, _, _, _, _, _, _, _ = flattener(cam, x, y, z)
+                px = cam[LENS] * a + cam[LENS + 2]
+                py = cam[LENS + 1] * b + cam[LENS + 3]
                 width, height = views.size[v, 0], views.size[v, 1]
                 if not (px >= _F0 and py >= _F0 and px < width and py < height):
                     continue

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.composite import harmonic
-from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite
+from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, log32
 from edge_server.fields.kernels.jit import kernel, part
 
 # Columns of a Gaussian's parameters; from COLOR + 3 on, three for each further spherical harmonic.
@@ -35,6 +35,11 @@ RAW_OPACITY = 12.0
 FAR = 1e5  # scene units: beyond it float32 squares lose their meaning
 _NO_DIRECTION = 1e-20  # squared length of a quaternion that has none
 
+# Rows of BLOCK numbers in which a block of Gaussians is projected side by side.
+_X, _VX, _M, _ALPHA, _REACH, _Q, _S = (n * BLOCK for n in (0, 3, 6, 15, 16, 17, 21))
+_PX, _PY, _PZ, _A, _B, _C, _WIDE, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLOCK for n in range(17, 28))
+_ROWS = 28
+
 _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
 
@@ -49,10 +54,23 @@ class Gaussians(NamedTuple):
 
 
 @part
-def _bent(cams, b, x, y):
+def held(cams, b):
+    """Camera b's columns as a tuple of CAMERA numbers. A loop that writes to arrays then need not read the
+    camera again for every Gaussian, which would keep LLVM from vectorising it; and no row of an array is
+    made an array of its own, whose owners the threads would count."""
+    return (
+        cams[b, 0], cams[b, 1], cams[b, 2], cams[b, 3], cams[b, 4], cams[b, 5], cams[b, 6], cams[b,
+        7], cams[b, 8], cams[b, 9], cams[b, 10], cams[b, 11], cams[b, 12], cams[b, 13], cams[b, 14],
+        cams[b, 15], cams[b, 16], cams[b, 17], cams[b, 18], cams[b, 19], cams[b, 20], cams[b, 21],
+        cams[b, 22], cams[b, 23], cams[b, 24], cams[b, 25], cams[b, 26], cams[b, 27],
+    )  # fmt: skip
+
+
+@part
+def bent(cam, x, y):
     """Distorted normalised coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
-    its derivatives xxx, xxy, xyy, yyy."""
-    k1, k2, p1, p2 = cams[b, LENS + 4], cams[b, LENS + 5], cams[b, LENS + 6], cams[b, LENS + 7]
+    its derivatives xxx, xxy, xyy, yyy. cam: ``held``."""
+    k1, k2, p1, p2 = cam[LENS + 4], cam[LENS + 5], cam[LENS + 6], cam[LENS + 7]
     six, eight = np.float32(6.0), np.float32(8.0)
     r2 = x * x + y * y
     radial = _F1 + r2 * (k1 + r2 * k2)
@@ -70,15 +88,15 @@ def _bent(cams, b, x, y):
 
 
 @part
-def _unit_quaternion(params, i):
+def _unit_quaternion(w, x, y, z):
     """The quaternion's direction and 1 / length; (1, 0, 0, 0) and 0 where it has none."""
-    w, x = params[i, QUATERNION], params[i, QUATERNION + 1]
-    y, z = params[i, QUATERNION + 2], params[i, QUATERNION + 3]
     square = w * w + x * x + y * y + z * z
-    if not (square > np.float32(_NO_DIRECTION) and square < np.float32(1e20)):
-        return _F1, _F0, _F0, _F0, _F0
-    inverse = _F1 / np.sqrt(square)
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+    has = (square > np.float32(_NO_DIRECTION)) & (square < np.float32(1e20))
+    inverse = _F1 / np.sqrt(square if has else _F1)
+    return (
+        w * inverse if has else _F1, x * inverse if has else _F0, y * inverse if has else _F0,
+        z * inverse if has else _F0, inverse if has else _F0,
+    )  # fmt: skip
 
 
 @part
@@ -91,32 +109,38 @@ def _rotation(w, x, y, z):
 
 
 @part
-def _scale(params, i, k):
-    return exp32(min(max(params[i, SCALE + k], np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
+def _scale(raw):
+    return exp32(min(max(raw, np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
 
 
 @part
-def _camera_point(cams, b, params, velocity, i):
-    t = cams[b, TIME]
-    x = params[i, 0] + t * velocity[i, 0] - cams[b, ORIGIN]
-    y = params[i, 1] + t * velocity[i, 1] - cams[b, ORIGIN + 1]
-    z = params[i, 2] + t * velocity[i, 2] - cams[b, ORIGIN + 2]
+def camera_point(cam, params, velocity, i):
+    """Gaussian i in the axes of camera ``held``, where it is when that looks."""
+    t = cam[TIME]
+    x = params[i, 0] + t * velocity[i, 0] - cam[ORIGIN]
+    y = params[i, 1] + t * velocity[i, 1] - cam[ORIGIN + 1]
+    z = params[i, 2] + t * velocity[i, 2] - cam[ORIGIN + 2]
+    return _turned(cam, x, y, z)
+
+
+@part
+def _turned(cam, x, y, z):
     return (
-        cams[b, 0] * x + cams[b, 1] * y + cams[b, 2] * z,
-        cams[b, 3] * x + cams[b, 4] * y + cams[b, 5] * z,
-        cams[b, 6] * x + cams[b, 7] * y + cams[b, 8] * z,
+        cam[0] * x + cam[1] * y + cam[2] * z,
+        cam[3] * x + cam[4] * y + cam[5] * z,
+        cam[6] * x + cam[7] * y + cam[8] * z,
     )
 
 
 @part
-def _flattener(cams, b, x, y, z):
+def flattener(cam, x, y, z):
     """What takes world axes to pixels at a camera point: mean (u, v), the rows of J W (2 x 3), and what its
     gradient needs. The ratios x / z and y / z are held to 1.3 of the field of view, where J is taken."""
     inverse = _F1 / z
     a, c = x * inverse, y * inverse
-    ta = min(max(a, cams[b, LIMITS]), cams[b, LIMITS + 1])
-    tc = min(max(c, cams[b, LIMITS + 2]), cams[b, LIMITS + 3])
-    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = _bent(cams, b, ta, tc)
+    ta = min(max(a, cam[LIMITS]), cam[LIMITS + 1])
+    tc = min(max(c, cam[LIMITS + 2]), cam[LIMITS + 3])
+    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = bent(cam, ta, tc)
     # Beyond the limits the lens goes on straight: its polynomial folds back into the picture out there.
     u += dxx * (a - ta) + dxy * (c - tc)
     v += dxy * (a - ta) + dyy * (c - tc)
@@ -124,77 +148,109 @@ def _flattener(cams, b, x, y, z):
 
 
 @part
-def _times(cams, b, j0, j1, j2):
+def _times(cam, j0, j1, j2):
     """A row of camera axes -> of world axes."""
     return (
-        j0 * cams[b, 0] + j1 * cams[b, 3] + j2 * cams[b, 6],
-        j0 * cams[b, 1] + j1 * cams[b, 4] + j2 * cams[b, 7],
-        j0 * cams[b, 2] + j1 * cams[b, 5] + j2 * cams[b, 8],
+        j0 * cam[0] + j1 * cam[3] + j2 * cam[6],
+        j0 * cam[1] + j1 * cam[4] + j2 * cam[7],
+        j0 * cam[2] + j1 * cam[5] + j2 * cam[8],
     )
 
 
 @part
-def project_one(cams, b, params, velocity, harmonics, i, projected, tiles):
-    """Fill projected[b, i] (PROJECTED,) and tiles[b, i] (x0, x1, y0, y1: tiles it may touch; x1 <= x0:
-    none). conic: the inverse of the picture covariance, upper triangle."""
-    tiles[b, i, 0] = tiles[b, i, 1] = tiles[b, i, 2] = tiles[b, i, 3] = 0
-    x, y, z = _camera_point(cams, b, params, velocity, i)
-    raw = params[i, OPACITY]
-    if not (z > cams[b, NEAR] and z < np.float32(FAR)) or not is_finite(raw):
-        return
-    fx, fy = cams[b, LENS], cams[b, LENS + 1]
-    _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = _flattener(cams, b, x, y, z)
-    gx, gy = fx * inverse, fy * inverse
-    t0, t1, t2 = _times(cams, b, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
-    t3, t4, t5 = _times(cams, b, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
-    qw, qx, qy, qz, _ = _unit_quaternion(params, i)
-    r0, r1, r2, r3, r4, r5, r6, r7, r8 = _rotation(qw, qx, qy, qz)
-    s0, s1, s2 = _scale(params, i, 0), _scale(params, i, 1), _scale(params, i, 2)
-    v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
-        t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
-    w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
-        t3 * r2 + t4 * r5 + t5 * r8) * s2  # fmt: skip
-    low = np.float32(LOW_PASS)
-    # The covariance is V V^T + low-pass: symmetric, and its determinant a sum of squares by Lagrange's
-    # identity, which a difference of products would lose for needles.
-    e, g = v0 * v0 + v1 * v1 + v2 * v2, w0 * w0 + w1 * w1 + w2 * w2
-    n0, n1, n2 = v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0
-    determinant = max(n0 * n0 + n1 * n1 + n2 * n2 + low * (e + g) + low * low, np.float32(1e-10))
-    e, g, f = e + low, g + low, v0 * w0 + v1 * w1 + v2 * w2
-    alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY)), np.float32(RAW_OPACITY))))
-    px, py = fx * u + cams[b, LENS + 2], fy * v + cams[b, LENS + 3]
-    if not is_finite(determinant) or not abs(px) + abs(py) < np.float32(1e6) or not is_finite(e + g):
-        return
-    if alpha <= np.float32(ALPHA_LEAST):
-        return
-    reach = _F2 * np.log(alpha * np.float32(1.0 / ALPHA_LEAST))
-    rx, ry = np.sqrt(reach * e), np.sqrt(reach * g)
-    width, height = cams[b, SIZE], cams[b, SIZE + 1]
-    if px + rx <= _F0 or px - rx >= width or py + ry <= _F0 or py - ry >= height:
-        return
-    over = np.float32(1.0 / TILE)
-    x0, y0 = max(px - rx, _F0), max(py - ry, _F0)
-    x1, y1 = min(px + rx, width - _HALF), min(py + ry, height - _HALF)
-    tiles[b, i, 0], tiles[b, i, 1] = np.int32(x0 * over), np.int32(x1 * over) + 1
-    tiles[b, i, 2], tiles[b, i, 3] = np.int32(y0 * over), np.int32(y1 * over) + 1
-    inv = _F1 / determinant
-    row = projected[b, i]
-    row[MX], row[MY], row[DEPTH] = px, py, z
-    row[QA], row[QB], row[QC] = g * inv, -f * inv, e * inv
-    row[ALPHA], row[RADIUS] = alpha, np.sqrt(max(e, g))
+def _unfold(gaussians, base, count, s):
+    """Gaussians base, ..., base + count - 1 as no camera has seen them yet, to the rows of ``s``: place,
+    velocity, the axes of the ellipsoid times their lengths, opacity, and how far the Gaussian reaches, in
+    standard deviations squared (0: nowhere)."""
+    params, velocity = gaussians.params, gaussians.velocity
+    for j in range(count):
+        i = base + j
+        for k in range(3):
+            s[_X + k * BLOCK + j], s[_VX + k * BLOCK + j] = params[i, k], velocity[i, k]
+            s[_S + k * BLOCK + j] = params[i, SCALE + k]
+        for k in range(4):
+            s[_Q + k * BLOCK + j] = params[i, QUATERNION + k]
+        s[_ALPHA + j] = params[i, OPACITY]
+    for j in range(BLOCK):
+        w, x, y, z, _ = _unit_quaternion(
+            s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
+        )
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = _rotation(w, x, y, z)
+        s0, s1, s2 = _scale(s[_S + j]), _scale(s[_S + BLOCK + j]), _scale(s[_S + 2 * BLOCK + j])
+        s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j] = r0 * s0, r1 * s1, r2 * s2
+        s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j] = r3 * s0, r4 * s1, r5 * s2
+        s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j] = r6 * s0, r7 * s1, r8 * s2
+        raw = s[_ALPHA + j]
+        alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY)), np.float32(RAW_OPACITY))))
+        shows = is_finite(raw) & (alpha > np.float32(ALPHA_LEAST))
+        s[_ALPHA + j] = alpha
+        s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_LEAST)) if shows else _F0
+
+
+@part
+def _flatten(cam, s):
+    """What camera ``held`` sees of the Gaussians in the rows of ``s``: mean, depth and covariance in the
+    picture, and the edges of what each reaches in tiles, LEFT > RIGHT where it is not in the picture."""
+    fx, fy, width, height = cam[LENS], cam[LENS + 1], cam[SIZE], cam[SIZE + 1]
+    low, over, t = np.float32(LOW_PASS), np.float32(1.0 / TILE), cam[TIME]
+    for j in range(BLOCK):
+        x, y, z = _turned(
+            cam,
+            s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
+            s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
+            s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
+        )
+        shows = (z > cam[NEAR]) & (z < np.float32(FAR)) & (s[_REACH + j] > _F0)
+        _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = flattener(cam, x, y, z if shows else _F1)
+        gx, gy = fx * inverse, fy * inverse
+        t0, t1, t2 = _times(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
+        t3, t4, t5 = _times(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
+        m0, m1, m2 = s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j]
+        m3, m4, m5 = s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j]
+        m6, m7, m8 = s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j]
+        v0, v1, v2 = t0 * m0 + t1 * m3 + t2 * m6, t0 * m1 + t1 * m4 + t2 * m7, t0 * m2 + t1 * m5 + t2 * m8
+        w0, w1, w2 = t3 * m0 + t4 * m3 + t5 * m6, t3 * m1 + t4 * m4 + t5 * m7, t3 * m2 + t4 * m5 + t5 * m8
+        # The covariance is V V^T + low-pass: symmetric, and its determinant a sum of squares by Lagrange's
+        # identity, which a difference of products would lose for needles.
+        e, g = v0 * v0 + v1 * v1 + v2 * v2, w0 * w0 + w1 * w1 + w2 * w2
+        n0, n1, n2 = v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0
+        determinant = max(n0 * n0 + n1 * n1 + n2 * n2 + low * (e + g) + low * low, np.float32(1e-10))
+        e, g, f = e + low, g + low, v0 * w0 + v1 * w1 + v2 * w2
+        px, py = fx * u + cam[LENS + 2], fy * v + cam[LENS + 3]
+        shows = shows & is_finite(determinant) & (abs(px) + abs(py) < np.float32(1e6)) & is_finite(e + g)
+        rx, ry = np.sqrt(s[_REACH + j] * e), np.sqrt(s[_REACH + j] * g)
+        shows = shows & (px + rx > _F0) & (px - rx < width) & (py + ry > _F0) & (py - ry < height)
+        inv = _F1 / determinant
+        s[_PX + j], s[_PY + j], s[_PZ + j] = px, py, z
+        s[_A + j], s[_B + j], s[_C + j] = g * inv, -f * inv, e * inv
+        s[_WIDE + j] = np.sqrt(max(e, g))
+        s[_LEFT + j] = max(px - rx, _F0) * over if shows else _F1
+        s[_RIGHT + j] = min(px + rx, width - _HALF) * over if shows else -_F1
+        s[_TOP + j], s[_BOTTOM + j] = max(py - ry, _F0) * over, min(py + ry, height - _HALF) * over
+
+
+@part
+def _write(cam, gaussians, i, s, j, row, edges):
+    """Fill row (PROJECTED,) and edges (4,) from lane j of ``s``. conic: the inverse of the picture
+    covariance, upper triangle."""
+    params, harmonics = gaussians.params, gaussians.harmonics
+    row[MX], row[MY], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
+    row[QA], row[QB], row[QC] = s[_A + j], s[_B + j], s[_C + j]
+    row[ALPHA], row[RADIUS] = s[_ALPHA + j], s[_WIDE + j]
     for k in range(3):
         row[RED + k] = params[i, COLOR + k]
     if harmonics > 1:
-        ox, oy, oz = params[i, 0] - cams[b, ORIGIN], params[i, 1] - cams[b, ORIGIN + 1], (
-            params[i, 2] - cams[b, ORIGIN + 2])  # fmt: skip
+        ox, oy, oz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (
+            params[i, 2] - cam[ORIGIN + 2])  # fmt: skip
         length = _F1 / max(np.sqrt(ox * ox + oy * oy + oz * oz), np.float32(1e-9))
         ox, oy, oz = ox * length, oy * length, oz * length
         for h in range(1, harmonics):
             value = harmonic(h, ox, oy, oz)
             for k in range(3):
                 row[RED + k] += value * params[i, BASE + 3 * (h - 1) + k]
-    if not is_finite(row[RED] + row[RED + 1] + row[RED + 2]):
-        tiles[b, i, 1] = tiles[b, i, 0]
+    if is_finite(row[RED] + row[RED + 1] + row[RED + 2]):
+        edges[0], edges[1] = np.int32(s[_LEFT + j]), np.int32(s[_RIGHT + j]) + 1
+        edges[2], edges[3] = np.int32(s[_TOP + j]), np.int32(s[_BOTTOM + j]) + 1
 
 
 @part
@@ -221,23 +277,25 @@ def _harmonic_slope(h, x, y, z):
 
 @part
 def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
-    """Add to out (BASE + ...,) the gradient of what ``project_one`` made of Gaussian i.
+    """Add to out (BASE + ...,) the gradient of what ``project`` made of Gaussian i.
 
     sums: float32 (9,), over the pixels it covers: d loss / d power (h), h dx, h dy, h dx^2, h dx dy, h dy^2
     with (dx, dy) from the mean to the pixel, and d loss / d colour. Returns the length of the gradient of
     the mean in the picture (pixels)."""
-    row = projected[b, i]
-    x, y, z = _camera_point(cams, b, params, velocity, i)
-    fx, fy = cams[b, LENS], cams[b, LENS + 1]
-    a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = _flattener(cams, b, x, y, z)
+    row, cam = projected[b, i], held(cams, b)
+    x, y, z = camera_point(cam, params, velocity, i)
+    fx, fy = cam[LENS], cam[LENS + 1]
+    a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = flattener(cam, x, y, z)
     gx, gy = fx * inverse, fy * inverse
     j0, j1, j2 = gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc)
     j3, j4, j5 = gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc)
-    t0, t1, t2 = _times(cams, b, j0, j1, j2)
-    t3, t4, t5 = _times(cams, b, j3, j4, j5)
-    qw, qx, qy, qz, q_inverse = _unit_quaternion(params, i)
+    t0, t1, t2 = _times(cam, j0, j1, j2)
+    t3, t4, t5 = _times(cam, j3, j4, j5)
+    qw, qx, qy, qz, q_inverse = _unit_quaternion(
+        params[i, QUATERNION], params[i, QUATERNION + 1], params[i, QUATERNION + 2], params[i, QUATERNION + 3]
+    )
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = _rotation(qw, qx, qy, qz)
-    s0, s1, s2 = _scale(params, i, 0), _scale(params, i, 1), _scale(params, i, 2)
+    s0, s1, s2 = _scale(params[i, SCALE]), _scale(params[i, SCALE + 1]), _scale(params[i, SCALE + 2])
     v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
         t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
     w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
@@ -275,12 +333,12 @@ def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
     # dT = dU R^T, then dJ = dT W^T
     c0, c1, c2 = a0 * r0 + a1 * r1 + a2 * r2, a0 * r3 + a1 * r4 + a2 * r5, a0 * r6 + a1 * r7 + a2 * r8
     c3, c4, c5 = b0 * r0 + b1 * r1 + b2 * r2, b0 * r3 + b1 * r4 + b2 * r5, b0 * r6 + b1 * r7 + b2 * r8
-    k0 = c0 * cams[b, 0] + c1 * cams[b, 1] + c2 * cams[b, 2]
-    k1 = c0 * cams[b, 3] + c1 * cams[b, 4] + c2 * cams[b, 5]
-    k2 = c0 * cams[b, 6] + c1 * cams[b, 7] + c2 * cams[b, 8]
-    k3 = c3 * cams[b, 0] + c4 * cams[b, 1] + c5 * cams[b, 2]
-    k4 = c3 * cams[b, 3] + c4 * cams[b, 4] + c5 * cams[b, 5]
-    k5 = c3 * cams[b, 6] + c4 * cams[b, 7] + c5 * cams[b, 8]
+    k0 = c0 * cam[0] + c1 * cam[1] + c2 * cam[2]
+    k1 = c0 * cam[3] + c1 * cam[4] + c2 * cam[5]
+    k2 = c0 * cam[6] + c1 * cam[7] + c2 * cam[8]
+    k3 = c3 * cam[0] + c4 * cam[1] + c5 * cam[2]
+    k4 = c3 * cam[3] + c4 * cam[4] + c5 * cam[5]
+    k5 = c3 * cam[6] + c4 * cam[7] + c5 * cam[8]
     dz = -inverse * (k0 * j0 + k1 * j1 + k2 * j2 + k3 * j3 + k4 * j4 + k5 * j5)
     # J by the ratios: J = D P with P = (1, 0, -ta; 0, 1, -tc) / z
     dda = fx * du * dxx + fy * dv * dxy
@@ -293,16 +351,16 @@ def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
         ddc += p0 * xxy + (p1 + p2) * xyy + p3 * yyy - (gx * dxy * k2 + gy * dyy * k5)
     dx, dy = dda * inverse, ddc * inverse
     dz -= (dda * a + ddc * c) * inverse
-    o0 = cams[b, 0] * dx + cams[b, 3] * dy + cams[b, 6] * dz
-    o1 = cams[b, 1] * dx + cams[b, 4] * dy + cams[b, 7] * dz
-    o2 = cams[b, 2] * dx + cams[b, 5] * dy + cams[b, 8] * dz
+    o0 = cam[0] * dx + cam[3] * dy + cam[6] * dz
+    o1 = cam[1] * dx + cam[4] * dy + cam[7] * dz
+    o2 = cam[2] * dx + cam[5] * dy + cam[8] * dz
     if abs(params[i, OPACITY]) < np.float32(RAW_OPACITY):
         out[OPACITY] += sums[0] * (_F1 - row[ALPHA])
     for k in range(3):
         out[COLOR + k] += sums[6 + k]
     if harmonics > 1:
-        nx, ny, nz = params[i, 0] - cams[b, ORIGIN], params[i, 1] - cams[b, ORIGIN + 1], (
-            params[i, 2] - cams[b, ORIGIN + 2])  # fmt: skip
+        nx, ny, nz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (
+            params[i, 2] - cam[ORIGIN + 2])  # fmt: skip
         length = _F1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-9))
         nx, ny, nz = nx * length, ny * length, nz * length
         lx, ly, lz = _F0, _F0, _F0
@@ -326,15 +384,22 @@ def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
 
 @kernel
 def project(counter, worker, cams, gaussians, count, projected, tiles):
-    """Tasks are blocks of Gaussians of one camera. cams: float32 (B, CAMERA). projected: float32
-    (B, >= count, PROJECTED), tiles: int32 (B, >= count, 4), both written."""
-    blocks = (count + BLOCK - 1) // BLOCK
+    """Fill projected: float32 (B, >= count, PROJECTED), and tiles: int32 (B, >= count, 4), the tiles that a
+    Gaussian may touch: x0, x1, y0, y1, x1 <= x0: none. Tasks are blocks of Gaussians, each for all the
+    cameras (float32 (B, CAMERA)): what no camera changes is worked out once."""
+    s = np.zeros(_ROWS * BLOCK, np.float32)
     while True:
-        task = fetch_add(counter, 1)
-        if task >= blocks * cams.shape[0]:
+        base = fetch_add(counter, 1) * BLOCK
+        if base >= count:
             return
-        b, block = task // blocks, task % blocks
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, count)):
-            project_one(
-                cams, b, gaussians.params, gaussians.velocity, gaussians.harmonics, i, projected, tiles
-            )
+        here = min(BLOCK, count - base)
+        _unfold(gaussians, base, here, s)
+        for b in range(cams.shape[0]):
+            cam = held(cams, b)
+            _flatten(cam, s)
+            for j in range(here):
+                i = base + j
+                edges = tiles[b, i]
+                edges[0] = edges[1] = edges[2] = edges[3] = 0
+                if s[_LEFT + j] <= s[_RIGHT + j]:
+                    _write(cam, gaussians, i, s, j, projected[b, i], edges)

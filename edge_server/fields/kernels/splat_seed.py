@@ -8,10 +8,14 @@ import numpy as np
 from edge_server.fields.kernels.intrinsics import fetch_add
 from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.rays import HORIZON, pixel_direction
-from edge_server.fields.kernels.splat_project import LENS, NEAR, ORIGIN, _bent
+from edge_server.fields.kernels.splat_project import LENS, NEAR, ORIGIN, bent, held
 
 MOST_VIEWS = 32  # that vote
 NOT_SEEN = -2.0
+SEES, UNMARKED = (
+    1,
+    256,
+)  # what a pixel says of a cell; more than MOST_VIEWS of the one are less than the other
 _EMPTY_VIEWS = 2  # that see plain background through a cell suffice to empty it
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
@@ -23,36 +27,94 @@ def _spread(u):
     return _F1 / ((np.float32(2.0) - u) * u) if u > _F1 else _F1
 
 
+@part
+def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
+    """Where camera ``held`` sees each cell of a row (its places: float32 (3, cells)): the pixel's number,
+    ``nowhere`` if it is not in the picture, to pixels: int32 (cells,)."""
+    for k in range(pixels.size):
+        x, y, z = row[0, k] - cam[ORIGIN], row[1, k] - cam[ORIGIN + 1], row[2, k] - cam[ORIGIN + 2]
+        depth = cam[6] * x + cam[7] * y + cam[8] * z
+        over = _F1 / (depth if depth > cam[NEAR] else _F1)
+        a, b = (cam[0] * x + cam[1] * y + cam[2] * z) * over, (cam[3] * x + cam[4] * y + cam[5] * z) * over
+        sees = (depth > cam[NEAR]) & (abs(a) < np.float32(4.0)) & (abs(b) < np.float32(4.0))
+        through = bent(cam, a, b)
+        px, py = cam[LENS] * through[0] + cam[LENS + 2], cam[LENS + 1] * through[1] + cam[LENS + 3]
+        sees = sees & (px >= _F0) & (py >= _F0) & (px < width) & (py < height)
+        column, line = np.int32(px if sees else _F0), np.int32(py if sees else _F0)
+        pixels[k] = first + line * width + column if sees else nowhere
+
+
+@part
+def _hidden_cells(cams, size, first, says, row, pixels, told, hidden):
+    """Which cells of a row most cameras that see them see unmarked, to hidden: bool (cells,); returns
+    whether all are. Side by side, since nearly all are: few of hundred thousands need a closer look.
+
+    says: int32 (P + 1,), what a pixel says: ``SEES``, ``SEES + UNMARKED``, or nothing, as the last does."""
+    total, cells = cams.shape[0], pixels.size
+    for k in range(cells):
+        told[k] = 0
+    for v in range(total):
+        width, height = np.int32(size[v, 0]), np.int32(size[v, 1])
+        _pixels_of_row(held(cams, v), np.int32(first[v]), width, height, np.int32(says.size - 1), row, pixels)
+        few = 0
+        for k in range(cells):
+            told[k] += says[np.int64(pixels[k])]
+        if 2 * v < total:
+            continue
+        for k in range(cells):
+            few += np.int32(2 * (told[k] // UNMARKED) <= total)
+        if few == 0:
+            return True
+    for k in range(cells):
+        hidden[k] = 2 * (told[k] // UNMARKED) > told[k] % UNMARKED
+    return False
+
+
 @kernel
-def score_cells(counter, worker, cams, views, blurred, marks, plain, plain_color, tolerance, contracted,
+def score_cells(counter, worker, cams, views, blurred, says, plain, plain_color, tolerance, contracted,
                 cells, min_views, scores):  # fmt: skip
     """scores: float32 (cells^3,), x fastest: how well the cameras agree on a colour there, up to 1; NOT_SEEN
     where fewer than min_views look or background shows. Tasks are layers along z.
 
     views: ``rays.Views`` of at most MOST_VIEWS cameras, rows of ``cams``; blurred: uint8 (pixels, 3 or 4),
-    their pictures at the cells' sharpness; pixels of weight 0 have no say. marks: uint8 (pixels,), or (0,):
-    only cells that most cameras see marked are looked at, the others are NOT_SEEN. plain: whether plain_color
-    (3,) is an empty background; tolerance: of a colour, summed over channels, in [0, 3].
+    their pictures at the cells' sharpness; pixels of weight 0 have no say. says: see ``_hidden_cells``:
+    only cells that most cameras see marked are looked at, the others are NOT_SEEN; or (0,): all are. plain:
+    whether plain_color (3,) is an empty background; tolerance: of a colour, summed over channels, in [0, 3].
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
     colors = np.empty((MOST_VIEWS, 3), np.float32)
+    places, pixels = np.empty((3, cells), np.float32), np.empty(cells, np.int32)
+    told, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
+    sizes, firsts = views.size, views.first
+    size = np.float32(2.0) * half / np.float32(cells)
     while True:
         layer = fetch_add(counter, 1)
         if layer >= cells:
             return
         for iy in range(cells):
+            if says.size > 0:
+                for ix in range(cells):
+                    x = (np.float32(ix) + np.float32(0.5)) * size - half
+                    y = (np.float32(iy) + np.float32(0.5)) * size - half
+                    z = (np.float32(layer) + np.float32(0.5)) * size - half
+                    s = _spread(max(abs(x), max(abs(y), abs(z)))) if contracted else _F1
+                    places[0, ix], places[1, ix], places[2, ix] = x * s, y * s, z * s
+                if _hidden_cells(cams, sizes, firsts, says, places, pixels, told, hidden):
+                    for ix in range(cells):
+                        scores[ix + cells * (iy + cells * layer)] = np.float32(NOT_SEEN)
+                    continue
             for ix in range(cells):
-                size = np.float32(2.0) * half / np.float32(cells)
+                if says.size > 0 and hidden[ix]:
+                    scores[ix + cells * (iy + cells * layer)] = np.float32(NOT_SEEN)
+                    continue
                 x = (np.float32(ix) + np.float32(0.5)) * size - half
                 y = (np.float32(iy) + np.float32(0.5)) * size - half
                 z = (np.float32(layer) + np.float32(0.5)) * size - half
                 if contracted:
                     s = _spread(max(abs(x), max(abs(y), abs(z))))
                     x, y, z = x * s, y * s, z * s
-                n, empty, unmarked = 0, 0, 0
+                n, empty = 0, 0
                 for v in range(total):
-                    if 2 * unmarked > total:
-                        break
                     dx, dy, dz = x - cams[v, ORIGIN], y - cams[v, ORIGIN + 1], z - cams[v, ORIGIN + 2]
                     depth = cams[v, 6] * dx + cams[v, 7] * dy + cams[v, 8] * dz
                     if depth <= cams[v, NEAR]:
@@ -61,17 +123,15 @@ def score_cells(counter, worker, cams, views, blurred, marks, plain, plain_color
                     b = (cams[v, 3] * dx + cams[v, 4] * dy + cams[v, 5] * dz) / depth
                     if not (abs(a) < np.float32(4.0) and abs(b) < np.float32(4.0)):
                         continue
-                    bent = _bent(cams, v, a, b)
-                    px = cams[v, LENS] * bent[0] + cams[v, LENS + 2]
-                    py = cams[v, LENS + 1] * bent[1] + cams[v, LENS + 3]
+                    through = bent(held(cams, v), a, b)
+                    px = cams[v, LENS] * through[0] + cams[v, LENS + 2]
+                    py = cams[v, LENS + 1] * through[1] + cams[v, LENS + 3]
                     width, height = views.size[v, 0], views.size[v, 1]
                     if not (px >= _F0 and py >= _F0 and px < width and py < height):
                         continue
                     pixel = views.first[v] + np.int64(py) * width + np.int64(px)
                     if views.weight.size > 0 and views.weight[pixel] <= _F0:
                         continue
-                    if marks.size > 0:
-                        unmarked += 1 if marks[pixel] == 0 else 0
                     away = _F0
                     for c in range(3):
                         colors[n, c] = np.float32(blurred[pixel, c]) * np.float32(1.0 / 255.0)
@@ -82,8 +142,7 @@ def score_cells(counter, worker, cams, views, blurred, marks, plain, plain_color
                         empty += 1
                     n += 1
                 best = 0
-                hidden = 2 * unmarked > n
-                for j in range(0 if hidden else n):
+                for j in range(n):
                     agree = 0
                     for k in range(n):
                         apart = (
@@ -94,7 +153,7 @@ def score_cells(counter, worker, cams, views, blurred, marks, plain, plain_color
                         agree += 1 if apart < tolerance else 0
                     best = max(best, agree)
                 score = np.float32(best - 1) / np.float32(n + 1)
-                if hidden or n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
+                if n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
                     score = np.float32(NOT_SEEN)
                 scores[ix + cells * (iy + cells * layer)] = score
 
