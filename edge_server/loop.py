@@ -267,6 +267,7 @@ class Loop:
         self._next_policy: Policy | None = None
         self._reset = False
         self._update_ms = 0.0
+        self._idle = False
         self.paused = False
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._main, name="loop", daemon=True)
@@ -349,11 +350,22 @@ class Loop:
             self._stop.wait(0.01)  # every selected frame is damaged: newer ones will come
             return
         views, report = fitted
+        self._warn_if_idle(report)
         renderer = self._updates.field.snapshot(present_ns=self._clock.now_ns())
         publication = self._updates.publication(selection, views, report, self._clock.now_ns())
         self._update_ms = publication.update_ms
         self._pacing.done(budget, publication.update_ms)
         self._on_published(publication, renderer, views)
+
+    def _warn_if_idle(self, report: FitReport) -> None:
+        """Say so once, and again if it comes back, where an update's time is too short to learn anything."""
+        if report.steps == 0 and not self._idle:
+            log.warning(
+                "an update of %.0f ms made no step: all its time went into taking in new pictures. Give "
+                "updates more (edge.update_ms or edge.deadline_ms), or take a field that needs less of it",
+                report.seconds * 1e3,
+            )
+        self._idle = report.steps == 0
 
     def _write_checkpoints(self) -> None:
         while True:

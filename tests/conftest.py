@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,9 @@ settings.register_profile("freshfield", deadline=None, derandomize=True)
 settings.load_profile("freshfield")
 
 ROOT = Path(__file__).resolve().parent.parent
+
+# deploy/ is a folder of scripts, not an installed package: tests put it on the path as python does.
+sys.path.insert(0, str(ROOT / "deploy"))
 
 # What computes, in virtual time or none: whoever runs beside it changes nothing but how long it takes. All
 # else meets clocks, ports or whole deployments and has the machine to itself.

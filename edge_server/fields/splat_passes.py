@@ -16,6 +16,7 @@ from edge_server.fields.kernels.splat_project import (
     NEAR,
     ORIGIN,
     PROJECTED,
+    REACHED,
     SIZE,
     TILE,
     TIME,
@@ -82,7 +83,7 @@ class Passes:
     def __init__(self, pool: Pool) -> None:
         self.pool = pool
         self.projected = np.zeros((0, 0, PROJECTED), np.float32)
-        self.tiles = np.zeros((0, 0, 4), np.int32)
+        self.tiles = np.zeros((0, 0, REACHED), np.int32)
         self.memory = np.zeros((pool.threads, ROWS * PIXELS), np.float32)
         self.kept = np.zeros((pool.threads, KEPT), np.float32)
         self.sums = np.zeros((0, 0, SUMS), np.float32)
@@ -116,6 +117,7 @@ class Passes:
             self._lists = self.lists._replace(
                 pair=np.zeros((self.lists.pair.shape[0], room), np.int32),
                 owner=np.zeros((self.lists.pair.shape[0], room), np.int32),
+                tile=np.zeros((self.lists.pair.shape[0], room), np.int32),
             )
             self._deal(count)
         length = max(int(self.lists.longest[:slots].max(initial=0)), 1) * KEPT if differentiate else KEPT
@@ -139,12 +141,13 @@ class Passes:
         tiles = max(tiles, 0 if self._lists is None else self._lists.wanted.shape[1])
         pairs = max(4 * room, 1024, 0 if self._lists is None else self._lists.pair.shape[1])
         self.projected = np.zeros((slots, room, PROJECTED), np.float32)
-        self.tiles = np.zeros((slots, room, 4), np.int32)
+        self.tiles = np.zeros((slots, room, REACHED), np.int32)
         self._lists = Lists(
             wanted=np.zeros((slots, tiles), np.uint8),
             first=np.zeros((slots, tiles + 1), np.int32),
             pair=np.zeros((slots, pairs), np.int32),
             owner=np.zeros((slots, pairs), np.int32),
+            tile=np.zeros((slots, pairs), np.int32),
             own_first=np.zeros((slots, room), np.int32),
             own_count=np.zeros((slots, room), np.int32),
             needed=np.zeros(slots, np.int64),

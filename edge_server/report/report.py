@@ -96,9 +96,9 @@ def ages(rows: Sequence[Row]) -> dict[str, Any]:
 
 def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     """{count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication, undecodable,
-    refused: {camera: how often the field left its picture out}}, and where the scenario sets one deadline_ms
-    and met_share, of the updates within it. ``edge``: the same as the edge knew it, for lines that were not
-    written any more."""
+    without_step: those that had no time to learn, refused: {camera: how often the field left its picture
+    out}}, and where the scenario sets one deadline_ms and met_share, of the updates within it. ``edge``: the
+    same as the edge knew it, for lines that were not written any more."""
     spent = _known(row.get("update_ms") for row in series)
     first = series[0]["t_s"] * 1e3 if series else None
     deadline_ms = _number(edge.get("deadline_ms"))
@@ -108,6 +108,7 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
         "ms_p95": float(np.percentile(spent, 95)) if spent else edge.get("ms_p95"),
         "first_ms": edge.get("first_ms", first),
         "undecodable": edge.get("undecodable"),
+        "without_step": sum(row.get("steps") == 0 for row in series),
         "refused": dict(sorted(Counter(c for row in series for c in row.get("refused") or ()).items())),
     }
     if deadline_ms is not None:

@@ -142,6 +142,30 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.published[-1][0].omega_ms == 0.0
 
 
+def test_an_update_without_time_to_learn_is_told_once_and_again_if_it_comes_back(running, caplog):
+    class Changing:
+        """No time at all, then some, then none again."""
+
+        def __init__(self):
+            self.updates = 0
+
+        def budget(self):
+            return Budget(steps=1) if self.updates == 4 else Budget(seconds=1e-6)
+
+        def done(self, budget, update_ms):
+            self.updates += 1
+
+    u = updates()
+    now = WallClock().now_ns()
+    u.buffer.put(frame("cam01", generated_ns=now), now)
+    run = running(u, pacing=Changing())
+    run.until(lambda: len(run.published) >= 8)
+    run.loop.stop()
+    assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]
+    told = [record.message for record in caplog.records if "made no step" in record.message]
+    assert len(told) == 2 and "edge.update_ms" in told[0]
+
+
 def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
     u = updates()
     run = running(u, grace_ms=100.0)

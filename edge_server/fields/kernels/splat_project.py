@@ -21,6 +21,9 @@ POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
 BASE = 14
 # Columns of a projected Gaussian.
 MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 12
+# Columns of what a Gaussian reaches: tiles x0, x1, y0, y1 (x1 <= x0: none); and which of them, bit by bit,
+# x fastest, the first 64 (from there on, all of them).
+FIRST_64, REACHED = 4, 6
 # Columns of a camera.
 ORIGIN, LENS, LIMITS, NEAR, SIZE, TIME, CAMERA = 9, 12, 20, 24, 25, 27, 28
 
@@ -230,8 +233,38 @@ def _flatten(cam, s):
 
 
 @part
+def _touched(px, py, a, b, c, reach, x0, x1, y0, y1):
+    """Which tiles of a box an ellipse has pixels in, as bits: those in whose nearest point to its middle
+    a dx^2 + 2 b dx dy + c dy^2 is no more than ``reach``. A box is twice as large as a slanting needle's
+    ellipse, and every tile of its costs as much as one that it touches."""
+    bits, bit = np.uint64(0), np.uint64(0)
+    most = reach * np.float32(1.001) + np.float32(1e-3)
+    slope_x, slope_y = -b / a, -b / c
+    for ty in range(y0, y1):
+        # From the middle to the centres of the tile's outermost pixels.
+        low_y = np.float32(TILE * ty) + _HALF - py
+        high_y = low_y + np.float32(TILE - 1)
+        dy = max(low_y, min(high_y, _F0))
+        for tx in range(x0, x1):
+            low_x = np.float32(TILE * tx) + _HALF - px
+            high_x = low_x + np.float32(TILE - 1)
+            dx = max(low_x, min(high_x, _F0))
+            # The least over a rectangle lies on one of the two edges that face the middle.
+            ex, ey = min(max(slope_x * dy, low_x), high_x), min(max(slope_y * dx, low_y), high_y)
+            least = min(
+                a * ex * ex + (b + b) * ex * dy + c * dy * dy, a * dx * dx + (b + b) * dx * ey + c * ey * ey
+            )
+            if least <= most:
+                bits |= np.uint64(1) << bit
+            bit += np.uint64(1)
+            if bit == np.uint64(64):
+                return bits
+    return bits
+
+
+@part
 def _write(cam, gaussians, i, s, j, row, edges):
-    """Fill row (PROJECTED,) and edges (4,) from lane j of ``s``. conic: the inverse of the picture
+    """Fill row (PROJECTED,) and edges (REACHED,) from lane j of ``s``. conic: the inverse of the picture
     covariance, upper triangle."""
     params, harmonics = gaussians.params, gaussians.harmonics
     row[MX], row[MY], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
@@ -251,6 +284,11 @@ def _write(cam, gaussians, i, s, j, row, edges):
     if is_finite(row[RED] + row[RED + 1] + row[RED + 2]):
         edges[0], edges[1] = np.int32(s[_LEFT + j]), np.int32(s[_RIGHT + j]) + 1
         edges[2], edges[3] = np.int32(s[_TOP + j]), np.int32(s[_BOTTOM + j]) + 1
+        bits = _touched(
+            row[MX], row[MY], row[QA], row[QB], row[QC], s[_REACH + j], edges[0], edges[1], edges[2], edges[3]
+        )
+        edges[FIRST_64] = np.int32(bits & np.uint64(0xFFFFFFFF))
+        edges[FIRST_64 + 1] = np.int32(bits >> np.uint64(32))
 
 
 @part
@@ -384,9 +422,9 @@ def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
 
 @kernel
 def project(counter, worker, cams, gaussians, count, projected, tiles):
-    """Fill projected: float32 (B, >= count, PROJECTED), and tiles: int32 (B, >= count, 4), the tiles that a
-    Gaussian may touch: x0, x1, y0, y1, x1 <= x0: none. Tasks are blocks of Gaussians, each for all the
-    cameras (float32 (B, CAMERA)): what no camera changes is worked out once."""
+    """Fill projected: float32 (B, >= count, PROJECTED), and tiles: int32 (B, >= count, REACHED). Tasks are
+    blocks of Gaussians, each for all the cameras (float32 (B, CAMERA)): what no camera changes is worked out
+    once."""
     s = np.zeros(_ROWS * BLOCK, np.float32)
     while True:
         base = fetch_add(counter, 1) * BLOCK

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.kernels.intrinsics import bits_of_float, fetch_add
 from edge_server.fields.kernels.jit import kernel, part
-from edge_server.fields.kernels.splat_project import DEPTH
+from edge_server.fields.kernels.splat_project import DEPTH, FIRST_64
 
 RADIX_BITS = 10
 RADIX = 1 << RADIX_BITS
@@ -20,19 +20,20 @@ _NEAREST, _UPPER = np.int32(0x3C23D70A), np.int32(9)  # the bits of .01; lower b
 
 
 class Lists(NamedTuple):
-    """A pair is a Gaussian and a tile it may touch; those of one Gaussian follow each other. B cameras,
+    """A pair is a Gaussian and a tile it touches; those of one Gaussian follow each other. B cameras,
     T tiles at most, N Gaussians, P pairs.
 
     wanted: uint8 (B, T), tiles that are looked at. first: int32 (B, T + 1) into ``pair``: int32 (B, P),
-    the tile's pairs front to back. owner: int32 (B, P), a pair's Gaussian. own_first, own_count: int32
-    (B, N), a Gaussian's pairs. needed, longest: int64 (B,), pairs there are (more than P: the farthest were
-    left out) and the longest list. order: int32 (B, 2, N), keys: uint32 (B, 2, N), scratch.
+    the tile's pairs front to back. owner, tile: int32 (B, P), a pair's Gaussian and its tile. own_first,
+    own_count: int32 (B, N), a Gaussian's pairs. needed, longest: int64 (B,), pairs there are (more than P:
+    the farthest were left out) and the longest list. order: int32 (B, 2, N), keys: uint32 (B, 2, N), scratch.
     """
 
     wanted: NDArray[np.uint8]
     first: NDArray[np.int32]
     pair: NDArray[np.int32]
     owner: NDArray[np.int32]
+    tile: NDArray[np.int32]
     own_first: NDArray[np.int32]
     own_count: NDArray[np.int32]
     needed: NDArray[np.int64]
@@ -65,6 +66,19 @@ def _sort(keys, order, n):
         order[0, to] = order[1, k]
 
 
+@part
+def _bits(tiles, b, i):
+    """The columns FIRST_64 of a Gaussian, as one number."""
+    low, high = np.uint64(np.uint32(tiles[b, i, FIRST_64])), np.uint64(np.uint32(tiles[b, i, FIRST_64 + 1]))
+    return low | (high << np.uint64(32))
+
+
+@part
+def _reaches(bits, n):
+    """1 if a Gaussian reaches the n-th tile of its box, else 0."""
+    return np.int64((bits >> np.uint64(min(n, 63))) & np.uint64(1)) if n < 64 else 1
+
+
 @kernel
 def deal(counter, worker, columns, rows, count, projected, tiles, lists):
     """Tasks are cameras. columns, rows: int64 (B,), tiles across and down. See ``Lists``."""
@@ -74,8 +88,8 @@ def deal(counter, worker, columns, rows, count, projected, tiles, lists):
             return
         keys, order, across = lists.keys[b], lists.order[b], columns[b]
         wanted, first = lists.wanted[b], lists.first[b]
-        own_first, own_count, owner, pair = (
-            lists.own_first[b], lists.own_count[b], lists.owner[b], lists.pair[b])  # fmt: skip
+        own_first, own_count, owner, tile, pair = (
+            lists.own_first[b], lists.own_count[b], lists.owner[b], lists.tile[b], lists.pair[b])  # fmt: skip
         total = across * rows[b]
         asked = 0
         for t in range(total):
@@ -86,12 +100,14 @@ def deal(counter, worker, columns, rows, count, projected, tiles, lists):
             x0, x1, y0, y1 = tiles[b, i, 0], tiles[b, i, 1], tiles[b, i, 2], tiles[b, i, 3]
             if x1 <= x0:
                 continue
-            touches = (x1 - x0) * (y1 - y0)
-            if asked < total:  # what lies elsewhere need not be sorted
-                touches = 0
+            bits, box, touches = _bits(tiles, b, i), 0, 0
+            if asked == total:
+                touches = 1 if bits != np.uint64(0) or (x1 - x0) * (y1 - y0) > 64 else 0
+            else:  # what lies elsewhere need not be sorted
                 for ty in range(y0, y1):
                     for tx in range(x0, x1):
-                        touches += np.int64(wanted[ty * across + tx])
+                        touches += np.int64(wanted[ty * across + tx]) * _reaches(bits, box)
+                        box += 1
             if touches > 0:
                 far = (bits_of_float(projected[b, i, DEPTH]) - _NEAREST) >> _UPPER
                 keys[0, n] = np.uint32(min(max(far, np.int32(0)), np.int32(RADIX * RADIX - 1)))
@@ -104,33 +120,27 @@ def deal(counter, worker, columns, rows, count, projected, tiles, lists):
         for k in range(n):
             i = order[0, k]
             own_first[i] = made
+            bits, box = _bits(tiles, b, i), 0
             for ty in range(tiles[b, i, 2], tiles[b, i, 3]):
                 for tx in range(tiles[b, i, 0], tiles[b, i, 1]):
                     t = ty * across + tx
-                    if wanted[t]:
-                        if made < room:
-                            owner[made] = i
-                            first[t + 1] += 1
-                            made += 1
-                        needed += 1
+                    hit = np.int64(wanted[t]) * _reaches(bits, box)
+                    if made < room:  # written in any case: a branch here would be guessed wrong too often
+                        owner[made], tile[made] = i, t
+                        first[t + 1] += hit
+                        made += hit
+                    needed += hit
+                    box += 1
             own_count[i] = made - own_first[i]
         longest = 0
         for t in range(total):
             longest = max(longest, first[t + 1])
             first[t + 1] += first[t]
         # first[t] serves as the tile's cursor and ends up where the next tile's list began.
-        made = 0
-        for k in range(n):
-            i = order[0, k]
-            if own_count[i] == 0:
-                continue
-            for ty in range(tiles[b, i, 2], tiles[b, i, 3]):
-                for tx in range(tiles[b, i, 0], tiles[b, i, 1]):
-                    t = ty * across + tx
-                    if wanted[t] and made < room:
-                        pair[first[t]] = made
-                        first[t] += 1
-                        made += 1
+        for p in range(made):
+            t = tile[p]
+            pair[first[t]] = p
+            first[t] += 1
         for t in range(total, 0, -1):
             first[t] = first[t - 1]
         first[0] = 0

@@ -12,12 +12,15 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.kernels.pool import CallerPool
+from edge_server.fields.kernels.splat_seed import NOT_SEEN, SEES, UNMARKED, score_cells
 from edge_server.fields.scene_box import scene_box
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_growth import opacity
 from edge_server.fields.splat_motion import drift
+from edge_server.fields.splat_passes import camera_rows
 from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.splat_settings import SplatSettings
+from edge_server.fields.supervision import pack_cameras
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
 SMALL = SplatSettings(gaussians=1500, start=800, seed_cells=32, densify_every=20, threads=2)
@@ -108,6 +111,47 @@ def test_nothing_begins_at_pixels_without_weight() -> None:
     assert len(found[0]) > 100
     np.testing.assert_array_equal(found[0], found[1])
     assert len(seeds(SMALL, pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(contracted: bool) -> None:
+    box, pool, cells = replace(scene_box(SEEN), contracted=contracted), CallerPool(), 12
+    cams = camera_rows([v.camera_to_world for v in SEEN], [v.intrinsics for v in SEEN], box)
+    data, rng = pack_cameras(SEEN, box), np.random.default_rng(3)
+    pixels = np.concatenate([v.image.reshape(-1, 3) for v in SEEN])
+    says = rng.choice([0, SEES, SEES + UNMARKED], len(pixels) + 1, p=[0.1, 0.7, 0.2]).astype(np.int32)
+    for k in range(0, len(SEEN), 2):  # most of them mark nothing
+        says[data.first[k] : data.first[k + 1]] = SEES + UNMARKED
+    says[-1] = 0
+    data = data._replace(weight=(says[:-1] > 0).astype(np.float32))
+
+    def scores(says: np.ndarray) -> np.ndarray:
+        found = np.zeros(cells**3, np.float32)
+        pool.run(score_cells, cams, data, pixels, says, False, np.zeros(3, np.float32), np.float32(0.3),
+                 contracted, cells, 2, found)  # fmt: skip
+        return found
+
+    everywhere, where_marked = scores(np.zeros(0, np.int32)), scores(says)
+    side = (np.arange(cells) + 0.5) * (4.0 if contracted else 2.0) / cells - (2.0 if contracted else 1.0)
+    z, y, x = np.meshgrid(side, side, side, indexing="ij")
+    places = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    far = np.abs(places).max(axis=1, keepdims=True)
+    if contracted:
+        places = np.where(far > 1.0, places / ((2.0 - far) * far), places)
+    seen, unmarked = np.zeros(len(places), int), np.zeros(len(places), int)
+    for k, view in enumerate(SEEN):
+        away = places * box.radius_m + box.centre_m - view.camera_to_world[:3, 3]
+        local = away @ view.camera_to_world[:3, :3]
+        ahead = local[:, 2] > max(0.01 * box.radius_m, box.near_m)
+        u, v = np.where(ahead[:, None], view.intrinsics.project(np.where(ahead[:, None], local, 1.0)), -1.0).T
+        inside = (u >= 0) & (v >= 0) & (u < view.intrinsics.width) & (v < view.intrinsics.height)
+        pixel = np.where(inside, v.astype(int) * view.intrinsics.width + u.astype(int), 0)
+        told = np.where(inside, says[data.first[k] : data.first[k + 1]][pixel], 0)
+        seen, unmarked = seen + told % UNMARKED, unmarked + told // UNMARKED
+    expected = np.where(2 * unmarked > seen, NOT_SEEN, everywhere)
+    assert 0.02 < (expected > NOT_SEEN).mean() < 0.8 * (everywhere > NOT_SEEN).mean()
+    # Rounding puts the middle of a cell now and then into the next pixel.
+    assert (where_marked == expected).mean() > 0.99
 
 
 def test_another_seed_is_another_field() -> None:

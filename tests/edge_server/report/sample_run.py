@@ -54,6 +54,7 @@ def publication(number: int) -> Publication:
         selected=CAMERAS[: 2 + number % 3],
         ages_ms=(80.0,) * (2 + number % 3),
         aaoi_ms=80.0 + number % 7,
+        steps=40,
         update_ms=740.0 + 3 * (number % 11),
         psnr_db=psnr if scored else None,
         psnr_moving_db=psnr - 4 if scored else None,

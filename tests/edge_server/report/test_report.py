@@ -36,7 +36,9 @@ def test_report_json_holds_what_is_returned_and_every_key_that_was_promised(run)
         "duplicated", "delivered", "rejected", "in_flight",
     }  # fmt: skip
     assert set(report["age_ms"]) == {"mean", "p50", "p95", "by_camera"}
-    assert set(report["updates"]) == {"count", "ms_p50", "ms_p95", "first_ms", "undecodable", "refused"}
+    assert set(report["updates"]) == {
+        "count", "ms_p50", "ms_p95", "first_ms", "undecodable", "without_step", "refused",
+    }  # fmt: skip
     assert set(report["fidelity"]["final"]) == set(report["fidelity"]["mean"]) == set(METRICS)
     assert set(report["fidelity"]["baseline"]) == {"mean_colour_db", "nearest_view_db"}
     assert report["fidelity"]["lpips_missing"] is None
@@ -81,6 +83,22 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
     assert updates["first_ms"] == 3100.0 and updates["undecodable"] == 1
     assert updates["ms_p50"] == np.percentile([publication(i).update_ms for i in range(49)], 50)
     assert updates["refused"] == {"cam02": 3}  # 5, 25 and 45
+    assert updates["without_step"] == 0
+
+
+def test_updates_that_had_no_time_to_learn_are_counted_and_shown():
+    rows = [{"t_s": 0.1 * k, "update_ms": 60.0, "steps": steps} for k, steps in enumerate((0, 3, 0))]
+    assert updates(rows, {})["without_step"] == 2
+
+
+def test_the_page_tells_of_updates_that_made_no_step(tmp_path):
+    write_run(tmp_path)
+    file = tmp_path / "series.jsonl"
+    lines = file.read_text().splitlines()
+    idle = [json.dumps(json.loads(line) | {"steps": 0}) for line in lines[:3]]
+    file.write_text("\n".join([*idle, *lines[3:]]) + "\n")
+    assert build_report(tmp_path)["updates"]["without_step"] == 3
+    assert "without time for a step: 3" in (tmp_path / "report.html").read_text()
 
 
 def test_every_figure_is_drawn_and_inside_the_page(run):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from edge_server.fields.kernels.intrinsics import exp32, fetch_add, uniform
+from edge_server.fields.kernels.intrinsics import exp32, fetch_add, log32, uniform
 from edge_server.fields.kernels.jit import FAST, SOURCES
 from edge_server.fields.kernels.mlp import forward
 from edge_server.fields.kernels.pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
@@ -107,6 +107,21 @@ def test_exp32_is_exp() -> None:
     np.testing.assert_allclose(_exp(x), np.exp(x.astype(np.float64)), rtol=3e-7)
     edge = _exp(np.array([-1e30, 1e30, np.nan], np.float32))
     assert 0 < edge[0] < 1e-37 and 1e38 < edge[1] < np.inf and np.isnan(edge[2])
+
+
+@njit(fastmath=FAST)
+def _log(x):
+    out = np.empty_like(x)
+    for k in range(x.size):
+        out[k] = log32(x[k])
+    return out
+
+
+def test_log32_is_log() -> None:
+    x = np.exp(np.linspace(-87.0, 88.0, 100_001)).astype(np.float32)
+    np.testing.assert_allclose(_log(x), np.log(x.astype(np.float64)), rtol=2e-7, atol=1e-8)
+    near = np.linspace(0.99, 1.01, 10_001).astype(np.float32)
+    np.testing.assert_allclose(_log(near), np.log(near.astype(np.float64)), rtol=2e-7, atol=1e-8)
 
 
 @njit

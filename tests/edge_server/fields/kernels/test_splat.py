@@ -354,6 +354,34 @@ def test_lists_are_front_to_back_whatever_the_thread_count() -> None:
         np.testing.assert_array_equal(a, c)
 
 
+@pytest.mark.parametrize("longest", [0.08, 3.0])
+def test_a_tile_lists_the_gaussians_that_have_a_pixel_in_it_and_hardly_another(longest: float) -> None:
+    """Needles in every direction, also such that the first 64 tiles of their box are not all of them."""
+    lens = Pinhole(150, 110, 160.0, 160.0, 74.0, 57.0)
+    params = _cloud(300, seed=6)
+    params[:, SCALE:QUATERNION] = np.log([0.01, 0.02, longest])
+    passes = Passes(CallerPool())
+    passes.look(_camera(lens), _still(params, 1), [None])
+    lists, columns = passes.lists, int(passes.columns[0])
+    total = columns * int(passes.rows[0])
+    listed = np.zeros((len(params), total), bool)
+    for t in range(total):
+        listed[lists.owner[0, lists.pair[0, lists.first[0, t] : lists.first[0, t + 1]]], t] = True
+    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    tile = (y // TILE).astype(int) * columns + (x // TILE).astype(int)
+    touched, over_64 = np.zeros_like(listed), np.zeros(len(params), bool)
+    for i in np.flatnonzero(passes.tiles[0, : len(params), 1] > 0):
+        mx, my, a, b, c, alpha = passes.projected[0, i, :6].astype(np.float64)
+        power = -0.5 * (a * (x - mx) ** 2 + c * (y - my) ** 2) - b * (x - mx) * (y - my)
+        touched[i, np.unique(tile[alpha * np.exp(power) >= 1.0 / 255.0])] = True
+        x0, x1, y0, y1 = passes.tiles[0, i, :4]
+        over_64[i] = (x1 - x0) * (y1 - y0) > 64
+    assert touched.sum() > 1000 and not (touched & ~listed).any()
+    assert over_64.any() == (longest > 1.0)
+    beside = listed & ~touched
+    assert beside[~over_64].sum() < 0.03 * touched.sum()
+
+
 def test_tiles_that_are_not_wanted_get_no_pairs() -> None:
     passes, cam = Passes(CallerPool()), _camera()
     total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
