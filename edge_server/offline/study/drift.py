@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ BEFORE, AFTER = 10, 60
 # Episodes whose rewards come back together: live, they come some seconds after the decisions.
 _TOGETHER = 5
 AGE = -0.003
+PRICE = 0.003
 # The nearest to the camera that rewards.
 DYING = "cam01"
 NOTHING_LOST, NOT_WITHIN = "nothing was lost", "not within the run"
@@ -40,15 +42,43 @@ POLICIES = ("fixed", "learnt", "still learning", "learnt afterwards")
 Rewards = dict[str, list[float]]
 
 
-def changes() -> dict[str, tuple[dict[str, Any], dict[str, Any], str | None]]:
-    """Name -> the channel before and after, and a camera that is gone afterwards."""
+@dataclass(frozen=True)
+class Change:
+    """The channel before and after, and a camera that is gone afterwards. price: what a view takes off the
+    reward; above 0, what is learnt selects views one by one instead of choosing a threshold of age: there,
+    which cameras there are is what a decision depends on."""
+
+    before: dict[str, Any]
+    after: dict[str, Any]
+    gone: str | None = None
+    price: float = 0.0
+
+    def settings(self) -> tuple[Setting, Setting]:
+        """What decisions are made in, before and after."""
+        return room(self.before), room(self.after, silent=(self.gone,) if self.gone else ())
+
+    def course(self, school: School, episodes: int, training: int) -> Course:
+        """What is learnt of either."""
+        parts = StateLayout(("age", "pose"))
+        if self.price:
+            reward = dataclasses.replace(school.reward("set"), views=-self.price)
+            return Course(Spec("select", parts), reward, episodes, seed=training)
+        reward = dataclasses.replace(school.reward("corrected"), age=AGE)
+        return Course(
+            Spec("threshold", parts, OMEGAS_MS["threshold"]), reward, episodes, tries=3, seed=training
+        )
+
+
+def changes() -> dict[str, Change]:
+    """By name."""
     usual = {"preset": "ch5"}
     slow = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 200.0}}
     return {
-        "delays three times as long": (usual, slow, None),
-        "bursts": (usual, {"preset": "swing"}, None),
-        "one camera dies": (usual, usual, DYING),
-        "half of the frames lost": (usual, {"preset": "ch5", "faults": {"loss": {"probability": 0.5}}}, None),
+        "delays three times as long": Change(usual, slow),
+        "bursts": Change(usual, {"preset": "swing"}),
+        "one camera dies": Change(usual, usual, DYING),
+        "half of the frames lost": Change(usual, {"preset": "ch5", "faults": {"loss": {"probability": 0.5}}}),
+        "the best camera dies where views cost": Change(usual, usual, DYING, PRICE),
     }
 
 
@@ -61,16 +91,12 @@ class Drift(Taught):
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
         with School(ask) as school:
-            reward = dataclasses.replace(school.reward("corrected"), age=AGE)
             known = changes()
             for name in ask.chosen(list(known), list(known)[:1]):
-                before, after, gone = known[name]
-                settings = room(before), room(after, silent=(gone,) if gone else ())
                 trainings = RUNS[ask.quick]
                 each = max(1, len(ask.repeats(3, 9)) // trainings)
                 runs = [
-                    [_one_run(school, name, *settings, reward, training, training * each + k)
-                     for k in range(each)]
+                    [_one_run(school, name, known[name], training, training * each + k) for k in range(each)]
                     for training in range(trainings)
                 ]  # fmt: skip
                 found += judge(f"room, {name}", runs)
@@ -85,21 +111,15 @@ class Drift(Taught):
         return found
 
 
-def _one_run(
-    school: School,
-    name: str,
-    before: Setting,
-    after: Setting,
-    reward: Reward,
-    training: int,
-    run: int,
-) -> Rewards:
+def _one_run(school: School, name: str, change: Change, training: int, run: int) -> Rewards:
     """Rewards of every decision as the reporting cameras have them, by policy: the same decisions for all."""
-    spec = Spec("threshold", StateLayout(("age", "pose")), OMEGAS_MS["threshold"])
-    course = Course(spec, reward, school.ask.taught(EPISODES), tries=3, seed=training)
-    home = school.teach(Lesson(f"drift-before-{training}", before, course))
+    before, after = change.settings()
+    course = change.course(school, school.ask.taught(EPISODES), training)
+    reward, priced = course.reward, "priced-" * bool(change.price)
+    home = school.teach(Lesson(f"drift-before-{priced}{training}", before, course))
     there = school.teach(Lesson(f"drift-{name.replace(' ', '-')}-{training}", after, course))
-    chosen = school.contest(before, rivals(spec.omegas_ms, ["threshold"], ("random",)), reward, 6, seed=7)
+    thresholds = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random",))
+    chosen = school.contest(before, thresholds, reward, 6, seed=7)
     fixed = named(chosen.best_fixed("threshold")[1])
     rng = np.random.default_rng([run, 7])
     policies: dict[str, Policy] = {

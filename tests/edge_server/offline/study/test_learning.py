@@ -266,10 +266,19 @@ def test_recovery_tells_that_nothing_was_lost_from_that_it_was_not_made_up():
 
 
 def test_where_a_camera_dies_the_policy_learnt_afterwards_is_another_one():
-    for name, (before, after, gone) in drift.changes().items():
-        there = learning.room(after, silent=(gone,) if gone else ())
-        assert learning.room(before).key != there.key, name
-        assert gone is None or (gone in there.silent and gone in there.scenario.training)
+    for name, change in drift.changes().items():
+        before, after = change.settings()
+        assert before.key != after.key, name
+        assert change.gone is None or (change.gone in after.silent and change.gone in after.scenario.training)
+
+
+def test_what_is_learnt_of_a_change_is_a_set_of_views_where_they_cost_something(tmp_path: Path):
+    with learning.School(Ask(True, tmp_path, Folders())) as school:
+        courses = {name: change.course(school, 7, 2) for name, change in drift.changes().items()}
+    priced = [name for name, course in courses.items() if course.reward.views < 0]
+    assert [courses[name].spec.action for name in priced] == ["select"]
+    assert {course.spec.action for name, course in courses.items() if name not in priced} == {"threshold"}
+    assert {(course.episodes, course.seed) for course in courses.values()} == {(7, 2)}
 
 
 def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
