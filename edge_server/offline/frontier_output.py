@@ -13,6 +13,8 @@ from edge_server.offline.update_time import best
 from edge_server.report.style import CYCLE, GREY, INK, figure, label_lines
 
 Row = dict[str, Any]
+_MARKS = ("o", "^", "s", "D", "v")
+_LINES = {"low": "--", "high": "-."}
 _METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
 
@@ -106,31 +108,34 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """Fidelity at the present against seconds an update takes, for each speed; the best one marked. The
-    highest effort measured is drawn out, others dashed and without what is seen between updates."""
+    """Fidelity at the present against seconds an update takes: a colour for each speed, a mark for each
+    representation, a line for each effort, the best of all encircled. What is seen between updates is shown
+    of one of them."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
-    efforts = list(dict.fromkeys(_who(row) for row in rows))
-    main = next((name for name in efforts if name.endswith("medium")), efforts[-1])
+    fields = list(dict.fromkeys(row["field"] for row in rows))
+    efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
+    main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
+    looks = {who: {"marker": _MARKS[fields.index(who[0]) % len(_MARKS)], "linestyle": _LINES.get(who[1], "-"),
+                   "markersize": 4} for who in efforts}  # fmt: skip
     panels = (("psnr_moving_db", "PSNR where it moves (dB)"), ("psnr_db", "PSNR, whole image (dB)"))
     with figure(path, len(panels), height_inch=3.0, sharex=True) as (_, axes):
         for ax, (key, label) in zip(axes[:, 0], panels):
             for colour, speed in zip(CYCLE, speeds):
                 here = [r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None]
-                for effort in efforts:
-                    group = sorted((r for r in here if _who(r) == effort), key=lambda r: r["update_s"])
+                for who in efforts:
+                    group = sorted((r for r in here if (r["field"], r["effort"]) == who),
+                                   key=lambda r: r["update_s"])  # fmt: skip
                     x = [r["update_s"] for r in group]
-                    y = [r[key] for r in group]
-                    if effort == main:
-                        ax.plot(x, y, ".-", color=colour, label=f"{speed:g} m/s")
-                        ax.plot(x, [r[f"seen_{key}"] for r in group], ":", color=colour, linewidth=1.2)
-                    else:
-                        ax.plot(x, y, "--", color=colour, linewidth=1.0, alpha=0.6)
+                    ax.plot(x, [r[key] for r in group], color=colour, linewidth=1.2, **looks[who])
+                    if who == main:
+                        ax.plot(x, [r[f"seen_{key}"] for r in group], ":", color=colour, linewidth=1.0)
+                ax.plot([], [], color=colour, label=f"{speed:g} m/s")
                 top = best(here, key)
                 if top is not None:
                     ax.plot([top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=colour)
-            for effort in efforts:
-                ax.plot([], [], "-" if effort == main else "--", color=GREY, label=effort)
-            ax.plot([], [], ":", color=GREY, label="seen on average,\nbetween updates too")
+            for who in efforts:
+                ax.plot([], [], color=GREY, label=" ".join(who), linewidth=1.2, **looks[who])
+            ax.plot([], [], ":", color=GREY, label=f"{' '.join(main)}, seen on\naverage, between updates too")
             ax.plot([], [], "o", markersize=10, mfc="none", color=GREY, label="best")
             last = key == panels[-1][0]
             title = None if last else "More is not always better: the world moves while the field is fitted"

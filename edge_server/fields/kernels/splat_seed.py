@@ -16,6 +16,8 @@ SEES, UNMARKED = (
     1,
     256,
 )  # what a pixel says of a cell; more than MOST_VIEWS of the one are less than the other
+_NO_COLOR = 1e3  # times a number of its own: no colour, and near no other
+_BYTE = np.float32(1.0 / 255.0)
 _EMPTY_VIEWS = 2  # that see plain background through a cell suffice to empty it
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
@@ -45,20 +47,24 @@ def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
 
 
 @part
-def _hidden_cells(cams, size, first, says, row, pixels, told, hidden):
-    """Which cells of a row most cameras that see them see unmarked, to hidden: bool (cells,); returns
-    whether all are. Side by side, since nearly all are: few of hundred thousands need a closer look.
+def _hidden_cells(cams, size, first, says, nowhere, row, pixels, told, hidden):
+    """Where each camera sees each cell of a row, to pixels: int32 (MOST_VIEWS, cells), and which of them most
+    cameras that see them see unmarked, to hidden: bool (cells,); returns whether all are, and the rest of
+    ``pixels`` is not needed. Side by side, since nearly all are: few of hundred thousands need a closer look.
 
-    says: int32 (P + 1,), what a pixel says: ``SEES``, ``SEES + UNMARKED``, or nothing, as the last does."""
-    total, cells = cams.shape[0], pixels.size
+    says: int32 (P + 1,), what a pixel says: ``SEES``, ``SEES + UNMARKED``, or nothing, as number P does,
+    which is ``nowhere``; or (0,): nothing is hidden."""
+    total, cells = cams.shape[0], hidden.size
     for k in range(cells):
         told[k] = 0
     for v in range(total):
-        width, height = np.int32(size[v, 0]), np.int32(size[v, 1])
-        _pixels_of_row(held(cams, v), np.int32(first[v]), width, height, np.int32(says.size - 1), row, pixels)
+        width, height, seen = np.int32(size[v, 0]), np.int32(size[v, 1]), pixels[v]
+        _pixels_of_row(held(cams, v), np.int32(first[v]), width, height, np.int32(nowhere), row, seen)
+        if says.size == 0:
+            continue
         few = 0
         for k in range(cells):
-            told[k] += says[np.int64(pixels[k])]
+            told[k] += says[np.int64(seen[k])]
         if 2 * v < total:
             continue
         for k in range(cells):
@@ -82,80 +88,59 @@ def score_cells(counter, worker, cams, views, blurred, says, plain, plain_color,
     whether plain_color (3,) is an empty background; tolerance: of a colour, summed over channels, in [0, 3].
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
-    colors = np.empty((MOST_VIEWS, 3), np.float32)
-    places, pixels = np.empty((3, cells), np.float32), np.empty(cells, np.int32)
+    red, green, blue = np.empty(MOST_VIEWS, np.float32), np.empty(MOST_VIEWS, np.float32), (
+        np.empty(MOST_VIEWS, np.float32))  # fmt: skip
+    places, pixels = np.empty((3, cells), np.float32), np.empty((MOST_VIEWS, cells), np.int32)
     told, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
-    sizes, firsts = views.size, views.first
+    sizes, firsts, weight, nowhere = views.size, views.first, views.weight, blurred.shape[0]
     size = np.float32(2.0) * half / np.float32(cells)
     while True:
         layer = fetch_add(counter, 1)
         if layer >= cells:
             return
         for iy in range(cells):
-            if says.size > 0:
-                for ix in range(cells):
-                    x = (np.float32(ix) + np.float32(0.5)) * size - half
-                    y = (np.float32(iy) + np.float32(0.5)) * size - half
-                    z = (np.float32(layer) + np.float32(0.5)) * size - half
-                    s = _spread(max(abs(x), max(abs(y), abs(z)))) if contracted else _F1
-                    places[0, ix], places[1, ix], places[2, ix] = x * s, y * s, z * s
-                if _hidden_cells(cams, sizes, firsts, says, places, pixels, told, hidden):
-                    for ix in range(cells):
-                        scores[ix + cells * (iy + cells * layer)] = np.float32(NOT_SEEN)
-                    continue
             for ix in range(cells):
-                if says.size > 0 and hidden[ix]:
-                    scores[ix + cells * (iy + cells * layer)] = np.float32(NOT_SEEN)
-                    continue
                 x = (np.float32(ix) + np.float32(0.5)) * size - half
                 y = (np.float32(iy) + np.float32(0.5)) * size - half
                 z = (np.float32(layer) + np.float32(0.5)) * size - half
-                if contracted:
-                    s = _spread(max(abs(x), max(abs(y), abs(z))))
-                    x, y, z = x * s, y * s, z * s
+                s = _spread(max(abs(x), max(abs(y), abs(z)))) if contracted else _F1
+                places[0, ix], places[1, ix], places[2, ix] = x * s, y * s, z * s
+            nothing = _hidden_cells(cams, sizes, firsts, says, nowhere, places, pixels, told, hidden)
+            for ix in range(cells):
+                at = ix + cells * (iy + cells * layer)
+                scores[at] = np.float32(NOT_SEEN)
+                if nothing or hidden[ix]:
+                    continue
+                for k in range(MOST_VIEWS):
+                    red[k] = green[k] = blue[k] = np.float32(_NO_COLOR * (k + 1))
                 n, empty = 0, 0
                 for v in range(total):
-                    dx, dy, dz = x - cams[v, ORIGIN], y - cams[v, ORIGIN + 1], z - cams[v, ORIGIN + 2]
-                    depth = cams[v, 6] * dx + cams[v, 7] * dy + cams[v, 8] * dz
-                    if depth <= cams[v, NEAR]:
+                    pixel = np.int64(pixels[v, ix])
+                    if pixel == nowhere or (weight.size > 0 and weight[pixel] <= _F0):
                         continue
-                    a = (cams[v, 0] * dx + cams[v, 1] * dy + cams[v, 2] * dz) / depth
-                    b = (cams[v, 3] * dx + cams[v, 4] * dy + cams[v, 5] * dz) / depth
-                    if not (abs(a) < np.float32(4.0) and abs(b) < np.float32(4.0)):
-                        continue
-                    through = bent(held(cams, v), a, b)
-                    px = cams[v, LENS] * through[0] + cams[v, LENS + 2]
-                    py = cams[v, LENS + 1] * through[1] + cams[v, LENS + 3]
-                    width, height = views.size[v, 0], views.size[v, 1]
-                    if not (px >= _F0 and py >= _F0 and px < width and py < height):
-                        continue
-                    pixel = views.first[v] + np.int64(py) * width + np.int64(px)
-                    if views.weight.size > 0 and views.weight[pixel] <= _F0:
-                        continue
-                    away = _F0
-                    for c in range(3):
-                        colors[n, c] = np.float32(blurred[pixel, c]) * np.float32(1.0 / 255.0)
-                        away += abs(colors[n, c] - plain_color[c])
+                    r, g, b = (
+                        np.float32(blurred[pixel, 0]) * _BYTE, np.float32(blurred[pixel, 1]) * _BYTE,
+                        np.float32(blurred[pixel, 2]) * _BYTE,
+                    )  # fmt: skip
+                    red[n], green[n], blue[n] = r, g, b
+                    away = abs(r - plain_color[0]) + abs(g - plain_color[1]) + abs(b - plain_color[2])
                     if blurred.shape[1] == 4:
                         empty += 1 if blurred[pixel, 3] < 16 else 0
                     elif plain and away < np.float32(0.06):
                         empty += 1
                     n += 1
+                    if empty >= _EMPTY_VIEWS:
+                        break
+                if n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
+                    continue
                 best = 0
                 for j in range(n):
                     agree = 0
-                    for k in range(n):
-                        apart = (
-                            abs(colors[j, 0] - colors[k, 0])
-                            + abs(colors[j, 1] - colors[k, 1])
-                            + abs(colors[j, 2] - colors[k, 2])
-                        )
-                        agree += 1 if apart < tolerance else 0
+                    r, g, b = red[j], green[j], blue[j]
+                    for k in range(MOST_VIEWS):
+                        agree += np.int32(abs(r - red[k]) + abs(g - green[k]) + abs(b - blue[k]) < tolerance)
                     best = max(best, agree)
-                score = np.float32(best - 1) / np.float32(n + 1)
-                if n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
-                    score = np.float32(NOT_SEEN)
-                scores[ix + cells * (iy + cells * layer)] = score
+                scores[at] = np.float32(best - 1) / np.float32(n + 1)
 
 
 @kernel
@@ -196,7 +181,7 @@ def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted
                     iy = min(np.int64((y * s + half) * scale), cells - 1)
                     iz = min(np.int64((z * s + half) * scale), cells - 1)
                     score = scores[ix + cells * (iy + cells * iz)]
-                    if score > np.float32(NOT_SEEN):
+                    if score > best:  # only then: what is subtracted is never negative
                         score -= np.float32(0.03) * abs(np.log(t / middle))
                         if score > best:
                             best, at = score, t
