@@ -61,8 +61,8 @@ LIMITS = {
 BLENDING, UNBLENDING = 41, 23
 # Of a Gaussian: projected; its pairs' sums led back through the projection, and a step of Adam.
 PROJECTING, UPDATING = 300, 680
-# Of a Gaussian that is sorted: three passes, each counts and moves it. Of a pair: counted, owned, listed.
-SORTING, DEALING = 6, 3
+# Of a Gaussian that is sorted: counted and moved, twice. Of a pair: counted, owned, listed.
+SORTING, DEALING = 4, 3
 
 
 class TimedPool(Pool):
@@ -197,7 +197,7 @@ def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int
 
 def _counted(field: SplatField) -> tuple[int, int, int, int]:
     """Of a field's last step, of one picture: Gaussians, those in the picture, pairs of one with a tile, and
-    pairs that changed a pixel: the others are hidden or beside it, and a better list would leave them out."""
+    pairs that changed a pixel: the others are hidden."""
     passes, count = field._passes, len(field.cloud)
     pairs = int(passes.lists.needed[0])
     used = int((passes.sums[0, :pairs] != 0.0).any(axis=-1).sum())
@@ -253,8 +253,8 @@ def _floors_of_splat(
     """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
 
     gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; touching: of which change a
-    pixel. An operation counts as one of BLAS's multiply-adds, as if all were vectorised: ``project`` and
-    ``update`` go through Gaussians one by one, ``deal`` sorts them on one core."""
+    pixel. An operation counts as one of BLAS's multiply-adds, as if all were vectorised: ``update``
+    goes through Gaussians one by one, ``deal`` sorts them on one core."""
     operations, divisions_ms = limits["gemm_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
     copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
     parameters = BASE
