@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
@@ -136,7 +137,8 @@ class _Helper(threading.Thread):
         super().join(1.0)
         for pipe in () if self.is_alive() else (self._process.stdin, self._process.stdout):
             if pipe is not None:
-                pipe.close()
+                with suppress(OSError):  # what it was still to be told has nowhere to go
+                    pipe.close()
 
 
 def _serve() -> None:
