@@ -12,10 +12,8 @@ from edge_server.fields.kernels.splat_project import LENS, NEAR, ORIGIN, bent, h
 
 MOST_VIEWS = 32  # that vote
 NOT_SEEN = -2.0
-SEES, UNMARKED = (
-    1,
-    256,
-)  # what a pixel says of a cell; more than MOST_VIEWS of the one are less than the other
+# What a pixel says of a cell. Added up over all views, the first stays below the second.
+SEES, UNMARKED = 1, 256
 _NO_COLOR = 1e3  # times a number of its own: no colour, and near no other
 _BYTE = np.float32(1.0 / 255.0)
 _EMPTY_VIEWS = 2  # that see plain background through a cell suffice to empty it

@@ -94,12 +94,18 @@ def test_no_threads_is_refused() -> None:
         Pool(-1)
 
 
-@njit(fastmath=FAST)
-def _exp(x):
-    out = np.empty_like(x)
-    for k in range(x.size):
-        out[k] = exp32(x[k])
-    return out
+def _of_each(function):
+    @njit(fastmath=FAST)
+    def values(x):
+        out = np.empty_like(x)
+        for k in range(x.size):
+            out[k] = function(x[k])
+        return out
+
+    return values
+
+
+_exp, _log = _of_each(exp32), _of_each(log32)
 
 
 def test_exp32_is_exp() -> None:
@@ -107,14 +113,6 @@ def test_exp32_is_exp() -> None:
     np.testing.assert_allclose(_exp(x), np.exp(x.astype(np.float64)), rtol=3e-7)
     edge = _exp(np.array([-1e30, 1e30, np.nan], np.float32))
     assert 0 < edge[0] < 1e-37 and 1e38 < edge[1] < np.inf and np.isnan(edge[2])
-
-
-@njit(fastmath=FAST)
-def _log(x):
-    out = np.empty_like(x)
-    for k in range(x.size):
-        out[k] = log32(x[k])
-    return out
 
 
 def test_log32_is_log() -> None:
