@@ -153,7 +153,7 @@ class NerfactoField(TrainedField):
         batch, bins, e = self._batch, self._bins, self._encoding
         grid = Grid(e.resolution, e.first, e.dense, e.table)
         self.pool.run(
-            scatter, grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
+            scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
         )
         if weight := smoothing(self.settings, self.step):
             self.pool.run(smooth_grid, grid, levels, np.float32(weight / scale), self._table_g, self._dirty)

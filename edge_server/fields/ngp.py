@@ -53,7 +53,7 @@ class NgpField(TrainedField):
     def _gather(self, levels: int, scale: float) -> None:
         batch = self._batch
         self.pool.run(
-            scatter, self._grid, levels, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
+            scatter, self._grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
         )
         if weight := smoothing(self.settings, self.step):
             self.pool.run(

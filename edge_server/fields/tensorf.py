@@ -70,7 +70,7 @@ class TensorfField(TrainedField):
     def _gather(self, levels: int, scale: float) -> None:
         s, batch, planes = self.settings, self._batch, self._encoding
         self.pool.run(
-            scatter_planes, planes, batch.x, batch.d_features, batch.samples, self._table_g, self._dirty
+            scatter_planes, planes, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
         )
         if s.smooth or s.sparse:
             weights = np.float32(s.smooth / scale), np.float32(s.sparse / scale)

@@ -279,6 +279,7 @@ class TrainedField:
             x=np.zeros((chunks, 3, CHUNK), np.float32),
             d_features=np.zeros((chunks, self._feature_rows(), CHUNK), np.float32),
             d_params=np.zeros((chunks, self._net.params.size), np.float32),
+            columns=np.zeros(chunks, np.int64),
             samples=np.zeros(chunks, np.int64),
             rays=np.zeros(chunks, np.int64),
             dropped=np.zeros(chunks, np.int64),
@@ -288,9 +289,13 @@ class TrainedField:
         self._scratch = Scratch(
             acts=np.zeros((workers, units, CHUNK), np.float32),
             d_acts=np.zeros((workers, units, CHUNK), np.float32),
-            line=np.zeros((workers, 3, CHUNK), np.float32),
+            line=np.zeros((workers, 2, CHUNK), np.float32),
+            laid=np.zeros((workers, 11, CHUNK), np.float32),
+            column=np.zeros((workers, CHUNK), np.int64),
             ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
             ray=np.zeros((workers, CHUNK_RAYS, 11), np.float32),
+            way=np.zeros((workers, CHUNK_RAYS, 3), np.float32),
+            piece=np.zeros((workers, CHUNK, 4), np.int64),
         )
         self._scratch_x = np.zeros((workers, 3, CHUNK), np.float32)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.kernels.intrinsics import AT_ONCE, add_products
 from edge_server.fields.kernels.jit import part
 
 BLOCK = 256
@@ -33,16 +34,15 @@ def param_count(widths: NDArray[np.int64]) -> int:
 @part
 def _combine(w, first, out_stride, in_stride, n_out, n_in, x, x_row, y, y_row, a, b):
     """y[y_row + o] += sum_i w[first + o out_stride + i in_stride] x[x_row + i], samples a to b."""
-    for o in range(n_out):
-        out = y[y_row + o, a:b]
+    whole = a + (b - a) // AT_ONCE * AT_ONCE
+    for o in range(0, n_out, 4):
         base = first + o * out_stride
-        for i in range(0, n_in, 4):
-            w0, w1 = w[base + i * in_stride], w[base + (i + 1) * in_stride]
-            w2, w3 = w[base + (i + 2) * in_stride], w[base + (i + 3) * in_stride]
-            x0, x1 = x[x_row + i, a:b], x[x_row + i + 1, a:b]
-            x2, x3 = x[x_row + i + 2, a:b], x[x_row + i + 3, a:b]
-            for s in range(out.size):
-                out[s] += w0 * x0[s] + w1 * x1[s] + w2 * x2[s] + w3 * x3[s]
+        add_products(w, base, out_stride, in_stride, n_in, x, x_row, y, y_row + o, a, whole)
+    for o in range(n_out):
+        for i in range(n_in):
+            weight = w[first + o * out_stride + i * in_stride]
+            for s in range(whole, b):
+                y[y_row + o, s] += weight * x[x_row + i, s]
 
 
 @part

@@ -20,7 +20,7 @@ from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.model import query_back, query_color, query_density
 from edge_server.fields.kernels.proposal import deal, interlevel, place, propose, weigh
 from edge_server.fields.kernels.rays import interval
-from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, compare, draw, keep
+from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, compare, draw
 
 _F0, _HALF = np.float32(0.0), np.float32(0.5)
 
@@ -75,6 +75,15 @@ def spread_looks(out, d_out, row, look, a, b, d_look):
                 total += base[s] * share[s]
                 d[s] = look[k] * base[s]
         d_look[k] += total
+
+
+@part
+def keep(rows, a, b, to):
+    """Move columns a to b of every row to ``to`` <= a."""
+    for k in range(rows.shape[0]):
+        row = rows[k]
+        for s in range(b - a):
+            row[to + s] = row[a + s]
 
 
 @part
@@ -196,6 +205,6 @@ def train_proposed(counter, worker, views, recipe, plan, space, encoding, net, l
                 spread_looks(out, d_out, row, looks[view], a, b, bins.looks[chunk, view])
         batch.d_params[chunk] = _F0
         query_back(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
-        batch.samples[chunk], batch.rays[chunk] = n, rays
+        batch.columns[chunk], batch.samples[chunk], batch.rays[chunk] = n, n, rays
         batch.dropped[chunk], batch.loss[chunk] = dropped, loss
         bins.counts[chunk] = bin_first[rays]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.fields import Budget
-from edge_server.fields.kernels.composite import Weights
+from edge_server.fields.kernels.composite import OPAQUE_DEPTH, Weights
 from edge_server.fields.kernels.pool import CallerPool
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.kernels.train import Recipe, train_chunks
@@ -62,13 +64,15 @@ def _oracle(field: NgpField, rays: int, weight: NDArray[np.float32], params: Ten
     """Colour error and loss of the samples that the last chunk took, for the network ``params``."""
     batch, scratch = field._batch, field._scratch
     first, ray = scratch.ray_first[0], scratch.ray[0]
-    x = torch.as_tensor(batch.x[0, :, : first[rays]].T.copy(), dtype=torch.float64)
+    column = scratch.column[0, : first[rays]]
+    x = torch.as_tensor(batch.x[0][:, column].T.copy(), dtype=torch.float64)
     grid = to_torch(field._grid, dtype=torch.float64)
     sigma, color = shade(mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, x)), 1, x)
     error = loss = torch.zeros((), dtype=torch.float64)
     for r in range(rays):
         a, b = int(first[r]), int(first[r + 1])
-        t, delta = (torch.as_tensor(scratch.line[0, k, a:b], dtype=torch.float64)[None] for k in (0, 1))
+        at = column[a:b]
+        t, delta = (torch.as_tensor(scratch.line[0, k, at], dtype=torch.float64)[None] for k in (0, 1))
         target, back = (torch.as_tensor(ray[r, k : k + 3], dtype=torch.float64)[None] for k in (3, 6))
         of_ray = ray_losses(sigma[None, a:b], color[None, a:b], t, delta, target, back, DISTORTION, SPARSITY)
         error, loss = error + weight[r] * of_ray[0].sum(), loss + weight[r] * of_ray[1].sum()
@@ -85,6 +89,20 @@ def test_loss_and_gradient_equal_the_oracle(field: NgpField, weighted: bool) -> 
     assert rays > 20 and loss == pytest.approx(error.item(), rel=1e-4) and params.grad is not None
     expected = params.grad.numpy()
     np.testing.assert_allclose(gradient, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_rays_are_whole_and_in_order(field: NgpField) -> None:
+    _, _, rays = _train(field, _packed(field, None))
+    batch, scratch = field._batch, field._scratch
+    first, column = scratch.ray_first[0, : rays + 1], scratch.column[0, : batch.columns[0]]
+    assert batch.samples[0] == first[rays] < batch.columns[0]
+    assert sorted(column) == list(range(batch.columns[0]))  # each once, those behind a surface last
+    density = scratch.laid[0, 0]
+    for a, b in pairwise(first):
+        t, length = scratch.line[0, :, column[a:b]].T
+        assert (np.diff(t) > 0).all()
+        depth = np.cumsum(density[a:b] * length)
+        assert (depth[:-1] <= OPAQUE_DEPTH).all()  # nothing behind the first opaque sample
 
 
 def test_gradient_of_weighted_rays_equals_finite_differences(field: NgpField) -> None:
