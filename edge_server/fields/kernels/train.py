@@ -40,7 +40,8 @@ class Batch(NamedTuple):
 
     x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, rows, CHUNK). d_params: float32 (C, P).
     columns, samples, rays, dropped: int64 (C,); samples stand in the first columns, not in all of them.
-    loss: float64 (C,), squared error summed over rays and channels. exposure: float64 (C, V, 3, 5), see ``compare``; V = 0 where exposures are not asked for.
+    loss: float64 (C,), squared error summed over rays and channels. exposure: float64 (C, V, 3, 5),
+    see ``compare``; V = 0 where exposures are not asked for.
     """
 
     x: NDArray[np.float32]
