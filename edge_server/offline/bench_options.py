@@ -50,7 +50,7 @@ class Effort:
         return self.seeds * (once * (self.updates if moving else 1) + 0.01 * self.warm_steps * moving)
 
 
-FULL = Effort(3, 400, (2.5, 8.0), 8, 25, (0.25, 1.0), 800)
+FULL = Effort(3, 400, (4.0,), 8, 25, (0.25,), 800)
 QUICK = Effort(1, 150, (2.5,), 4, 25, (0.25,), 300)
 
 

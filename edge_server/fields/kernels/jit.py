@@ -79,7 +79,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     names = list(inspect.signature(function).parameters)
     text = f"def {function.__name__}({', '.join(names)}):\n"
     text += f"    return inside({', '.join(f'borrowed({name})' for name in names)})\n"
-    scope = {"inside": _compiled(forceinline=True)(function), "borrowed": borrowed}
+    scope = {"inside": _compiled(inline="always")(function), "borrowed": borrowed}
     exec(text, scope)
     outer = scope[function.__name__]
     assert isinstance(outer, FunctionType)
