@@ -81,13 +81,13 @@ def activate_color(out, a, b):
 
 @part
 def seen_samples(out, dts, first, end):
-    """How many samples of a ray there are until it is opaque, and whether it is: density in row 0 of out."""
+    """How many samples of a ray there are until it is opaque: density in row 0 of out."""
     depth = _F0
     for s in range(first, end):
         depth += out[0, s] * dts[s]
         if depth > np.float32(OPAQUE_DEPTH):
-            return s + 1 - first, True
-    return end - first, False
+            return s + 1 - first
+    return end - first
 
 
 @part

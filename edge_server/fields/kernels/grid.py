@@ -151,7 +151,7 @@ def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirt
     """Add the table's gradient of all samples to ``gradient``; a task is a level, so nothing races.
 
     x: float32 (chunks, 3, N), unit cube. d_features: float32 (chunks, >= 2 L, N), dLoss / dfeatures.
-    counts: int64 (chunks,), samples in use. gradient: float32 like ``grid.table``. dirty: bool
+    counts: int64 (chunks,), columns in use. gradient: float32 like ``grid.table``. dirty: bool
     (vertices / SEGMENT,), set where a segment received anything.
     """
     while True:

@@ -13,6 +13,7 @@ from typing import Any
 
 from numba import njit, types
 from numba.core import cgutils
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
 try:
@@ -41,7 +42,7 @@ def borrowed(typingctx: Any, value: Any) -> Any:
 
     numba counts references wherever an array, or a tuple that holds some, is given to a function or a row is
     taken of it, one atomic operation each: passing ten arrays on for every ray costs ten times what drawing
-    the ray does. Whoever calls a kernel holds its arrays until it returns.
+    the ray does. Whoever calls a kernel holds its arrays until it returns; a kernel returns none of them.
     """
 
     def strip(context: Any, builder: Any, kind: Any, given: Any) -> Any:
@@ -52,6 +53,8 @@ def borrowed(typingctx: Any, value: Any) -> Any:
         if isinstance(kind, types.BaseTuple):
             parts = zip(kind, cgutils.unpack_tuple(builder, given), strict=True)
             return context.make_tuple(builder, kind, [strip(context, builder, k, p) for k, p in parts])
+        if not isinstance(kind, types.Number | types.Boolean):
+            raise TypingError(f"a kernel takes arrays, numbers and tuples of them, not {kind}")
         return given
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:

@@ -5,8 +5,7 @@ components of its groups; colour's components feed the network (the paper's basi
 first layer). Groups take turns at the three orientations. A point is given in the unit cube; planes are
 interpolated bilinearly, lines linearly, eight channels at a time in one vector register.
 
-Density needs no network, so it is known before colour is asked for: samples behind a surface never cost more
-than the density's planes.
+Density needs no network: it is known before colour is asked for.
 """
 
 from __future__ import annotations
@@ -225,7 +224,7 @@ def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dir
     """Add the factors' gradient of all samples to ``gradient``; a task is a group, so nothing races.
 
     x: float32 (chunks, 3, N). d_features: float32 (chunks, 8 colour groups + 1, N), dLoss / dcomponent;
-    the last row is dLoss / draw density. counts: int64 (chunks,), samples in use. gradient: float32 like
+    the last row is dLoss / draw density. counts: int64 (chunks,), columns in use. gradient: float32 like
     ``planes.table``. dirty: bool (table rows / ROWS,), set where a segment received anything.
     """
     d = np.empty((TILE, CHANNELS), np.float32)

@@ -90,7 +90,7 @@ def keep(rows, a, b, to):
 def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell,
                   depth, weight, group, bin_first):  # fmt: skip
     """Fill a chunk with rays, their bins, their samples and what ``query_density`` says of them. Samples that
-    cannot be seen are left out, and their room is filled again, as in ``train.fill_chunk``.
+    cannot be seen are left out, and their room is filled again.
     Returns (rays, samples, rays whose proposal is not finite)."""
     dts, out = line[1], acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
@@ -133,7 +133,7 @@ def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray
         begin = n
         for r in range(rays, drawn):
             stop = ray_first[r + 1]
-            kept, _ = seen_samples(out, dts, begin, stop)
+            kept = seen_samples(out, dts, begin, stop)
             if n < begin:
                 keep(acts, begin, begin + kept, n)
                 keep(x, begin, begin + kept, n)

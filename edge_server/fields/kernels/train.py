@@ -24,8 +24,10 @@ CHUNK = 2048  # samples a chunk has room for; its activations stay in the second
 CHUNK_RAYS = 512
 
 DRAWN = 32  # rays drawn at a time
-# Rounds of a chunk begin fresh rays up to so many samples, and with no more than half of the room that is
-# left of those: a ray that is begun needs more of it in the rounds to come.
+# Rounds of a chunk begin fresh rays up to so many samples, and with no more than an eighth of the room that
+# is left of those: a ray that is begun needs more of it in the rounds to come, several times as much where
+# the grid's densities are too high, and one that is not finished is lost. (A quarter is enough up to three
+# times too high.)
 FRESH, LEAST = CHUNK - CHUNK // 8, 32
 
 # Optical depth of the grid's densities that a ray is followed by before it is asked whether it is opaque:
@@ -39,7 +41,8 @@ class Batch(NamedTuple):
     """What the chunks of a step leave behind, C of them.
 
     x: float32 (C, 3, CHUNK), unit cube. d_features: float32 (C, rows, CHUNK). d_params: float32 (C, P).
-    columns, samples, rays, dropped: int64 (C,); samples stand in the first columns, not in all of them.
+    columns, samples, rays, dropped: int64 (C,): the first so many columns are in use, not all by samples of
+    whole rays.
     loss: float64 (C,), squared error summed over rays and channels. exposure: float64 (C, V, 3, 5),
     see ``compare``; V = 0 where exposures are not asked for.
     """
@@ -61,10 +64,11 @@ class Scratch(NamedTuple):
     acts, d_acts: float32 (W, units, CHUNK) and line: float32 (W, 2, CHUNK), distance and length, have a
     sample a column, in the order in which they were found. laid: float32 (W, 11, CHUNK), ray after ray:
     density and colour, their gradient, distance, length and weight of each sample; column: int64 (W, CHUNK),
-    where it was found. ray_first: int64 (W, R + 1), of ``laid``. ray: float32 (W, R, 11): direction, target,
-    background, view, weight; the last only where ``Views`` has weights. way: float32 (W, R, 3):
-    distance reached, distance of leaving, and optical depth so far. piece: int64 (W, CHUNK, 4): ray (-1:
-    none) and first column of samples that were found together, where the seen ones end, and where they end.
+    where it was found, and behind the last of them the columns of what is not used. ray_first: int64
+    (W, R + 1), of ``laid``. ray: float32 (W, R, 11): direction, target, background, view, weight; the last
+    only where ``Views`` has weights. way: float32 (W, R, 3): distance reached, distance of leaving, and
+    optical depth so far. piece: int64 (W, CHUNK, 4): ray (-1: none) and first column of samples that were
+    found together, where the seen ones end, and where they end.
     """
 
     acts: NDArray[np.float32]
@@ -185,7 +189,8 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, w
     n, room = np.int64(0), np.int64(CHUNK)
     under_way = fresh = ready = pieces = 0
     while (under_way > 0 and n < room) or (fresh < limit and n < FRESH):
-        end, marched, until = n, 0, n + max((FRESH - n) // 2, LEAST)
+        end, marched = n, 0
+        until = n + max((FRESH - n) // 8, LEAST) if n < FRESH else n
         while end < room and (marched < under_way or (fresh < limit and end < until)):
             if marched == under_way:
                 if fresh == ready:
@@ -222,10 +227,7 @@ def fill_chunk(views, recipe, space, encoding, net, chunk, x, line, acts, ray, w
                 piece[pieces, 3] = stop
                 pieces += 1
             begin = stop
-        for k in range(marched, under_way):
-            turn[left] = turn[k]
-            left += 1
-        n, under_way = end, left
+        n, under_way = end, left  # those that were not followed had no room, and will have none
     return fresh, n, pieces
 
 
@@ -337,8 +339,9 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
         query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
         if recipe.harmonics > 1:
             for k in range(pieces):
-                r, a, b = max(piece[k, 0], 0), piece[k, 1], piece[k, 2]
-                add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                r, a, b = piece[k, 0], piece[k, 1], piece[k, 2]
+                if r >= 0:
+                    add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
         activate_color(out, np.int64(0), n)
         gather(out, line, column, used, laid)
         # Nothing that is not used may reach the others' sums: 0 times NaN is NaN.

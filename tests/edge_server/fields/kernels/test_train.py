@@ -47,13 +47,17 @@ def _packed(field: NgpField, weights: list[NDArray[np.float32]] | None) -> Views
     return pack_views(VIEWS, field.rig.box, field.rig.memory, weights)
 
 
-def _train(field: NgpField, data: Views) -> tuple[float, NDArray[np.float32], int]:
-    """Loss, the network's gradient and number of rays of one chunk."""
+def _train(
+    field: NgpField, data: Views, rays: int = SETTINGS.rays, over: float = 1.0
+) -> tuple[float, NDArray[np.float32], int]:
+    """Loss, the network's gradient and number of rays of one chunk of at most ``rays``; the occupancy grid
+    takes everything to be ``over`` times as dense as it knows."""
     recipe = Recipe(
-        key=np.uint64(7), chunk_rays=SETTINGS.rays, levels=SETTINGS.levels, harmonics=1,
+        key=np.uint64(7), chunk_rays=rays, levels=SETTINGS.levels, harmonics=1,
         changed_share=np.float32(0.5), background=np.full(3, 0.5, np.float32), random_background=False,
     )  # fmt: skip
     space = field._occupancy.space(step_length(SETTINGS, field.step))
+    space = space._replace(density=space.density * np.float32(over))
     weights = Weights(np.float32(DISTORTION), np.float32(SPARSITY), np.float32(0.0))
     batch, scratch = field._batch, field._scratch
     field.pool.run(train_chunks, data, recipe, space, field._grid, field._net, weights, batch, scratch)
@@ -96,13 +100,28 @@ def test_rays_are_whole_and_in_order(field: NgpField) -> None:
     batch, scratch = field._batch, field._scratch
     first, column = scratch.ray_first[0, : rays + 1], scratch.column[0, : batch.columns[0]]
     assert batch.samples[0] == first[rays] <= batch.columns[0]
-    assert sorted(column) == list(range(batch.columns[0]))  # each once, those behind a surface last
+    assert sorted(column) == list(range(batch.columns[0]))  # each once, those nobody uses last
     density = scratch.laid[0, 0]
     for a, b in pairwise(first):
         t, length = scratch.line[0, :, column[a:b]].T
         assert (np.diff(t) > 0).all()
         depth = np.cumsum(density[a:b] * length)
         assert (depth[:-1] <= OPAQUE_DEPTH).all()  # nothing behind the first opaque sample
+
+
+def test_no_ray_is_cut_off_where_the_grid_is_wrong(field: NgpField) -> None:
+    def rays_of(over: float) -> list[NDArray[np.float32]]:
+        _, _, rays = _train(field, _packed(field, None), rays=512, over=over)
+        first, column = field._scratch.ray_first[0], field._scratch.column[0]
+        return [field._scratch.line[0, 0, column[a:b]] for a, b in pairwise(first[: rays + 1])]
+
+    whole = rays_of(0.0)  # nothing to be asked about: each in one piece
+    assert sum(map(len, whole)) > 1500
+    for over in (1.0, 5.0, 30.0):
+        found = rays_of(over)
+        assert len(found) > 0.8 * len(whole)
+        for mine, other in zip(found, whole, strict=False):
+            np.testing.assert_array_equal(mine, other)
 
 
 def test_gradient_of_weighted_rays_equals_finite_differences(field: NgpField) -> None:
