@@ -110,8 +110,9 @@ def add_products(typingctx: Any, w: Any, first: Any, out_stride: Any, in_stride:
     """``y[y_row + o, s] += sum_i w[first + o out_stride + i in_stride] x[x_row + i, s]``, o < 4, a <= s < b.
 
     w: contiguous float32; x, y: contiguous float32 (rows, N), or one array whose rows read and written are
-    not the same; the rest int64, b - a a multiple of ``AT_ONCE``. With AVX-512 the sums stay in registers while all inputs
-    pass: left to LLVM, they are read and written once for every four inputs, which takes twice as long.
+    not the same; the rest int64, b - a a multiple of ``AT_ONCE``. With AVX-512 the sums stay in registers
+    while all inputs pass: left to LLVM, they are read and written once for every four inputs, which takes
+    twice as long.
     """
     wide = types.int64
 
