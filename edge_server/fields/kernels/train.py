@@ -26,8 +26,8 @@ CHUNK_RAYS = 512
 DRAWN = 32  # rays drawn at a time
 # Rounds of a chunk begin fresh rays up to so many samples, and with no more than an eighth of the room that
 # is left of those: a ray that is begun needs more of it in the rounds to come, several times as much where
-# the grid's densities are too high, and one that is not finished is lost. (A quarter is enough up to three
-# times too high.)
+# the grid's densities are too high, and one that is not finished is lost: next to none where they are eight
+# times too high; with a quarter, one in six.
 FRESH, LEAST = CHUNK - CHUNK // 8, 32
 
 # Optical depth of the grid's densities that a ray is followed by before it is asked whether it is opaque:
