@@ -25,6 +25,7 @@ from edge_server.decisions import Decisions
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.fields import View, checkpoint
+from edge_server.fields.kernels.pool import SERVER_NICE
 from edge_server.fields.registry import make_field
 from edge_server.ingest import Ingest, Recent
 from edge_server.journal import Journal
@@ -87,7 +88,8 @@ class EdgeServer:
         options.out.mkdir(parents=True, exist_ok=True)
 
         self.pacing, field_options = _pacing(scenario, config)
-        self.field = make_field(config.field, field_options, seed=scenario.seed)
+        aside = {"nice": SERVER_NICE, **field_options}
+        self.field = make_field(config.field, aside, seed=scenario.seed)
         updates = 0
         if options.resume is not None:
             state, about = checkpoint.load(options.resume)
@@ -137,6 +139,7 @@ class EdgeServer:
             self._published,
             self._say,
             self._checkpoint,
+            nice=aside["nice"],
         )
         self.state = EdgeState(
             scenario=scenario.name,

@@ -63,7 +63,7 @@ class SplatSettings:
     refuse_beyond: float = shared_option("refuse_beyond")
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
-    nice: int = _option(5, "how far workers lower their own priority (Linux)")
+    nice: int = _option(0, "how far workers lower their own priority (Linux); in a server 5")
     device: str = _option("auto", "cpu (numba) or cuda (gsplat, only where asked for); auto: cpu")
 
     def __post_init__(self) -> None:

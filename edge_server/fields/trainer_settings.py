@@ -79,7 +79,7 @@ class TrainerSettings:
     refine_deg: float = option(0.0, "by how much a camera's given rotation may be corrected; 0: not at all")
     seed: int = option(0, "seed of initial values and of all sampling")
     threads: int | None = option(None, "worker threads; results do not depend on it. None: all cores")
-    nice: int = option(5, "how far workers lower their own priority (Linux)")
+    nice: int = option(0, "how far workers lower their own priority (Linux); in a server 5")
     device: str = option("auto", "cpu (numba), cuda (torch) or auto")
 
     def __post_init__(self) -> None:

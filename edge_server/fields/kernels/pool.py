@@ -1,7 +1,13 @@
-"""A small pool of threads that run one nogil kernel at a time, side by side, at low priority.
+"""A small pool of threads that run nogil kernels side by side, at low priority where others go first.
 
 Not numba's own threading layers: those abort or serialise when several Python threads start parallel
 kernels, and here a page renders while the field trains.
+
+A kernel takes milliseconds or less, so where its threads wake up matters. Linux puts a thread that wakes on
+a core that is idle at that moment, and seldom moves it afterwards, the less so the lower its priority. A
+caller that woke one worker a core would itself keep a core busy until it slept: two workers on one core,
+the other idle, in four calls of ten on two cores. So whoever computes wakes at most two others first, and
+the caller computes, too, unless it is to be more important than the workers.
 """
 
 from __future__ import annotations
@@ -16,6 +22,10 @@ import numpy as np
 
 # For who runs several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
+
+SERVER_NICE = 5  # of what computes in a server that answers cameras meanwhile
+
+_here = threading.local()
 
 
 def cores() -> int:
@@ -41,10 +51,11 @@ class Pool:
     """``threads`` workers. ``run(kernel, *args)`` calls ``kernel(counter, worker, *args)`` on each of them;
     the kernel draws task numbers from ``counter`` until none are left (see ``kernels.intrinsics``).
 
-    Any number of Python threads may call ``run``: jobs are served in the order in which they come.
+    Any number of Python threads may call ``run``; kernels of several may run at once, so that memory that a
+    kernel has for each worker is for one call at a time.
     threads: default, the environment's FRESHFIELD_THREADS, else the number of cores this process may use.
-    Results do not depend on it. nice: added to the workers' own priority
-    where the system allows it (Linux counts it per thread), so that who ingests frames goes first.
+    Results do not depend on it. nice: the workers' own priority where the system allows it (Linux counts it
+    per thread), so that who ingests frames goes first. A caller of the same priority is worker 0 itself.
     """
 
     def __init__(self, threads: int | None = None, nice: int = 10) -> None:
@@ -53,17 +64,17 @@ class Pool:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice
         self._queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
-        self._order = threading.Lock()
-        for worker, queue in enumerate(self._queues):
+        for worker in range(self.threads):
             name = f"field-worker-{worker}"
-            threading.Thread(target=self._serve, args=(worker, queue), name=name, daemon=True).start()
+            threading.Thread(target=self._serve, args=(worker,), name=name, daemon=True).start()
 
     def run(self, kernel: Callable[..., Any], *args: Any) -> None:
         """Run ``kernel`` on all workers and wait for them; raises what a worker raised."""
         job = _Job(kernel, args)
-        with self._order:  # the same order of jobs in every queue
-            for queue in self._queues:
-                queue.put(job)
+        if getattr(_here, "nice", 0) >= self.nice:
+            self._work(job, 0)
+        else:
+            self._queues[0].put(job)
         for _ in self._queues:
             job.done.acquire()
         if job.error is not None:
@@ -71,19 +82,27 @@ class Pool:
 
     def close(self) -> None:
         """End the workers once they have finished what is queued."""
-        with self._order:
-            for queue in self._queues:
-                queue.put(None)
+        self._queues[0].put(None)
 
-    def _serve(self, worker: int, queue: SimpleQueue[_Job | None]) -> None:
-        _lower_priority(self.nice)
-        while (job := queue.get()) is not None:
-            try:
-                job.kernel(job.counter, worker, *job.args)
-            except BaseException as error:  # handed to the caller of run()
-                job.error = error
-            job.done.release()
+    def _serve(self, worker: int) -> None:
+        lower_priority(self.nice)
+        while (job := self._queues[worker].get()) is not None:
+            self._work(job, worker)
             del job  # or the last job's arrays would live until the next one comes
+        self._wake_others(worker, None)
+
+    def _work(self, job: _Job, worker: int) -> None:
+        self._wake_others(worker, job)
+        try:
+            job.kernel(job.counter, worker, *job.args)
+        except BaseException as error:  # handed to the caller of run()
+            job.error = error
+        job.done.release()
+
+    def _wake_others(self, worker: int, job: _Job | None) -> None:
+        for other in (2 * worker + 1, 2 * worker + 2):
+            if other < self.threads:
+                self._queues[other].put(job)
 
 
 class CallerPool(Pool):
@@ -110,7 +129,9 @@ def shared_pool(threads: int | None = None, nice: int = 10) -> Pool:
         return _shared[threads, nice]
 
 
-def _lower_priority(nice: int) -> None:
+def lower_priority(nice: int) -> None:
+    """Lower the calling thread's own priority for good. It then works along in pools of that ``nice``."""
+    _here.nice = nice
     if nice <= 0 or not hasattr(os, "setpriority"):
         return
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from numba import njit
 from edge_server.fields.kernels.intrinsics import exp32, fetch_add, log32, uniform
 from edge_server.fields.kernels.jit import FAST, SOURCES
 from edge_server.fields.kernels.mlp import forward
-from edge_server.fields.kernels.pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
+from edge_server.fields.kernels.pool import THREADS_VARIABLE, CallerPool, Pool, lower_priority, shared_pool
 
 
 @njit(nogil=True)
@@ -72,6 +73,68 @@ def test_workers_lower_their_own_priority_and_nobody_elses() -> None:
     Pool(1, nice=5).run(look)
     assert seen == [min(mine + 5, 19)]
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == mine
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+def test_all_workers_compute_at_once_and_each_once(threads: int) -> None:
+    """Whoever waits for the others before it computes would wait for ever if it had to wake them after."""
+    pool, together, seen = Pool(threads), threading.Barrier(threads), []
+
+    def meet(counter, worker):
+        together.wait(10)
+        seen.append(worker)
+
+    for _ in range(3):
+        pool.run(meet)
+    pool.close()
+    assert sorted(seen) == sorted(3 * list(range(threads)))
+
+
+@pytest.mark.skipif(os.uname().sysname != "Linux", reason="priorities of single threads: Linux only")
+@pytest.mark.parametrize("nice, works", [(0, False), (3, False), (4, True), (9, True)])
+def test_a_caller_works_along_unless_it_is_to_go_first(nice: int, works: bool) -> None:
+    pool, seen = Pool(2, nice=4), {}
+
+    def who(counter, worker):
+        seen[worker] = threading.get_ident()
+
+    def call():
+        lower_priority(nice)
+        pool.run(who)
+        assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == nice
+
+    caller = threading.Thread(target=call)
+    caller.start()
+    caller.join(10)
+    assert seen.keys() == {0, 1} and len(set(seen.values())) == 2
+    assert (seen[0] == caller.ident) is works and seen[1] != caller.ident
+
+
+def test_an_error_of_a_caller_that_works_along_waits_for_the_others() -> None:
+    pool, done = Pool(2, nice=0), []
+
+    def fails_first(counter, worker):
+        if worker == 0:
+            raise RuntimeError("worker 0")
+        time.sleep(0.05)
+        done.append(worker)
+
+    with pytest.raises(RuntimeError, match="worker 0"):
+        pool.run(fails_first)
+    assert done == [1]
+
+
+def test_a_closed_pool_ends_its_threads_after_what_is_queued() -> None:
+    before, pool, done = set(threading.enumerate()), Pool(5), np.zeros(10_000, np.int64)
+    caller = threading.Thread(target=pool.run, args=(_count, done))
+    own = set(threading.enumerate()) - before
+    assert len(own) == 5
+    caller.start()
+    caller.join(30)
+    pool.close()
+    for thread in own:
+        thread.join(10)
+    assert (done == 1).all() and not any(thread.is_alive() for thread in own)
 
 
 def test_a_pool_is_shared_by_equal_settings() -> None:
