@@ -46,7 +46,7 @@ class Effort:
     rate_repeats: int
 
 
-FULL = Effort(5, (0.25, 0.5, 1.0, 1.5, 2.5, 3.0, 4.0, 8.0, 15.0), (2.0, 5.0, 15.0, 60.0), 9)
+FULL = Effort(5, (0.25, 0.3, 0.5, 0.8, 1.0, 1.5, 2.5, 3.0, 4.0, 8.0, 15.0), (2.0, 5.0, 15.0, 60.0), 9)
 QUICK = Effort(1, (0.5, 1.0, 2.5, 8.0), (2.0, 5.0), 3)
 
 # Under the data folder: file or folder, what is held out, by what its images are divided.
