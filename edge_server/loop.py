@@ -22,7 +22,6 @@ import numpy as np
 from edge_server.buffer import Buffered, FrameBuffer
 from edge_server.config import KeyframesConfig
 from edge_server.fields import Budget, Field, FitReport, Renderer, View
-from edge_server.fields.kernels.pool import SERVER_NICE, lower_priority
 from edge_server.pacing import Pacing
 from edge_server.scheduler import STATE_PARTS, Epoch, Plan, Policy, embedding_of, treatment_of
 from edge_server.state import Publication
@@ -242,8 +241,7 @@ class Loop:
     """Runs ``updates`` on the wall clock until stopped.
 
     on_published(publication, renderer, views) is called after each update, on the loop's thread. Policy
-    changes, pause and reset asked for from other threads take effect at the next decision. nice: the
-    priority of that thread, once the kernels are compiled.
+    changes, pause and reset asked for from other threads take effect at the next decision.
     """
 
     def __init__(
@@ -255,10 +253,8 @@ class Loop:
         on_published: Callable[[Publication, Renderer, list[View]], None],
         on_status: Callable[[str], None],
         on_checkpoint: Callable[[Path], None],
-        nice: int = SERVER_NICE,
     ) -> None:
         self._updates = updates
-        self._nice = nice
         self._clock = clock
         self._pacing = pacing
         self._grace_ns = round(grace_ms * 1e6)
@@ -307,7 +303,6 @@ class Loop:
         try:
             self._on_status("compiling the field's kernels")
             self._updates.field.warm_up()
-            lower_priority(self._nice)  # not sooner: beside other work, compiling would take minutes
             self._await_cameras()
             while not self._stop.is_set():
                 self._once()

@@ -139,7 +139,6 @@ class EdgeServer:
             self._published,
             self._say,
             self._checkpoint,
-            nice=aside["nice"],
         )
         self.state = EdgeState(
             scenario=scenario.name,

@@ -26,7 +26,7 @@ from edge_server.fields.kernels.splat_raster import Loss, train_tiles
 from edge_server.fields.kernels.splat_update import Rule, bound_all, update
 from edge_server.fields.ngp_rig import Arrays, Rig, same_views
 from edge_server.fields.ngp_schedule import BETA1, BETA2, Pace, Usual, step_key
-from edge_server.fields.ngp_state import all_or_nothing
+from edge_server.fields.ngp_state import all_or_nothing, unpack_meta
 from edge_server.fields.scene_box import NOWHERE
 from edge_server.fields.splat_growth import Cloud, grow_and_prune
 from edge_server.fields.splat_motion import (
@@ -451,15 +451,7 @@ class SplatField:
 
 def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], Cloud]:
     """The facts and the Gaussians in ``state``; ValueError unless a field with ``settings`` made them."""
-    try:
-        meta = json.loads(str(state["meta"]))
-        if meta["field"] != "splat":
-            raise ValueError(f"it is of a field called {meta['field']!r}")
-        theirs = int(meta["settings"]["harmonics"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"not a state of a splat field: {error!r}") from None
-    if theirs != settings.harmonics:
-        raise ValueError(f"the state was made with harmonics = {theirs}, this field has {settings.harmonics}")
+    meta = unpack_meta(settings, state, "splat", ("harmonics",))
     empty = Cloud.empty(settings)
     count = len(state["params"]) if "params" in state else 0
     arrays = {}

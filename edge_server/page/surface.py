@@ -68,6 +68,7 @@ class SurfaceLayer:
         import numpy as np
         import trimesh
 
+        from edge_server.fields.kernels.pool import SERVER_NICE, shared_pool
         from edge_server.surface import SurfaceError
         from edge_server.surface.reconstruct import MeshSettings, grid_for, maps_of, mesh_of_maps
 
@@ -76,15 +77,15 @@ class SurfaceLayer:
         if renderer is None or not views:
             raise SurfaceError("the field has not been trained yet")
         # The depth as the field has it: what moves is in no two pictures alike.
-        settings = MeshSettings(sharpen=False, memory_mb=MEMORY_MB)
-        maps = maps_of(renderer, views, settings)
+        settings, pool = MeshSettings(sharpen=False, memory_mb=MEMORY_MB), shared_pool(nice=SERVER_NICE)
+        maps = maps_of(renderer, views, settings, pool=pool)
         grid = grid_for(maps, settings)
         span = float(np.subtract(grid.upper, grid.lower).max())
         settings = MeshSettings(
             sharpen=False, memory_mb=MEMORY_MB, voxel_m=max(grid.voxel_m, span / VOXELS),
             bounds=(grid.lower, grid.upper),
         )  # fmt: skip
-        mesh = mesh_of_maps(maps, settings)
+        mesh = mesh_of_maps(maps, settings, pool=pool)
         return self._server.scene.add_mesh_trimesh(
             NODE, trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.color, process=False)
         )

@@ -4,10 +4,10 @@ Not numba's own threading layers: those abort or serialise when several Python t
 kernels, and here a page renders while the field trains.
 
 A kernel takes milliseconds or less, so where its threads wake up matters. Linux puts a thread that wakes on
-a core that is idle at that moment, and seldom moves it afterwards, the less so the lower its priority. A
+a core that is idle at that moment, and seldom moves it afterwards, least of all one of low priority. A
 caller that woke one worker a core would itself keep a core busy until it slept: two workers on one core,
 the other idle, in four calls of ten on two cores. So whoever computes wakes at most two others first, and
-the caller computes, too, unless it is to be more important than the workers.
+the caller computes itself, unless its priority is higher than the workers'.
 """
 
 from __future__ import annotations
@@ -51,29 +51,35 @@ class Pool:
     """``threads`` workers. ``run(kernel, *args)`` calls ``kernel(counter, worker, *args)`` on each of them;
     the kernel draws task numbers from ``counter`` until none are left (see ``kernels.intrinsics``).
 
-    Any number of Python threads may call ``run``; kernels of several may run at once, so that memory that a
-    kernel has for each worker is for one call at a time.
+    Any number of Python threads may call ``run``: no more than ``threads`` of them compute, one job after
+    the other in each.
     threads: default, the environment's FRESHFIELD_THREADS, else the number of cores this process may use.
-    Results do not depend on it. nice: the workers' own priority where the system allows it (Linux counts it
-    per thread), so that who ingests frames goes first. A caller of the same priority is worker 0 itself.
+    Results do not depend on it. nice: the workers' priority where the system allows it (Linux counts it per
+    thread), so that who ingests frames goes first. A caller whose own is as low, or lower, is worker 0.
     """
 
-    def __init__(self, threads: int | None = None, nice: int = 10) -> None:
+    def __init__(self, threads: int | None = None, nice: int = 0) -> None:
         self.threads = cores() if threads is None else int(threads)
         if self.threads < 1:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice
         self._queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
+        self._seats = [threading.Lock() for _ in range(self.threads)]  # held by whoever is that worker
+        self._closed = False
         for worker in range(self.threads):
             name = f"field-worker-{worker}"
             threading.Thread(target=self._serve, args=(worker,), name=name, daemon=True).start()
 
     def run(self, kernel: Callable[..., Any], *args: Any) -> None:
-        """Run ``kernel`` on all workers and wait for them; raises what a worker raised."""
+        """Run ``kernel`` on all workers and wait for them; raises what a worker raised. RuntimeError if the
+        pool is closed."""
         job = _Job(kernel, args)
         if getattr(_here, "nice", 0) >= self.nice:
-            self._work(job, 0)
+            with self._seats[0]:
+                self._check_open()
+                self._work(job, 0)
         else:
+            self._check_open()
             self._queues[0].put(job)
         for _ in self._queues:
             job.done.acquire()
@@ -81,22 +87,29 @@ class Pool:
             raise job.error
 
     def close(self) -> None:
-        """End the workers once they have finished what is queued."""
+        """End the workers once they have finished what was begun."""
+        self._closed = True
         self._queues[0].put(None)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("the pool is closed")
 
     def _serve(self, worker: int) -> None:
         lower_priority(self.nice)
         while (job := self._queues[worker].get()) is not None:
-            self._work(job, worker)
+            with self._seats[worker]:
+                self._work(job, worker)
             del job  # or the last job's arrays would live until the next one comes
-        self._wake_others(worker, None)
+        with self._seats[worker]:  # what a caller has begun to hand on goes before the end
+            self._wake_others(worker, None)
 
     def _work(self, job: _Job, worker: int) -> None:
         self._wake_others(worker, job)
         try:
             job.kernel(job.counter, worker, *job.args)
         except BaseException as error:  # handed to the caller of run()
-            job.error = error
+            job.error = job.error or error
         job.done.release()
 
     def _wake_others(self, worker: int, job: _Job | None) -> None:
@@ -121,7 +134,7 @@ _shared: dict[tuple[int | None, int], Pool] = {}
 _shared_lock = threading.Lock()
 
 
-def shared_pool(threads: int | None = None, nice: int = 10) -> Pool:
+def shared_pool(threads: int | None = None, nice: int = 0) -> Pool:
     """The process's pool for these settings, made at the first call. All fields of a process share it."""
     with _shared_lock:
         if (threads, nice) not in _shared:
@@ -130,13 +143,15 @@ def shared_pool(threads: int | None = None, nice: int = 10) -> Pool:
 
 
 def lower_priority(nice: int) -> None:
-    """Lower the calling thread's own priority for good. It then works along in pools of that ``nice``."""
+    """Lower the calling thread's own priority to ``nice`` (Linux), for good; it then works along in pools of
+    that one and of higher ones."""
     _here.nice = nice
     if nice <= 0 or not hasattr(os, "setpriority"):
         return
     try:
         # On Linux a thread's priority is its own; elsewhere this would slow the whole process.
         if os.uname().sysname == "Linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+            mine = threading.get_native_id()
+            os.setpriority(os.PRIO_PROCESS, mine, max(nice, os.getpriority(os.PRIO_PROCESS, mine)))
     except OSError:
         pass  # a sandbox may forbid it: the field then competes on equal terms

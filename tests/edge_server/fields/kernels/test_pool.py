@@ -25,9 +25,11 @@ def _count(counter, worker, done):
         done[task] += 1
 
 
+# With a nice of 0 the caller is a worker itself.
+@pytest.mark.parametrize("nice", [0, 5])
 @pytest.mark.parametrize("threads", [1, 3])
-def test_every_task_is_done_once(threads: int) -> None:
-    pool, done = Pool(threads), np.zeros(10_000, np.int64)
+def test_every_task_is_done_once(threads: int, nice: int) -> None:
+    pool, done = Pool(threads, nice), np.zeros(10_000, np.int64)
     pool.run(_count, done)
     pool.close()
     assert (done == 1).all()
@@ -52,14 +54,31 @@ def test_no_threads_are_not_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None
         Pool()
 
 
-def test_several_python_threads_may_run_kernels_at_once() -> None:
-    pool, arrays = Pool(2), [np.zeros(2000, np.int64) for _ in range(8)]
-    callers = [threading.Thread(target=pool.run, args=(_count, a)) for a in arrays]
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_several_python_threads_may_run_kernels_at_once(threads: int) -> None:
+    """Some of them work along, others go first: either way no more compute than the pool has threads."""
+    pool, arrays = Pool(threads, nice=3), [np.zeros(2000, np.int64) for _ in range(8)]
+    now, most = set(), [0]
+
+    def noted(counter, worker, done):
+        now.add(threading.get_ident())
+        most[0] = max(most[0], len(now))
+        time.sleep(0.002)
+        _count(counter, worker, done)
+        now.discard(threading.get_ident())
+
+    def call(nice, done):
+        lower_priority(nice)
+        for _ in range(5):
+            pool.run(noted, done)
+
+    callers = [threading.Thread(target=call, args=(3 * (k % 2), a)) for k, a in enumerate(arrays)]
     for caller in callers:
         caller.start()
     for caller in callers:
         caller.join(30)
-    assert all((a == 1).all() for a in arrays)
+    assert all((a == 5).all() for a in arrays)
+    assert most[0] == threads
 
 
 @pytest.mark.skipif(os.uname().sysname != "Linux", reason="priorities of single threads: Linux only")
@@ -71,14 +90,15 @@ def test_workers_lower_their_own_priority_and_nobody_elses() -> None:
 
     mine = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     Pool(1, nice=5).run(look)
-    assert seen == [min(mine + 5, 19)]
+    assert seen == [max(mine, 5)]
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == mine
 
 
+@pytest.mark.parametrize("nice", [0, 5])
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])
-def test_all_workers_compute_at_once_and_each_once(threads: int) -> None:
-    """Whoever waits for the others before it computes would wait for ever if it had to wake them after."""
-    pool, together, seen = Pool(threads), threading.Barrier(threads), []
+def test_all_workers_compute_at_once_and_each_once(threads: int, nice: int) -> None:
+    """They wait for each other here: who computed first and woke the others then would wait for ever."""
+    pool, together, seen = Pool(threads, nice), threading.Barrier(threads), []
 
     def meet(counter, worker):
         together.wait(10)
@@ -101,11 +121,13 @@ def test_a_caller_works_along_unless_it_is_to_go_first(nice: int, works: bool) -
     def call():
         lower_priority(nice)
         pool.run(who)
-        assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == nice
+        own.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
 
+    own, mine = [], os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     caller = threading.Thread(target=call)
     caller.start()
     caller.join(10)
+    assert own == [max(mine, nice)]
     assert seen.keys() == {0, 1} and len(set(seen.values())) == 2
     assert (seen[0] == caller.ident) is works and seen[1] != caller.ident
 
@@ -124,17 +146,32 @@ def test_an_error_of_a_caller_that_works_along_waits_for_the_others() -> None:
     assert done == [1]
 
 
-def test_a_closed_pool_ends_its_threads_after_what_is_queued() -> None:
-    before, pool, done = set(threading.enumerate()), Pool(5), np.zeros(10_000, np.int64)
-    caller = threading.Thread(target=pool.run, args=(_count, done))
+@pytest.mark.parametrize("nice", [0, 5])
+def test_a_closed_pool_ends_its_threads_after_what_was_begun(nice: int) -> None:
+    before, pool = set(threading.enumerate()), Pool(5, nice)
     own = set(threading.enumerate()) - before
-    assert len(own) == 5
-    caller.start()
-    caller.join(30)
+    go, begun, arrays = threading.Event(), threading.Barrier(6), np.zeros((2, 10_000), np.int64)
+
+    def waits(counter, worker, done):
+        begun.wait(10)
+        go.wait(10)
+        _count(counter, worker, done)
+
+    callers = [threading.Thread(target=pool.run, args=(waits, arrays[0]))]
+    callers[0].start()
+    begun.wait(10)  # all five compute; what is asked for now has to wait
+    if nice:
+        callers.append(threading.Thread(target=pool.run, args=(_count, arrays[1])))
+        callers[1].start()
+        while pool._queues[0].empty():
+            time.sleep(0.001)
     pool.close()
-    for thread in own:
+    go.set()
+    for thread in (*callers, *own):
         thread.join(10)
-    assert (done == 1).all() and not any(thread.is_alive() for thread in own)
+    assert (arrays[: len(callers)] == 1).all() and not any(thread.is_alive() for thread in own)
+    with pytest.raises(RuntimeError, match="closed"):
+        pool.run(_count, arrays[0])
 
 
 def test_a_pool_is_shared_by_equal_settings() -> None:
