@@ -18,11 +18,7 @@ from edge_server.fields.splat import SplatField
 from edge_server.fields.tensorf import TensorfField
 from edge_server.fields.voxel import VoxelField
 from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.test_nerfacto import SMALL as NERFACTO
-from tests.edge_server.fields.test_ngp import SMALL as NGP
-from tests.edge_server.fields.test_splat import SMALL as SPLAT
-from tests.edge_server.fields.test_tensorf import SMALL as TENSORF
-from tests.edge_server.fields.test_voxel import SMALL as VOXEL
+from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
 
 
 class Fits:

@@ -10,8 +10,9 @@ import pytest
 from edge_server.fields import Budget
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_torch_field import NgpTorchField, cuda_present
-from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.test_ngp import HELD, SEEN, SMALL, psnr
+from tests.edge_server.fields.scenes import psnr, ring
+from tests.edge_server.fields.small import HELD, SEEN
+from tests.edge_server.fields.small import NGP as SMALL
 
 
 @pytest.mark.parametrize("contracted", [False, True])

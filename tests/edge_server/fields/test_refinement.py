@@ -13,17 +13,9 @@ from edge_server.fields.ngp import NgpField
 from edge_server.fields.refinement import Exposures, Poses
 from edge_server.fields.tensorf import TensorfField
 from freshfield.geometry import so3_exp
-from tests.edge_server.fields.scenes import psnr, ring
-from tests.edge_server.fields.test_ngp import SMALL as NGP
-from tests.edge_server.fields.test_tensorf import SMALL as TENSORF
+from tests.edge_server.fields.small import NGP, SEEN, TENSORF, score
 
-VIEWS = ring(13)
-HELD, SEEN = VIEWS[6], VIEWS[:6] + VIEWS[7:]
 KINDS: list[tuple[Any, Any]] = [(NgpField, NGP), (TensorfField, TENSORF)]
-
-
-def _score(field: Any) -> float:
-    return psnr(field.render(HELD.camera_to_world, HELD.intrinsics).color, HELD.image / 255.0)
 
 
 def _exposed(views: list[View]) -> tuple[list[View], np.ndarray]:
@@ -67,7 +59,7 @@ def test_gains_are_found_and_the_held_out_view_gains(kind: Any, settings: Any) -
     for on in (False, True):
         field = kind(replace(settings, exposure=on, background="#80b2e6", contracted=False))
         field.fit(views, Budget(steps=500))
-        scores[on] = _score(field)
+        scores[on] = score(field)
     assert scores[True] > scores[False] + 1.0
     found = np.array([field._cameras.exposures.known[v.camera][:, 0] for v in views])
     assert np.corrcoef(np.log(found).ravel(), -np.log(gains).ravel())[0, 1] > 0.65
@@ -79,7 +71,7 @@ def test_poses_are_improved_and_kept_within_their_bounds() -> None:
     for on in (False, True):
         field = NgpField(replace(NGP, refine_m=0.1 * on, refine_deg=4.0 * on))
         field.fit(views, Budget(steps=600))
-        scores[on] = _score(field)
+        scores[on] = score(field)
     assert scores[True] > scores[False] + 0.5
     assert field._cameras.poses is not None
     before = _pixels_off([v.camera_to_world for v in views])
@@ -97,7 +89,7 @@ def test_exact_poses_and_equal_exposures_are_not_harmed() -> None:
     plain, both = NgpField(NGP), NgpField(replace(NGP, exposure=True, refine_m=0.05, refine_deg=2.0))
     for field in (plain, both):
         field.fit(SEEN, Budget(steps=400))
-    assert _score(both) > _score(plain) - 0.3
+    assert score(both) > score(plain) - 0.3
 
 
 def test_both_repeat_themselves_and_resume_bit_for_bit() -> None:

@@ -1,10 +1,9 @@
-"""The Gaussian field as a whole: it learns, repeats itself bit for bit, keeps budgets, saves and resumes."""
+"""What is the Gaussian field's own; ``test_every_representation`` has the rest."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -19,68 +18,10 @@ from edge_server.fields.splat_growth import opacity
 from edge_server.fields.splat_motion import drift
 from edge_server.fields.splat_passes import camera_rows
 from edge_server.fields.splat_seeds import seeds
-from edge_server.fields.splat_settings import SplatSettings
 from edge_server.fields.supervision import pack_cameras
-from tests.edge_server.fields.scenes import picture, psnr, ring
-
-SMALL = SplatSettings(gaussians=1500, start=800, seed_cells=32, densify_every=20, threads=2)
-VIEWS = ring(13)
-HELD, SEEN = VIEWS[6], VIEWS[:6] + VIEWS[7:]
-
-
-def _score(field: SplatField, view: View = HELD) -> float:
-    return psnr(field.render(view.camera_to_world, view.intrinsics).color, view.image / 255.0)
-
-
-@pytest.fixture(scope="module")
-def trained() -> SplatField:
-    field = SplatField(SMALL)
-    field.fit(SEEN, Budget(steps=250))
-    return field
-
-
-def test_it_learns_a_view_it_has_not_seen(trained: SplatField) -> None:
-    mean = np.mean([v.image for v in SEEN], axis=(0, 1, 2)) / 255.0
-    assert psnr(mean, HELD.image / 255.0) < 16.0
-    assert _score(trained) > 20.0
-
-
-def test_depth_is_in_metres(trained: SplatField) -> None:
-    out = trained.render(HELD.camera_to_world, HELD.intrinsics)
-    middle = out.depth[22:26, 22:26]
-    expected = np.linalg.norm(HELD.camera_to_world[:3, 3] - [0, 0, 0.45]) - 0.5
-    # Soft Gaussians: the mean of a pixel's depths lies somewhat behind the surface.
-    assert -0.1 < np.median(middle) - expected < 0.4
-    assert out.opacity.min() >= 0.0 and out.opacity.max() <= 1.0 + 1e-5
-
-
-def test_points_lie_on_surfaces(trained: SplatField) -> None:
-    points, colors = trained.points(500)
-    assert 100 < len(points) <= 500 and points.dtype == colors.dtype == np.float32
-    ball = np.abs(np.linalg.norm(points - [0, 0, 0.5], axis=1) - 0.5)
-    assert np.median(np.minimum(ball, np.abs(points[:, 2]))) < 0.2
-    assert colors.min() >= 0.0 and colors.max() <= 1.0
-
-
-def _same_state(a: SplatField, b: SplatField) -> None:
-    one, two = a.state(), b.state()
-    assert one.keys() == two.keys()
-    for name in one.keys() - {"meta"}:
-        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
-
-
-def test_results_are_equal_bit_for_bit_whatever_the_thread_count() -> None:
-    fields = [SplatField(replace(SMALL, threads=threads)) for threads in (1, 2, 2)]
-    reports = []
-    for field in fields:
-        field.fit(SEEN[:5], Budget(steps=15))
-        reports.append(field.fit(SEEN, Budget(steps=10)))
-    assert len({(r.loss, r.rays, r.samples) for r in reports}) == 1
-    _same_state(fields[0], fields[1])
-    _same_state(fields[1], fields[2])
-    pictures = [f.render(HELD.camera_to_world, HELD.intrinsics) for f in fields]
-    np.testing.assert_array_equal(pictures[0].color, pictures[1].color)
-    np.testing.assert_array_equal(pictures[0].depth, pictures[1].depth)
+from tests.edge_server.fields.scenes import picture
+from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, same_state, score
+from tests.edge_server.fields.small import SPLAT as SMALL
 
 
 def test_a_state_knows_the_views_it_was_fitted_to() -> None:
@@ -97,7 +38,7 @@ def test_a_state_knows_the_views_it_was_fitted_to() -> None:
     for field in (a, b):
         field.fit([replace(v, image=v.image.copy()) for v in moved], Budget(steps=10))
     assert (a.cloud.guest > 0).any() and a.cloud.velocity.shape == (len(a.cloud), 3)
-    _same_state(a, b)
+    same_state(a, b)
 
 
 def test_nothing_begins_at_pixels_without_weight() -> None:
@@ -154,27 +95,10 @@ def test_where_something_moved_only_cells_that_most_cameras_see_move_are_scored(
     assert (where_marked == expected).mean() > 0.99
 
 
-def test_another_seed_is_another_field() -> None:
-    a, b = SplatField(SMALL), SplatField(replace(SMALL, seed=1))
-    for field in (a, b):
-        field.fit(SEEN[:3], Budget(steps=1))
-    assert not np.array_equal(a.state()["params"], b.state()["params"])
-
-
-def test_resuming_continues_bit_for_bit() -> None:
-    moved = [
-        replace(v, image=picture(v.intrinsics, v.camera_to_world, np.array([0.3, 0, 0.5]))) for v in SEEN
-    ]
-    a, b = SplatField(SMALL), SplatField(replace(SMALL, threads=1))
-    a.fit(SEEN, Budget(steps=20))
-    b.load_state(a.state())
-    for field in (a, b):
-        field.fit(moved, Budget(steps=20))  # depends on the remembered pictures: what has changed?
-    _same_state(a, b)
-
-
-def test_a_state_of_another_shape_is_refused(trained: SplatField) -> None:
-    state = trained.state()
+def test_a_state_of_another_shape_is_refused() -> None:
+    field = SplatField(SMALL)
+    field.fit(SEEN, Budget(steps=1))
+    state = field.state()
     with pytest.raises(ValueError, match="harmonics = 1"):
         SplatField(replace(SMALL, harmonics=4)).load_state(state)
     with pytest.raises(ValueError, match="not a state"):
@@ -184,23 +108,6 @@ def test_a_state_of_another_shape_is_refused(trained: SplatField) -> None:
     del state["v"]
     with pytest.raises(ValueError, match="'v'"):
         SplatField(SMALL).load_state(state)
-
-
-def test_reset_forgets_everything() -> None:
-    field = SplatField(SMALL)
-    before = field.state()
-    field.fit(SEEN, Budget(steps=5))
-    field.reset()
-    after = field.state()
-    assert before.keys() == after.keys() and all((before[k] == after[k]).all() for k in before)
-
-
-@pytest.mark.alone
-def test_a_budget_in_seconds_is_kept(trained: SplatField) -> None:
-    trained.fit(SEEN, Budget(seconds=0.3))  # by then it is known how long a step takes here
-    reports = [trained.fit(SEEN, Budget(seconds=0.3)) for _ in range(5)]
-    spent = np.median([r.seconds for r in reports])
-    assert 0.85 * 0.3 <= spent <= 1.1 * 0.3 and all(r.steps > 3 for r in reports)
 
 
 @pytest.mark.alone
@@ -217,32 +124,6 @@ def test_a_budget_in_seconds_is_kept_while_things_move() -> None:
     assert np.median(spent) <= 1.1 * 0.3
 
 
-def test_a_snapshot_does_not_change_while_the_field_trains(trained: SplatField) -> None:
-    snapshot = trained.snapshot()
-    before = snapshot.render(HELD.camera_to_world, HELD.intrinsics).color
-    trained.fit(SEEN, Budget(steps=5))
-    np.testing.assert_array_equal(before, snapshot.render(HELD.camera_to_world, HELD.intrinsics).color)
-    assert not np.array_equal(before, trained.render(HELD.camera_to_world, HELD.intrinsics).color)
-
-
-def test_others_render_while_it_trains() -> None:
-    field = SplatField(SMALL)
-    field.fit(SEEN, Budget(steps=5))
-    worker = threading.Thread(target=field.fit, args=(SEEN, Budget(steps=60)))
-    worker.start()
-    pictures = 0
-    while worker.is_alive():
-        out = field.snapshot().render(HELD.camera_to_world, HELD.intrinsics)
-        assert np.isfinite(out.color).all()
-        pictures += 1
-    worker.join()
-    assert pictures > 5, "rendering starved while the field trained"
-    alone = SplatField(SMALL)
-    alone.fit(SEEN, Budget(steps=5))
-    alone.fit(SEEN, Budget(steps=60))
-    _same_state(field, alone)
-
-
 def test_what_is_gone_is_forgotten_and_what_came_grows() -> None:
     """The ball moves aside; a few steps later it stands at its new place and nowhere else."""
     field = SplatField(SMALL)
@@ -250,9 +131,9 @@ def test_what_is_gone_is_forgotten_and_what_came_grows() -> None:
     place = np.array([0.45, -0.3, 0.5])
     moved = [replace(v, image=picture(v.intrinsics, v.camera_to_world, place)) for v in SEEN]
     truth = replace(HELD, image=picture(HELD.intrinsics, HELD.camera_to_world, place))
-    stale = _score(field, truth)
+    stale = score(field, truth)
     field.fit(moved, Budget(steps=60))
-    assert _score(field, truth) > stale + 4.0 and _score(field, truth) > 20.0
+    assert score(field, truth) > stale + 4.0 and score(field, truth) > 20.0
 
 
 MS = 1_000_000
@@ -321,7 +202,7 @@ def test_what_has_stopped_stays_where_it_is(seen: int) -> None:
         field.fit(now, Budget(steps=1))
     assert np.abs(field.cloud.velocity).max() == 0
     truth = picture(HELD.intrinsics, HELD.camera_to_world, START + SPEED * 0.3)
-    assert _score(field, replace(HELD, image=truth)) > 18.0
+    assert score(field, replace(HELD, image=truth)) > 18.0
 
 
 def test_time_that_stands_still_or_goes_back_does_not_fling_anything() -> None:
@@ -375,7 +256,7 @@ def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:
 def test_every_option_learns(options: dict) -> None:
     field = SplatField(replace(SMALL, **options))
     field.fit(SEEN, Budget(steps=200))
-    assert _score(field) > 18.0
+    assert score(field) > 18.0
 
 
 def test_a_lens_with_distortion_is_learnt_as_it_is() -> None:
@@ -383,55 +264,14 @@ def test_a_lens_with_distortion_is_learnt_as_it_is() -> None:
     views = [replace(v, intrinsics=bent, image=picture(bent, v.camera_to_world)) for v in VIEWS]
     field = SplatField(SMALL)
     field.fit(views[:6] + views[7:], Budget(steps=250))
-    assert _score(field, views[6]) > 20.0
-    assert _score(field, HELD) > 19.0, "a pinhole camera sees the same scene"
-
-
-def test_transparent_views_are_seen_against_the_background() -> None:
-    views = []
-    for view in SEEN:
-        sky = (view.image == view.image[0, 0]).all(axis=-1)
-        alpha = np.where(sky, 0, 255).astype(np.uint8)
-        views.append(replace(view, image=np.dstack([view.image, alpha])))
-    field = SplatField(replace(SMALL, background="white"))
-    field.fit(views, Budget(steps=120))
-    out = field.render(views[0].camera_to_world, views[0].intrinsics)
-    clear = views[0].image[..., 3] == 0
-    assert field.rig.box is not None and not field.rig.box.contracted
-    assert out.color[clear].mean() > 0.9 and out.opacity[clear].mean() < 0.3
-    assert out.opacity[~clear].mean() > 0.7
+    assert score(field, views[6]) > 20.0
+    assert score(field, HELD) > 19.0, "a pinhole camera sees the same scene"
 
 
 def test_a_random_background_leaves_transparent_pixels_open() -> None:
-    views = []
-    for view in SEEN:
-        sky = (view.image == view.image[0, 0]).all(axis=-1)
-        views.append(replace(view, image=np.dstack([view.image, np.where(sky, 0, 255).astype(np.uint8)])))
+    views = [cut_out(view) for view in SEEN]
     field = SplatField(replace(SMALL, background="random"))
     field.fit(views, Budget(steps=150))
     out = field.render(views[0].camera_to_world, views[0].intrinsics)
     clear = views[0].image[..., 3] == 0
     assert out.opacity[clear].mean() < 0.2 < 0.8 < out.opacity[~clear].mean()
-
-
-def test_no_views_do_nothing_and_the_report_says_so() -> None:
-    field = SplatField(SMALL)
-    before = field.state()
-    report = field.fit([], Budget(seconds=5.0))
-    assert report.steps == 0 and report.seconds < 0.5 and "no views" in report.note
-    assert all((before[k] == v).all() for k, v in field.state().items())
-
-
-def test_views_that_cannot_be_are_refused() -> None:
-    field, good = SplatField(SMALL), SEEN[0]
-    pose = good.camera_to_world.copy()
-    pose[0, 3] = np.nan
-    for wrong, text in (
-        (replace(good, image=good.image[:-1]), "48 x 47"),
-        (replace(good, image=good.image.astype(np.float32)), "uint8"),
-        (replace(good, camera_to_world=pose), "finite"),
-        (replace(good, intrinsics=replace(good.intrinsics, fx=0.0)), "focal"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            field.fit([wrong], Budget(steps=1))
-    assert field.step == 0 and not field.rig.memory

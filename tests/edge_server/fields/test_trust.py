@@ -21,11 +21,7 @@ from edge_server.fields.tensorf import TensorfField
 from edge_server.fields.trust import PATIENCE, refused, weights
 from edge_server.fields.voxel import VoxelField
 from tests.edge_server.fields.scenes import picture, psnr, ring
-from tests.edge_server.fields.test_nerfacto import SMALL as NERFACTO
-from tests.edge_server.fields.test_ngp import SMALL as NGP
-from tests.edge_server.fields.test_splat import SMALL as SPLAT
-from tests.edge_server.fields.test_tensorf import SMALL as TENSORF
-from tests.edge_server.fields.test_voxel import SMALL as VOXEL
+from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
 
 MS = 1_000_000
 AGES_MS = (0, 50, 100, 200)

@@ -1,0 +1,245 @@
+"""What every representation must do: learn, repeat itself bit for bit, keep budgets, save, resume, refuse."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget
+from edge_server.fields.registry import field_names
+from tests.edge_server.fields.scenes import psnr
+from tests.edge_server.fields.small import (
+    CLASSES,
+    HELD,
+    SEEN,
+    SMALL,
+    cut_out,
+    moved,
+    same_state,
+    score,
+    small,
+)
+
+EVERY = pytest.mark.parametrize("name", tuple(SMALL))
+
+
+@lru_cache
+def _trained(name: str) -> Any:
+    field = small(name)
+    field.fit(SEEN, Budget(steps=250))
+    return field
+
+
+def test_none_is_left_out() -> None:
+    assert set(SMALL) == set(CLASSES) == set(field_names())
+
+
+@EVERY
+def test_it_learns_a_view_it_has_not_seen(name: str) -> None:
+    mean = np.mean([v.image for v in SEEN], axis=(0, 1, 2)) / 255.0
+    assert psnr(mean, HELD.image / 255.0) < 16.0
+    assert score(_trained(name)) > 20.0
+
+
+@EVERY
+def test_depth_is_in_metres(name: str) -> None:
+    out = _trained(name).render(HELD.camera_to_world, HELD.intrinsics)
+    middle = out.depth[22:26, 22:26]
+    expected = np.linalg.norm(HELD.camera_to_world[:3, 3] - [0, 0, 0.45]) - 0.5
+    # Gaussians are soft: the mean of a pixel's depths lies somewhat behind the surface.
+    low, high = (-0.1, 0.4) if name == "splat" else (-0.25, 0.25)
+    assert low < np.median(middle) - expected < high
+    assert out.opacity.min() >= 0.0 and out.opacity.max() <= 1.0 + 1e-5
+
+
+@EVERY
+def test_points_lie_on_surfaces(name: str) -> None:
+    points, colors = _trained(name).points(500)
+    assert 100 < len(points) <= 500 and points.dtype == colors.dtype == np.float32
+    ball = np.abs(np.linalg.norm(points - [0, 0, 0.5], axis=1) - 0.5)
+    off = 0.2 if name == "splat" else 0.12
+    assert np.median(np.minimum(ball, np.abs(points[:, 2]))) < off
+    assert colors.min() >= 0.0 and colors.max() <= 1.0
+
+
+@EVERY
+def test_a_warm_start_follows_what_moved(name: str) -> None:
+    field, target = small(name), moved(HELD)
+    field.load_state(_trained(name).state())
+    stale = score(field, target)
+    field.fit([moved(v) for v in SEEN], Budget(steps=100))
+    assert score(field, target) > stale + 2.0
+
+
+@EVERY
+@pytest.mark.alone
+def test_a_budget_in_seconds_is_kept(name: str) -> None:
+    trained = small(name)
+    trained.load_state(_trained(name).state())
+    trained.fit(SEEN, Budget(seconds=0.3))  # by then it is known how long a step takes here
+    reports = [trained.fit(SEEN, Budget(seconds=0.3)) for _ in range(5)]
+    spent = np.median([r.seconds for r in reports])
+    assert 0.85 * 0.3 <= spent <= 1.1 * 0.3 and all(r.steps > 3 for r in reports)
+
+
+@EVERY
+def test_a_snapshot_does_not_change_while_the_field_trains(name: str) -> None:
+    trained = small(name)
+    trained.load_state(_trained(name).state())
+    snapshot = trained.snapshot()
+    before = snapshot.render(HELD.camera_to_world, HELD.intrinsics).color
+    trained.fit(SEEN, Budget(steps=5))
+    np.testing.assert_array_equal(before, snapshot.render(HELD.camera_to_world, HELD.intrinsics).color)
+    assert not np.array_equal(before, trained.render(HELD.camera_to_world, HELD.intrinsics).color)
+
+
+@pytest.mark.parametrize(
+    ("name", "extra"),
+    [
+        ("ngp", {}),
+        ("nerfacto", {"exposure": True}),
+        ("nerfacto", {"appearance": 3, "harmonics": 4}),
+        ("tensorf", {}),
+        ("tensorf", {"smooth": 1e-3, "sparse": 1e-4, "harmonics": 4}),
+        ("splat", {}),
+        ("voxel", {}),
+        ("voxel", {"background": "random", "contracted": True}),
+    ],
+)
+def test_results_are_equal_bit_for_bit_whatever_the_thread_count(name: str, extra: dict[str, Any]) -> None:
+    fields = [small(name, threads=threads, **extra) for threads in (1, 2, 2, 3)]
+    reports = []
+    for field in fields:
+        field.fit(SEEN[:5], Budget(steps=15))
+        reports.append(field.fit(SEEN, Budget(steps=10)))
+    assert len({(r.loss, r.rays, r.samples) for r in reports}) == 1
+    first = fields[0].render(HELD.camera_to_world, HELD.intrinsics)
+    for field in fields[1:]:
+        same_state(fields[0], field)
+        out = field.render(HELD.camera_to_world, HELD.intrinsics)
+        np.testing.assert_array_equal(first.color, out.color)
+        np.testing.assert_array_equal(first.depth, out.depth)
+
+
+@EVERY
+def test_another_seed_is_another_field(name: str) -> None:
+    a, b = small(name), small(name, seed=1)
+    learnt = "params" if name == "splat" else "table"
+    if name not in ("splat", "voxel"):  # whose first values come from the pictures, or are all the same
+        assert not np.array_equal(a.state()[learnt], b.state()[learnt])
+    for field in (a, b):
+        field.fit(SEEN[:3], Budget(steps=1))
+    assert not np.array_equal(a.state()[learnt], b.state()[learnt])
+
+
+@pytest.mark.parametrize(
+    ("name", "extra", "steps"),
+    [
+        ("ngp", {}, 20),
+        ("nerfacto", {}, 25),
+        ("nerfacto", {"appearance": 3}, 25),
+        ("tensorf", {}, 20),  # where planes get finer,
+        ("tensorf", {}, 30),  # and elsewhere
+        ("splat", {}, 20),
+        ("voxel", {}, 30),
+    ],
+)
+def test_resuming_continues_bit_for_bit(name: str, extra: dict[str, Any], steps: int) -> None:
+    """Also across a change of size; what has changed in the pictures since is remembered, too."""
+    a, b = small(name, **extra), small(name, threads=1, **extra)
+    a.fit(SEEN[:9], Budget(steps=steps))
+    before = a.state()
+    b.load_state(before)
+    for field in (a, b):
+        field.fit([moved(v) for v in SEEN], Budget(steps=40))
+    if name in ("tensorf", "voxel"):
+        assert a.state()["table"].size > before["table"].size
+    same_state(a, b)
+    if name == "nerfacto":
+        assert a._cameras.meta() == b._cameras.meta()
+
+
+@EVERY
+def test_a_state_of_another_kind_is_refused(name: str) -> None:
+    field, other = small(name), "ngp" if name != "ngp" else "voxel"
+    with pytest.raises(ValueError, match=f"a field called {other}, this one is {name}"):
+        field.load_state(small(other).state())
+    state = field.state()
+    state.pop("meta")
+    with pytest.raises(ValueError, match="not a state"):
+        field.load_state(state)
+
+
+@EVERY
+def test_reset_forgets_everything(name: str) -> None:
+    field = small(name)
+    before = field.state()
+    field.fit(SEEN, Budget(steps=25))
+    field.reset()
+    after = field.state()
+    assert before.keys() == after.keys() and all((before[k] == after[k]).all() for k in before)
+
+
+@EVERY
+def test_others_render_while_it_trains(name: str) -> None:
+    """Snapshots stay what they were, also where the field grows meanwhile, and who looks changes nothing."""
+    field = small(name)
+    field.fit(SEEN, Budget(steps=5))
+    snapshot = field.snapshot()
+    first = snapshot.render(HELD.camera_to_world, HELD.intrinsics).color
+    worker = threading.Thread(target=field.fit, args=(SEEN, Budget(steps=60)))
+    worker.start()
+    pictures = 0
+    while worker.is_alive():
+        again = snapshot.render(HELD.camera_to_world, HELD.intrinsics).color
+        np.testing.assert_array_equal(first, again)
+        assert np.isfinite(field.snapshot().render(HELD.camera_to_world, HELD.intrinsics).color).all()
+        pictures += 1
+    worker.join()
+    assert pictures > 5, "rendering starved while the field trained"
+    alone = small(name)
+    alone.fit(SEEN, Budget(steps=5))
+    alone.fit(SEEN, Budget(steps=60))
+    same_state(field, alone)
+
+
+@EVERY
+def test_transparent_views_are_seen_against_the_background(name: str) -> None:
+    views = [cut_out(view) for view in SEEN]
+    field = small(name, background="white")
+    field.fit(views, Budget(steps=120))
+    out = field.render(views[0].camera_to_world, views[0].intrinsics)
+    clear = views[0].image[..., 3] == 0
+    assert field.rig.box is not None and not field.rig.box.contracted
+    assert out.color[clear].mean() > 0.9 and out.opacity[clear].mean() < 0.3
+    assert out.opacity[~clear].mean() > 0.7
+
+
+@EVERY
+def test_no_views_do_nothing_and_the_report_says_so(name: str) -> None:
+    field = small(name)
+    before = field.state()
+    report = field.fit([], Budget(seconds=5.0))
+    assert report.steps == 0 and report.seconds < 0.5 and "no views" in report.note
+    assert all((before[k] == v).all() for k, v in field.state().items())
+
+
+@EVERY
+def test_views_that_cannot_be_are_refused(name: str) -> None:
+    field, good = small(name), SEEN[0]
+    pose = good.camera_to_world.copy()
+    pose[0, 3] = np.nan
+    for wrong, text in (
+        (replace(good, image=good.image[:-1]), "48 x 47"),
+        (replace(good, image=good.image.astype(np.float32)), "uint8"),
+        (replace(good, camera_to_world=pose), "finite"),
+        (replace(good, intrinsics=replace(good.intrinsics, fx=0.0)), "focal"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            field.fit([wrong], Budget(steps=1))
+    assert field.step == 0 and not field.rig.memory
