@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,10 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # deploy/ is a folder of scripts, not an installed package: tests put it on the path as python does.
 sys.path.insert(0, str(ROOT / "deploy"))
+
+# A shell that runs a script in the background has it ignore Ctrl-C, and Python goes along with that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What computes, in virtual time or none: whoever runs beside it changes nothing but how long it takes. All
 # else meets clocks, ports or whole deployments and has the machine to itself.
