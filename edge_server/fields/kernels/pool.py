@@ -7,7 +7,7 @@ A kernel takes milliseconds or less, so where its threads wake up matters. Linux
 a core that is idle at that moment, and seldom moves it afterwards, least of all one of low priority. A
 caller that woke one worker a core would itself keep a core busy until it slept: two workers on one core,
 the other idle, in four calls of ten on two cores. So whoever computes wakes at most two others first, and
-the caller computes itself, unless its priority is higher than the workers'.
+the caller computes itself, unless it is to go before the workers.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ import numpy as np
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
 
 SERVER_NICE = 5  # of what computes in a server that answers cameras meanwhile
-
-_here = threading.local()
 
 
 def cores() -> int:
@@ -55,7 +53,7 @@ class Pool:
     the other in each.
     threads: default, the environment's FRESHFIELD_THREADS, else the number of cores this process may use.
     Results do not depend on it. nice: the workers' priority where the system allows it (Linux counts it per
-    thread), so that who ingests frames goes first. A caller whose own is as low, or lower, is worker 0.
+    thread), so that who ingests frames goes first. With 0, the caller's, a caller is worker 0 itself.
     """
 
     def __init__(self, threads: int | None = None, nice: int = 0) -> None:
@@ -74,7 +72,7 @@ class Pool:
         """Run ``kernel`` on all workers and wait for them; raises what a worker raised. RuntimeError if the
         pool is closed."""
         job = _Job(kernel, args)
-        if getattr(_here, "nice", 0) >= self.nice:
+        if self.nice == 0:
             with self._seats[0]:
                 self._check_open()
                 self._work(job, 0)
@@ -96,7 +94,7 @@ class Pool:
             raise RuntimeError("the pool is closed")
 
     def _serve(self, worker: int) -> None:
-        lower_priority(self.nice)
+        _lower_priority(self.nice)
         while (job := self._queues[worker].get()) is not None:
             with self._seats[worker]:
                 self._work(job, worker)
@@ -142,10 +140,7 @@ def shared_pool(threads: int | None = None, nice: int = 0) -> Pool:
         return _shared[threads, nice]
 
 
-def lower_priority(nice: int) -> None:
-    """Lower the calling thread's own priority to ``nice`` (Linux), for good; it then works along in pools of
-    that one and of higher ones."""
-    _here.nice = nice
+def _lower_priority(nice: int) -> None:
     if nice <= 0 or not hasattr(os, "setpriority"):
         return
     try:
