@@ -1,9 +1,15 @@
-"""What a machine can do at most: random reads of, and additions to, vertices of two float32, divisions, and
-copies within a core's own cache."""
+"""What a machine can do at most: random reads of, and additions to, vertices of two float32, divisions, copies
+within a core's own cache, and arithmetic on what is in registers."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from edge_server.fields.kernels.intrinsics import fetch_add
 from edge_server.fields.kernels.jit import kernel
@@ -51,3 +57,56 @@ def copies(counter, worker, memory):
     while fetch_add(counter, 1) < TASKS:
         for i in range(half):
             mine[half + i] = mine[i] + np.float32(1.0)
+
+
+# Chains of operations, each of which waits for its predecessor: as many as keep all units of a core busy, and
+# no more than its registers hold. Multiply-adds and additions, by the lanes of a vector: some cores have units
+# of their own for additions, and those with 16 lanes have 32 registers instead of 16.
+CHAINS = ((8, 12, 0), (8, 7, 7), (16, 12, 0), (16, 12, 12))
+CHAINED = 20_000  # operations of each chain in one task
+
+
+def _chains(lanes: int, multiply_adds: int, additions: int) -> Any:
+    """A kernel that does nothing but arithmetic in registers; what comes out of it goes to out[worker]."""
+    vector = ir.VectorType(ir.FloatType(), lanes)
+
+    def spread(builder: Any, number: Any) -> Any:
+        undefined = ir.Constant(vector, ir.Undefined)
+        first = builder.insert_element(undefined, number, ir.IntType(32)(0))
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+        return builder.shuffle_vector(first, undefined, zeros)
+
+    @intrinsic
+    def chained(typingctx: Any, count: Any, number: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            step = spread(builder, args[1])
+            chains = [cgutils.alloca_once(builder, vector) for _ in range(multiply_adds + additions)]
+            for k, chain in enumerate(chains):
+                builder.store(spread(builder, ir.FloatType()(float(k))), chain)
+            with cgutils.for_range(builder, args[0]):
+                for k, chain in enumerate(chains):
+                    value = builder.load(chain)
+                    if k < multiply_adds:
+                        value = builder.fmul(value, step, flags=("contract",))
+                    builder.store(builder.fadd(value, step, flags=("contract",)), chain)
+            total = spread(builder, ir.FloatType()(0.0))
+            for chain in chains:
+                total = builder.fadd(total, builder.load(chain))
+            result = ir.FloatType()(0.0)
+            for k in range(lanes):
+                result = builder.fadd(result, builder.extract_element(total, ir.IntType(32)(k)))
+            return result
+
+        return types.float32(types.int64, types.float32), codegen
+
+    @kernel
+    def arithmetic(counter, worker, out):
+        total = np.float32(0.0)
+        while fetch_add(counter, 1) < TASKS:
+            total += chained(np.int64(CHAINED), np.float32(0.5))
+        out[worker] = total
+
+    return arithmetic
+
+
+arithmetic = tuple(_chains(*shape) for shape in CHAINS)
