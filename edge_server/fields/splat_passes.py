@@ -23,7 +23,8 @@ from edge_server.fields.kernels.splat_project import (
     Gaussians,
     project,
 )
-from edge_server.fields.kernels.splat_raster import KEPT, PIXELS, ROWS, SUMS
+from edge_server.fields.kernels.splat_raster import ROWS
+from edge_server.fields.kernels.splat_strips import KEPT, PIXELS, STRIPS, SUMS
 from edge_server.fields.kernels.splat_tiles import Lists, deal
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.supervision import lens_row
@@ -120,7 +121,8 @@ class Passes:
                 tile=np.zeros((self.lists.pair.shape[0], room), np.int32),
             )
             self._deal(count)
-        length = max(int(self.lists.longest[:slots].max(initial=0)), 1) * KEPT if differentiate else KEPT
+        longest = max(int(self.lists.longest[:slots].max(initial=0)), 1)
+        length = longest * STRIPS * KEPT if differentiate else KEPT
         if self.kept.shape[1] < length:
             self.kept = np.zeros((self.pool.threads, length + length // 4), np.float32)
         if differentiate and self.sums.shape[:2] != self.lists.pair.shape:

@@ -38,7 +38,7 @@ from edge_server.fields.kernels.probe import (
     random_reads,
 )
 from edge_server.fields.kernels.splat_project import BASE
-from edge_server.fields.kernels.splat_raster import KEPT, PIXELS, SUMS
+from edge_server.fields.kernels.splat_strips import KEPT, PIXELS, SUMS
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_schedule import active_levels
 from edge_server.fields.ngp_settings import NgpSettings

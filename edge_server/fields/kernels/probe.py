@@ -1,5 +1,5 @@
-"""What a machine can do at most: random reads of, and additions to, vertices of two float32, divisions, copies
-within a core's own cache, and arithmetic on what is in registers."""
+"""What a machine can do at most: random reads of, and additions to, vertices of two float32, divisions,
+copies within a core's own cache, and arithmetic on what is in registers."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ def copies(counter, worker, memory):
             mine[half + i] = mine[i] + np.float32(1.0)
 
 
-# Chains of operations, each of which waits for its predecessor: as many as keep all units of a core busy, and
-# no more than its registers hold. Multiply-adds and additions, by the lanes of a vector: some cores have units
-# of their own for additions, and those with 16 lanes have 32 registers instead of 16.
+# Chains of operations, each of which waits for its predecessor: as many as keep all units of a core busy,
+# and no more than its registers hold. Lanes of a vector, multiply-adds, additions: some cores have units of
+# their own for additions, and those with 16 lanes have 32 registers instead of 16.
 CHAINS = ((8, 12, 0), (8, 7, 7), (16, 12, 0), (16, 12, 12))
 CHAINED = 20_000  # operations of each chain in one task
 

@@ -12,7 +12,8 @@ import numpy as np
 from edge_server.fields.kernels.intrinsics import fetch_add
 from edge_server.fields.kernels.jit import kernel
 from edge_server.fields.kernels.splat_project import TILE
-from edge_server.fields.kernels.splat_raster import _T, PIXELS, _begin, blend
+from edge_server.fields.kernels.splat_raster import _T, begin_tile, room
+from edge_server.fields.kernels.splat_strips import PIXELS, STRIP, STRIPS, lay, sort_into_strips
 
 _F0 = np.float32(0.0)
 
@@ -25,23 +26,28 @@ def render_planes(
     axes and its distance from the camera along it. out: float32 (H, W, 5), written: normal and distance, each
     summed with the weights of the colours, and opacity. Tasks are tiles."""
     s, store = memory[worker], kept[worker]
+    who, count = room(lists)
     sums = np.empty((4, PIXELS), np.float32)
     while True:
         t = fetch_add(counter, 1)
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        _begin(s, x0, y0)
+        begin_tile(s)
         sums[:] = _F0
-        for j in range(lists.first[slot, t], lists.first[slot, t + 1]):
-            i = lists.owner[slot, lists.pair[slot, j]]
-            left = blend(s, store, np.int64(0), projected[slot, i])
-            for c in range(4):
-                value = planes[i, c]
-                for k in range(PIXELS):
-                    sums[c, k] += store[k] * store[PIXELS + k] * value
-            if left == _F0:
-                break
+        sort_into_strips(
+            lists, slot, lists.first[slot, t], lists.first[slot, t + 1], projected, y0, who, count
+        )
+        for n in range(STRIPS):
+            for j in range(count[n]):
+                lay(
+                    who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
+                    np.float32(y0 + 2 * n), s, _T + n * STRIP, store, 0,
+                )  # fmt: skip
+                for c in range(4):
+                    value = planes[lists.owner[slot, who[n, j]], c]
+                    for k in range(STRIP):
+                        sums[c, n * STRIP + k] += store[k] * store[STRIP + k] * value
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x < width and y < height:
@@ -58,24 +64,34 @@ def tell_normals(
     the Gaussians: told, float32 (P, 4), written for every pair of the slot: the normals times the weight that
     the Gaussian has in the pixel, and the sum of these weights. Tasks are tiles."""
     s, store = memory[worker], kept[worker]
+    who, count = room(lists)
     while True:
         t = fetch_add(counter, 1)
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        _begin(s, x0, y0)
-        left = np.float32(1.0)
-        for j in range(lists.first[slot, t], lists.first[slot, t + 1]):
-            pair = lists.pair[slot, j]
-            nx = ny = nz = total = _F0
-            if left > _F0:
-                left = blend(s, store, np.int64(0), projected[slot, lists.owner[slot, pair]])
-                for k in range(PIXELS):
-                    x, y = x0 + k % TILE, y0 + k // TILE
+        begin_tile(s)
+        begin, end = lists.first[slot, t], lists.first[slot, t + 1]
+        sort_into_strips(lists, slot, begin, end, projected, y0, who, count)
+        for j in range(begin, end):
+            told[lists.pair[slot, j]] = _F0
+        for n in range(STRIPS):
+            for j in range(count[n]):
+                lay(
+                    who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
+                    np.float32(y0 + 2 * n), s, _T + n * STRIP, store, 0,
+                )  # fmt: skip
+                nx = ny = nz = total = _F0
+                for k in range(STRIP):
+                    x, y = x0 + k % TILE, y0 + 2 * n + k // TILE
                     if x < width and y < height:
-                        w = store[k] * store[PIXELS + k] * normals[y, x, 3]
+                        w = store[k] * store[STRIP + k] * normals[y, x, 3]
                         nx += w * normals[y, x, 0]
                         ny += w * normals[y, x, 1]
                         nz += w * normals[y, x, 2]
                         total += w
-            told[pair, 0], told[pair, 1], told[pair, 2], told[pair, 3] = nx, ny, nz, total
+                pair = told[who[n, j]]
+                pair[0] += nx
+                pair[1] += ny
+                pair[2] += nz
+                pair[3] += total

@@ -20,7 +20,7 @@ from edge_server.fields.kernels.jit import kernel, part
 POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
 BASE = 14
 # Columns of a projected Gaussian.
-MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 12
+MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, HALF_HEIGHT, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 12
 # Columns of what a Gaussian reaches: tiles x0, x1, y0, y1 (x1 <= x0: none); and which of them, bit by bit,
 # x fastest, the first 64 (from there on, all of them).
 FIRST_64, REACHED = 4, 6
@@ -40,8 +40,8 @@ _NO_DIRECTION = 1e-20  # squared length of a quaternion that has none
 
 # Rows of BLOCK numbers in which a block of Gaussians is projected side by side.
 _X, _VX, _M, _ALPHA, _REACH, _Q, _S = (n * BLOCK for n in (0, 3, 6, 15, 16, 17, 21))
-_PX, _PY, _PZ, _A, _B, _C, _WIDE, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLOCK for n in range(17, 28))
-_ROWS = 28
+_PX, _PY, _PZ, _A, _B, _C, _WIDE, _HIGH, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLOCK for n in range(17, 29))
+_ROWS = 29
 
 _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
 
@@ -226,7 +226,7 @@ def _flatten(cam, s):
         inv = _F1 / determinant
         s[_PX + j], s[_PY + j], s[_PZ + j] = px, py, z
         s[_A + j], s[_B + j], s[_C + j] = g * inv, -f * inv, e * inv
-        s[_WIDE + j] = np.sqrt(max(e, g))
+        s[_WIDE + j], s[_HIGH + j] = np.sqrt(max(e, g)), ry
         s[_LEFT + j] = max(px - rx, _F0) * over if shows else _F1
         s[_RIGHT + j] = min(px + rx, width - _HALF) * over if shows else -_F1
         s[_TOP + j], s[_BOTTOM + j] = max(py - ry, _F0) * over, min(py + ry, height - _HALF) * over
@@ -269,7 +269,7 @@ def _write(cam, gaussians, i, s, j, row, edges):
     params, harmonics = gaussians.params, gaussians.harmonics
     row[MX], row[MY], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
     row[QA], row[QB], row[QC] = s[_A + j], s[_B + j], s[_C + j]
-    row[ALPHA], row[RADIUS] = s[_ALPHA + j], s[_WIDE + j]
+    row[ALPHA], row[RADIUS], row[HALF_HEIGHT] = s[_ALPHA + j], s[_WIDE + j], s[_HIGH + j]
     for k in range(3):
         row[RED + k] = params[i, COLOR + k]
     if harmonics > 1:

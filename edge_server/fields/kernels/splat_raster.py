@@ -1,7 +1,9 @@
-"""Compositing a tile's Gaussians front to back (thesis 3.20 with alphas in place of densities) and back.
+"""Compositing a tile's Gaussians (thesis 3.20 with alphas in place of densities), losses of its pixels, and
+back.
 
 A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with offsets that
-are constants, which is what lets LLVM vectorise it without tests for overlap.
+are constants, which is what lets LLVM vectorise it without tests for overlap; the Gaussians are laid down
+strip by strip, in ``splat_strips``.
 """
 
 from __future__ import annotations
@@ -16,7 +18,6 @@ from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.splat_project import (
     ALPHA,
     ALPHA_LEAST,
-    DEPTH,
     MX,
     MY,
     QA,
@@ -25,18 +26,24 @@ from edge_server.fields.kernels.splat_project import (
     RED,
     TILE,
 )
+from edge_server.fields.kernels.splat_strips import (
+    ALPHA_MOST,
+    KEPT,
+    PIXELS,
+    STOP,
+    STRIP,
+    STRIPS,
+    SUMS,
+    lay,
+    lift,
+    sort_into_strips,
+)
 
-PIXELS = TILE * TILE
-# One constant in both passes: no Gaussian hides everything, and one that would has no gradient.
-ALPHA_MOST = 0.99
-STOP = 1e-4  # of the light: what lies behind is not seen
-SUMS = 9
-
-# Rows of a tile's memory.
-_X, _Y, _T, _R, _G, _B, _Z = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS, 5 * PIXELS, 6 * PIXELS
-_ER, _EG, _EB, _BEHIND = 7 * PIXELS, 8 * PIXELS, 9 * PIXELS, 10 * PIXELS
-ROWS = 11
-KEPT = 2 * PIXELS  # floats kept of a pair between the passes: alphas, and the light that reached it
+# Rows of a tile's memory: light, colour and depth, in ``lay``'s order; what the loss makes of each colour,
+# and what lies behind, in ``lift``'s.
+_T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
+_ER, _EG, _EB, _BEHIND = (n * PIXELS for n in range(5, 9))
+ROWS = 9
 
 _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
 _BYTE = np.float32(1.0 / 255.0)
@@ -56,70 +63,32 @@ class Loss(NamedTuple):
 
 
 @part
-def _begin(s, x0, y0):
+def begin_tile(s):
+    """All light, no colour."""
     for k in range(PIXELS):
-        s[_X + k] = np.float32(x0 + k % TILE) + _HALF
-        s[_Y + k] = np.float32(y0 + k // TILE) + _HALF
         s[_T + k] = _F1
         s[_R + k] = s[_G + k] = s[_B + k] = s[_Z + k] = _F0
 
 
 @part
-def blend(s, kept, at, row):
-    """Lay one Gaussian (projected row) behind what tile memory ``s`` holds; its alphas and the light that
-    reached it go to kept[at : at + KEPT]. Returns in how many pixels light is left."""
-    mx, my, qa, qb, qc = row[MX], row[MY], row[QA], row[QB], row[QC]
-    alpha, r, g, b, z = row[ALPHA], row[RED], row[RED + 1], row[RED + 2], row[DEPTH]
-    most, least, stop = np.float32(ALPHA_MOST), np.float32(ALPHA_LEAST), np.float32(STOP)
-    qa, qc = -_HALF * qa, -_HALF * qc
-    alive = _F0
-    out = kept[at : at + KEPT]
-    for k in range(PIXELS):
-        dx, dy, t = s[_X + k] - mx, s[_Y + k] - my, s[_T + k]
-        a = min(alpha * exp32(dx * (qa * dx - qb * dy) + qc * dy * dy), most)
-        a = a if a >= least and t >= stop else _F0
-        w = a * t
-        out[k] = a
-        out[PIXELS + k] = t
-        s[_R + k] += w * r
-        s[_G + k] += w * g
-        s[_B + k] += w * b
-        s[_Z + k] += w * z
-        t -= w
-        s[_T + k] = t
-        alive += _F1 if t >= stop else _F0
-    return alive
+def room(lists):
+    """Scratch of ``sort_into_strips`` for the longest list: who and count."""
+    longest = np.int64(1)
+    for b in range(lists.longest.size):
+        longest = max(longest, lists.longest[b])
+    return np.empty((STRIPS, longest), np.int32), np.empty(STRIPS, np.int64)
 
 
 @part
-def unblend(s, kept, at, row, sums):
-    """The gradient of ``blend``, back to front: rows ER, EG, EB of ``s`` hold d loss / d colour, row BEHIND
-    what the pixel's colour behind this Gaussian has to do with it. sums: float32 (9,), written; see
-    ``project_back``."""
-    mx, my, r, g, b = row[MX], row[MY], row[RED], row[RED + 1], row[RED + 2]
-    most = np.float32(ALPHA_MOST)
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _F0
-    back = kept[at : at + KEPT]
-    for k in range(PIXELS):
-        a, t = back[k], back[PIXELS + k]
-        er, eg, eb, behind = s[_ER + k], s[_EG + k], s[_EB + k], s[_BEHIND + k]
-        dx, dy = s[_X + k] - mx, s[_Y + k] - my
-        w, shade = a * t, er * r + eg * g + eb * b
-        h = a * (t * shade - behind / (_F1 - a))
-        h = h if a < most else _F0
-        s[_BEHIND + k] = behind + w * shade
-        hx, hy = h * dx, h * dy
-        s0 += h
-        s1 += hx
-        s2 += hy
-        s3 += hx * dx
-        s4 += hx * dy
-        s5 += hy * dy
-        s6 += w * er
-        s7 += w * eg
-        s8 += w * eb
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = s0, s1, s2, s3, s4, s5
-    sums[6], sums[7], sums[8] = s6, s7, s8
+def lay_tile(s, lists, b, t, x0, y0, projected, who, count, store):
+    """Lay all Gaussians of tile t of camera slot b over the tile memory ``s``; nothing is kept of them."""
+    begin_tile(s)
+    sort_into_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, who, count)
+    for n in range(STRIPS):
+        lay(
+            who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+            _T + n * STRIP, store, 0,
+        )  # fmt: skip
 
 
 @part
@@ -210,38 +179,41 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
                 sums, losses):  # fmt: skip
     """Render, compare, differentiate. views: ``rays.Views``; picked: int64 (B,), the view of each camera
     slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), kept: float32
-    (W, longest * KEPT), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written. losses:
-    float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not finite.
+    (W, longest * STRIPS * KEPT), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written.
+    losses: float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not
+    finite.
 
     With ``views.weight``, a pixel's loss is multiplied by its own, that of a tile's SSIM by their mean over
     the pixels that have any; the others are not part of the window."""
     s, store = memory[worker], kept[worker]
     weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
     target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
+    (who, count), laid = room(lists), np.empty(STRIPS, np.int64)
     while True:
         task = fetch_add(counter, 1)
         if task >= tasks.shape[0]:
             return
         b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
         x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
-        count, dssim = _target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
+        inside, dssim = _target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
         if weighed:
-            count, mean = _trust(views, picked[b], x0, y0, target, share)
+            inside, mean = _trust(views, picked[b], x0, y0, target, share)
             dssim *= mean
-        _begin(s, x0, y0)
+        begin_tile(s)
         begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
-        last = end if count > 0 else begin
-        for j in range(begin, last):
-            i = lists.owner[b, lists.pair[b, j]]
-            if blend(s, store, (j - begin) * KEPT, projected[b, i]) == _F0:
-                last = j + 1
-                break
+        size = (end - begin) * KEPT
+        sort_into_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, who, count)
+        for n in range(STRIPS):
+            laid[n] = lay(
+                who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+                _T + n * STRIP, store[n * size : (n + 1) * size], KEPT,
+            )  # fmt: skip
         total, square = _F0, _F0
         for c in range(3):
             for k in range(PIXELS):
                 s[_R + c * PIXELS + k] += s[_T + k] * back[c]
-                inside = target[c, k] >= _F0
-                e = s[_R + c * PIXELS + k] - target[c, k] if inside else _F0
+                known = target[c, k] >= _F0
+                e = s[_R + c * PIXELS + k] - target[c, k] if known else _F0
                 square += e * e
                 total += abs(e) if loss.absolute else e * e
                 sign = _F1 if e > _F0 else (-_F1 if e < _F0 else _F0)
@@ -250,21 +222,23 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
             total, square = _weigh(s, target, share, loss.absolute)
         if dssim > _F0:
             for c in range(3):
-                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], count, dssim)
+                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], inside, dssim)
         finite = is_finite(total)
         losses[task, 0], losses[task, 1] = total if finite else 0.0, square if finite else 0.0
         losses[task, 2] = 0.0 if finite else 1.0
-        if not finite:
-            last = begin
-        for j in range(last, end):
+        for j in range(begin, end):
             rest = sums[b, lists.pair[b, j]]
             for k in range(SUMS):
                 rest[k] = _F0
+        if not finite:
+            continue
         for k in range(PIXELS):
             s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
-        for j in range(last - 1, begin - 1, -1):
-            p = lists.pair[b, j]
-            unblend(s, store, (j - begin) * KEPT, projected[b, lists.owner[b, p]], sums[b, p])
+        for n in range(STRIPS):
+            lift(
+                who[n], laid[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+                _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
+            )  # fmt: skip
 
 
 @kernel
@@ -272,16 +246,13 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
                  color, depth, opacity):  # fmt: skip
     """The picture of camera slot 0. color: float32 (H, W, 3), depth (z) and opacity (H, W), all written."""
     s, store = memory[worker], kept[worker]
+    who, count = room(lists)
     while True:
         t = fetch_add(counter, 1)
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        _begin(s, x0, y0)
-        for j in range(lists.first[0, t], lists.first[0, t + 1]):
-            i = lists.owner[0, lists.pair[0, j]]
-            if blend(s, store, np.int64(0), projected[0, i]) == _F0:
-                break
+        lay_tile(s, lists, 0, t, x0, y0, projected, who, count, store)
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x >= width or y >= height:
@@ -338,6 +309,7 @@ def compare_tiles(
     pixels of the tasks' tiles. picked: int64 (B,), the view of each camera slot. tasks: int32 (M, 2), slot
     and tile."""
     s, store = memory[worker], kept[worker]
+    who, count = room(lists)
     while True:
         task = fetch_add(counter, 1)
         if task >= tasks.shape[0]:
@@ -346,10 +318,7 @@ def compare_tiles(
         x0, y0, v = TILE * (t % columns[b]), TILE * (t // columns[b]), picked[b]
         width, height, first = views.size[v, 0], views.size[v, 1], views.first[v]
         transparent = views.pixels.shape[1] == 4
-        _begin(s, x0, y0)
-        for j in range(lists.first[b, t], lists.first[b, t + 1]):
-            if blend(s, store, np.int64(0), projected[b, lists.owner[b, lists.pair[b, j]]]) == _F0:
-                break
+        lay_tile(s, lists, b, t, x0, y0, projected, who, count, store)
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x >= width or y >= height:
