@@ -1,4 +1,4 @@
-"""From a Gaussian in space to one in the picture (Kerbl et al. 2023, after Zwicker et al. 2001), and back.
+"""From a Gaussian in space to one in the picture (Kerbl et al. 2023, after Zwicker et al. 2001).
 
 Everything is in scene units and float32. A lens with distortion is part of the projection: the mean is
 distorted, and the Jacobian that flattens the covariance is that of the distorted projection, so pictures
@@ -91,7 +91,7 @@ def bent(cam, x, y):
 
 
 @part
-def _unit_quaternion(w, x, y, z):
+def unit_quaternion(w, x, y, z):
     """The quaternion's direction and 1 / length; (1, 0, 0, 0) and 0 where it has none."""
     square = w * w + x * x + y * y + z * z
     has = (square > np.float32(_NO_DIRECTION)) & (square < np.float32(1e20))
@@ -103,7 +103,8 @@ def _unit_quaternion(w, x, y, z):
 
 
 @part
-def _rotation(w, x, y, z):
+def rotation(w, x, y, z):
+    """The matrix of a unit quaternion, row by row."""
     return (
         _F1 - _F2 * (y * y + z * z), _F2 * (x * y - w * z), _F2 * (x * z + w * y),
         _F2 * (x * y + w * z), _F1 - _F2 * (x * x + z * z), _F2 * (y * z - w * x),
@@ -112,7 +113,8 @@ def _rotation(w, x, y, z):
 
 
 @part
-def _scale(raw):
+def held_scale(raw):
+    """A length, of its raw parameter."""
     return exp32(min(max(raw, np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
 
 
@@ -123,11 +125,12 @@ def camera_point(cam, params, velocity, i):
     x = params[i, 0] + t * velocity[i, 0] - cam[ORIGIN]
     y = params[i, 1] + t * velocity[i, 1] - cam[ORIGIN + 1]
     z = params[i, 2] + t * velocity[i, 2] - cam[ORIGIN + 2]
-    return _turned(cam, x, y, z)
+    return turned(cam, x, y, z)
 
 
 @part
-def _turned(cam, x, y, z):
+def turned(cam, x, y, z):
+    """A vector of world axes in those of the camera."""
     return (
         cam[0] * x + cam[1] * y + cam[2] * z,
         cam[3] * x + cam[4] * y + cam[5] * z,
@@ -151,7 +154,7 @@ def flattener(cam, x, y, z):
 
 
 @part
-def _times(cam, j0, j1, j2):
+def times(cam, j0, j1, j2):
     """A row of camera axes -> of world axes."""
     return (
         j0 * cam[0] + j1 * cam[3] + j2 * cam[6],
@@ -175,11 +178,11 @@ def _unfold(gaussians, base, count, s):
             s[_Q + k * BLOCK + j] = params[i, QUATERNION + k]
         s[_ALPHA + j] = params[i, OPACITY]
     for j in range(BLOCK):
-        w, x, y, z, _ = _unit_quaternion(
+        w, x, y, z, _ = unit_quaternion(
             s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
         )
-        r0, r1, r2, r3, r4, r5, r6, r7, r8 = _rotation(w, x, y, z)
-        s0, s1, s2 = _scale(s[_S + j]), _scale(s[_S + BLOCK + j]), _scale(s[_S + 2 * BLOCK + j])
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(w, x, y, z)
+        s0, s1, s2 = held_scale(s[_S + j]), held_scale(s[_S + BLOCK + j]), held_scale(s[_S + 2 * BLOCK + j])
         s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j] = r0 * s0, r1 * s1, r2 * s2
         s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j] = r3 * s0, r4 * s1, r5 * s2
         s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j] = r6 * s0, r7 * s1, r8 * s2
@@ -197,7 +200,7 @@ def _flatten(cam, s):
     fx, fy, width, height = cam[LENS], cam[LENS + 1], cam[SIZE], cam[SIZE + 1]
     low, over, t = np.float32(LOW_PASS), np.float32(1.0 / TILE), cam[TIME]
     for j in range(BLOCK):
-        x, y, z = _turned(
+        x, y, z = turned(
             cam,
             s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
             s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
@@ -206,8 +209,8 @@ def _flatten(cam, s):
         shows = (z > cam[NEAR]) & (z < np.float32(FAR)) & (s[_REACH + j] > _F0)
         _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = flattener(cam, x, y, z if shows else _F1)
         gx, gy = fx * inverse, fy * inverse
-        t0, t1, t2 = _times(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
-        t3, t4, t5 = _times(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
+        t0, t1, t2 = times(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
+        t3, t4, t5 = times(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
         m0, m1, m2 = s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j]
         m3, m4, m5 = s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j]
         m6, m7, m8 = s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j]
@@ -289,135 +292,6 @@ def _write(cam, gaussians, i, s, j, row, edges):
         )
         edges[FIRST_64] = np.int32(bits & np.uint64(0xFFFFFFFF))
         edges[FIRST_64 + 1] = np.int32(bits >> np.uint64(32))
-
-
-@part
-def _harmonic_slope(h, x, y, z):
-    """Derivatives of harmonic h by x, y and z."""
-    a, b, c = np.float32(0.4886025), np.float32(1.0925485), np.float32(0.3153916)
-    if h == 1:
-        return _F0, a, _F0
-    if h == 2:
-        return _F0, _F0, a
-    if h == 3:
-        return a, _F0, _F0
-    if h == 4:
-        return b * y, b * x, _F0
-    if h == 5:
-        return _F0, b * z, b * y
-    if h == 6:
-        return _F0, _F0, np.float32(6.0) * c * z
-    if h == 7:
-        return b * z, _F0, b * x
-    d = np.float32(2.0 * 0.5462742)
-    return d * x, -d * y, _F0
-
-
-@part
-def project_back(cams, b, params, velocity, harmonics, i, sums, projected, out):
-    """Add to out (BASE + ...,) the gradient of what ``project`` made of Gaussian i.
-
-    sums: float32 (9,), over the pixels it covers: d loss / d power (h), h dx, h dy, h dx^2, h dx dy, h dy^2
-    with (dx, dy) from the mean to the pixel, and d loss / d colour. Returns the length of the gradient of
-    the mean in the picture (pixels)."""
-    row, cam = projected[b, i], held(cams, b)
-    x, y, z = camera_point(cam, params, velocity, i)
-    fx, fy = cam[LENS], cam[LENS + 1]
-    a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = flattener(cam, x, y, z)
-    gx, gy = fx * inverse, fy * inverse
-    j0, j1, j2 = gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc)
-    j3, j4, j5 = gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc)
-    t0, t1, t2 = _times(cam, j0, j1, j2)
-    t3, t4, t5 = _times(cam, j3, j4, j5)
-    qw, qx, qy, qz, q_inverse = _unit_quaternion(
-        params[i, QUATERNION], params[i, QUATERNION + 1], params[i, QUATERNION + 2], params[i, QUATERNION + 3]
-    )
-    r0, r1, r2, r3, r4, r5, r6, r7, r8 = _rotation(qw, qx, qy, qz)
-    s0, s1, s2 = _scale(params[i, SCALE]), _scale(params[i, SCALE + 1]), _scale(params[i, SCALE + 2])
-    v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
-        t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
-    w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
-        t3 * r2 + t4 * r5 + t5 * r8) * s2  # fmt: skip
-    # mean and conic
-    qa, qb, qc = row[QA], row[QB], row[QC]
-    du, dv = qa * sums[1] + qb * sums[2], qb * sums[1] + qc * sums[2]
-    ga, gb, gc = -_HALF * sums[3], -_HALF * sums[4], -_HALF * sums[5]
-    # d cov = - Q G Q
-    m0, m1 = qa * ga + qb * gb, qa * gb + qb * gc
-    m2, m3 = qb * ga + qc * gb, qb * gb + qc * gc
-    e, f, g = -(m0 * qa + m1 * qb), -(m0 * qb + m1 * qc), -(m2 * qb + m3 * qc)
-    # cov = V V^T
-    a0, a1, a2 = _F2 * (e * v0 + f * w0), _F2 * (e * v1 + f * w1), _F2 * (e * v2 + f * w2)
-    b0, b1, b2 = _F2 * (f * v0 + g * w0), _F2 * (f * v1 + g * w1), _F2 * (f * v2 + g * w2)
-    for k, d in enumerate((a0 * v0 + b0 * w0, a1 * v1 + b1 * w1, a2 * v2 + b2 * w2)):
-        raw = params[i, SCALE + k]
-        if raw > np.float32(SCALE_LOW) and raw < np.float32(SCALE_HIGH):
-            out[SCALE + k] += d
-    a0, a1, a2, b0, b1, b2 = a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2
-    # rotation: T^T dU, then the quaternion and its normalisation
-    if q_inverse > _F0:
-        d0, d1, d2 = t0 * a0 + t3 * b0, t0 * a1 + t3 * b1, t0 * a2 + t3 * b2
-        d3, d4, d5 = t1 * a0 + t4 * b0, t1 * a1 + t4 * b1, t1 * a2 + t4 * b2
-        d6, d7, d8 = t2 * a0 + t5 * b0, t2 * a1 + t5 * b1, t2 * a2 + t5 * b2
-        hw = _F2 * (qx * (d7 - d5) + qy * (d2 - d6) + qz * (d3 - d1))
-        hx = _F2 * (qy * (d1 + d3) + qz * (d2 + d6) + qw * (d7 - d5) - _F2 * qx * (d4 + d8))
-        hy = _F2 * (qx * (d1 + d3) + qz * (d5 + d7) + qw * (d2 - d6) - _F2 * qy * (d0 + d8))
-        hz = _F2 * (qx * (d2 + d6) + qy * (d5 + d7) + qw * (d3 - d1) - _F2 * qz * (d0 + d4))
-        along = hw * qw + hx * qx + hy * qy + hz * qz
-        out[QUATERNION] += (hw - along * qw) * q_inverse
-        out[QUATERNION + 1] += (hx - along * qx) * q_inverse
-        out[QUATERNION + 2] += (hy - along * qy) * q_inverse
-        out[QUATERNION + 3] += (hz - along * qz) * q_inverse
-    # dT = dU R^T, then dJ = dT W^T
-    c0, c1, c2 = a0 * r0 + a1 * r1 + a2 * r2, a0 * r3 + a1 * r4 + a2 * r5, a0 * r6 + a1 * r7 + a2 * r8
-    c3, c4, c5 = b0 * r0 + b1 * r1 + b2 * r2, b0 * r3 + b1 * r4 + b2 * r5, b0 * r6 + b1 * r7 + b2 * r8
-    k0 = c0 * cam[0] + c1 * cam[1] + c2 * cam[2]
-    k1 = c0 * cam[3] + c1 * cam[4] + c2 * cam[5]
-    k2 = c0 * cam[6] + c1 * cam[7] + c2 * cam[8]
-    k3 = c3 * cam[0] + c4 * cam[1] + c5 * cam[2]
-    k4 = c3 * cam[3] + c4 * cam[4] + c5 * cam[5]
-    k5 = c3 * cam[6] + c4 * cam[7] + c5 * cam[8]
-    dz = -inverse * (k0 * j0 + k1 * j1 + k2 * j2 + k3 * j3 + k4 * j4 + k5 * j5)
-    # J by the ratios: J = D P with P = (1, 0, -ta; 0, 1, -tc) / z
-    dda = fx * du * dxx + fy * dv * dxy
-    ddc = fx * du * dxy + fy * dv * dyy
-    p0, p1 = gx * (k0 - ta * k2), gx * (k1 - tc * k2)  # by dxx and dxy through the first row
-    p2, p3 = gy * (k3 - ta * k5), gy * (k4 - tc * k5)  # by dxy and dyy through the second
-    if a == ta:
-        dda += p0 * xxx + (p1 + p2) * xxy + p3 * xyy - (gx * dxx * k2 + gy * dxy * k5)
-    if c == tc:
-        ddc += p0 * xxy + (p1 + p2) * xyy + p3 * yyy - (gx * dxy * k2 + gy * dyy * k5)
-    dx, dy = dda * inverse, ddc * inverse
-    dz -= (dda * a + ddc * c) * inverse
-    o0 = cam[0] * dx + cam[3] * dy + cam[6] * dz
-    o1 = cam[1] * dx + cam[4] * dy + cam[7] * dz
-    o2 = cam[2] * dx + cam[5] * dy + cam[8] * dz
-    if abs(params[i, OPACITY]) < np.float32(RAW_OPACITY):
-        out[OPACITY] += sums[0] * (_F1 - row[ALPHA])
-    for k in range(3):
-        out[COLOR + k] += sums[6 + k]
-    if harmonics > 1:
-        nx, ny, nz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (
-            params[i, 2] - cam[ORIGIN + 2])  # fmt: skip
-        length = _F1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-9))
-        nx, ny, nz = nx * length, ny * length, nz * length
-        lx, ly, lz = _F0, _F0, _F0
-        for h in range(1, harmonics):
-            value = harmonic(h, nx, ny, nz)
-            hx, hy, hz = _harmonic_slope(h, nx, ny, nz)
-            share = _F0
-            for k in range(3):
-                out[BASE + 3 * (h - 1) + k] += value * sums[6 + k]
-                share += params[i, BASE + 3 * (h - 1) + k] * sums[6 + k]
-            lx, ly, lz = lx + share * hx, ly + share * hy, lz + share * hz
-        along = lx * nx + ly * ny + lz * nz
-        o0 += (lx - along * nx) * length
-        o1 += (ly - along * ny) * length
-        o2 += (lz - along * nz) * length
-    out[0] += o0
-    out[1] += o1
-    out[2] += o2
-    return np.sqrt(du * du + dv * dv)
 
 
 @kernel

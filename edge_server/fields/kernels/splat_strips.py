@@ -35,6 +35,7 @@ from edge_server.fields.kernels.vectors import (
     anywhere,
     both,
     constant,
+    contiguous,
     eight_sums,
     sum_of,
 )
@@ -127,12 +128,6 @@ class _Strip:
         return [Wide.spread(self.builder, self.builder.load(self.at(row, _I64(k)))) for k in which]
 
 
-def _typed(name: str, *kinds: Any) -> None:
-    for kind in kinds:
-        if not (isinstance(kind, types.Array) and kind.layout == "C"):
-            raise TypeError(f"{name} takes contiguous arrays, not {kind}")
-
-
 @intrinsic
 def lay(typingctx: Any, who: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any, tile: Any,
         first: Any, kept: Any, step: Any) -> Any:  # fmt: skip
@@ -144,7 +139,7 @@ def lay(typingctx: Any, who: Any, count: Any, owner: Any, projected: Any, x0: An
 
     Returns how many were laid before it was dark.
     """
-    _typed("lay", who, owner, projected, tile, kept)
+    contiguous(who, owner, projected, tile, kept)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         strip = _Strip(context, builder, signature, args)
@@ -185,8 +180,8 @@ def lift(typingctx: Any, who: Any, count: Any, owner: Any, projected: Any, x0: A
          first: Any, kept: Any, sums: Any) -> Any:  # fmt: skip
     """The gradient of ``lay``, back to front. slopes: float32 rows of PIXELS: d loss / d red, green and blue,
     and what the pixel's colour behind all Gaussians has to do with it. Added to the pairs' sums, float32
-    (P, SUMS); see ``project_back``."""
-    _typed("lift", who, owner, projected, slopes, kept, sums)
+    (P, SUMS); see ``splat_back.back``."""
+    contiguous(who, owner, projected, slopes, kept, sums)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         strip = _Strip(context, builder, signature, args)

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from llvmlite import ir
+from numba import types
 from numba.core import cgutils
+from numba.core.errors import TypingError
 
 from edge_server.fields.kernels.jit import FAST
 
@@ -81,9 +83,10 @@ class Wide:
         """In which lanes it is a number less than ``bound``."""
         return self.builder.fcmp_ordered("<", self.value, constant(bound))
 
-    def where(self, mask: Any, other: float = 0.0) -> Wide:
+    def where(self, mask: Any, other: Wide | float = 0.0) -> Wide:
         """This where the mask holds, ``other`` elsewhere."""
-        return Wide(self.builder, self.builder.select(mask, self.value, constant(other)))
+        operand = other.value if isinstance(other, Wide) else constant(other)
+        return Wide(self.builder, self.builder.select(mask, self.value, operand))
 
     def most(self, bound: float) -> Wide:
         """The lesser of this and ``bound``; ``bound`` where this is not a number."""
@@ -93,16 +96,25 @@ class Wide:
         """The greater of this and ``bound``; ``bound`` where this is not a number."""
         return self.where(self.at_least(bound), bound)
 
+    def finite(self) -> Any:
+        """In which lanes it is a number, and not infinite."""
+        return self.builder.fcmp_ordered("<=", self._called("fabs", self.value), constant(3.4e38))
+
+    def root(self) -> Wide:
+        """The square root."""
+        return Wide(self.builder, self._called("sqrt", self.value))
+
+    def _called(self, name: str, value: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        called = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.v{LANES}f32")
+        return self.builder.call(called, [value])
+
     def power_of_2(self) -> Wide:
         """2 to this, which is taken to be 0 where it is more and -64 where it is less or not a number;
         relative error below 3e-7."""
         builder = self.builder
         clamped = self.least(_LEAST_POWER).most(0.0)
-        rounding = ir.FunctionType(_VECTOR, [_VECTOR])
-        name = f"llvm.roundeven.v{LANES}f32"
-        nearest = builder.call(
-            cgutils.get_or_insert_function(builder.module, rounding, name), [clamped.value]
-        )
+        nearest = self._called("roundeven", clamped.value)
         whole = Wide(builder, nearest)
         left = clamped - whole
         power = left * _POWER[0] + _POWER[1]
@@ -112,6 +124,13 @@ class Wide:
         moved = builder.shl(builder.fptosi(nearest, _INTEGERS), ir.Constant(_INTEGERS, [23] * LANES))
         raised = builder.add(builder.bitcast(power.value, _INTEGERS), moved)
         return Wide(builder, builder.bitcast(raised, _VECTOR))
+
+
+def contiguous(*kinds: Any) -> None:
+    """Refuse to compile for anything but contiguous arrays: pointers know of no strides."""
+    for kind in kinds:
+        if not (isinstance(kind, types.Array) and kind.layout == "C"):
+            raise TypingError(f"vectors take contiguous arrays, not {kind}")
 
 
 def both(builder: Any, a: Any, b: Any) -> Any:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from llvmlite import ir
 from numba import njit, types
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.jit import FAST
-from edge_server.fields.kernels.vectors import LANES, Wide, anywhere, both, eight_sums, sum_of
+from edge_server.fields.kernels.vectors import LANES, Wide, anywhere, both, contiguous, eight_sums, sum_of
 
 
 def _run(work: Callable[[Wide, Wide], Any], a: NDArray[np.float32], b: NDArray[np.float32]) -> Any:
@@ -83,6 +84,17 @@ def test_bounds_hold_for_what_is_not_a_number():
     np.testing.assert_array_equal(_run(lambda x, y: x.least(-2.0), a, a), [-2.0, np.inf, -2.0, 0.5] * 4)
 
 
+def test_what_is_not_finite_is_told():
+    a = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, 1e-40, -1.0] * 2, np.float32)
+    got = _run(lambda x, y: (x - x + 1.0).where(x.finite(), y), a, np.full(LANES, 5.0, np.float32))
+    np.testing.assert_array_equal(got, [5, 5, 5, 1, 1, 1, 1, 1] * 2)
+
+
+def test_roots(pair):
+    got = _run(lambda x, y: (x * x).root() + y, *pair)
+    np.testing.assert_allclose(got, np.abs(pair[0]) + pair[1], rtol=1e-6)
+
+
 def test_powers_of_two_are_exact_to_the_last_bits():
     for given in np.linspace(-63.99, 0.0, 160).astype(np.float32).reshape(-1, LANES):
         got = _run(lambda x, y: x.power_of_2(), given, given)
@@ -103,3 +115,18 @@ def test_sums_of_lanes(pair):
     expected = [v.sum(dtype=np.float64) for v in (a, b, a * b, a + b, a - b, a * a, b * b, a * 3)]
     np.testing.assert_allclose(got[:8], expected, rtol=1e-5, atol=1e-4)
     assert (got[8:] == -7.0).all()
+
+
+def test_strided_arrays_are_refused(pair):
+    @njit
+    def sliced(x):
+        checked(x)
+
+    @intrinsic
+    def checked(typingctx: Any, x: Any) -> Any:
+        contiguous(x)
+        return types.void(x), lambda context, builder, signature, args: context.get_dummy_value()
+
+    sliced(pair[0])
+    with pytest.raises(TypingError, match="contiguous"):
+        sliced(pair[0][::2])
