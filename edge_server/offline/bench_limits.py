@@ -37,8 +37,8 @@ from edge_server.fields.kernels.probe import (
     random_adds,
     random_reads,
 )
-from edge_server.fields.kernels.splat_project import BASE
-from edge_server.fields.kernels.splat_strips import KEPT, PIXELS, SUMS
+from edge_server.fields.kernels.splat_project import BASE, HALF_HEIGHT, MY, TILE
+from edge_server.fields.kernels.splat_strips import KEPT, STRIP, STRIPS, SUMS
 from edge_server.fields.ngp import NgpField
 from edge_server.fields.ngp_schedule import active_levels
 from edge_server.fields.ngp_settings import NgpSettings
@@ -63,9 +63,9 @@ LIMITS = {
 }
 
 # Operations of the Gaussians' kernels, counted in their sources: additions, multiplications, comparisons and
-# conversions, a multiplication with the addition that follows it as one. Of a pixel and a pair, forward (an
-# exponential is 20 of them) and back:
-BLENDING, UNBLENDING = 41, 23
+# conversions, a multiplication with the addition that follows it as one. Of a pixel and a Gaussian in one of
+# its strips, forward (a power of 2 is 12 of them) and back (folding the sums of lanes is 11):
+LAYING, LIFTING = 33, 31
 # Of a Gaussian: projected; its pairs' sums led back through the projection, and a step of Adam.
 PROJECTING, UPDATING = 300, 680
 # Of a Gaussian that is sorted: counted and moved, twice. Of a pair: counted, owned, listed.
@@ -204,17 +204,23 @@ def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int
         counts.append(_counted(field))
     pool.seconds.clear()
     pool.seconds.update(spent)
-    gaussians, seen, pairs, touching = np.mean(counts, axis=0)
-    return _against(_floors_of_splat(gaussians, seen, pairs, touching, limits.around()), report, pool)
+    gaussians, seen, pairs, strips = np.mean(counts, axis=0)
+    return _against(_floors_of_splat(gaussians, seen, pairs, strips, limits.around()), report, pool)
 
 
 def _counted(field: SplatField) -> tuple[int, int, int, int]:
     """Of a field's last step, of one picture: Gaussians, those in the picture, pairs of one with a tile, and
-    pairs that changed a pixel: the others are hidden."""
+    the strips that pairs which changed a pixel lie in: the others are hidden."""
     passes, count = field._passes, len(field.cloud)
-    pairs = int(passes.lists.needed[0])
-    used = int((passes.sums[0, :pairs] != 0.0).any(axis=-1).sum())
-    return count, int((passes.lists.own_count[0, :count] > 0).sum()), pairs, used
+    lists, pairs = passes.lists, int(passes.lists.needed[0])
+    used = (passes.sums[0, :pairs] != 0.0).any(axis=-1)
+    rows = passes.projected[0, lists.owner[0, :pairs][used]]
+    middle = rows[:, MY] - TILE * (lists.tile[0, :pairs][used] // passes.columns[0]) - 0.5
+    top, bottom = (
+        np.clip(edge, 0, TILE - 1).astype(np.int64) * STRIPS // TILE
+        for edge in (np.ceil(middle - rows[:, HALF_HEIGHT]), middle + rows[:, HALF_HEIGHT])
+    )
+    return count, int((lists.own_count[0, :count] > 0).sum()), pairs, int((bottom - top + 1).sum())
 
 
 def _against(floors: dict[str, dict[str, float]], report: FitReport, pool: TimedPool) -> dict[str, Any]:
@@ -261,11 +267,11 @@ def _floors_of_ngp(
 
 
 def _floors_of_splat(
-    gaussians: float, seen: float, pairs: float, touching: float, limits: dict[str, float]
+    gaussians: float, seen: float, pairs: float, strips: float, limits: dict[str, float]
 ) -> dict[str, dict[str, float]]:
     """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
 
-    gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; touching: of which change a
+    gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; strips: in which these change a
     pixel. Operations count as if all were vectorised: ``update`` goes through Gaussians one by one, ``deal``
     sorts them on one core."""
     operations, divisions_ms = limits["operations_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
@@ -273,9 +279,9 @@ def _floors_of_splat(
     parameters = BASE
     return {
         "train_tiles": {
-            "arithmetic": touching * PIXELS * (BLENDING + UNBLENDING) / operations,
-            "divisions": touching * PIXELS / divisions_ms,
-            "copies": touching * KEPT * 4 / copied,  # kept of a pair: written once, read once
+            "arithmetic": strips * STRIP * (LAYING + LIFTING) / operations,
+            "divisions": strips * STRIP / divisions_ms,
+            "copies": strips * KEPT * 4 / copied,  # written once, read once
         },
         "project": {"arithmetic": gaussians * PROJECTING / operations},
         "deal": {"moves": (seen * SORTING + pairs * DEALING) / added},
