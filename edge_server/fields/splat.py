@@ -295,10 +295,9 @@ class SplatField:
         self._usual_renewal.took(pace.seconds() - began)
         return rays, samples
 
-    def _choose(self) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
-        """The views of this step and which of their tiles."""
+    def _choose(self, key: np.uint64) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
+        """The views of this step, whose random bits ``key`` are, and which of their tiles."""
         s, n = self.settings, len(self._asked)
-        rng = self._rng(3)
         slots = min(s.views_a_step, n)
         first = self.step * s.views_a_step
         if self._epoch != first // n:
@@ -307,11 +306,12 @@ class SplatField:
             self._order = np.random.default_rng(pick).permutation(n)
         picked = np.array(self._asked, np.int64)[self._order[(first + np.arange(slots)) % n]]
         moving = [k for k, tiles in enumerate(self._changed) if tiles is not None]
-        if moving and rng.random() < s.changed_share:
+        if moving and int(key) * 2.0**-64 < s.changed_share:
             some = np.array(moving)[(first + np.arange(min(CHANGED_SLOTS, len(moving)))) % len(moving)]
             return some, [self._changed[k] for k in some]
         if s.tile_share >= 1.0:
             return picked, [None] * slots
+        rng = self._rng(3)
         wanted: list[NDArray[np.uint8] | None] = []
         for k in picked:
             size = self._data.size[k]
@@ -326,23 +326,20 @@ class SplatField:
         how many tiles and gradients were not finite. progress: of the fit, in [0, 1]."""
         s, box = self.settings, self.rig.box
         assert box is not None
-        picked, wanted = self._choose()
+        key = step_key(s.seed, self.step)
+        picked, wanted = self._choose(key)
         cams, cloud = np.ascontiguousarray(self._cams[picked]), self.cloud
         gaussians = cloud.gaussians(s.harmonics)
         passes = self._passes
         passes.look(cams, gaussians, wanted)
-        tasks = np.concatenate([
-            np.stack(np.broadcast_arrays(np.int32(b), np.flatnonzero(
-                passes.lists.wanted[b, : int(passes.columns[b] * passes.rows[b])]).astype(np.int32)), axis=-1)
-            for b in range(len(picked))
-        ])  # fmt: skip
+        tasks = passes.tasks()
         losses = np.zeros((len(tasks), 3))
         loss = Loss(
             absolute=s.loss == "l1",
             dssim=np.float32(s.dssim),
             background=self.rig.background(),
             random=s.background == "random",
-            key=step_key(s.seed, self.step),
+            key=key,
         )
         self.pool.run(
             train_tiles, self._data, picked.astype(np.int64), tasks, passes.columns, passes.projected,
@@ -355,13 +352,13 @@ class SplatField:
         )  # fmt: skip
         if s.planar:
             self._lay_flat(int(picked[0]))
-        lost = int(losses[:, 2].sum() + dropped.sum())
-        if losses[:, 2].any():
+        _, square, broken = losses.sum(axis=0).tolist()
+        if broken:
             self._repair()
         self._count_step()
-        pixels = TILE * TILE * len(tasks)
-        pairs = int(np.minimum(passes.lists.needed, passes.lists.pair.shape[1])[: len(picked)].sum())
-        return float(losses[:, 1].sum()) / (3 * pixels), pixels, pairs, lost
+        pixels, room = TILE * TILE * len(tasks), passes.lists.pair.shape[1]
+        pairs = sum(min(needed, room) for needed in passes.lists.needed[: len(picked)].tolist())
+        return square / (3 * pixels), pixels, pairs, int(broken) + int(dropped.sum())
 
     def _lay_flat(self, view: int) -> None:
         """The part of a step that is for surfaces; view: which to take normals from."""

@@ -33,6 +33,7 @@ from edge_server.fields.kernels.splat_project import (
     TIME,
 )
 from edge_server.fields.kernels.splat_update import GRADIENT_LIMIT, bound_all
+from edge_server.fields.ngp_schedule import step_key
 from edge_server.fields.ngp_torch import harmonics as harmonics_of
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_motion import Moved
@@ -67,7 +68,7 @@ class SplatCudaField(SplatField):
 
     def _one_step(self, progress: float) -> tuple[float, int, int, int]:
         s, cloud = self.settings, self.cloud
-        picked, _ = self._choose()
+        picked, _ = self._choose(step_key(s.seed, self.step))
         params = torch.tensor(cloud.params, device=self._device, requires_grad=True)
         pixels, square, lost = 0, 0.0, 0
         drawn = torch.zeros(len(cloud), device=self._device)

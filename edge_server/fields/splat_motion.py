@@ -122,17 +122,6 @@ def _by_tiles(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return tiles
 
 
-def tasks_of(tiles: Sequence[NDArray[np.uint8] | None], slots: Sequence[int]) -> NDArray[np.int32]:
-    """The changed tiles of views ``slots`` as (slot, tile) rows, int32 (M, 2)."""
-    parts = [np.zeros((0, 2), np.int32)]
-    for b, k in enumerate(slots):
-        mask = tiles[k]
-        assert mask is not None
-        where = np.flatnonzero(mask).astype(np.int32)
-        parts.append(np.stack([np.full_like(where, b), where], axis=-1))
-    return np.concatenate(parts)
-
-
 def drift(cloud: Cloud, elapsed_s: float, moves: bool) -> None:
     """Let every guest go on as it went, or back if the newest view is an older one; after a long pause, or
     where no camera sees anything move, none."""
@@ -175,9 +164,9 @@ def carry(
             turn = (steps - k) * CARRY_VIEWS + level  # other views each time
             some_slots = [slots[(turn + j) % len(slots)] for j in range(min(CARRY_VIEWS, len(slots)))]
             picked, cams = np.array(some_slots, np.int64), np.ascontiguousarray(seen.cams[some_slots])
-            tasks = tasks_of(seen.tiles, some_slots)
-            losses = np.zeros((len(tasks), 3))
             passes.look(cams, gaussians, [seen.tiles[k] for k in some_slots])
+            tasks = passes.tasks()
+            losses = np.zeros((len(tasks), 3))
             passes.pool.run(
                 train_tiles, seen.data, picked, tasks, passes.columns, passes.projected, passes.lists, loss,
                 passes.memory, passes.kept, passes.sums, losses,
@@ -307,7 +296,7 @@ def _still_wrong(
         return off
     passes.look(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
                 [seen.tiles[k] for k in slots], differentiate=False)  # fmt: skip
-    data, tasks = seen.data, tasks_of(seen.tiles, slots)
+    data, tasks = seen.data, passes.tasks()
     error = np.zeros(int(data.first[-1]), np.float32)
     passes.pool.run(
         compare_tiles, data, np.array(slots, np.int64), tasks, passes.columns, passes.projected, passes.lists,

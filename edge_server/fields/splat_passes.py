@@ -90,6 +90,8 @@ class Passes:
         self.sums = np.zeros((0, 0, SUMS), np.float32)
         self.columns = self.rows = np.zeros(0, np.int64)
         self._lists: Lists | None = None
+        self._tasks: dict[tuple[int, ...], NDArray[np.int32]] = {}  # where all tiles are wanted
+        self._all_wanted = False
 
     @property
     def lists(self) -> Lists:
@@ -107,6 +109,7 @@ class Passes:
         self.columns, self.rows = (-(-sizes[:, k] // TILE) for k in (0, 1))
         tiles = int((self.columns * self.rows).max())
         self._make_room(slots, count, tiles)
+        self._all_wanted = all(mask is None for mask in wanted)
         for b, mask in enumerate(wanted):
             total = int(self.columns[b] * self.rows[b])
             self.lists.wanted[b, :total] = 1 if mask is None else mask
@@ -127,6 +130,18 @@ class Passes:
             self.kept = np.zeros((self.pool.threads, length + length // 4), np.float32)
         if differentiate and self.sums.shape[:2] != self.lists.pair.shape:
             self.sums = np.zeros((*self.lists.pair.shape, SUMS), np.float32)
+
+    def tasks(self) -> NDArray[np.int32]:
+        """Slot and tile, int32 (M, 2), of all tiles that were wanted by the last ``look``."""
+        totals = tuple((self.columns * self.rows).tolist())
+        if self._all_wanted and totals in self._tasks:
+            return self._tasks[totals]
+        found = [np.flatnonzero(self.lists.wanted[b, :total]) for b, total in enumerate(totals)]
+        slots = np.repeat(np.arange(len(totals)), [len(tiles) for tiles in found])
+        tasks = np.stack([slots, np.concatenate(found)], axis=-1).astype(np.int32)
+        if self._all_wanted:
+            self._tasks = {totals: tasks}
+        return tasks
 
     def _deal(self, count: int) -> None:
         self.pool.run(deal, self.columns, self.rows, count, self.projected, self.tiles, self.lists)

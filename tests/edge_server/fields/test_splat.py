@@ -152,26 +152,28 @@ def _ball_at(t_ms: int, late: bool = False) -> list[View]:
 
 @pytest.mark.parametrize("late", [False, True])
 def test_what_moves_is_carried_along_and_on_to_the_present(late: bool) -> None:
-    field = SplatField(SMALL)
-    field.fit(_ball_at(0), Budget(steps=200))
-    for t_ms in range(100, 600, 100):
-        field.fit(_ball_at(t_ms, late), Budget(steps=30))
-    cloud = field.cloud
-    guests = (cloud.guest > 0) & (opacity(cloud.params) > 0.3)
-    assert field.rig.box is not None
-    found = np.median(cloud.velocity[guests] * field.rig.box.radius_m, axis=0)
-    np.testing.assert_allclose(found, SPEED, atol=0.3)
     truth, then = (
         picture(HELD.intrinsics, HELD.camera_to_world, START + SPEED * t) / 255.0 for t in (0.65, 0.5)
     )
     moving = np.abs(truth - then).max(axis=2) > 0.03
+    found = []
+    for seed in range(3):  # of a few dozen Gaussians, one seed's median is off by .1 m/s more or less
+        field = SplatField(replace(SMALL, seed=seed))
+        field.fit(_ball_at(0), Budget(steps=200))
+        for t_ms in range(100, 600, 100):
+            field.fit(_ball_at(t_ms, late), Budget(steps=30))
+        cloud = field.cloud
+        guests = (cloud.guest > 0) & (opacity(cloud.params) > 0.3)
+        assert field.rig.box is not None
+        found.append(np.median(cloud.velocity[guests] * field.rig.box.radius_m, axis=0))
 
-    def off(present_ns: int | None) -> float:
-        shown = field.snapshot(present_ns).render(HELD.camera_to_world, HELD.intrinsics)
-        return float(np.square(shown.color - truth)[moving].mean())
+        def off(field: SplatField, present_ns: int | None) -> float:
+            shown = field.snapshot(present_ns).render(HELD.camera_to_world, HELD.intrinsics)
+            return float(np.square(shown.color - truth)[moving].mean())
 
-    assert off(650 * MS) < 0.8 * off(None)
-    assert off(100 * MS) == off(None)  # the past is not shown: what is known is newer
+        assert off(field, 650 * MS) < 0.8 * off(field, None)
+        assert off(field, 100 * MS) == off(field, None)  # the past is not shown: what is known is newer
+    np.testing.assert_allclose(np.median(found, axis=0), SPEED, atol=0.3)
 
 
 def test_a_long_pause_leaves_nothing_known_of_motion() -> None:
