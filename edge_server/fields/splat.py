@@ -2,8 +2,9 @@
 
 One step: the Gaussians are projected into a few cameras (``kernels.splat_project``), dealt out to tiles
 front to back (``kernels.splat_tiles``), tiles are rendered, compared and differentiated side by side
-(``kernels.splat_raster``), and every Gaussian gathers the gradients of its tiles in a fixed order and makes
-an Adam step (``kernels.splat_update``). Every now and then Gaussians are split and pruned.
+(``kernels.splat_raster``, strip by strip in ``kernels.splat_strips``), and every Gaussian gathers the
+gradients of its tiles in a fixed order, leads them back through the projection (``kernels.splat_back``) and
+makes an Adam step (``kernels.splat_update``). Every now and then Gaussians are split and pruned.
 """
 
 from __future__ import annotations

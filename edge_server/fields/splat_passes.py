@@ -90,7 +90,7 @@ class Passes:
         self.sums = np.zeros((0, 0, SUMS), np.float32)
         self.columns = self.rows = np.zeros(0, np.int64)
         self._lists: Lists | None = None
-        self._tasks: dict[tuple[int, ...], NDArray[np.int32]] = {}  # where all tiles are wanted
+        self._whole: tuple[list[int], NDArray[np.int32]] | None = None  # tasks where all tiles are wanted
         self._all_wanted = False
 
     @property
@@ -133,14 +133,14 @@ class Passes:
 
     def tasks(self) -> NDArray[np.int32]:
         """Slot and tile, int32 (M, 2), of all tiles that were wanted by the last ``look``."""
-        totals = tuple((self.columns * self.rows).tolist())
-        if self._all_wanted and totals in self._tasks:
-            return self._tasks[totals]
+        totals = (self.columns * self.rows).tolist()
+        if self._all_wanted and self._whole is not None and self._whole[0] == totals:
+            return self._whole[1]
         found = [np.flatnonzero(self.lists.wanted[b, :total]) for b, total in enumerate(totals)]
         slots = np.repeat(np.arange(len(totals)), [len(tiles) for tiles in found])
         tasks = np.stack([slots, np.concatenate(found)], axis=-1).astype(np.int32)
         if self._all_wanted:
-            self._tasks = {totals: tasks}
+            self._whole = (totals, tasks)
         return tasks
 
     def _deal(self, count: int) -> None:

@@ -210,7 +210,8 @@ def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int
 
 def _counted(field: SplatField) -> tuple[int, int, int, int]:
     """Of a field's last step, of one picture: Gaussians, those in the picture, pairs of one with a tile, and
-    the strips that pairs which changed a pixel lie in: the others are hidden."""
+    the strips that pairs which changed a pixel reach: the others are hidden. Some of these strips may have
+    been dark already, so that the floor is a little high where much is hidden."""
     passes, count = field._passes, len(field.cloud)
     lists, pairs = passes.lists, int(passes.lists.needed[0])
     used = (passes.sums[0, :pairs] != 0.0).any(axis=-1)
@@ -272,8 +273,8 @@ def _floors_of_splat(
     """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
 
     gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; strips: in which these change a
-    pixel. Operations count as if all were vectorised: ``update`` goes through Gaussians one by one, ``deal``
-    sorts them on one core."""
+    pixel. Operations count as if that were all there is: what ``project`` and ``update`` do is mostly to move
+    numbers so that they lie side by side, and ``deal`` sorts on one core."""
     operations, divisions_ms = limits["operations_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
     copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
     parameters = BASE

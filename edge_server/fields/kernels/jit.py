@@ -78,7 +78,13 @@ def part(function: Callable[..., Any]) -> Any:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """``njit`` for arguments that are ``borrowed``, with a cache that knows what a kernel is made of."""
+    """``njit`` for arguments that are ``borrowed``, with a cache that knows what a kernel is made of.
+
+    ValueError for a function within another one: all that this makes would share the first one's code, since
+    what they enclose is not part of the cache's key. Its ``__qualname__`` can be set to a name of its own.
+    """
+    if "<locals>" in function.__qualname__:
+        raise ValueError(f"{function.__qualname__} needs a __qualname__ of its own to be a kernel")
     names = list(inspect.signature(function).parameters)
     text = f"def {function.__name__}({', '.join(names)}):\n"
     text += f"    return inside({', '.join(f'borrowed({name})' for name in names)})\n"

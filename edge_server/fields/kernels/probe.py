@@ -63,7 +63,7 @@ def copies(counter, worker, memory):
 # and no more than its registers hold. Lanes of a vector, multiply-adds, additions: some cores have units of
 # their own for additions, and those with 16 lanes have 32 registers instead of 16.
 CHAINS = ((8, 12, 0), (8, 7, 7), (16, 12, 0), (16, 12, 12))
-CHAINED = 20_000  # operations of each chain in one task
+CHAINED = 200_000  # operations of each chain in one task
 
 
 def _chains(lanes: int, multiply_adds: int, additions: int) -> Any:
@@ -82,7 +82,8 @@ def _chains(lanes: int, multiply_adds: int, additions: int) -> Any:
             step = spread(builder, args[1])
             chains = [cgutils.alloca_once(builder, vector) for _ in range(multiply_adds + additions)]
             for k, chain in enumerate(chains):
-                builder.store(spread(builder, ir.FloatType()(float(k))), chain)
+                # From 2 on: 1 times 1/2 and 1/2 more is 1 again, a chain that would be left out.
+                builder.store(spread(builder, ir.FloatType()(float(k + 2))), chain)
             with cgutils.for_range(builder, args[0]):
                 for k, chain in enumerate(chains):
                     value = builder.load(chain)
@@ -99,14 +100,14 @@ def _chains(lanes: int, multiply_adds: int, additions: int) -> Any:
 
         return types.float32(types.int64, types.float32), codegen
 
-    @kernel
     def arithmetic(counter, worker, out):
         total = np.float32(0.0)
         while fetch_add(counter, 1) < TASKS:
             total += chained(np.int64(CHAINED), np.float32(0.5))
         out[worker] = total
 
-    return arithmetic
+    arithmetic.__qualname__ = f"arithmetic_{lanes}_{multiply_adds}_{additions}"
+    return kernel(arithmetic)
 
 
 arithmetic = tuple(_chains(*shape) for shape in CHAINS)

@@ -10,12 +10,22 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.kernels.intrinsics import fetch_add
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.splat_project import TILE
 from edge_server.fields.kernels.splat_raster import _T, begin_tile, room
-from edge_server.fields.kernels.splat_strips import PIXELS, STRIP, STRIPS, lay, sort_into_strips
+from edge_server.fields.kernels.splat_strips import PIXELS, STOP, STRIP, STRIPS, lay, sort_into_strips
 
+LOOK = 8  # Gaussians are laid one by one before it is looked again whether light is left
 _F0 = np.float32(0.0)
+
+
+@part
+def dark(s, first):
+    """Whether no light is left in the strip whose light begins at ``first``."""
+    most = _F0
+    for k in range(first, first + STRIP):
+        most = max(most, s[k])
+    return most < np.float32(STOP)
 
 
 @kernel
@@ -40,6 +50,8 @@ def render_planes(
         )
         for n in range(STRIPS):
             for j in range(count[n]):
+                if j % LOOK == 0 and dark(s, _T + n * STRIP):
+                    break
                 lay(
                     who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
                     np.float32(y0 + 2 * n), s, _T + n * STRIP, store, 0,
@@ -77,6 +89,8 @@ def tell_normals(
             told[lists.pair[slot, j]] = _F0
         for n in range(STRIPS):
             for j in range(count[n]):
+                if j % LOOK == 0 and dark(s, _T + n * STRIP):
+                    break
                 lay(
                     who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
                     np.float32(y0 + 2 * n), s, _T + n * STRIP, store, 0,

@@ -114,7 +114,7 @@ class Wide:
         relative error below 3e-7."""
         builder = self.builder
         clamped = self.least(_LEAST_POWER).most(0.0)
-        nearest = self._called("roundeven", clamped.value)
+        nearest = self._called("rint", clamped.value)
         whole = Wide(builder, nearest)
         left = clamped - whole
         power = left * _POWER[0] + _POWER[1]

@@ -166,6 +166,7 @@ def test_what_moves_is_carried_along_and_on_to_the_present(late: bool) -> None:
         guests = (cloud.guest > 0) & (opacity(cloud.params) > 0.3)
         assert field.rig.box is not None
         found.append(np.median(cloud.velocity[guests] * field.rig.box.radius_m, axis=0))
+        np.testing.assert_allclose(found[-1], SPEED, atol=0.4)
 
         def off(field: SplatField, present_ns: int | None) -> float:
             shown = field.snapshot(present_ns).render(HELD.camera_to_world, HELD.intrinsics)

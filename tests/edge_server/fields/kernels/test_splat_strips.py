@@ -132,7 +132,7 @@ def test_what_is_hidden_has_no_gradient() -> None:
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf, 3e38, -3e38])
 @pytest.mark.parametrize("column", [MX, MY, QA, QB, QC, ALPHA])
-def test_a_broken_row_leaves_light_and_sums_finite(column: int, broken: float) -> None:
+def test_a_broken_row_leaves_light_and_the_others_sums_finite(column: int, broken: float) -> None:
     rows = np.stack([_row(0.6), _row(0.7), _row(0.5)])
     rows[1, column] = broken
     who, tile, kept = np.arange(3, dtype=np.int32), _dark_tile(), np.zeros(3 * KEPT, np.float32)
@@ -148,11 +148,16 @@ def test_each_strip_of_a_tile_has_its_own_light() -> None:
     """``first`` says where a strip lies: the others of the tile are left alone, forward and back."""
 
     @njit
-    def second(who, owner, projected, tile, kept):
+    def second(who, owner, projected, tile, slopes, kept, sums):
         lay(who, 1, owner, projected, np.float32(0.0), np.float32(2.0), tile, STRIP, kept, 0)
+        lift(who, 1, owner, projected, np.float32(0.0), np.float32(2.0), slopes, STRIP, kept, sums)
 
-    rows, who = _row(0.6)[None], np.zeros(1, np.int32)
-    tile, kept = _dark_tile(), np.zeros(KEPT, np.float32)
-    second(who, who, rows, tile, kept)
+    rows, who, sums = _row(0.6)[None], np.zeros(1, np.int32), np.zeros((2, 1, SUMS), np.float32)
+    inside = np.zeros((4, STRIPS, STRIP), np.float32)
+    inside[:, 1] = 1.0
+    for n, slopes in enumerate((inside, 1.0 - inside)):
+        tile, kept = _dark_tile(), np.zeros(KEPT, np.float32)
+        second(who, who, rows, tile, slopes.reshape(-1), kept, sums[n])
+    assert sums[0].all() and not sums[1].any()
     changed = (tile != _dark_tile()).reshape(5, STRIPS, STRIP).any(axis=(0, 2))
     assert changed.tolist() == [False, True, False, False]
