@@ -78,12 +78,15 @@ def test_the_library_moves_the_arm(control, receive):
     assert control.moveJ(list(HOME_RAD), 1.0, 4.0, True)  # does not wait
     assert not np.allclose(receive.getActualQ(), HOME_RAD, atol=1e-3)
     control.stopJ(8.0)
+    _await_next_state(receive)
     assert np.abs(receive.getActualQd()).max() < 1e-9
     where = receive.getActualQ()
     assert control.moveJ(list(HOME_RAD), 2.0, 8.0) and not np.allclose(where, HOME_RAD, atol=1e-4)
+    _await_next_state(receive)
     assert np.allclose(receive.getActualQ(), HOME_RAD, atol=1e-9)
     assert control.moveJ(goal.tolist(), 1.0, 4.0, True)
     assert control.moveJ(list(HOME_RAD), 2.0, 8.0)  # while the other is on its way
+    _await_next_state(receive)
     assert np.allclose(receive.getActualQ(), HOME_RAD, atol=1e-9)
 
 
