@@ -20,12 +20,21 @@ _F0 = np.float32(0.0)
 
 
 @part
-def dark(s, first):
-    """Whether no light is left in the strip whose light begins at ``first``."""
-    most = _F0
-    for k in range(first, first + STRIP):
-        most = max(most, s[k])
-    return most < np.float32(STOP)
+def lay_next(s, who, n, j, lists, slot, projected, x0, y0, store):
+    """Lay the j-th Gaussian of strip n alone: its alphas and the light before it are in ``store`` then.
+    False, and nothing is laid, if it was seen to be dark; it is looked every LOOK Gaussians."""
+    first = _T + n * STRIP
+    if j % LOOK == 0:
+        most = _F0
+        for k in range(first, first + STRIP):
+            most = max(most, s[k])
+        if most < np.float32(STOP):
+            return False
+    lay(
+        who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0), np.float32(y0 + 2 * n), s,
+        first, store, 0,
+    )  # fmt: skip
+    return True
 
 
 @kernel
@@ -50,12 +59,8 @@ def render_planes(
         )
         for n in range(STRIPS):
             for j in range(count[n]):
-                if j % LOOK == 0 and dark(s, _T + n * STRIP):
+                if not lay_next(s, who, n, j, lists, slot, projected, x0, y0, store):
                     break
-                lay(
-                    who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
-                    np.float32(y0 + 2 * n), s, _T + n * STRIP, store, 0,
-                )  # fmt: skip
                 for c in range(4):
                     value = planes[lists.owner[slot, who[n, j]], c]
                     for k in range(STRIP):
@@ -89,12 +94,8 @@ def tell_normals(
             told[lists.pair[slot, j]] = _F0
         for n in range(STRIPS):
             for j in range(count[n]):
-                if j % LOOK == 0 and dark(s, _T + n * STRIP):
+                if not lay_next(s, who, n, j, lists, slot, projected, x0, y0, store):
                     break
-                lay(
-                    who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
-                    np.float32(y0 + 2 * n), s, _T + n * STRIP, store, 0,
-                )  # fmt: skip
                 nx = ny = nz = total = _F0
                 for k in range(STRIP):
                     x, y = x0 + k % TILE, y0 + 2 * n + k // TILE
