@@ -21,7 +21,7 @@ from edge_server.fields.kernels.splat_project import TILE, Gaussians
 from edge_server.fields.kernels.splat_raster import Loss, compare_tiles, train_tiles
 from edge_server.fields.kernels.splat_update import pull
 from edge_server.fields.scene_box import SceneBox
-from edge_server.fields.splat_growth import Cloud, opacity
+from edge_server.fields.splat_growth import Cloud, make_room
 from edge_server.fields.splat_passes import Passes
 from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.splat_settings import SplatSettings
@@ -236,11 +236,7 @@ def renew(
     new.keep(_hull(settings, passes.pool, new, seen)[0])
     new.guest[:] = 1
     _pass_on(cloud, new, CELLS_PX[0] * seen.box.pixel_m / seen.box.radius_m)
-    over = len(cloud) + len(new) - settings.gaussians
-    if over > 0:  # room is made by the ones that show least
-        keep = np.ones(len(cloud), bool)
-        keep[np.argsort(opacity(cloud.params), kind="stable")[:over]] = False
-        cloud.keep(keep)
+    make_room(cloud, len(cloud) + len(new) - settings.gaussians)
     cloud.add(new)
 
 

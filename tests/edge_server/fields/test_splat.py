@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +12,16 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.kernels.pool import CallerPool
+from edge_server.fields.kernels.splat_project import OPACITY, QUATERNION, SCALE
 from edge_server.fields.kernels.splat_seed import NOT_SEEN, SEES, UNMARKED, score_cells
 from edge_server.fields.scene_box import scene_box
 from edge_server.fields.splat import SplatField
-from edge_server.fields.splat_growth import opacity
+from edge_server.fields.splat_growth import Cloud, make_room, opacity
 from edge_server.fields.splat_motion import drift
 from edge_server.fields.splat_passes import camera_rows
 from edge_server.fields.splat_seeds import seeds
 from edge_server.fields.supervision import pack_cameras
-from tests.edge_server.fields.scenes import picture
+from tests.edge_server.fields.scenes import mean_psnr, picture
 from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, same_state, score
 from tests.edge_server.fields.small import SPLAT as SMALL
 
@@ -250,6 +252,39 @@ def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:
         field.fit(SEEN, Budget(steps=20))
         counts.append(len(field.cloud))
     assert counts[0] < counts[-1] == max(counts) <= SMALL.gaussians and counts[-1] > 1400
+
+
+def test_room_is_made_by_what_pictures_depend_on_least() -> None:
+    """What is hidden goes before what is faint; of what has made no step, nothing."""
+    field, hidden, unknown, count = SplatField(SMALL), 60, 5, 120
+    field.fit(SEEN, Budget(steps=300))
+    box = field.rig.box
+    assert box is not None
+    inside = field.cloud.params[: hidden + unknown].copy()  # small, opaque, in the middle of the ball
+    spread_m = np.random.default_rng(0).uniform(-0.1, 0.1, (len(inside), 3))
+    inside[:, :3] = box.normalise(np.array([0.0, 0.0, 0.5]) + spread_m)
+    inside[:, SCALE:QUATERNION], inside[:, OPACITY] = np.log(0.03), 4.0
+    field.cloud.keep(np.arange(len(field.cloud)) < SMALL.gaussians - 200)
+    field.cloud.add(Cloud.of(inside[:hidden]))
+    field.fit(SEEN, Budget(steps=12))  # less than lies between two prunings
+    field.cloud.add(Cloud.of(inside[hidden:]))
+    state, known, n = field.state(), mean_psnr(field, SEEN), len(field.cloud)
+
+    def without(room: Callable[[Cloud], None]) -> tuple[float, np.ndarray]:
+        """The score afterwards, and which are left."""
+        other = SplatField(SMALL)
+        other.load_state(state)
+        other.cloud.slope[:] = np.arange(n)  # their names
+        room(other.cloud)
+        return mean_psnr(other, SEEN), np.isin(np.arange(n), other.cloud.slope)
+
+    lowered, left = without(lambda cloud: make_room(cloud, count))
+    assert left.sum() == n - count
+    assert left[-unknown:].all() and left[-unknown - hidden : -unknown].mean() < 0.5
+    faint = np.argsort(opacity(field.cloud.params), kind="stable")[:count]
+    by_opacity, _ = without(lambda cloud: cloud.keep(~np.isin(np.arange(n), faint)))
+    assert lowered > known - 0.1 and lowered > by_opacity, (known, lowered, by_opacity)
+    assert without(lambda cloud: make_room(cloud, -3))[1].all()
 
 
 @pytest.mark.parametrize("options", [
