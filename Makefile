@@ -119,7 +119,7 @@ clean:  ## remove the virtual environment and every cache (runs/ stays)
 	@$(INSTALL) -e '.[edge,embed,up]'
 	@touch $@
 
-# The field's kernels are compiled at their first use, which takes most of a minute: better beside the
+# The field's kernels are compiled at their first use, which takes some ten seconds: better beside the
 # installation of everything else than after it. Should it fail here, the edge server tries again.
 .venv/.ok-kernels: .venv/.ok-numba
 	@PYTHONPATH=proto:. $(PY) -c '$(WARM_UP)' >.venv/kernels.log 2>&1 || \

@@ -62,15 +62,17 @@ class NgpField(TrainedField):
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``ngp_settings``), for the device they ask for."""
+    """A field from plain options (``ngp_settings``), for the device they ask for; ``auto`` takes a GPU only
+    where it can do all that they ask for. ValueError where ``cuda`` is asked for and cannot."""
     settings = make_settings(options, seed)
     if settings.device == "cpu" or (settings.device == "auto" and not driver_present()):
         return NgpField(settings)
     from edge_server.fields.ngp_torch_field import (  # torch, only where it may be used
         NgpTorchField,
         cuda_present,
+        lacks,
     )
 
-    if settings.device == "cuda" or cuda_present():
+    if settings.device == "cuda" or (cuda_present() and not lacks(settings)):
         return NgpTorchField(settings)
     return NgpField(settings)

@@ -1,6 +1,8 @@
 """``NgpField`` for CUDA devices, in plain torch (also runs on a CPU, slowly, which is how it is tested).
 
-Same settings and the same state as ``NgpField``: a checkpoint of one loads into the other.
+The same state as ``NgpField``: a checkpoint of one loads into the other. The same settings, too, but for
+those in ``ONLY_KERNELS``, which are refused, ``smooth``, which is left out, and ``batch_samples``: every ray
+of a step is taken, however many samples it has.
 """
 
 from __future__ import annotations
@@ -42,6 +44,12 @@ from edge_server.fields.scene_box import NOWHERE, SceneBox
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # at a time
+ONLY_KERNELS = ("exposure", "refine_m", "refine_deg", "near_fade")  # options that have no code here
+
+
+def lacks(settings: NgpSettings) -> tuple[str, ...]:
+    """The options in ``settings`` that ask for what only the kernels do."""
+    return tuple(name for name in ONLY_KERNELS if getattr(settings, name))
 
 
 @contextmanager
@@ -162,10 +170,13 @@ class TorchSnapshot:
 
 
 class NgpTorchField:
-    """See ``NgpField``: the protocol and its meaning are the same."""
+    """See ``NgpField``: the protocol and its meaning are the same. ValueError for a device that is not here,
+    and for options that only the kernels have (``lacks``)."""
 
     def __init__(self, settings: NgpSettings | None = None, device: str | None = None) -> None:
         self.settings = settings or NgpSettings()
+        if missing := lacks(self.settings):
+            raise ValueError(f"ngp: {', '.join(missing)} needs device cpu; the field in torch has it not")
         self.device = device or ("cuda" if cuda_present() else "cpu")
         if self.device.startswith("cuda") and not cuda_present():
             raise ValueError("ngp: device cuda was asked for, but torch finds none here; use cpu or auto")

@@ -85,22 +85,24 @@ def raw_opacity(alpha: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.log(alpha / (1.0 - alpha)).astype(np.float32)
 
 
-def weight_in_pictures(cloud: Cloud) -> NDArray[np.float32]:
-    """How much the pictures depend on each Gaussian, float32 (N,), of a scale that only comparisons know:
-    the mean square of the loss's gradient by its colour, which Adam keeps. That gradient is the sum, over the
-    pixels where it shows, of its share in the pixel times the error there, so small, hidden and faint ones
-    have little of it. Infinite for those that have made no step: nothing is known of them.
+def pull_of_colour(cloud: Cloud) -> NDArray[np.float32]:
+    """How much the pictures' errors depend on each Gaussian, float32 (N,), of a scale that only comparisons
+    know: the mean square of the loss's gradient by its colour, which Adam keeps. That gradient is the sum,
+    over the pixels where it shows, of its share in the pixel times the error there. Small, hidden and faint
+    ones have little of it, and so has what is shown without any error: there are more than enough there, and
+    when there no longer are, errors and gradients come back. Infinite for those that have made no step:
+    nothing is known of them.
     """
     square = cloud.v[:, COLOR:BASE].sum(axis=1) / (1.0 - BETA2 ** np.maximum(cloud.age, 1))
     return np.where(cloud.age > 0, square, np.inf).astype(np.float32)
 
 
 def make_room(cloud: Cloud, count: int) -> None:
-    """Remove the ``count`` Gaussians on which the pictures depend least. By opacity, all that is faint would
-    go in time, and it is what edges are made of: -1.1 dB after 300 updates of ``room``."""
+    """Remove the ``count`` Gaussians on which the pictures' errors depend least. By opacity, all that is faint
+    would go in time, and it is what edges are made of: -1.1 dB after 300 updates of ``room``."""
     if count > 0:
         keep = np.ones(len(cloud), bool)
-        keep[np.argsort(weight_in_pictures(cloud), kind="stable")[:count]] = False
+        keep[np.argsort(pull_of_colour(cloud), kind="stable")[:count]] = False
         cloud.keep(keep)
 
 

@@ -25,12 +25,13 @@ Measure this machine. Figures are medians; outside_cores says how many cores oth
 
   edge-server bench                       # everything but peer, hours
   edge-server bench field --quick
-  edge-server bench track --scene room --field ngp --updates 300
+  edge-server bench track --scene room --field ngp --update-s 0.5
   edge-server bench field track options --json docs/results/field.json
   edge-server bench ingest --json ingest.json
 
 field      steps, rays and samples a second, ms a rendering, compile time, memory, seconds to 22..30 dB
-track      updates after motion: how far behind a fit from scratch, and whether it drifts
+track      updates after motion: how far behind a fit from scratch
+drift      the same for 300 updates of room: whether a field wears out
 options    what each optional part of a representation costs in time and gains in dB
 limits     what this machine allows (random reads and additions, multiply-adds), and how near each kernel gets
 ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
@@ -49,16 +50,17 @@ With --json FILE figures are written scene by scene as they are measured; at the
 with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on where it stopped.
 """
 
-PARTS = ("field", "track", "options", "limits", "ingest", "fidelity", "decide")
+PARTS = ("field", "track", "drift", "options", "limits", "ingest", "fidelity", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
 MORE = ("embed", "foreground", "peer", "surface")
 # Parts that write each figure as it comes, and can skip what is known.
-_KEEPING = ("field", "track", "options", "surface")
+_KEEPING = ("field", "track", "drift", "options", "surface")
+_FOLLOWING = ("track", "drift")
 # Flags that mean something to some parts only.
 _ONLY_OF = {
-    "field": _KEEPING, "resume": (*PARTS, *MORE), "only": ("options",), "scene": ("track",),
-    "updates": ("track",), "update_s": ("track",), "steps": ("track",), "samples": ("track",),
-    "option": ("track",), "model": ("embed", "foreground"),
+    "field": _KEEPING, "resume": (*PARTS, *MORE), "only": ("options",), "scene": _FOLLOWING,
+    "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
+    "option": _FOLLOWING, "model": ("embed", "foreground"),
 }  # fmt: skip
 
 
@@ -118,16 +120,22 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME",
-        help="of field, track, options, surface [all there are]",
+        help="of field, track, drift, options, surface [all there are]",
     )
     add("--quick", action="store_true", help="fewer repetitions, cached kernels only")
     add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
     add("--only", action="append", default=[], metavar="NAME", help="of options: 'exposure', ... [all]")
     add("--model", type=Path, metavar="FILE", help="of embed, foreground: a YOLO ONNX [the shipped ones]")
-    track = parser.add_argument_group("of track")
+    track = parser.add_argument_group("of track and drift")
     add = track.add_argument
-    add("--scene", action="append", default=[], choices=("room", "kitchen"), help="[both]")
-    add("--updates", type=_at_least_one, metavar="N", help="consecutive updates [100; --quick: 16]")
+    scenes = ("room", "kitchen")
+    add("--scene", action="append", default=[], choices=scenes, help="[track: both; drift: room]")
+    add(
+        "--updates",
+        type=_at_least_one,
+        metavar="N",
+        help="consecutive updates [100, drift 300; --quick: 16, drift 32]",
+    )
     add("--update-s", type=_seconds, metavar="S,...", help="seconds of an update, a run each [1,0.25]")
     add("--steps", type=_at_least_one, metavar="N", help="steps of an update instead: repeats bit for bit")
     add("--samples", type=_at_least_one, metavar="N", help="frames with a fresh fit [8; --quick: 3]")
@@ -181,7 +189,7 @@ def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: d
     elif args.resume and part in figures:
         print("  known already", flush=True)
         return
-    if part == "track":
+    if part in _FOLLOWING:
         more |= {
             "scenes": args.scene, "updates": args.updates, "update_s": args.update_s, "steps": args.steps,
             "samples": args.samples, "options": args.option or None,

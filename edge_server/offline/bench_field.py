@@ -31,7 +31,7 @@ from edge_server.offline.still import Still, open_still, smallest_angle_deg, syn
 from edge_server.offline.usage import Usage, peak_rss_mb
 from freshfield.geometry import Pinhole
 
-GROWN = 120  # steps after which every representation has its full size
+GROWN = 500  # steps after which every representation has its full size
 VIEWS, SIZE = 18, 128
 TARGETS_DB = (22, 25, 28, 30)
 

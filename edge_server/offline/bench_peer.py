@@ -1,9 +1,9 @@
 """Seconds to a quality, side by side with peers a user might pick on the same machine in the same run.
 
 Peers: nerfstudio's nerfacto (its torch implementation, which is what runs without a GPU) where nerfstudio can
-be imported, and our own field in plain torch, which does the same arithmetic as the kernels. Time spent on
-evaluation is not counted for anybody. nerfstudio is no dependency; to have it as a peer:
-``pip install nerfstudio`` in the same environment.
+be imported, and our own field in plain torch, which does the same arithmetic as the kernels but for the
+smoothness prior. Time spent on evaluation is not counted for anybody. nerfstudio is no dependency; to have it
+as a peer: ``pip install nerfstudio`` in the same environment.
 """
 
 from __future__ import annotations

@@ -102,6 +102,19 @@ def test_a_field_that_learns_nothing_is_as_good_as_fresh(tmp_path, flat):
     assert fresh["psnr_db"] == fresh["not_updated_psnr_db"] and fresh["fitted_s"] == 15.0
 
 
+def test_drift_is_the_same_at_length_and_kept_apart(tmp_path, flat):
+    path = tmp_path / "bench.json"
+    assert bench(path, "--field", "ngp", "--updates", "4") == 0
+    words = ["bench", "drift", "--quick", "--resume", "--json", str(path), "--field", "ngp"]
+    assert edge_server(words) == 0
+    found = json.loads(path.read_text())
+    assert found["track"]["room"]["ngp"]["1_s"]["updates"] == 4
+    assert list(found["drift"]) == ["room"] and found["drift"]["room"]["ngp"]["0.25_s"]["updates"] == 32
+    assert "![drift](drift.png)" in path.with_suffix(".md").read_text()
+    assert edge_server([*words, "--updates", "5"]) == 0
+    assert json.loads(path.read_text())["drift"]["room"]["ngp"]["0.25_s"]["updates"] == 5
+
+
 def test_gaps_are_against_the_interpolated_fresh_fits():
     frames = list(range(1, 21))
     # Fresh falls from 30 to 20 dB; the follower starts with it and loses 0.1 dB more at every frame.
@@ -175,7 +188,7 @@ def test_recordings_are_followed_too_or_said_to_be_missing(tmp_path, flat, monke
 def test_flags_that_mean_nothing_to_the_parts_asked_for_are_refused(capsys):
     with pytest.raises(SystemExit):
         edge_server(["bench", "field", "--scene", "room"])
-    assert "--scene is for track; asked for: field" in capsys.readouterr().err
+    assert "--scene is for track, drift; asked for: field" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         edge_server(["bench", "track", "--field", "voxel,ngp", "--option", "sizes=64"])
     assert "voxel: sizes must be a list like [32, 64], not 64" in capsys.readouterr().err

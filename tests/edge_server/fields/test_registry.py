@@ -8,6 +8,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -153,3 +154,16 @@ def test_where_a_gpu_can_be_torch_is_asked(monkeypatch: pytest.MonkeyPatch) -> N
     for cuda, kind in ((True, in_torch), (False, NgpField)):
         monkeypatch.setattr(ngp_torch_field, "cuda_present", lambda cuda=cuda: cuda)
         assert type(make_field("ngp", {"log2_table": 9})) is kind
+
+
+@pytest.mark.parametrize("option", [{"exposure": True}, {"refine_m": 0.03}, {"near_fade": 0.3}])
+def test_what_only_the_kernels_do_is_not_lost_on_a_gpu(
+    option: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from edge_server.fields import ngp, ngp_torch_field
+
+    monkeypatch.setattr(ngp, "driver_present", lambda: True)
+    monkeypatch.setattr(ngp_torch_field, "cuda_present", lambda: True)
+    assert type(make_field("ngp", {"log2_table": 9, **option})) is NgpField
+    with pytest.raises(ValueError, match=f"{next(iter(option))} needs device cpu"):
+        make_field("ngp", {"log2_table": 9, "device": "cuda", **option})
