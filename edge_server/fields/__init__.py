@@ -1,6 +1,8 @@
 """Radiance fields behind one small protocol: fit a view set within a budget, render a camera, save, load.
 
-Adding a representation is one file here (and its kernels in ``kernels/``) plus a line in ``registry``.
+Adding a representation NAME is one file here with its settings beside it (``NAME_settings``: the class
+``NameSettings``, ``EFFORTS``, ``make_settings``, ``help_text``), its kernels in ``kernels/``, and a line in
+``registry``.
 """
 
 from __future__ import annotations

@@ -40,7 +40,8 @@ class RigSettings(TrustSettings, Protocol):
 
 
 class PixelRenderer(Protocol):
-    """Shows single pixels: ``NgpSnapshot.render_pixels``."""
+    """Shows single pixels, as ``NgpSnapshot`` does: colour (N, 3), depth (N,) in metres and opacity (N,) at
+    image points (N, 2)."""
 
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from edge_server.fields.kernels.mlp import Net
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import Space
 from edge_server.fields.kernels.render import ROUND, TILE, render_tiles
+from edge_server.fields.ngp_rig import PixelRenderer
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.supervision import lens_row
 from freshfield.geometry import Pinhole
@@ -88,14 +89,6 @@ class NgpSnapshot:
         """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras' rays
         meet a surface: their pixels are sampled evenly."""
         return surface_points(self, self.cameras, count)
-
-
-class PixelRenderer(Protocol):
-    """Renders single pixels: what ``surface_points`` needs of a field."""
-
-    def render_pixels(
-        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]: ...
 
 
 def surface_points(

@@ -32,6 +32,14 @@ def option_help(name: str) -> dict[str, str]:
     return found
 
 
+def efforts_of(name: str) -> Mapping[str, Mapping[str, Any]]:
+    """The presets of a representation by name. ValueError: there is no such representation."""
+    if name not in _FIELDS:
+        raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
+    found: Mapping[str, Mapping[str, Any]] = import_module(f"edge_server.fields.{name}_settings").EFFORTS
+    return found
+
+
 def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 0) -> Field:
     """A fresh field. ValueError: no such representation, or an option it does not have (both are listed)."""
     given = _checked(name, options or {})

@@ -98,8 +98,8 @@ def pull_of_colour(cloud: Cloud) -> NDArray[np.float32]:
 
 
 def make_room(cloud: Cloud, count: int) -> None:
-    """Remove the ``count`` Gaussians on which the pictures' errors depend least. By opacity, all that is faint
-    would go in time, and it is what edges are made of: -1.1 dB after 300 updates of ``room``."""
+    """Remove the ``count`` Gaussians on which the pictures' errors depend least. By opacity, all that is
+    faint would go in time, and it is what edges are made of: -1.1 dB after 300 updates of ``room``."""
     if count > 0:
         keep = np.ones(len(cloud), bool)
         keep[np.argsort(pull_of_colour(cloud), kind="stable")[:count]] = False

@@ -282,7 +282,10 @@ def table(figures: dict[str, Any]) -> str:
         "scene|representation|steps/s|rays/s|samples/s|128 x 128 in ms|256 x 256 in ms|outside cores": rates,
         "representation|JIT cold s|of CPU s|JIT cached s|of CPU s|peak memory MB|cores busy": starts,
     }
-    return "\n\n".join(_markdown(head.split("|"), rows) for head, rows in tables.items() if rows)
+    told = [_markdown(head.split("|"), rows) for head, rows in tables.items() if rows]
+    if any(name == "splat" for _, name, *_ in rates):
+        told.append("Rays of `splat` are pixels, its samples pairs of a Gaussian and a tile of 8 x 8 pixels.")
+    return "\n\n".join(told)
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -169,9 +169,7 @@ def run(job: Job, out: Path, lpips_folder: Path | None = None, resume: bool = Fa
     if resume:
         run_.load()
     print(run_.headline(), flush=True)
-    warm_up = getattr(model, "warm_up", None)
-    if warm_up is not None:
-        print(f"kernels ready after {warm_up():.1f} s", flush=True)
+    print(f"kernels ready after {model.warm_up():.1f} s", flush=True)
     return run_.go()
 
 

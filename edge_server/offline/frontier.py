@@ -281,7 +281,7 @@ class Frontier:
 
     @property
     def _live(self) -> list[sweep.Effort]:
-        return [e for e in self.levels if e.live and e.name in (*self.plan.efforts, "default")]
+        return [e for e in self.levels if e.live and e.name in self.plan.efforts]
 
     def _charged(self) -> dict[str, Compute]:
         """What virtual time charges the updates of each effort: what they take here, of pictures as many as

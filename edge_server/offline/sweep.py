@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,18 +12,11 @@ import numpy as np
 
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget, View
+from edge_server.fields.registry import efforts_of, make_field
 from edge_server.offline.fitting import evaluate
 from edge_server.offline.still import Still
 from edge_server.offline.usage import Usage
 
-# Where a field keeps its named effort levels: option values by name. A field without any has one level.
-_EFFORTS = {
-    "ngp": "edge_server.fields.ngp_settings:EFFORTS",
-    "nerfacto": "edge_server.fields.nerfacto_settings:EFFORTS",
-    "tensorf": "edge_server.fields.tensorf_settings:EFFORTS",
-    "splat": "edge_server.fields.splat_settings:EFFORTS",
-    "voxel": "edge_server.fields.voxel_settings:EFFORTS",
-}
 # What one knob alone buys, against the level "medium" (only in the full sweep).
 _KNOBS: dict[str, dict[str, dict[str, Any]]] = {
     "ngp": {
@@ -59,11 +51,7 @@ class Effort:
 def efforts(field: str, options: dict[str, Any], knobs: bool) -> list[Effort]:
     """The field's effort levels, cheapest first; with ``knobs`` also images of half the size, and each knob
     turned alone. ``options`` apply to all of them."""
-    levels: list[Effort] = [Effort(field, "default", dict(options))]
-    if field in _EFFORTS:
-        module, _, name = _EFFORTS[field].partition(":")
-        known = getattr(importlib.import_module(module), name)
-        levels = [Effort(field, level, {"effort": level, **options}) for level in known]
+    levels = [Effort(field, level, {"effort": level, **options}) for level in efforts_of(field)]
     if knobs:
         levels += [replace(e, name=f"{e.name}, half size", divided=2.0, live=False) for e in levels]
         levels += [
@@ -95,13 +83,9 @@ def fit_from_scratch(
     effort: Effort, still: Still, seconds: float, seed: int, lpips: PerceptualMetric | None
 ) -> dict[str, Any]:
     """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost."""
-    from edge_server.fields.registry import make_field
-
     model = make_field(effort.field, effort.options, seed=seed)
     still = replace(still, training=shrunk(still.training, effort.divided))
-    warm_up = getattr(model, "warm_up", None)
-    if warm_up is not None:
-        warm_up()
+    model.warm_up()
     usage = Usage("fit")
     report = model.fit(still.training, Budget(seconds=seconds))
     row = usage.row(seconds)

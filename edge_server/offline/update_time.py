@@ -144,8 +144,7 @@ class Seen:
     def published(self, publication: Publication, field: Field) -> None:
         """Another picture is shown from now on; score what was shown until now."""
         self.until(publication.t_s)
-        snapshot = getattr(field, "snapshot", None)
-        self._shown = snapshot() if snapshot is not None else field
+        self._shown = field.snapshot()
 
     def until(self, t_s: float) -> None:
         """Score the instants up to ``t_s`` that are still open."""
