@@ -44,7 +44,13 @@ from edge_server.fields.scene_box import NOWHERE, SceneBox
 from freshfield.geometry import Pinhole
 
 RENDER_RAYS = 8192  # at a time
-ONLY_KERNELS = ("exposure", "refine_m", "refine_deg", "near_fade")  # options that have no code here
+ONLY_KERNELS = (
+    "exposure",
+    "refine_m",
+    "refine_deg",
+    "near_fade",
+    "depth_guide",
+)  # options that have no code here
 
 
 def lacks(settings: NgpSettings) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,14 +11,12 @@ from edge_server.fields import View
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.kernels.splat_project import BASE, COLOR, OPACITY, QUATERNION, SCALE
-from edge_server.fields.kernels.splat_seed import MOST_VIEWS, SEES, UNMARKED, score_cells, sweep_rays
 from edge_server.fields.kernels.splat_update import bound_all
-from edge_server.fields.scene_box import SceneBox, plain_background
-from edge_server.fields.splat_passes import camera_rows
+from edge_server.fields.plane_sweep import empty_color, score, sweep
+from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.splat_settings import SplatSettings
 from edge_server.fields.supervision import asked_views, pack_cameras
 
-TOLERANCE = 0.08  # summed over the channels: more and walls are taken to be where they are not
 _CANDIDATES = 4  # rays a Gaussian: those without a surface are left out
 _PLAIN = 0.06
 
@@ -40,16 +37,15 @@ def seeds(
     drawn = rng.choice(where, min(_CANDIDATES * count, where.size), replace=False)
     view_of = np.searchsorted(data.first, drawn, side="right") - 1
     local = drawn - data.first[view_of]
-    middle = np.float32(box.distance_m / box.radius_m)
-    distance = np.zeros(drawn.size, np.float32)
-    cells = max(settings.seed_cells, 8)
-    scores = np.zeros(cells**3, np.float32)
-    near = np.float32(max(0.01, box.near_m / box.radius_m))
     if settings.seed_cells:
-        _score(settings, pool, box, views, moved, data, scores, cells)
-        pool.run(sweep_rays, data, view_of, local, near, middle, box.contracted, cells, scores, distance)
+        cells = max(settings.seed_cells, 8)
+        distance = sweep(
+            pool, box, data, view_of, local, score(settings, pool, box, views, moved, data, cells), cells
+        )
     else:
-        distance[:] = np.maximum(near, middle * rng.uniform(0.4, 1.6, drawn.size))
+        middle = box.distance_m / box.radius_m
+        near = max(0.01, box.near_m / box.radius_m)
+        distance = np.maximum(near, middle * rng.uniform(0.4, 1.6, drawn.size)).astype(np.float32)
     found = np.flatnonzero(distance > 0)[:count]
     params = np.zeros((found.size, width), np.float32)
     if found.size == 0:
@@ -77,7 +73,7 @@ def _pixels(
     masks: Sequence[NDArray[np.bool_] | None] | None,
 ) -> NDArray[np.int64]:  # fmt: skip
     """Numbers of the pixels that show something, over all views."""
-    plain = _empty_color(settings, [views[k] for k in asked_views(data)])
+    plain = empty_color(settings, [views[k] for k in asked_views(data)])
     parts = [np.zeros(0, np.int64)]
     for k, view in enumerate(views):
         image = view.image
@@ -94,46 +90,3 @@ def _pixels(
             shows = shows & (data.weight[data.first[k] : data.first[k + 1]] > 0).reshape(shows.shape)
         parts.append(data.first[k] + np.flatnonzero(shows))
     return np.concatenate(parts).astype(np.int64)
-
-
-def _empty_color(settings: SplatSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
-    """The plain colour (3,) that is rendered where nothing is, if pictures have one: with a background of
-    the user's choice, a plain sky has to be made of Gaussians like everything else."""
-    return plain_background(views) if settings.background == "auto" and views else None
-
-
-def _score(settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
-           moved: Sequence[NDArray[np.bool_] | None] | None, all_data: Views,
-           scores: NDArray[np.float32], cells: int) -> None:  # fmt: skip
-    asked = asked_views(all_data)
-    chosen = [asked[k] for k in np.unique(np.linspace(0, len(asked) - 1, MOST_VIEWS).astype(int))]
-    some = [views[k] for k in chosen]
-    cams = camera_rows([v.camera_to_world for v in some], [v.intrinsics for v in some], box)
-    data = pack_cameras(some, box)._replace(weight=np.concatenate(
-        [all_data.weight[all_data.first[k] : all_data.first[k + 1]] for k in chosen]
-    ))  # fmt: skip
-    channels = max(v.image.shape[2] for v in some)
-    blurred = np.full((int(data.first[-1]), channels), 255, np.uint8)
-    says = np.zeros(0 if moved is None else len(blurred) + 1, np.int32)
-    for k, view in enumerate(some):
-        footprint = (4.0 if box.contracted else 2.0) * box.radius_m / cells / box.distance_m
-        size = 2 * (max(int(0.5 * footprint * view.intrinsics.fx), 1) // 2) + 1
-        a, b = data.first[k], data.first[k + 1]
-        image = cv2.blur(view.image, (size, size)) if size > 1 else view.image
-        blurred[a:b, : image.shape[2]] = image.reshape(int(b - a), -1)
-        if moved is None:
-            continue
-        says[a:b] = SEES + UNMARKED
-        mask = moved[chosen[k]]
-        if mask is not None:  # a cell is as wide as so many pixels
-            wide = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
-            says[a:b][wide.reshape(-1) > 0] = SEES
-        if data.weight.size:
-            says[a:b][data.weight[a:b] <= 0] = 0
-    plain = _empty_color(settings, some)
-    needed = min(settings.min_views, len(some))
-    pool.run(
-        score_cells, cams, data, blurred, says, plain is not None,
-        plain if plain is not None else np.zeros(3, np.float32), np.float32(TOLERANCE), box.contracted, cells,
-        needed, scores,
-    )  # fmt: skip

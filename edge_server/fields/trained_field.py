@@ -40,6 +40,7 @@ from edge_server.fields.ngp_schedule import (
 )
 from edge_server.fields.ngp_snapshot import NgpSnapshot
 from edge_server.fields.ngp_state import all_or_nothing, fill, pack, unpack_meta
+from edge_server.fields.plane_sweep import LEAST_VIEWS, guide
 from edge_server.fields.refinement import CameraErrors
 from edge_server.fields.scene_box import NOWHERE
 from edge_server.fields.trainer_settings import BATCH
@@ -48,6 +49,7 @@ from freshfield.geometry import Pinhole
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
 assert BATCH == CHUNK, "settings and kernels must mean the same by a chunk"
+GUIDED, FEW = 0.1, 6  # the weight of a depth guide, and with how many cameras it is used in any scene
 DIRTY = 32  # parameters that one dirty flag stands for: what ``adam`` calls a segment, times its width
 
 
@@ -105,6 +107,8 @@ class TrainedField:
             if not cameras.asked:
                 data = self.rig.trusted(views, intake, self.step, self._live())
             data = cameras.corrected(views, data, box)
+            if self._guiding() > 0:
+                data = data._replace(guide=guide(self.settings, self.pool, box, views, data))
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
             self._batch = self._batch._replace(exposure=sums)
@@ -180,7 +184,8 @@ class TrainedField:
         for channels in (3, 4):
             field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), pool)
             image = np.full((8, 8, channels), 128, np.uint8)
-            field.fit([View("warm-up", image, pose, camera)], Budget(steps=1))
+            views = [View(f"warm-up {k}", image, pose, camera) for k in range(LEAST_VIEWS)]
+            field.fit(views, Budget(steps=1))  # with a depth guide, if any is to be expected
             field.render(pose, camera)
 
     # --- state --------------------------------------------------------------------------------
@@ -259,6 +264,16 @@ class TrainedField:
         """
         raise NotImplementedError
 
+    def _guiding(self) -> float:
+        """The present weight of what a plane sweep says about depth."""
+        s, rig = self.settings, self.rig
+        weight = s.depth_guide
+        if weight is None:
+            # Rooms that many cameras look into are as good without, sooner or later.
+            calls = (rig.plain and s.background == "auto") or len(rig.memory) <= FEW
+            weight = GUIDED if calls else 0.0
+        return float(weight * max(1.0 - self.step / s.guide_steps, 0.0))
+
     # --- inside -------------------------------------------------------------------------------
 
     def _forget_parameters(self) -> None:
@@ -293,7 +308,7 @@ class TrainedField:
             laid=np.zeros((workers, 11, CHUNK), np.float32),
             column=np.zeros((workers, CHUNK), np.int64),
             ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
-            ray=np.zeros((workers, CHUNK_RAYS, 11), np.float32),
+            ray=np.zeros((workers, CHUNK_RAYS, 12), np.float32),
             way=np.zeros((workers, CHUNK_RAYS, 3), np.float32),
             piece=np.zeros((workers, CHUNK, 4), np.int64),
         )
@@ -330,6 +345,7 @@ class TrainedField:
             distortion=np.float32(s.distortion),
             sparsity=np.float32(s.sparsity),
             near=np.float32(s.near_fade * box.distance_m / box.radius_m),
+            guide=np.float32(self._guiding()),
         )
         self._train(data, recipe, space, weights)
         rays = max(int(batch.rays.sum()), 1)

@@ -61,6 +61,12 @@ class TrainerSettings:
     distortion: float = option(1e-2, "weight of the distortion loss: gathers each ray's density")
     sparsity: float = option(0.0, "weight of the loss on optical depth: empties what no picture needs")
     near_fade: float = option(0.0, "share of the cameras' distance over which gradients are held back")
+    depth_guide: float | None = option(
+        None,
+        "weight on density that is not where a plane sweep of the pictures says, 0: none is made; None: .1 "
+        "where the background is plain or six cameras at most look, else 0",
+    )
+    guide_steps: int = option(300, "steps over which ``depth_guide`` falls to nothing")
     changed_share: float = option(0.25, "rays drawn from pixels that changed since the camera's last view")
     age_tau_ms: float = option(0.0, "age at which a view counts by 1/e beside the newest; 0: all alike")
     mask_stale_ms: float = option(
@@ -97,12 +103,15 @@ class TrainerSettings:
             ("distortion", 0.0, 1e3),
             ("sparsity", 0.0, 1e3),
             ("near_fade", 0.0, 10.0),
+            ("guide_steps", 1, 1 << 30),
             *COMMON_BOUNDS,
             ("refine_m", 0.0, 1.0),
             ("refine_deg", 0.0, 20.0),
         )
         if self.threads is not None:
             self._within(("threads", 1, MOST_THREADS))
+        if self.depth_guide is not None:
+            self._within(("depth_guide", 0.0, 1e3))
         if self.batch_samples % BATCH:
             raise ValueError(f"{name}: batch_samples must be a multiple of {BATCH}, not {self.batch_samples}")
         if self.hidden % 4 or self.cells % 4:

@@ -21,6 +21,7 @@ from edge_server.offline.still import Still, open_still, synthetic
 from freshfield.geometry import so3_exp
 
 VIEWS, SIZE = 18, 128
+FEW = 6  # of the training views, spread over them
 GAIN_SPREAD = 0.2  # standard deviation of the logarithm of a camera's gain, a channel
 POSE_M, POSE_DEG = 0.01, 1.0
 LATE_FRAMES = 4  # of 1/15 s: views up to 267 ms old
@@ -55,6 +56,10 @@ CHOICES: tuple[Choice, ...] = (
         "changed pixels first", {"changed_share": 0.0}, {"changed_share": 0.25},
         ("room, moving", "kitchen, moving"),
     ),
+    Choice(
+        "depth guide", {"depth_guide": 0.0}, {"depth_guide": 0.1},
+        ("tile", "tile, six", "lego", "kitchen, six", "room"),
+    ),
     Choice("smoothness", {"smooth": 0.0}, {"smooth": 3e-3}, ("tile", "room")),
     Choice("appearance", {"appearance": 0}, {"appearance": 8}, ("room, gains", "room")),
     Choice("outlines", {"outline": 0.0}, {"outline": 0.25}, ("tile", "room")),
@@ -88,6 +93,15 @@ def _recorded(path: str, holdout: str, scale: float) -> Scene:
     return Scene(open_still(str(_data() / path), holdout=holdout, scale=scale))
 
 
+def _few(make: Callable[[], Scene]) -> Scene:
+    """Some of a still scene's views, evenly spread."""
+    scene = make()
+    assert scene.still is not None
+    training = scene.still.training
+    some = [training[k] for k in np.linspace(0, len(training) - 1, FEW).round().astype(int)]
+    return replace(scene, still=replace(scene.still, training=tuple(some)))
+
+
 def _data() -> Path:
     if not (data := os.environ.get("FRESHFIELD_DATA")):
         raise DatasetError("set FRESHFIELD_DATA to the folder that holds it")
@@ -108,6 +122,10 @@ def _moving(late: int = 0) -> Scene:
     return Scene(film=synthetic_film("room", VIEWS + 1, SIZE, 15.0, speed_m_per_s=1.0), late=late)
 
 
+def _kitchen() -> Scene:
+    return _recorded("blender_kitchen/transforms.json", "cam00", 1.0)
+
+
 def _kitchen_moving() -> Scene:
     return Scene(film=recorded_film(_data() / "blender_kitchen" / "transforms.json", "cam00"))
 
@@ -120,9 +138,9 @@ SCENES: dict[str, tuple[str, Callable[[], Scene]]] = {
     "room, moving": ("a person at 1 m/s, 15 frames a second", _moving),
     "room, late": ("the same, views 0 to 267 ms old", partial(_moving, LATE_FRAMES)),
     "lego": ("at 200 x 200, every 8th held out", partial(_recorded, "lego_synthetic", "8", 2.0)),
-    "kitchen": (
-        "the first instant", partial(_recorded, "blender_kitchen/transforms.json", "cam00", 1.0)
-    ),
+    "kitchen": ("the first instant", _kitchen),
+    "tile, six": (f"{FEW} of them", partial(_few, partial(_ours, "tile"))),
+    "kitchen, six": (f"{FEW} of its 18 views", partial(_few, _kitchen)),
     "kitchen, moving": ("30 frames a second", _kitchen_moving),
 }  # fmt: skip
 MOVING = ("room, moving", "room, late", "kitchen, moving")
@@ -155,7 +173,7 @@ def missing(scenes: Iterable[str]) -> set[str]:
     """Those scenes that cannot be had; says why."""
     out = set()
     for scene in sorted(scenes):
-        if scene in ("lego", "kitchen", "kitchen, moving"):
+        if scene == "lego" or scene.startswith("kitchen"):
             folder = "lego_synthetic" if scene == "lego" else "blender_kitchen"
             try:
                 if not (_data() / folder).is_dir():

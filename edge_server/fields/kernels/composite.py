@@ -18,6 +18,9 @@ from edge_server.fields.kernels.jit import part
 RAW_LOW, RAW_HIGH = -12.0, 9.0
 OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance of 1e-4
 
+# Weight so much nearer or farther than a guide, as a share of its distance, is half as wrong as can be.
+GUIDE_REACH = 0.04
+
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 # A density beyond these was clamped, whatever the exponential's last bit: it has no gradient.
@@ -28,11 +31,14 @@ _CLAMPED_HIGH = np.float32(np.exp(RAW_HIGH) * 0.99999)
 class Weights(NamedTuple):
     """Strengths of the regularisers, float32. distortion: mip-NeRF 360's, gathers a ray's weight in one
     place. sparsity: on optical depth itself, empties what no picture needs. near: distance in scene units
-    below which gradients fall with the square of distance, against haze before the lens (0: off)."""
+    below which gradients fall with the square of distance, against haze before the lens (0: off). guide: on
+    weight that is not where a ray's guide says, or nowhere (the robust estimator of Geman and McClure, so
+    that a wrong guide pulls no harder than a doubtful one)."""
 
     distortion: np.float32
     sparsity: np.float32
     near: np.float32
+    guide: np.float32 = np.float32(0.0)
 
 
 @part
@@ -113,12 +119,13 @@ def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
 
 
 @part
-def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
+def ray_loss(out, d_out, ts, dts, w, first, end, target, background, guide, weights):
     """Squared colour error of one ray (3.22) and its gradient.
 
     out: float32 (>= 4, N), activated density and colour of samples first to end. d_out: like out, rows 0
     to 3 receive dLoss / draw. ts, dts: float32 (N,). w: float32 (N,), scratch. target, background: float32
-    (3,). Returns the colour error, or -1 for a ray that is not finite: its gradient is 0.
+    (3,). guide: float32, the distance at which the ray ends as far as is known, 0: it is not. Returns the
+    colour error, or -1 for a ray that is not finite: its gradient is 0.
     """
     depth, shade_r, shade_g, shade_b = _F0, _F0, _F0, _F0
     transmitted, weight, moment = _F1, _F0, _F0
@@ -147,6 +154,9 @@ def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
     two = np.float32(2.0)
     d_r, d_g, d_b = two * e_r, two * e_g, two * e_b
     behind = transmitted * (d_r * background[0] + d_g * background[1] + d_b * background[2])
+    guided = weights.guide if guide > _F0 else _F0
+    across = _F1 / (np.float32(GUIDE_REACH) * guide) if guide > _F0 else _F0
+    behind += transmitted * guided
     weight_before, moment_before = weight, moment
     after = transmitted
     for s in range(last - 1, first - 1, -1):
@@ -158,6 +168,9 @@ def ray_loss(out, d_out, ts, dts, w, first, end, target, background, weights):
         spread = t * (weight_before - weight_after) - moment_before + moment_after
         d_w = d_r * r + d_g * g + d_b * b
         d_w += weights.distortion * (two * spread + np.float32(2.0 / 3.0) * w[s] * delta)
+        if guided > _F0:
+            off = (t - guide) * across
+            d_w += guided * off * off / (_F1 + off * off)
         d_depth = d_w * after - behind + weights.sparsity
         behind += w[s] * d_w
         after += w[s]

@@ -181,7 +181,8 @@ def train_proposed(counter, worker, views, recipe, plan, space, encoding, net, l
         loss, dropped = 0.0, broken
         for r in range(rays):
             a, b, p, q = ray_first[r], ray_first[r + 1], bin_first[r], bin_first[r + 1]
-            error = ray_loss(out, d_out, ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], weights)
+            guide = ray[r, 11] if views.guide.size > 0 else _F0
+            error = ray_loss(out, d_out, ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], guide, weights)
             if error < _F0:
                 # Nothing of this ray may reach the others' sums: 0 times NaN is NaN.
                 dropped += 1

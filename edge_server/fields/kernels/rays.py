@@ -41,7 +41,8 @@ class Views(NamedTuple):
     scene units. pixels: uint8 (N, 3 or 4). changed: int64 (M,), pixels that moved since the camera's
     previous view. exposure: float32 (V, 3, 2), gain and bias that pixels are corrected by; V = 0: none.
     weight: float32 (N,), what each pixel's loss is multiplied by; size 0: all by 1. drawn: int64 (K,), the
-    pixels of weight above 0; size 0: all of them. ``changed`` holds none of weight 0.
+    pixels of weight above 0; size 0: all of them. ``changed`` holds none of weight 0. guide: float32 (N,),
+    distance in scene units of what a pixel shows (``plane_sweep.guide``), 0: not known; size 0: of none.
     """
 
     first: NDArray[np.int64]
@@ -54,6 +55,7 @@ class Views(NamedTuple):
     exposure: NDArray[np.float32] = np.zeros((0, 3, 2), np.float32)
     weight: NDArray[np.float32] = np.zeros(0, np.float32)
     drawn: NDArray[np.int64] = np.zeros(0, np.int64)
+    guide: NDArray[np.float32] = np.zeros(0, np.float32)
 
 
 @part

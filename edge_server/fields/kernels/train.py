@@ -65,8 +65,8 @@ class Scratch(NamedTuple):
     sample a column, in the order in which they were found. laid: float32 (W, 11, CHUNK), ray after ray:
     density and colour, their gradient, distance, length and weight of each sample; column: int64 (W, CHUNK),
     where it was found, and behind the last of them the columns of what is not used. ray_first: int64
-    (W, R + 1), of ``laid``. ray: float32 (W, R, 11): direction, target, background, view, weight; the last
-    only where ``Views`` has weights. way: float32 (W, R, 3): distance reached, distance of leaving, and
+    (W, R + 1), of ``laid``. ray: float32 (W, R, 12): direction, target, background, view, weight, guide; the
+    last two only where ``Views`` has them. way: float32 (W, R, 3): distance reached, distance of leaving, and
     optical depth so far. piece: int64 (W, CHUNK, 4): ray (-1: none) and first column of samples that were
     found together, where the seen ones end, and where they end.
     """
@@ -111,7 +111,7 @@ def _view_of(first, pixel):
 
 @part
 def draw(views, recipe, n, ray):
-    """Choose the n-th ray of the step: fills ray (11,), returns its view's number."""
+    """Choose the n-th ray of the step: fills ray (12,), returns its view's number."""
     key, k = recipe.key, np.uint64(n) * np.uint64(8)
     total = views.pixels.shape[0]
     # 53 bits, because float32 cannot count the pixels of a hundred pictures.
@@ -127,8 +127,8 @@ def draw(views, recipe, n, ray):
 
 @part
 def take_pixel(views, recipe, pixel, n, ray):
-    """Fill ray (11,), the step's n-th, from a pixel: direction, target, background, view, weight (the
-    last only where ``Views`` has weights). Returns the view's number."""
+    """Fill ray (12,), the step's n-th, from a pixel: direction, target, background, view, weight, guide (the
+    last two only where ``Views`` has them). Returns the view's number."""
     key, k = recipe.key, np.uint64(n) * np.uint64(8)
     view = _view_of(views.first, pixel)
     local = pixel - views.first[view]
@@ -152,6 +152,8 @@ def take_pixel(views, recipe, pixel, n, ray):
             ray[3 + c] = views.exposure[view, c, 0] * ray[3 + c] + views.exposure[view, c, 1]
     if views.weight.size > 0:
         ray[10] = views.weight[pixel]
+    if views.guide.size > 0:
+        ray[11] = views.guide[pixel]
     return view
 
 
@@ -351,7 +353,10 @@ def train_chunks(counter, worker, views, recipe, space, encoding, net, weights, 
         loss, dropped = 0.0, 0
         for r in range(rays):
             a, b = ray_first[r], ray_first[r + 1]
-            error = ray_loss(laid[:4], laid[4:8], ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], weights)
+            guide = ray[r, 11] if views.guide.size > 0 else _F0
+            error = ray_loss(
+                laid[:4], laid[4:8], ts, dts, w, a, b, ray[r, 3:6], ray[r, 6:9], guide, weights
+            )  # fmt: skip
             if error < _F0:
                 dropped += 1
                 clear_columns(acts, column, a, b)

@@ -15,6 +15,13 @@ BALL_M, RADIUS_M = np.array([0.0, 0.0, 0.5]), 0.5
 
 def picture(camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M) -> NDArray:
     """uint8 (H, W, 3): striped ball, checkered plate, plain sky."""
+    return seen(camera, pose, ball_m)[0]
+
+
+def seen(
+    camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float64] = BALL_M
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """The picture (H, W, 3), and how far away in metres what it shows is (H, W), inf for the sky."""
     origin, rays = world_rays(camera, pose)
     color = np.broadcast_to(np.array([0.5, 0.7, 0.9]), rays.shape).copy()
     down = rays[..., 2] < -1e-6
@@ -32,7 +39,8 @@ def picture(camera: Pinhole, pose: NDArray[np.float64], ball_m: NDArray[np.float
     stripe = 0.5 + 0.5 * np.sign(np.sin(8.0 * normal[..., 2]))
     paint = np.stack([0.9 - 0.5 * stripe, 0.2 + 0.4 * stripe, 0.2 + 0.2 * normal[..., 0]], axis=-1)
     color[front] = paint[front]
-    return np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8)
+    away_m = np.where(front, t_ball, np.where(near, t_ground, np.inf))
+    return np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8), away_m
 
 
 def ring(

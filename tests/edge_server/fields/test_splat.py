@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
+from edge_server.fields.kernels.plane_sweep import NOT_SEEN, SEES, UNMARKED, score_cells
 from edge_server.fields.kernels.pool import CallerPool
 from edge_server.fields.kernels.splat_project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.kernels.splat_seed import NOT_SEEN, SEES, UNMARKED, score_cells
 from edge_server.fields.scene_box import scene_box
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_growth import Cloud, make_room, opacity
@@ -229,11 +229,11 @@ def test_time_that_stands_still_or_goes_back_does_not_fling_anything() -> None:
 def test_warming_up_compiles_every_kernel() -> None:
     """In a process of its own: the first motion must not wait for a compiler."""
     code = """
-from edge_server.fields.kernels import splat_judge, splat_project, splat_raster, splat_seed, splat_tiles
+from edge_server.fields.kernels import plane_sweep, splat_judge, splat_project, splat_raster, splat_tiles
 from edge_server.fields.kernels import splat_update
 from edge_server.fields.splat import SplatField
 SplatField().warm_up()
-for module in (splat_judge, splat_project, splat_raster, splat_seed, splat_tiles, splat_update):
+for module in (plane_sweep, splat_judge, splat_project, splat_raster, splat_tiles, splat_update):
     for name, thing in vars(module).items():
         if hasattr(thing, "signatures") and thing.py_func.__code__.co_varnames[0] == "counter":
             print(name, len(thing.signatures))

@@ -8,6 +8,7 @@ import torch
 
 from edge_server.fields import ngp_torch
 from edge_server.fields.kernels.composite import (
+    GUIDE_REACH,
     OPAQUE_DEPTH,
     RAW_HIGH,
     Weights,
@@ -35,11 +36,12 @@ def _ray(seed: int, density: float, harmonics: int = 1):
     return raw, line, ray
 
 
-def _kernel(raw, line, ray, weights, harmonics):
+def _kernel(raw, line, ray, weights, harmonics, guide=0.0):
     out, d_out = raw.copy(), np.zeros_like(raw)
     add_harmonics(out, harmonics, 0, SAMPLES, *ray[:3])
     activate(out, 0, SAMPLES)
-    error = ray_loss(out, d_out, line[0], line[1], line[2], 0, SAMPLES, ray[3:6], ray[6:9], weights)
+    error = ray_loss(out, d_out, line[0], line[1], line[2], 0, SAMPLES, ray[3:6], ray[6:9], np.float32(guide),
+                     weights)  # fmt: skip
     spread_harmonics(d_out, harmonics, 0, SAMPLES, *ray[:3])
     return error, d_out
 
@@ -65,6 +67,30 @@ def test_loss_and_gradient_equal_the_oracle(density: float, harmonics: int) -> N
     loss.sum().backward()
     assert params.grad is not None
     np.testing.assert_allclose(d_out.T, params.grad.numpy(), atol=2e-5, rtol=2e-3)
+
+
+@pytest.mark.parametrize("guide", [1.4, 0.2, 50.0])
+def test_weight_away_from_a_guide_costs_what_geman_and_mcclure_say(guide: float) -> None:
+    raw, line, ray = _ray(9, 1.0)
+    weights = Weights(*np.float32([0.3, 0.05, 0.0, 0.7]))
+    error, d_out = _kernel(raw, line, ray, weights, 1, guide)
+    params, expected, loss = _oracle(raw, line, ray, 0.3, 0.05, 1)
+    assert error == pytest.approx(expected.item(), rel=1e-4)  # the guide is no colour
+    sigma, _ = ngp_torch.shade(params, 1, torch.zeros(SAMPLES, 3, dtype=torch.float64))
+    through = torch.exp(-torch.cumsum(sigma * torch.as_tensor(line[1], dtype=torch.float64), 0))
+    before = torch.cat([torch.ones(1, dtype=torch.float64), through[:-1]])
+    off = (torch.as_tensor(line[0], dtype=torch.float64) - guide) / (GUIDE_REACH * guide)
+    away = ((before - through) * off**2 / (1 + off**2)).sum() + through[-1]
+    (loss.sum() + 0.7 * away).backward()
+    assert params.grad is not None
+    np.testing.assert_allclose(d_out.T, params.grad.numpy(), atol=2e-5, rtol=2e-3)
+
+
+def test_a_ray_without_a_guide_is_left_alone() -> None:
+    raw, line, ray = _ray(9, 1.0)
+    none = _kernel(raw, line, ray, Weights(*np.float32([0.3, 0.05, 0.0, 0.0])), 1)[1]
+    off = _kernel(raw, line, ray, Weights(*np.float32([0.3, 0.05, 0.0, 0.7])), 1)[1]
+    np.testing.assert_array_equal(none, off)
 
 
 def test_gradient_equals_finite_differences() -> None:

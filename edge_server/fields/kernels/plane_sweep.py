@@ -142,9 +142,11 @@ def score_cells(counter, worker, cams, views, blurred, says, plain, plain_color,
 
 
 @kernel
-def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted, cells, scores, distance):
+def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted, cells, least, scores,
+               distance):  # fmt: skip
     """For ray n, through pixel ``pixels[n]`` (int64, within the view) of view ``view_of[n]`` (int64), the
-    distance in scene units of the best cell on it; 0 where there is none. Tasks are runs of 256 rays.
+    distance in scene units of the best cell on it; 0 where none is better than ``least``, float32. Tasks are
+    runs of 256 rays.
 
     middle: the distance that is taken where nothing speaks for another one."""
     half = np.float32(2.0) if contracted else _F1
@@ -165,7 +167,7 @@ def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted
             ox, oy, oz = (
                 np.float32(views.origin[v, 0]), np.float32(views.origin[v, 1]), np.float32(views.origin[v, 2])
             )  # fmt: skip
-            best, at, t = np.float32(NOT_SEEN), _F0, max(near, size)
+            best, at, t = least, _F0, max(near, size)
             while t < np.float32(2.0) * horizon + middle:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
                 m = max(abs(x), max(abs(y), abs(z)))
