@@ -133,7 +133,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     plan = parser.add_mutually_exclusive_group().add_argument
     plan("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
-    plan("--shipped", action="store_true", help="the points to ship, with --field ngp,splat --points FILE")
+    plan("--shipped", action="store_true", help="the points to ship, with --field all --points FILE")
     add("--scene", default="room", metavar="NAME|DATA", help="room, tile or a data set [%(default)s]")
     add("--holdout", default="8", metavar="K|NAME,...", help="of a data set, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="of a data set, as in fit [%(default)g]")

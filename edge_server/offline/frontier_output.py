@@ -10,10 +10,9 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from edge_server.offline.update_time import best
-from edge_server.report.style import CYCLE, GREY, INK, figure, label_lines
+from edge_server.report.style import CYCLE, INK, figure
 
 Row = dict[str, Any]
-_MARKS = ("o", "^", "s", "D", "v")
 _LINES = {"low": "--", "high": "-."}
 _METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
 
@@ -81,15 +80,14 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
     """PSNR, SSIM and LPIPS of every effort level against seconds from scratch; the front in PSNR marked."""
     shown = [(key, label) for key, label in _METRICS if any(row[key] is not None for row in rows)]
     efforts = list(dict.fromkeys(row["effort"] for row in rows))
+    looks = _looks([tuple(effort.split(" ", 1)) for effort in efforts])
     front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["seconds"])
-    with figure(path, len(shown), height_inch=2.7, sharex=True) as (_, axes):
+    with figure(path, len(shown), height_inch=2.7, sharex=True) as (fig, axes):
         for ax, (key, label) in zip(axes[:, 0], shown):
-            for number, effort in enumerate(efforts):
+            for effort, look in zip(efforts, looks):
                 group = sorted((r for r in rows if r["effort"] == effort), key=lambda r: r["seconds"])
                 ax.plot(
-                    [r["seconds"] for r in group], [r[key] for r in group], marker=".",
-                    color=CYCLE[number % len(CYCLE)], alpha=1.0 if number < len(CYCLE) else 0.5,
-                    linestyle=("-", "--", ":")[number // len(CYCLE) % 3],
+                    [r["seconds"] for r in group], [r[key] for r in group], marker=".", **look,
                     label=f"{effort} ({data['ms_per_step'][effort]:.1f} ms a step)",
                 )  # fmt: skip
             if key == "psnr_db":
@@ -98,49 +96,59 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
                     color=INK, label="Pareto front",
                 )  # fmt: skip
             name = f"LPIPS-{data['lpips_network']}" if key == "lpips" else label
-            better = "lower" if key == "lpips" else "higher"
-            last = key == shown[-1][0]
-            title = f"What accuracy costs in time: {data['scene']}" if key == "psnr_db" else None
-            label_lines(ax, f"{name}, {better} is better", "seconds from scratch" if last else None, title)
-            if key != "psnr_db" and ax.get_legend() is not None:
-                ax.get_legend().remove()
+            ax.set_ylabel(f"{name}, {'lower' if key == 'lpips' else 'higher'} is better")
+        axes[0, 0].set_title(f"What accuracy costs in time: {data['scene']}")
+        axes[-1, 0].set_xlabel("seconds from scratch")
+        fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
         _seconds_axis(axes[-1, 0], [row["planned_s"] for row in rows])
 
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """Fidelity at the present against seconds an update takes: a colour for each speed, a mark for each
+    """Fidelity at the present against seconds an update takes: a column for each speed, a colour for each
     representation, a line for each effort, the best of all encircled. What is seen between updates is shown
     of one of them."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
-    fields = list(dict.fromkeys(row["field"] for row in rows))
     efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
     main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
-    looks = {who: {"marker": _MARKS[fields.index(who[0]) % len(_MARKS)], "linestyle": _LINES.get(who[1], "-"),
-                   "markersize": 4} for who in efforts}  # fmt: skip
-    panels = (("psnr_moving_db", "PSNR where it moves (dB)"), ("psnr_db", "PSNR, whole image (dB)"))
-    with figure(path, len(panels), height_inch=3.0, sharex=True) as (_, axes):
-        for ax, (key, label) in zip(axes[:, 0], panels):
-            for colour, speed in zip(CYCLE, speeds):
+    panels = (("psnr_db", "PSNR, whole image (dB)"), ("psnr_moving_db", "PSNR where it moves (dB)"))
+    shape = {"rows": len(panels), "columns": len(speeds), "height_inch": 3.0}
+    with figure(path, **shape, sharex=True, sharey="row") as (fig, axes):
+        for row, (key, label) in enumerate(panels):
+            axes[row, 0].set_ylabel(label)
+            for ax, speed in zip(axes[row], speeds):
                 here = [r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None]
-                for who in efforts:
+                for who, look in zip(efforts, _looks(efforts)):
                     group = sorted((r for r in here if (r["field"], r["effort"]) == who),
                                    key=lambda r: r["update_s"])  # fmt: skip
                     x = [r["update_s"] for r in group]
-                    ax.plot(x, [r[key] for r in group], color=colour, linewidth=1.2, **looks[who])
+                    ax.plot(
+                        x, [r[key] for r in group], marker=".", linewidth=1.2, label=" ".join(who), **look
+                    )
                     if who == main:
-                        ax.plot(x, [r[f"seen_{key}"] for r in group], ":", color=colour, linewidth=1.0)
-                ax.plot([], [], color=colour, label=f"{speed:g} m/s")
+                        ax.plot(x, [r[f"seen_{key}"] for r in group], ":", color=look["color"], linewidth=1.0,
+                                label=f"{' '.join(main)}, seen on\naverage, between updates too")  # fmt: skip
                 top = best(here, key)
                 if top is not None:
-                    ax.plot([top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=colour)
-            for who in efforts:
-                ax.plot([], [], color=GREY, label=" ".join(who), linewidth=1.2, **looks[who])
-            ax.plot([], [], ":", color=GREY, label=f"{' '.join(main)}, seen on\naverage, between updates too")
-            ax.plot([], [], "o", markersize=10, mfc="none", color=GREY, label="best")
-            last = key == panels[-1][0]
-            title = None if last else "More is not always better: the world moves while the field is fitted"
-            label_lines(ax, label, "seconds an update takes" if last else None, title)
-        _seconds_axis(axes[-1, 0], [row["planned_update_s"] for row in rows])
+                    ax.plot(
+                        [top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=INK, label="best"
+                    )
+        for ax, speed in zip(axes[0], speeds):
+            ax.set_title(f"{speed:g} m/s")
+        for ax in axes[-1]:
+            ax.set_xlabel("seconds an update takes")
+            _seconds_axis(ax, [row["planned_update_s"] for row in rows])
+            ax.tick_params(axis="x", labelrotation=90)
+        fig.suptitle("More is not always better: the world moves while the field is fitted")
+        fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
+
+
+def _looks(efforts: Sequence[tuple[str, ...]]) -> list[Row]:
+    """How to draw (representation, effort): a colour and a line."""
+    fields = list(dict.fromkeys(who[0] for who in efforts))
+    return [
+        {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")}
+        for who in efforts
+    ]
 
 
 def _seconds_axis(axes: Axes, seconds: Sequence[float]) -> None:
