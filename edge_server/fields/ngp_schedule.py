@@ -87,6 +87,12 @@ class Pace:
         """Seconds since the beginning."""
         return self._now() - self._start
 
+    def has_room(self, seconds: float, share: float, then_s: float) -> bool:
+        """Whether something may be done that usually takes ``seconds``: not above that share of the budget,
+        and ``then_s`` still fit behind it. A budget in steps has room for everything."""
+        whole = self._budget.seconds
+        return whole is None or (seconds <= share * whole and self.seconds() + seconds + then_s <= whole)
+
     def begin(self, usual: Usual, then_s: float = 0.0) -> float | None:
         """Progress of the fit in [0, 1] at which the next step is made; None when the budget is spent.
 

@@ -1,7 +1,8 @@
 """``NgpField`` for CUDA devices, in plain torch (also runs on a CPU, slowly, which is how it is tested).
 
 The same state as ``NgpField``: a checkpoint of one loads into the other. The same settings, too, but for
-those in ``ONLY_KERNELS``, which are refused, ``smooth``, which is left out, and ``batch_samples``: every ray
+those in ``ONLY_KERNELS``, which are refused, ``smooth`` and the depth guide where none is asked for by
+name, which are left out, and ``batch_samples``: every ray
 of a step is taken, however many samples it has.
 """
 

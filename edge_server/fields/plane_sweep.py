@@ -26,10 +26,11 @@ from edge_server.fields.splat_passes import camera_rows
 from edge_server.fields.supervision import asked_views, pack_cameras
 
 TOLERANCE = 0.08  # summed over the channels: more and walls are taken to be where they are not
-GUIDE_CELLS = 96  # a side: finer ones are of less than a pixel, and cost their cube
+GUIDE_CELLS = 96  # a side: finer ones are hardly better a guide, and cost their cube
 GUIDE_RAYS = 1 << 16  # swept at most; the pixels between two share what is found
-AGREED = 0.3  # share of the cameras that have to agree with one on a guide
-LEAST_VIEWS = 3  # two agree on a colour wherever their rays meet
+AGREED = 0.3  # of the scores of ``score_cells``: half of the cameras that see a place, and three at least
+LEAST_VIEWS = 3  # that see a place: two agree on a colour all too often
+_PLAIN, _CLEAR = 0.06, 16  # of a colour, summed over channels; of alpha: below, a pixel shows nothing
 
 
 class SweepSettings(Protocol):
@@ -47,12 +48,22 @@ def empty_color(settings: SweepSettings, views: Sequence[View]) -> NDArray[np.fl
     return plain_background(views) if settings.background == "auto" and views else None
 
 
+def shows(image: NDArray[np.uint8], plain: NDArray[np.float32] | None) -> NDArray[np.bool_]:
+    """Which pixels (H, W) show something: neither transparent nor of the plain colour (3,) behind all."""
+    if image.shape[2] == 4:
+        return np.asarray(image[..., 3] >= _CLEAR)
+    if plain is None:
+        return np.ones(image.shape[:2], bool)
+    return np.asarray(np.abs(image / 255.0 - plain).sum(axis=2) >= _PLAIN)
+
+
 def score(
     settings: SweepSettings, pool: Pool, box: SceneBox, views: Sequence[View],
-    moved: Sequence[NDArray[np.bool_] | None] | None, all_data: Views, cells: int,
+    moved: Sequence[NDArray[np.bool_] | None] | None, all_data: Views, cells: int, least: int = 0,
 ) -> NDArray[np.float32]:  # fmt: skip
     """How well the cameras agree on a colour, float32 (cells^3,): see ``kernels.plane_sweep.score_cells``.
-    moved: bool (H, W) of each view; None: all places are looked at, else those that most cameras see move."""
+    moved: bool (H, W) of each view; None: all places are looked at, else those that most cameras see move.
+    least: cameras that have to see a place, if ``min_views`` does not ask for more."""
     asked = asked_views(all_data)
     chosen = [asked[k] for k in np.unique(np.linspace(0, len(asked) - 1, MOST_VIEWS).astype(int))]
     some = [views[k] for k in chosen]
@@ -80,7 +91,7 @@ def score(
         if data.weight.size:
             says[a:b][data.weight[a:b] <= 0] = 0
     plain = empty_color(settings, some)
-    needed = min(settings.min_views, len(some))
+    needed = min(max(settings.min_views, least), len(some))
     scores = np.zeros(cells**3, np.float32)
     pool.run(
         score_cells, cams, data, blurred, says, plain is not None,
@@ -112,21 +123,25 @@ def guide(
     pixels of ``data``, 0 where they do not; (0,) where too few views are to be learnt from."""
     if len(asked_views(data)) < LEAST_VIEWS:
         return np.zeros(0, np.float32)
-    scores = score(settings, pool, box, views, None, data, GUIDE_CELLS)
+    scores = score(settings, pool, box, views, None, data, GUIDE_CELLS, LEAST_VIEWS)
+    plain = empty_color(settings, [views[k] for k in asked_views(data)])
     # A pixel of each square speaks for all of it.
     side = max(int(np.ceil(np.sqrt(data.first[-1] / GUIDE_RAYS))), 1)
-    rasters = [_raster(v.image.shape[0], v.image.shape[1], side) for v in views]
-    of = np.repeat(np.arange(len(views)), [len(middle) for middle, _ in rasters])
+    middles = [_middles(v.image.shape[0], v.image.shape[1], side) for v in views]
+    of = np.repeat(np.arange(len(views)), [m.size for m in middles])
     found = sweep(
-        pool, box, data, of, np.concatenate([middle for middle, _ in rasters]), scores, GUIDE_CELLS, AGREED
+        pool, box, data, of, np.concatenate([m.reshape(-1) for m in middles]), scores, GUIDE_CELLS, AGREED
     )
-    return np.concatenate([found[of == k][square] for k, (_, square) in enumerate(rasters)])
+    out = []
+    for k, (view, m) in enumerate(zip(views, middles)):
+        height, width = view.image.shape[:2]
+        squares = found[of == k].reshape(m.shape)
+        wide = squares.repeat(side, axis=0)[:height].repeat(side, axis=1)[:, :width]
+        out.append(np.where(shows(view.image, plain), wide, np.float32(0.0)).reshape(-1))
+    return np.concatenate(out)
 
 
-def _raster(height: int, width: int, side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The pixel in the middle of each square of a picture, (squares,), and the square of each pixel,
-    (height * width,)."""
+def _middles(height: int, width: int, side: int) -> NDArray[np.int64]:
+    """The pixel in the middle of each square of a picture, (squares down, squares across)."""
     y, x = (np.minimum(np.arange(side // 2, n + side, side), n - 1)[: -(-n // side)] for n in (height, width))
-    middle = (y[:, None] * width + x).reshape(-1)
-    square = (np.arange(height) // side)[:, None] * len(x) + np.arange(width) // side
-    return middle.astype(np.int64), square.reshape(-1).astype(np.int64)
+    return np.asarray(y[:, None] * width + x, dtype=np.int64)

@@ -12,13 +12,12 @@ from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.kernels.splat_project import BASE, COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.kernels.splat_update import bound_all
-from edge_server.fields.plane_sweep import empty_color, score, sweep
+from edge_server.fields.plane_sweep import empty_color, score, shows, sweep
 from edge_server.fields.scene_box import SceneBox
 from edge_server.fields.splat_settings import SplatSettings
 from edge_server.fields.supervision import asked_views, pack_cameras
 
 _CANDIDATES = 4  # rays a Gaussian: those without a surface are left out
-_PLAIN = 0.06
 
 
 def seeds(
@@ -76,17 +75,11 @@ def _pixels(
     plain = empty_color(settings, [views[k] for k in asked_views(data)])
     parts = [np.zeros(0, np.int64)]
     for k, view in enumerate(views):
-        image = view.image
-        if image.shape[2] == 4:
-            shows = image[..., 3] >= 16  # as in ``score_cells``
-        elif plain is not None:
-            shows = np.abs(image / 255.0 - plain).sum(axis=2) >= _PLAIN
-        else:
-            shows = np.ones(image.shape[:2], bool)
+        there = shows(view.image, plain)
         if masks is not None:
             mask = masks[k]
-            shows = shows & mask if mask is not None else np.zeros_like(shows)
+            there = there & mask if mask is not None else np.zeros_like(there)
         if data.weight.size:
-            shows = shows & (data.weight[data.first[k] : data.first[k + 1]] > 0).reshape(shows.shape)
-        parts.append(data.first[k] + np.flatnonzero(shows))
+            there = there & (data.weight[data.first[k] : data.first[k + 1]] > 0).reshape(there.shape)
+        parts.append(data.first[k] + np.flatnonzero(there))
     return np.concatenate(parts).astype(np.int64)

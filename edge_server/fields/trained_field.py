@@ -28,7 +28,7 @@ from edge_server.fields.kernels.pool import Pool, shared_pool
 from edge_server.fields.kernels.rays import Space, Views
 from edge_server.fields.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
 from edge_server.fields.ngp_occupancy import EVERY, Occupancy
-from edge_server.fields.ngp_rig import Arrays, Rig
+from edge_server.fields.ngp_rig import Arrays, Rig, same_views
 from edge_server.fields.ngp_schedule import (
     BETA1_FIELD,
     BETA2,
@@ -40,16 +40,17 @@ from edge_server.fields.ngp_schedule import (
 )
 from edge_server.fields.ngp_snapshot import NgpSnapshot
 from edge_server.fields.ngp_state import all_or_nothing, fill, pack, unpack_meta
-from edge_server.fields.plane_sweep import LEAST_VIEWS, guide
 from edge_server.fields.refinement import CameraErrors
-from edge_server.fields.scene_box import NOWHERE
+from edge_server.fields.scene_box import NOWHERE, SceneBox
+from edge_server.fields.supervision import asked_views
 from edge_server.fields.trainer_settings import BATCH
 from edge_server.fields.turn import Turn
 from freshfield.geometry import Pinhole
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
 assert BATCH == CHUNK, "settings and kernels must mean the same by a chunk"
-GUIDED, FEW = 0.1, 6  # the weight of a depth guide, and with how many cameras it is used in any scene
+GUIDED, FEW = 0.1, 6  # the weight of a depth guide, and with how many views it is used in any scene
+SWEEP_SHARE = 0.5  # of a budget in seconds that finding it may take
 DIRTY = 32  # parameters that one dirty flag stands for: what ``adam`` calls a segment, times its width
 
 
@@ -67,6 +68,9 @@ class TrainedField:
     _encoding: Any  # a named tuple with a ``table`` of float32 parameters, as kernels.model wants it
     _net: Net
     _batch: Batch
+    _cameras: CameraErrors
+    _occupancy: Occupancy
+    _swept: tuple[tuple[View, ...], NDArray[np.float32]] | None  # views, and what a plane sweep said of them
 
     def __init__(self, settings: Any, pool: Pool | None = None) -> None:
         self.settings = settings
@@ -107,8 +111,7 @@ class TrainedField:
             if not cameras.asked:
                 data = self.rig.trusted(views, intake, self.step, self._live())
             data = cameras.corrected(views, data, box)
-            if self._guiding() > 0:
-                data = data._replace(guide=guide(self.settings, self.pool, box, views, data))
+            data = self._guided(views, data, box, pace, intake.fresh)
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
             self._batch = self._batch._replace(exposure=sums)
@@ -184,7 +187,7 @@ class TrainedField:
         for channels in (3, 4):
             field = type(self)(replace(tiny, min_views=1, contracted=channels == 3), pool)
             image = np.full((8, 8, channels), 128, np.uint8)
-            views = [View(f"warm-up {k}", image, pose, camera) for k in range(LEAST_VIEWS)]
+            views = [View(f"warm-up {k}", image, pose, camera) for k in range(3)]
             field.fit(views, Budget(steps=1))  # with a depth guide, if any is to be expected
             field.render(pose, camera)
 
@@ -264,15 +267,32 @@ class TrainedField:
         """
         raise NotImplementedError
 
-    def _guiding(self) -> float:
-        """The present weight of what a plane sweep says about depth."""
-        s, rig = self.settings, self.rig
+    def _guided(self, views: Sequence[View], data: Views, box: SceneBox, pace: Pace, fresh: bool) -> Views:
+        """``data`` with what a plane sweep says about depth, if that is called for and fits the budget."""
+        s = self.settings
         weight = s.depth_guide
         if weight is None:
             # Rooms that many cameras look into are as good without, sooner or later.
-            calls = (rig.plain and s.background == "auto") or len(rig.memory) <= FEW
-            weight = GUIDED if calls else 0.0
-        return float(weight * max(1.0 - self.step / s.guide_steps, 0.0))
+            plain = self.rig.plain and s.background == "auto"
+            weight = GUIDED if plain or len(asked_views(data)) <= FEW else 0.0
+        # Colours and poses that are still to be learnt do not agree.
+        self._guide_weight = 0.0 if self._cameras.asked else weight
+        if self._guiding() == 0.0:
+            return data
+        if fresh or self._swept is None or not same_views(views, self._swept[0]):
+            if not pace.has_room(self._usual_sweep.seconds, SWEEP_SHARE, self._usual.seconds):
+                return data
+            # Only where it is called for: other scenes shall neither load nor compile what they do not use.
+            from edge_server.fields.plane_sweep import guide
+
+            begun = self.now()
+            self._swept = (tuple(views), guide(s, self.pool, box, views, data))
+            self._usual_sweep.took(self.now() - begun)
+        return data._replace(guide=self._swept[1])
+
+    def _guiding(self) -> float:
+        """The present weight of what a plane sweep says about depth."""
+        return float(self._guide_weight * max(1.0 - self.step / self.settings.guide_steps, 0.0))
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -282,7 +302,9 @@ class TrainedField:
         self.step = 0
         self._snapshot = None  # it is known by its step alone
         self._updates = 0  # optimiser steps that Adam's bias correction counts
-        self._usual = Usual()
+        self._usual, self._usual_sweep = Usual(), Usual()
+        self._guide_weight = 0.0
+        self._swept = None
         self._encoding, self._net = self._make(rng)
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))

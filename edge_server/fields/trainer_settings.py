@@ -64,7 +64,7 @@ class TrainerSettings:
     depth_guide: float | None = option(
         None,
         "weight on density that is not where a plane sweep of the pictures says, 0: none is made; None: .1 "
-        "where the background is plain or six cameras at most look, else 0",
+        "where the background is found to be plain, or of six views at most, else 0",
     )
     guide_steps: int = option(300, "steps over which ``depth_guide`` falls to nothing")
     changed_share: float = option(0.25, "rays drawn from pixels that changed since the camera's last view")

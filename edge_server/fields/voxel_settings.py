@@ -14,6 +14,7 @@ from edge_server.fields.trainer_settings import TrainerSettings, help_of, option
 _NOT_HERE = (
     "hidden", "hidden_layers", "harmonics", "batch_samples", "samples", "samples_start", "samples_ramp",
     "rate_net", "distortion", "sparsity", "near_fade", "exposure", "refine_m", "refine_deg",
+    "depth_guide", "guide_steps",
 )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ def make_trace(workers: int) -> Trace:
     return Trace(
         row=np.zeros((workers, ROOM), np.int64),
         line=np.zeros((workers, ROOM, 9), np.float32),
-        ray=np.zeros((workers, 11), np.float32),
+        ray=np.zeros((workers, 12), np.float32),
     )
 
 

@@ -111,8 +111,7 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
     efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
     main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
     panels = (("psnr_db", "PSNR, whole image (dB)"), ("psnr_moving_db", "PSNR where it moves (dB)"))
-    shape = {"rows": len(panels), "columns": len(speeds), "height_inch": 3.0}
-    with figure(path, **shape, sharex=True, sharey="row") as (fig, axes):
+    with figure(path, len(panels), len(speeds), height_inch=3.0, sharex=True, sharey="row") as (fig, axes):
         for row, (key, label) in enumerate(panels):
             axes[row, 0].set_ylabel(label)
             for ax, speed in zip(axes[row], speeds):

@@ -52,7 +52,7 @@ class Voxels(NamedTuple):
 
 class Trace(NamedTuple):
     """Memory of each worker, W of them: the samples of one ray. row: int64 (W, ROOM), a sample's lowest
-    vertex. line: float32 (W, ROOM, 9). ray: float32 (W, 11), see ``train.take_pixel``."""
+    vertex. line: float32 (W, ROOM, 9). ray: float32 (W, 12), see ``train.take_pixel``."""
 
     row: NDArray[np.int64]
     line: NDArray[np.float32]

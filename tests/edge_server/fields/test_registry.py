@@ -74,7 +74,9 @@ def test_options_of_another_type_are_refused(name: str, option: dict, text: str)
         ("epsilon", 0.0, "in 1e-10..1000.0"), ("epsilon", -1.0, "in 1e-10..1000.0"),
         ("changed_share", 7.0, "in 0.0..1.0"), ("distortion", -5.0, "in 0.0..1000.0"),
         ("sparsity", -1.0, "in 0.0..1000.0"), ("sparse", -1.0, "in 0.0..1000.0"),
-        ("near_fade", -1.0, "in 0.0..10.0"), ("decay", -1.0, "in 0.0..1000.0"),
+        ("near_fade", -1.0, "in 0.0..10.0"), ("depth_guide", -1.0, "in 0.0..1000.0"),
+        ("guide_steps", 0, "in 1..1073741824"),
+        ("decay", -1.0, "in 0.0..1000.0"),
         ("smooth", -1.0, "in 0.0..1000.0"), ("levels_start", 0, "in 1..24"),
         ("prune_from", -1, "in 0..1073741824"), ("batch_samples", 2049, "a multiple of 2048"),
         ("threads", 0, "in 1..1024"), ("nice", -1, "in 0..19"), ("seed", -1, "in 0..9223372036854775807"),
@@ -156,7 +158,9 @@ def test_where_a_gpu_can_be_torch_is_asked(monkeypatch: pytest.MonkeyPatch) -> N
         assert type(make_field("ngp", {"log2_table": 9})) is kind
 
 
-@pytest.mark.parametrize("option", [{"exposure": True}, {"refine_m": 0.03}, {"near_fade": 0.3}])
+@pytest.mark.parametrize(
+    "option", [{"exposure": True}, {"refine_m": 0.03}, {"near_fade": 0.3}, {"depth_guide": 0.1}]
+)
 def test_what_only_the_kernels_do_is_not_lost_on_a_gpu(
     option: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
