@@ -128,7 +128,7 @@ def test_every_choice_is_one_of_some_representation_and_has_scenes():
 
 def test_scenes_without_their_data_are_left_out(monkeypatch, tmp_path, capsys):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    assert missing(SCENES) == {"lego", "kitchen", "kitchen, moving"}
+    assert missing(SCENES) == {"lego", "kitchen", "kitchen, moving", "kitchen, six"}
     (tmp_path / "blender_kitchen").mkdir()
     monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
     assert missing(("tile", "lego", "kitchen")) == {"lego"}
