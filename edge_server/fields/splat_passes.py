@@ -31,7 +31,7 @@ from edge_server.fields.supervision import lens_row
 from freshfield.geometry import Pinhole
 
 NEAR_LEAST = 0.01  # scene units
-PAIRS_MOST = 1 << 22  # a camera: what is farther is left out rather than memory exhausted
+PAIRS_MOST = 1 << 22  # a camera: Gaussians that come later are left out rather than memory exhausted
 _BORDER = 17
 
 
@@ -121,7 +121,7 @@ class Passes:
             self._lists = self.lists._replace(
                 pair=np.zeros((self.lists.pair.shape[0], room), np.int32),
                 owner=np.zeros((self.lists.pair.shape[0], room), np.int32),
-                tile=np.zeros((self.lists.pair.shape[0], room), np.int32),
+                dealt=np.zeros((self.pool.threads, 2, room), np.int32),
             )
             self._deal(count)
         longest = max(int(self.lists.longest[:slots].max(initial=0)), 1)
@@ -144,7 +144,8 @@ class Passes:
         return tasks
 
     def _deal(self, count: int) -> None:
-        self.pool.run(deal, self.columns, self.rows, count, self.projected, self.tiles, self.lists)
+        bands = max(self.pool.threads // len(self.columns), 1)
+        self.pool.run(deal, self.columns, self.rows, bands, count, self.tiles, self.lists)
 
     def _make_room(self, slots: int, count: int, tiles: int) -> None:
         if (
@@ -154,6 +155,7 @@ class Passes:
             and self._lists.wanted.shape[1] >= tiles
         ):
             return
+        threads = self.pool.threads
         slots, room = max(slots, self.projected.shape[0]), max(count, self.projected.shape[1])
         tiles = max(tiles, 0 if self._lists is None else self._lists.wanted.shape[1])
         pairs = max(4 * room, 1024, 0 if self._lists is None else self._lists.pair.shape[1])
@@ -164,11 +166,12 @@ class Passes:
             first=np.zeros((slots, tiles + 1), np.int32),
             pair=np.zeros((slots, pairs), np.int32),
             owner=np.zeros((slots, pairs), np.int32),
-            tile=np.zeros((slots, pairs), np.int32),
             own_first=np.zeros((slots, room), np.int32),
             own_count=np.zeros((slots, room), np.int32),
             needed=np.zeros(slots, np.int64),
-            longest=np.zeros(slots, np.int64),
-            order=np.zeros((slots, 2, room), np.int32),
-            keys=np.zeros((slots, 2, room), np.uint32),
+            longest=np.zeros((slots, threads), np.int64),
+            keys=np.zeros((threads, 2, room + 1), np.uint32),
+            order=np.zeros((threads, 2, room + 1), np.int32),
+            begins=np.zeros((threads, room), np.int32),
+            dealt=np.zeros((threads, 2, pairs), np.int32),
         )

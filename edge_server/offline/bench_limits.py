@@ -216,7 +216,10 @@ def _counted(field: SplatField) -> tuple[int, int, int, int]:
     lists, pairs = passes.lists, int(passes.lists.needed[0])
     used = (passes.sums[0, :pairs] != 0.0).any(axis=-1)
     rows = passes.projected[0, lists.owner[0, :pairs][used]]
-    middle = rows[:, MY] - TILE * (lists.tile[0, :pairs][used] // passes.columns[0]) - 0.5
+    row = np.zeros(pairs, np.int64)  # of tiles, of each pair
+    lengths = np.diff(lists.first[0, : int(passes.columns[0] * passes.rows[0]) + 1])
+    row[lists.pair[0, :pairs]] = np.repeat(np.arange(len(lengths)) // passes.columns[0], lengths)
+    middle = rows[:, MY] - TILE * row[used] - 0.5
     top, bottom = (
         np.clip(edge, 0, TILE - 1).astype(np.int64) * STRIPS // TILE
         for edge in (np.ceil(middle - rows[:, HALF_HEIGHT]), middle + rows[:, HALF_HEIGHT])
@@ -274,7 +277,7 @@ def _floors_of_splat(
 
     gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; strips: in which these change a
     pixel. Operations count as if that were all there is: what ``project`` and ``update`` do is mostly to move
-    numbers so that they lie side by side, and ``deal`` sorts on one core."""
+    numbers so that they lie side by side, and ``deal`` to sort."""
     operations, divisions_ms = limits["operations_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
     copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
     parameters = BASE

@@ -22,6 +22,7 @@ import numpy as np
 from numba import typeof
 from numba.core.dispatcher import Dispatcher
 
+from edge_server.fields.kernels import board
 from edge_server.fields.kernels.jit import is_stored
 from edge_server.fields.kernels.pool import CallerPool, Pool, cores
 
@@ -45,8 +46,12 @@ def compile_ahead(tour: Callable[[Pool], None]) -> float:
     listing = _Listing()
     with np.errstate(all="ignore"):  # of memory that nobody filled
         tour(listing)
-    missing = [call for call in listing.calls if not is_stored(*call)]
+    missing = sorted(
+        (c for c in listing.calls if not is_stored(*c)), key=lambda call: -_size(call[0].py_func)
+    )
     if len(missing) > 1:
+        own = [(kernel, tuple(map(typeof, args))) for kernel, args in board.calls(cores())]  # a pool's
+        missing += [call for call in own if not is_stored(*call)]
         _compile_together(missing, min(cores() - 1, HELPERS, len(missing) - 1))
     tour(CallerPool())
     return time.perf_counter() - start
@@ -66,9 +71,9 @@ class _Listing(CallerPool):
 
 
 def _compile_together(calls: list[Call], helpers: int) -> None:
-    """Compile the kernels here and in ``helpers`` other processes, the largest first. Whatever goes wrong
+    """Compile the kernels, the largest first, here and in ``helpers`` other processes. Whatever goes wrong
     there is compiled here when it is needed."""
-    waiting = deque(sorted(calls, key=lambda call: -_size(call[0].py_func)))
+    waiting = deque(calls)
     # The largest here: a helper has to be started first.
     mine = waiting.popleft()
     running = [_Helper(waiting) for _ in range(helpers)]

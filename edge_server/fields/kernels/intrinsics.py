@@ -1,4 +1,4 @@
-"""What numba lacks on CPUs: an atomic counter, a float's bits, a vectorisable exp, counter-based noise."""
+"""What numba lacks on CPUs: an atomic counter, a number's bits, a vectorisable exp, counter-based noise."""
 
 from __future__ import annotations
 
@@ -25,6 +25,35 @@ def fetch_add(typingctx: Any, array: Any, value: Any) -> Any:
 
 
 @intrinsic
+def _fetch_add_at(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """``fetch_add`` of any element."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", builder.gep(data, [args[1]]), args[2], "seq_cst")
+
+    return types.int64(array, types.int64, types.int64), codegen
+
+
+# Elements of a counter for each worker: a cache line.
+COUNTER = 8
+
+
+@part
+def draw(counter, worker, tasks):
+    """The number of a task that nobody has drawn, ``tasks`` or more where none is left. Each worker has a
+    range of its own to begin with, the same in every kernel, so that its core still has in its cache what it
+    wrote there the last time; then it helps the others."""
+    workers = max(counter.size // COUNTER, 1)
+    for k in range(workers):
+        of = (worker + k) % workers
+        task = tasks * of // workers + _fetch_add_at(counter, of * COUNTER, 1)
+        if task < tasks * (of + 1) // workers:
+            return task
+    return tasks
+
+
+@intrinsic
 def float_from_bits(typingctx: Any, bits: Any) -> Any:
     """The float32 whose IEEE representation is the int32 ``bits``."""
 
@@ -42,6 +71,26 @@ def bits_of_float(typingctx: Any, value: Any) -> Any:
         return builder.bitcast(args[0], ir.IntType(32))
 
     return types.int32(types.float32), codegen
+
+
+@intrinsic
+def count_bits(typingctx: Any, value: Any) -> Any:
+    """How many bits of a uint64 are set, int64."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.ctpop(args[0])
+
+    return types.int64(types.uint64), codegen
+
+
+@intrinsic
+def lowest_bit(typingctx: Any, value: Any) -> Any:
+    """The number of the lowest bit of a uint64 that is set, int64; 64 if none is."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.IntType(1)(0))
+
+    return types.int64(types.uint64), codegen
 
 
 _PAIR = ir.VectorType(ir.FloatType(), 2)

@@ -14,11 +14,26 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
+
+from edge_server.fields.kernels.board import (
+    ASLEEP,
+    COUNTERS,
+    DONE,
+    LOOKS,
+    NOTHING,
+    WORK,
+    attend,
+    await_others,
+    make_board,
+    offer,
+)
+from edge_server.fields.kernels.intrinsics import COUNTER
 
 # For who runs several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
@@ -34,14 +49,21 @@ def cores() -> int:
         if not given.isdigit():
             raise ValueError(f"{THREADS_VARIABLE}: expected a number of threads, got {given!r}")
         return int(given)
+    return _own_cores()
+
+
+def _own_cores() -> int:
+    """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Job:
-    def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...], threads: int) -> None:
         self.kernel, self.args = kernel, args
-        self.counter = np.zeros(1, np.int64)
-        self.done = threading.Semaphore(0)
+        self.counter = np.zeros(COUNTER * threads, np.int64)
+        self.number = 0  # on the board, if it stands there
+        self.taken = bytearray(threads)  # 1 where a worker has it
+        self.done, self.over = threading.Semaphore(0), threading.Semaphore(0)
         self.error: BaseException | None = None
 
 
@@ -49,11 +71,11 @@ class Pool:
     """``threads`` workers. ``run(kernel, *args)`` calls ``kernel(counter, worker, *args)`` on each of them;
     the kernel draws task numbers from ``counter`` until none are left (see ``kernels.intrinsics``).
 
-    Any number of Python threads may call ``run``: no more than ``threads`` of them compute, one job after
-    the other in each.
+    Any number of Python threads may call ``run``: one job is done after the other.
     threads: default, the environment's FRESHFIELD_THREADS, else the number of cores this process may use.
     Results do not depend on it. nice: the workers' priority where the system allows it (Linux counts it per
-    thread), so that who ingests frames goes first. With 0, the caller's, a caller is worker 0 itself.
+    thread), so that who ingests frames goes first. With 0, the caller's, a caller is worker 0 itself. Where
+    there is a core for each worker, they look for work on a ``board`` for a moment before they sleep.
     """
 
     def __init__(self, threads: int | None = None, nice: int = 0) -> None:
@@ -62,8 +84,12 @@ class Pool:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice
         self._queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
-        self._seats = [threading.Lock() for _ in range(self.threads)]  # held by whoever is that worker
+        self._seat = threading.Lock()  # held by whoever is worker 0
         self._closed = False
+        self._looks = LOOKS if 1 < self.threads <= _own_cores() else 0
+        self._board, self._states = make_board(self.threads), np.zeros(COUNTER * self.threads, np.int64)
+        self._number = 0
+        self._job: _Job | None = None  # on the board
         for worker in range(self.threads):
             name = f"field-worker-{worker}"
             threading.Thread(target=self._serve, args=(worker,), name=name, daemon=True).start()
@@ -71,16 +97,15 @@ class Pool:
     def run(self, kernel: Callable[..., Any], *args: Any) -> None:
         """Run ``kernel`` on all workers and wait for them; raises what a worker raised. RuntimeError if the
         pool is closed."""
-        job = _Job(kernel, args)
+        job = _Job(kernel, args, self.threads)
         if self.nice == 0:
-            with self._seats[0]:
+            with self._seat:
                 self._check_open()
-                self._work(job, 0)
+                self._lead(job)
         else:
             self._check_open()
             self._queues[0].put(job)
-        for _ in self._queues:
-            job.done.acquire()
+            job.over.acquire()
         if job.error is not None:
             raise job.error
 
@@ -93,14 +118,59 @@ class Pool:
         if self._closed:
             raise RuntimeError("the pool is closed")
 
+    def _lead(self, job: _Job) -> None:
+        """What worker 0 does: its share, and see to it that the others do theirs."""
+        while self._job is not None and self._board[DONE] % ASLEEP < self.threads - 1:
+            time.sleep(1e-3)  # who had it done was interrupted, the others go on
+        if self._looks:
+            self._number += 1
+            job.number, job.counter, self._job = self._number, self._board[COUNTERS:], job
+            offer(self._board, job.number)
+        self._work(job, 0)
+        if not self._looks:
+            for _ in range(self.threads - 1):
+                job.done.acquire()
+        elif not await_others(self._board, self.threads - 1, self._looks):
+            job.done.acquire()
+        self._job = None
+
     def _serve(self, worker: int) -> None:
         _lower_priority(self.nice)
-        while (job := self._queues[worker].get()) is not None:
-            with self._seats[worker]:
-                self._work(job, worker)
-            del job  # or the last job's arrays would live until the next one comes
-        with self._seats[worker]:  # what a caller has begun to hand on goes before the end
-            self._wake_others(worker, None)
+        if worker == 0:
+            while (job := self._queues[0].get()) is not None:
+                with self._seat:
+                    self._lead(job)
+                job.over.release()
+                del job  # or the last job's arrays would live until the next one comes
+            with self._seat:  # what a caller has begun goes before the end
+                self._wake_others(worker, None)
+            return
+        last = others = 0
+        while (job := self._next(worker, last, others)) is not None:
+            self._work(job, worker)
+            last, others = job.number, self.threads - 1
+            if not self._looks:
+                job.done.release()
+            del job
+        self._wake_others(worker, None)
+
+    def _next(self, worker: int, last: int, others: int) -> _Job | None:
+        """What this worker is to do next, None: to end. last, others: see ``attend``."""
+        while self._looks:
+            found = attend(self._board, self._states, worker, last, others, self._looks)
+            others, job = 0, self._job
+            if found == NOTHING:
+                break
+            assert job is not None
+            if found == WORK:
+                job.taken[worker] = 1
+                return job
+            job.done.release()
+        while (job := self._queues[worker].get()) is not None and job.taken[worker]:
+            pass  # it stood on the board, too
+        if job is not None:
+            job.taken[worker] = 1
+        return job
 
     def _work(self, job: _Job, worker: int) -> None:
         self._wake_others(worker, job)
@@ -108,11 +178,10 @@ class Pool:
             job.kernel(job.counter, worker, *job.args)
         except BaseException as error:  # handed to the caller of run()
             job.error = job.error or error
-        job.done.release()
 
     def _wake_others(self, worker: int, job: _Job | None) -> None:
         for other in (2 * worker + 1, 2 * worker + 2):
-            if other < self.threads:
+            if other < self.threads and (job is None or not self._states[other * COUNTER]):
                 self._queues[other].put(job)
 
 

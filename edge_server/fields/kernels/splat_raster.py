@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.intrinsics import exp32, fetch_add, is_finite, uniform
+from edge_server.fields.kernels.intrinsics import draw, exp32, fetch_add, is_finite, uniform
 from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.splat_project import (
     ALPHA,
@@ -74,8 +74,9 @@ def begin_tile(s):
 def room(lists):
     """Scratch of ``sort_into_strips`` for the longest list: who and count."""
     longest = np.int64(1)
-    for b in range(lists.longest.size):
-        longest = max(longest, lists.longest[b])
+    for b in range(lists.longest.shape[0]):
+        for r in range(lists.longest.shape[1]):
+            longest = max(longest, lists.longest[b, r])
     return np.empty((STRIPS, longest), np.int32), np.empty(STRIPS, np.int64)
 
 
@@ -190,7 +191,7 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
     target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
     (who, count), laid = room(lists), np.empty(STRIPS, np.int64)
     while True:
-        task = fetch_add(counter, 1)
+        task = draw(counter, worker, tasks.shape[0])
         if task >= tasks.shape[0]:
             return
         b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])

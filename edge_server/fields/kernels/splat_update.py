@@ -11,7 +11,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.intrinsics import fetch_add, is_finite, log32
+from edge_server.fields.kernels.intrinsics import draw, fetch_add, is_finite, log32
 from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.splat_back import (
     GRADIENT,
@@ -220,7 +220,7 @@ def update(counter, worker, cams, gaussians, count, projected, own_first, own_co
     g = np.empty(3 * width * BLOCK, np.float32)
     blocks = (count + BLOCK - 1) // BLOCK
     while True:
-        block = fetch_add(counter, 1)
+        block = draw(counter, worker, blocks)
         if block >= blocks:
             return
         base = block * BLOCK

@@ -235,7 +235,8 @@ from edge_server.fields.splat import SplatField
 SplatField().warm_up()
 for module in (plane_sweep, splat_judge, splat_project, splat_raster, splat_tiles, splat_update):
     for name, thing in vars(module).items():
-        if hasattr(thing, "signatures") and thing.py_func.__code__.co_varnames[0] == "counter":
+        own = hasattr(thing, "signatures") and thing.py_func.__module__ == module.__name__
+        if own and thing.py_func.__code__.co_varnames[0] == "counter":
             print(name, len(thing.signatures))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from edge_server.fields.kernels.intrinsics import exp32, fetch_add, log32, uniform
+from edge_server.fields.kernels.intrinsics import COUNTER, draw, exp32, fetch_add, log32, uniform
 from edge_server.fields.kernels.jit import FAST, SOURCES
 from edge_server.fields.kernels.mlp import forward
 from edge_server.fields.kernels.pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
@@ -162,6 +163,91 @@ def test_a_closed_pool_ends_its_threads_after_what_was_begun(nice: int) -> None:
     assert (arrays[: len(callers)] == 1).all() and not any(thread.is_alive() for thread in own)
     with pytest.raises(RuntimeError, match="closed"):
         pool.run(_count, arrays[0])
+
+
+@njit(nogil=True)
+def _share(counter, worker, done):
+    while True:
+        task = draw(counter, worker, done.size)
+        if task >= done.size:
+            return
+        done[task] += 1
+
+
+@njit
+def _drawn(counter, worker, tasks):
+    return draw(counter, worker, tasks)
+
+
+@pytest.mark.parametrize("tasks", [0, 1, 2, 7, 100])
+@pytest.mark.parametrize("workers", [1, 3])
+def test_each_task_is_drawn_once_each_worker_s_own_ones_first(workers: int, tasks: int) -> None:
+    counter, done = np.zeros(COUNTER * workers, np.int64), np.zeros(tasks, np.int64)
+    first = [_drawn(counter, worker, tasks) for worker in range(workers)]
+    own = [range(tasks * w // workers, tasks * (w + 1) // workers) for w in range(workers)]
+    for worker, task in enumerate(first):
+        assert tasks < workers or task == own[worker][0]  # fewer: some begin by helping
+    rest = [_drawn(counter, workers - 1, tasks) for _ in range(tasks + 1)]
+    for task in (*first, *rest):
+        if task < tasks:
+            done[task] += 1
+    assert (done == 1).all() and rest[-1] >= tasks
+    alone, done = np.zeros(1, np.int64), np.zeros(tasks, np.int64)
+    _share(alone, 0, done)
+    assert (done == 1).all()
+
+
+@pytest.mark.parametrize("nice", [0, 5])
+@pytest.mark.parametrize("threads", [2, 3])
+def test_no_job_is_lost_however_long_it_lets_the_others_wait(threads, nice, monkeypatch) -> None:
+    """Breaks about as long as workers look for work before they sleep, and several who ask at once."""
+    monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: 8)
+    pool, failed = Pool(threads, nice), []
+
+    def call(seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        for size in rng.integers(1, 300, 400):
+            done = np.zeros(size, np.int64)
+            pool.run(_count if size % 2 else _share, done)
+            if (done != 1).any():
+                failed.append(size)
+            until = time.perf_counter() + rng.choice([0.0, 1e-5, 1e-4, 3e-4, 1e-3])
+            while time.perf_counter() < until:
+                pass
+
+    callers = [threading.Thread(target=call, args=(k,)) for k in range(3)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(60)
+    assert not failed and not any(caller.is_alive() for caller in callers)
+    pool.close()
+
+
+def test_what_an_interrupted_caller_leaves_is_finished_before_the_next_job(monkeypatch) -> None:
+    monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: 8)
+    pool, seen = Pool(2, nice=0), []
+
+    def slow(counter, worker):
+        if worker == 1:
+            time.sleep(0.3)
+            seen.append("slow")
+
+    def stop(number, frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(KeyboardInterrupt):
+            pool.run(slow)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert seen == []
+    for _ in range(3):
+        pool.run(lambda counter, worker: seen.append(worker))
+    assert seen[0] == "slow" and sorted(seen[1:]) == [0, 0, 0, 1, 1, 1]
 
 
 def test_a_pool_is_shared_by_equal_settings() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge_server.fields import View, splat_torch
+from edge_server.fields import View, splat_passes, splat_torch
 from edge_server.fields.kernels.pool import CallerPool, Pool
 from edge_server.fields.kernels.rays import Views
 from edge_server.fields.kernels.splat_judge import Verdicts, judge
@@ -380,6 +380,44 @@ def test_a_tile_lists_the_gaussians_that_have_a_pixel_in_it_and_hardly_another(l
     assert over_64.any() == (longest > 1.0)
     beside = listed & ~touched
     assert beside[~over_64].sum() < 0.03 * touched.sum()
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+@pytest.mark.parametrize("longest", [0.08, 3.0])
+def test_lists_do_not_depend_on_how_many_bands_there_are(longest: float, share: float) -> None:
+    """Bands without a row among them, and every pair dealt to one tile, those of a Gaussian side by side."""
+    lens, params = Pinhole(150, 50, 160.0, 160.0, 74.0, 27.0), _cloud(300, seed=6)
+    params[:, SCALE:QUATERNION] = np.log([0.01, 0.02, longest])
+    total = -(-lens.width // TILE) * -(-lens.height // TILE)
+    wanted = (np.random.default_rng(2).random(total) < share).astype(np.uint8)
+    found = []
+    for threads in (1, 2, 3, 9):
+        passes = Passes(Pool(threads, 0))
+        passes.look(_camera(lens), _still(params, 1), [wanted if share < 1.0 else None])
+        lists, first = passes.lists, passes.lists.first[0, : total + 1]
+        pairs, own_first, own_count = int(lists.needed[0]), lists.own_first[0, :300], lists.own_count[0, :300]
+        assert first[0] == 0 and first[-1] == pairs == own_count.sum() > 400
+        assert not np.diff(first)[wanted == 0].any() and np.diff(first).max() == lists.longest[0].max()
+        assert (np.sort(lists.pair[0, :pairs]) == np.arange(pairs)).all()
+        assert (lists.owner[0, :pairs] == np.repeat(np.arange(300), own_count)).all()
+        assert (own_first[own_count > 0] == (np.cumsum(own_count) - own_count)[own_count > 0]).all()
+        found.append((first.copy(), lists.pair[0, :pairs].copy()))
+    for other in found[1:]:
+        assert all((a == b).all() for a, b in zip(found[0], other))
+
+
+def test_pairs_beyond_what_memory_is_for_are_left_out_and_nothing_else(monkeypatch) -> None:
+    monkeypatch.setattr(splat_passes, "PAIRS_MOST", 2500)
+    params = _cloud(600, seed=6)
+    params[:, SCALE:QUATERNION] = np.log(0.3)
+    total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
+    for threads in (1, 3):
+        passes = Passes(Pool(threads, 0))
+        passes.look(_camera(), _still(params, 1), [None])
+        lists = passes.lists
+        listed = int(lists.first[0, total])
+        assert lists.needed[0] > lists.pair.shape[1] >= listed == lists.own_count[0, :600].sum() > 2000
+        assert (np.sort(lists.pair[0, :listed]) == np.arange(listed)).all()
 
 
 def test_tiles_that_are_not_wanted_get_no_pairs() -> None:
