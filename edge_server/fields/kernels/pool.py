@@ -27,6 +27,7 @@ from edge_server.fields.kernels.board import (
     DONE,
     LOOKS,
     NOTHING,
+    NUMBER,
     WORK,
     attend,
     await_others,
@@ -120,8 +121,7 @@ class Pool:
 
     def _lead(self, job: _Job) -> None:
         """What worker 0 does: its share, and see to it that the others do theirs."""
-        while self._job is not None and self._board[DONE] % ASLEEP < self.threads - 1:
-            time.sleep(1e-3)  # who had it done was interrupted, the others go on
+        self._finish_abandoned()
         if self._looks:
             self._number += 1
             job.number, job.counter, self._job = self._number, self._board[COUNTERS:], job
@@ -133,6 +133,13 @@ class Pool:
         elif not await_others(self._board, self.threads - 1, self._looks):
             job.done.acquire()
         self._job = None
+
+    def _finish_abandoned(self) -> None:
+        """Wait for what the others do of a job whose caller was interrupted."""
+        if self._job is not None and self._board[NUMBER] == self._job.number:
+            self._wake_others(0, self._job)  # who has it already takes it no more
+            while self._board[DONE] % ASLEEP < self.threads - 1:
+                time.sleep(1e-3)
 
     def _serve(self, worker: int) -> None:
         _lower_priority(self.nice)
@@ -155,8 +162,8 @@ class Pool:
         self._wake_others(worker, None)
 
     def _next(self, worker: int, last: int, others: int) -> _Job | None:
-        """What this worker is to do next, None: to end. last, others: see ``attend``."""
-        while self._looks:
+        """What this worker is to do next, None: to end. last, others: see ``attend``; last: 0 at first."""
+        while self._looks and last > 0:
             found = attend(self._board, self._states, worker, last, others, self._looks)
             others, job = 0, self._job
             if found == NOTHING:

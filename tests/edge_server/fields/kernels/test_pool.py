@@ -236,6 +236,7 @@ def test_what_an_interrupted_caller_leaves_is_finished_before_the_next_job(monke
     def stop(number, frame):
         raise KeyboardInterrupt
 
+    pool.run(lambda counter, worker: None)  # what is loaded at first must not be interrupted
     before = signal.signal(signal.SIGALRM, stop)
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.1)
@@ -248,6 +249,21 @@ def test_what_an_interrupted_caller_leaves_is_finished_before_the_next_job(monke
     for _ in range(3):
         pool.run(lambda counter, worker: seen.append(worker))
     assert seen[0] == "slow" and sorted(seen[1:]) == [0, 0, 0, 1, 1, 1]
+
+
+def test_a_job_whose_caller_was_interrupted_before_anybody_heard_of_it_is_finished_too(monkeypatch) -> None:
+    monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: 8)
+    pool, seen = Pool(3, nice=0), []
+    time.sleep(0.05)  # all sleep
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pool, "_work", _interrupted)
+        pool.run(lambda counter, worker: seen.append("lost"))
+    pool.run(lambda counter, worker: seen.append(worker))
+    assert seen[:2] == ["lost"] * 2 and sorted(seen[2:]) == [0, 1, 2]
+
+
+def _interrupted(job, worker):
+    raise KeyboardInterrupt
 
 
 def test_a_pool_is_shared_by_equal_settings() -> None:
