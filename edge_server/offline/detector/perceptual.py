@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         raise FitFailed(f"real LPIPS is what is fitted to: {missing}")
     args.out.mkdir(parents=True, exist_ok=True)
     layers = Layers(args.detector, tuple(f"model.{k}" for k in LAYERS))
-    worlds, held = (20, 4) if args.quick else (args.worlds, 20)
+    worlds, held = (8, 3) if args.quick else (args.worlds, 20)
 
     def distort(pictures: Pictures, purpose: str) -> tuple[NDArray[np.uint8], list[str]]:
         return pairs_of(pictures.images, np.random.default_rng([args.seed, *purpose.encode()]))
@@ -246,6 +246,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--worlds", type=int, default=80, metavar="N", help="to fit on, 8 pictures each [%(default)s]")
     add("--side", type=int, default=128, metavar="PX", help="of the pictures [%(default)s]")
     add("--workers", type=int, default=2, metavar="N", help="processes that render [%(default)s]")
-    add("--quick", action="store_true", help="20 worlds: to try it out")
+    add("--quick", action="store_true", help="8 worlds: to try it out")
     add("--json", action="store_true", help="print perceptual.json instead of a summary")
     return parser
