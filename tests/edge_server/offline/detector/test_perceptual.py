@@ -7,7 +7,7 @@ import pytest
 
 from camera_node.world.scene import make_scene
 from edge_server.cli import main as edge_server
-from edge_server.offline.detector import scenes
+from edge_server.offline.detector import renderings, scenes
 from edge_server.offline.detector.dataset import INSTANTS, scenes_of
 from edge_server.offline.detector.distortions import DISTORTIONS, distorted
 from edge_server.offline.detector.perceptual import TRIES, Compared, correlation, fit, left_out, pairs_of
@@ -100,8 +100,9 @@ def test_without_lpips_there_is_nothing_to_fit_to(tmp_path, monkeypatch, capsys)
 
 
 @pytest.mark.slow
-def test_the_command_fits_and_says_how_well(tmp_path, capsys):
+def test_the_command_fits_and_says_how_well(tmp_path, capsys, monkeypatch):
     pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
+    monkeypatch.setattr(renderings, "STEPS", (5, 10))  # fog will do: most of the minutes are these fits
     out = tmp_path / "fit"
     words = [
         "train-perceptual",
