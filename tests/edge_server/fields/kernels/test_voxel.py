@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from edge_server.fields.kernels.pool import CallerPool
-from edge_server.fields.kernels.rays import Views
+from edge_server.fields.kernels.rays import Views, interval
 from edge_server.fields.kernels.train import Recipe
 from edge_server.fields.kernels.voxel import SEGMENT, Clearing, Voxels, spread, trace, train_rays
 from edge_server.fields.kernels.voxel_update import (
@@ -26,7 +26,7 @@ from edge_server.fields.kernels.voxel_update import (
 )
 from edge_server.fields.scene_box import scene_box
 from edge_server.fields.supervision import pack_views
-from edge_server.fields.voxel_snapshot import make_trace
+from edge_server.fields.voxel_snapshot import VoxelSnapshot, make_trace
 from tests.edge_server.fields.scenes import ring
 
 SIZE, CELLS = 9, 8
@@ -187,6 +187,36 @@ def test_empty_cells_are_stepped_over_on_the_same_raster() -> None:
             np.testing.assert_allclose(mine, ts, atol=2e-5)
             seen += n
     assert seen > 30
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_pictures_are_those_of_the_oracle(contracted: bool) -> None:
+    """Colour, depth and opacity of a distorted camera's pixels, whichever worker renders them."""
+    lower = np.repeat(np.array([1, 0], np.uint8), CELLS**3 // 2)
+    voxels, space, view = _voxels(6, densest=0.4), _space(contracted, lower), ring(5, size=12)[2]
+    camera = replace(view.intrinsics, distortion=(-0.1, 0.02, 0.003, -0.002))
+    pose, box = view.camera_to_world, scene_box([view], contracted=contracted)
+    snapshot = VoxelSnapshot(box, voxels, space, BACK, (), CallerPool(), 0)
+    rendered = snapshot.render(pose, camera)
+    v, u = np.mgrid[0:12, 0:12] + 0.5
+    directions = (camera.rays(np.stack([u, v], axis=-1)) @ pose[:3, :3].T).astype(np.float64)
+    directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
+    origin, checked, missed = box.normalise(pose[:3, 3]).astype(np.float32), 0, 0
+    table = torch.tensor(voxels.table, dtype=torch.float64)
+    for at in np.ndindex(12, 12):
+        enter, leave = interval(space, *origin, *directions[at])
+        ray = Ray(origin, directions[at], float(enter + 0.5 * space.step), float(leave))
+        places, ts = _sampled(space, ray)
+        _, (n, through, *_) = _traced(space, voxels, ray)
+        if n != len(places) or through < 2e-3:
+            continue  # the raster's end falls on the box's side, or the ray ends early
+        color, distance, solid = (x.numpy() for x in _oracle(table, places, ts))
+        np.testing.assert_allclose(rendered.color[at], color, atol=1e-5)
+        assert rendered.opacity[at] == pytest.approx(float(solid), abs=1e-5)
+        away_m = float(distance / solid) * box.radius_m if solid > 1e-3 else 0.0
+        assert rendered.depth[at] == pytest.approx(away_m, rel=1e-4)
+        checked, missed = checked + (n > 0), missed + (n == 0)
+    assert checked > 50 and missed > 5
 
 
 def test_a_ray_ends_where_it_is_opaque() -> None:
