@@ -31,7 +31,7 @@ from edge_server.fields.supervision import lens_row
 from freshfield.geometry import Pinhole
 
 NEAR_LEAST = 0.01  # scene units
-PAIRS_MOST = 1 << 22  # a camera: Gaussians that come later are left out rather than memory exhausted
+PAIRS_MOST = 1 << 22  # a camera: what does not fit in is left out rather than memory exhausted
 _BORDER = 17
 
 

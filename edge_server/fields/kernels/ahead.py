@@ -50,7 +50,7 @@ def compile_ahead(tour: Callable[[Pool], None]) -> float:
         (c for c in listing.calls if not is_stored(*c)), key=lambda call: -_size(call[0].py_func)
     )
     if len(missing) > 1:
-        own = [(kernel, tuple(map(typeof, args))) for kernel, args in board.calls(cores())]  # a pool's
+        own = [(kernel, tuple(map(typeof, args))) for kernel, args in board.calls()]  # a pool's
         missing += [call for call in own if not is_stored(*call)]
         _compile_together(missing, min(cores() - 1, HELPERS, len(missing) - 1))
     tour(CallerPool())

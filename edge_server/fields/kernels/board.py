@@ -3,17 +3,20 @@
 A thread that sleeps takes tens of microseconds to wake, and a kernel may be done in a hundred. So who has
 just computed looks at a board for a while before it sleeps, without the GIL; and who waits for others looks
 there, too. Python threads that want the GIL while another holds it sleep as well: therefore nobody answers
-a new job before its caller is inside a kernel, which gives the GIL up, and has drawn its first task.
+a new job before its caller is inside a kernel, which gives the GIL up, and has drawn its first task; or has
+had time to.
 
 The board tells of one job: its number (0: there was none yet), whether its caller waits, how many others are
-done, and what its kernel counts tasks with (``intrinsics.draw``). All words are read and written in one order
-for all threads: who goes to sleep says so first and then looks once more, who offers a job writes it first
-and then looks who sleeps, so that one of the two sees the other.
+done, and what its kernel counts tasks with (``intrinsics.draw``). Who goes to sleep says so first and then
+looks once more for a new number; who offers a job writes its number, last of all, and then looks who sleeps:
+one of the two sees the other.
 """
 
 from __future__ import annotations
 
 import platform
+import time
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,8 +33,8 @@ from edge_server.fields.kernels.jit import kernel
 NUMBER, WAITS, DONE, COUNTERS = 0, COUNTER, 2 * COUNTER, 3 * COUNTER
 NOTHING, WORK, RELEASE = 0, 1, 2
 ASLEEP = 1 << 32  # added to DONE by a caller that went to sleep
-# Looks at the board, some 50 to 100 ns each: as long as it takes to wake.
-LOOKS = 2000
+SEARCH_S = 150e-6  # before a thread sleeps: as long as it takes to wake, a few times
+_TRIED = 500  # looks, to learn how long one takes: 50 to 100 ns on x86, where waiting is an instruction
 _X86, _ARM = ("x86_64", "AMD64"), ("aarch64", "arm64")
 
 
@@ -95,10 +98,14 @@ def _pause(typingctx: Any) -> Any:
 
 @kernel
 def offer(board, number):
-    """Tell of a job; the last one is done. Who looks now, or goes to sleep after this, sees it."""
+    """Tell of a job; the last one is done. Who looks now, or goes to sleep after this, sees it. Returns its
+    number."""
     for k in range(WAITS, board.size):
         board[k] = 0
     _swap(board, NUMBER, number)
+    # On ARM a plain read may be done before a write that stands before it, but not before this one: else the
+    # caller could take for awake who has just gone to sleep.
+    return _load(board, NUMBER)
 
 
 @kernel
@@ -131,7 +138,21 @@ def await_others(board, others, looks):
     return 1 if _add(board, DONE, ASLEEP) == others else 0
 
 
-def calls(threads: int) -> list[tuple[Any, tuple[Any, ...]]]:
+def calls() -> list[tuple[Any, tuple[Any, ...]]]:
     """The kernels above, with arguments such as a pool gives them: to be compiled ahead."""
-    board = make_board(threads)
+    board = make_board(1)
     return [(offer, (board, 0)), (attend, (board, board, 0, 0, 0, 0)), (await_others, (board, 0, 0))]
+
+
+@cache
+def looks() -> int:
+    """How often a thread looks at a board before it sleeps, on this machine: for ``SEARCH_S``. Compiles the
+    kernels above, or loads them: afterwards they do not fail."""
+    for one, args in calls():
+        one(*args)
+    board, states, took_s = make_board(1), make_board(1), 1.0
+    for _ in range(5):
+        start = time.perf_counter()
+        attend(board, states, 0, 0, 0, _TRIED)
+        took_s = min(took_s, time.perf_counter() - start)
+    return int(SEARCH_S / took_s * _TRIED) + 1

@@ -25,12 +25,12 @@ from edge_server.fields.kernels.board import (
     ASLEEP,
     COUNTERS,
     DONE,
-    LOOKS,
     NOTHING,
     NUMBER,
     WORK,
     attend,
     await_others,
+    looks,
     make_board,
     offer,
 )
@@ -63,7 +63,8 @@ class _Job:
         self.kernel, self.args = kernel, args
         self.counter = np.zeros(COUNTER * threads, np.int64)
         self.number = 0  # on the board, if it stands there
-        self.taken = bytearray(threads)  # 1 where a worker has it
+        # 1 where a worker has it, and is done with it: worker 0 is who waits for the others.
+        self.taken, self.finished = bytearray(threads), bytearray(threads)
         self.done, self.over = threading.Semaphore(0), threading.Semaphore(0)
         self.error: BaseException | None = None
 
@@ -86,11 +87,11 @@ class Pool:
         self.nice = nice
         self._queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
         self._seat = threading.Lock()  # held by whoever is worker 0
-        self._closed = False
-        self._looks = LOOKS if 1 < self.threads <= _own_cores() else 0
+        self._gate, self._closed = threading.Lock(), False
+        self._boards = 1 < self.threads <= _own_cores()
         self._board, self._states = make_board(self.threads), np.zeros(COUNTER * self.threads, np.int64)
         self._number = 0
-        self._job: _Job | None = None  # on the board
+        self._job: _Job | None = None  # that is being done
         for worker in range(self.threads):
             name = f"field-worker-{worker}"
             threading.Thread(target=self._serve, args=(worker,), name=name, daemon=True).start()
@@ -104,77 +105,111 @@ class Pool:
                 self._check_open()
                 self._lead(job)
         else:
-            self._check_open()
-            self._queues[0].put(job)
-            job.over.acquire()
+            with self._gate:
+                self._check_open()
+                self._queues[0].put(job)
+            try:
+                job.over.acquire()
+            except BaseException:
+                job.over.acquire()  # its arrays are the caller's
+                raise
         if job.error is not None:
             raise job.error
 
     def close(self) -> None:
         """End the workers once they have finished what was begun."""
-        self._closed = True
-        self._queues[0].put(None)
+        with self._gate:
+            self._closed = True
+            self._queues[0].put(None)
 
     def _check_open(self) -> None:
         if self._closed:
             raise RuntimeError("the pool is closed")
 
     def _lead(self, job: _Job) -> None:
-        """What worker 0 does: its share, and see to it that the others do theirs."""
+        """What worker 0 does: its share, and see to it that the others do theirs. Who is interrupted waits
+        for them all the same, or the next one does: nobody writes to a job's arrays after that."""
         self._finish_abandoned()
-        if self._looks:
+        searching = looks() if self._boards else 0
+        if searching:
             self._number += 1
-            job.number, job.counter, self._job = self._number, self._board[COUNTERS:], job
-            offer(self._board, job.number)
-        self._work(job, 0)
-        if not self._looks:
-            for _ in range(self.threads - 1):
+            job.number, job.counter = self._number, self._board[COUNTERS:]
+        try:
+            self._job = job
+            if searching:
+                offer(self._board, job.number)
+            self._work(job, 0)
+            if not searching:
+                for _ in range(self.threads - 1):
+                    job.done.acquire()
+            elif not await_others(self._board, self.threads - 1, searching):
                 job.done.acquire()
-        elif not await_others(self._board, self.threads - 1, self._looks):
-            job.done.acquire()
+        except BaseException:
+            self._finish_abandoned()
+            raise
         self._job = None
 
     def _finish_abandoned(self) -> None:
         """Wait for what the others do of a job whose caller was interrupted."""
-        if self._job is not None and self._board[NUMBER] == self._job.number:
-            self._wake_others(0, self._job)  # who has it already takes it no more
-            while self._board[DONE] % ASLEEP < self.threads - 1:
+        job = self._job
+        if job is None:
+            return
+        if not self._boards or self._board[NUMBER] == job.number:  # else nobody was told of it
+            self._wake_others(0, job)  # who has it already takes it no more
+            while not self._others_are_done(job):
                 time.sleep(1e-3)
+        self._job = None
+
+    def _others_are_done(self, job: _Job) -> bool:
+        if self._boards:
+            return bool(self._board[DONE] % ASLEEP == self.threads - 1)
+        return all(job.finished[1:])
 
     def _serve(self, worker: int) -> None:
         _lower_priority(self.nice)
         if worker == 0:
             while (job := self._queues[0].get()) is not None:
-                with self._seat:
-                    self._lead(job)
+                try:
+                    with self._seat:
+                        self._lead(job)
+                except BaseException as error:  # of a kernel's compilation, say
+                    job.error = job.error or error
                 job.over.release()
                 del job  # or the last job's arrays would live until the next one comes
             with self._seat:  # what a caller has begun goes before the end
                 self._wake_others(worker, None)
             return
-        last = others = 0
-        while (job := self._next(worker, last, others)) is not None:
+        last, done = 0, threading.Semaphore(0)
+        while (job := self._next(worker, last, done)) is not None:
             self._work(job, worker)
-            last, others = job.number, self.threads - 1
-            if not self._looks:
-                job.done.release()
+            last, done = job.number, job.done
+            job.finished[worker] = 1
+            if not self._boards:
+                done.release()
             del job
         self._wake_others(worker, None)
 
-    def _next(self, worker: int, last: int, others: int) -> _Job | None:
-        """What this worker is to do next, None: to end. last, others: see ``attend``; last: 0 at first."""
-        while self._looks and last > 0:
-            found = attend(self._board, self._states, worker, last, others, self._looks)
-            others, job = 0, self._job
+    def _next(self, worker: int, last: int, done: threading.Semaphore) -> _Job | None:
+        """What this worker is to do next, None: to end. last: the number of what it has just done, whose
+        caller may sleep until ``done`` is released; 0 at first."""
+        others = self.threads - 1
+        while self._boards and last > 0:
+            found = attend(self._board, self._states, worker, last, others, looks())
+            others = 0
             if found == NOTHING:
                 break
-            assert job is not None
             if found == WORK:
+                job = self._job  # cannot be another one before this worker is done
+                assert job is not None
                 job.taken[worker] = 1
                 return job
-            job.done.release()
+            done.release()
+        return self._woken(worker)
+
+    def _woken(self, worker: int) -> _Job | None:
+        """What a sleeping worker is woken for. It holds no job meanwhile, or its arrays would live on."""
         while (job := self._queues[worker].get()) is not None and job.taken[worker]:
-            pass  # it stood on the board, too
+            del job  # it stood on the board, too
         if job is not None:
             job.taken[worker] = 1
         return job
@@ -188,7 +223,9 @@ class Pool:
 
     def _wake_others(self, worker: int, job: _Job | None) -> None:
         for other in (2 * worker + 1, 2 * worker + 2):
-            if other < self.threads and (job is None or not self._states[other * COUNTER]):
+            if other >= self.threads:
+                return
+            if job is None or not (self._states[other * COUNTER] or job.taken[other]):
                 self._queues[other].put(job)
 
 

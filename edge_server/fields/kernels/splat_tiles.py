@@ -23,10 +23,11 @@ class Lists(NamedTuple):
 
     wanted: uint8 (B, T), tiles that are looked at. first: int32 (B, T + 1) into ``pair``: int32 (B, P),
     the tile's pairs front to back. owner: int32 (B, P), a pair's Gaussian. own_first, own_count: int32
-    (B, N), a Gaussian's pairs. needed: int64 (B,), pairs there are (more than P: some were left out).
-    longest: int64 (B, W), the longest list of a tile of each band. Scratch of each worker, which costs more
-    to get and give back than to use: keys: uint32 (workers, 2, N + 1), order: int32 (workers, 2, N + 1),
-    begins: int32 (workers, N), dealt: int32 (workers, 2, P).
+    (B, N), a Gaussian's pairs. needed: int64 (B,), pairs there are (more than P: Gaussians that did not fit
+    in any more, in the order of their numbers, were left out with all their pairs). longest: int64 (B, W),
+    the longest list of a tile of each band. Scratch of each worker, which costs more to get and give back
+    than to use: keys: uint32 (workers, 2, N + 1), order: int32 (workers, 2, N + 1), begins: int32
+    (workers, N), dealt: int32 (workers, 2, P).
     """
 
     wanted: NDArray[np.uint8]

@@ -6,11 +6,14 @@ import os
 import signal
 import threading
 import time
+import weakref
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numba import njit
 
+from edge_server.fields.kernels.board import RELEASE, attend
 from edge_server.fields.kernels.intrinsics import COUNTER, draw, exp32, fetch_add, log32, uniform
 from edge_server.fields.kernels.jit import FAST, SOURCES
 from edge_server.fields.kernels.mlp import forward
@@ -198,7 +201,7 @@ def test_each_task_is_drawn_once_each_worker_s_own_ones_first(workers: int, task
 
 
 @pytest.mark.parametrize("nice", [0, 5])
-@pytest.mark.parametrize("threads", [2, 3])
+@pytest.mark.parametrize("threads", [2, 3, 7])
 def test_no_job_is_lost_however_long_it_lets_the_others_wait(threads, nice, monkeypatch) -> None:
     """Breaks about as long as workers look for work before they sleep, and several who ask at once."""
     monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: 8)
@@ -215,7 +218,7 @@ def test_no_job_is_lost_however_long_it_lets_the_others_wait(threads, nice, monk
             while time.perf_counter() < until:
                 pass
 
-    callers = [threading.Thread(target=call, args=(k,)) for k in range(3)]
+    callers = [threading.Thread(target=call, args=(k,), daemon=True) for k in range(3)]
     for caller in callers:
         caller.start()
     for caller in callers:
@@ -224,8 +227,52 @@ def test_no_job_is_lost_however_long_it_lets_the_others_wait(threads, nice, monk
     pool.close()
 
 
-def test_what_an_interrupted_caller_leaves_is_finished_before_the_next_job(monkeypatch) -> None:
+@pytest.fixture
+def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: 8)
+
+
+def _interrupted_after(seconds: float, run: Callable[[], None]) -> None:
+    """KeyboardInterrupt reaches ``run``, as from Ctrl-C."""
+
+    def stop(number, frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("cores", [1, 8])
+@pytest.mark.parametrize("nice", [0, 5])
+def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice, cores, monkeypatch) -> None:
+    """With cores for all workers, and without; else others would write to arrays that are the caller's."""
+    monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: cores)
+    pool, seen = Pool(3, nice), []
+
+    def slow(counter, worker):
+        if worker == 1:
+            time.sleep(0.3)
+            seen.append("slow")
+
+    pool.run(lambda counter, worker: None)  # what is loaded at first must not be interrupted
+    for _ in range(2):
+        _interrupted_after(0.1, lambda: pool.run(slow))
+        assert seen == ["slow"]
+        pool.run(lambda counter, worker: seen.append(worker))
+        assert sorted(seen[1:]) == [0, 1, 2]
+        seen.clear()
+    pool.close()
+
+
+@pytest.mark.parametrize("cores", [1, 8])
+def test_who_is_interrupted_twice_leaves_it_to_the_next_job(cores, monkeypatch) -> None:
+    monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: cores)
     pool, seen = Pool(2, nice=0), []
 
     def slow(counter, worker):
@@ -233,37 +280,120 @@ def test_what_an_interrupted_caller_leaves_is_finished_before_the_next_job(monke
             time.sleep(0.3)
             seen.append("slow")
 
-    def stop(number, frame):
-        raise KeyboardInterrupt
-
-    pool.run(lambda counter, worker: None)  # what is loaded at first must not be interrupted
-    before = signal.signal(signal.SIGALRM, stop)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
-        with pytest.raises(KeyboardInterrupt):
-            pool.run(slow)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+    pool.run(lambda counter, worker: None)
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "_finish_abandoned", lambda: None)
+        _interrupted_after(0.1, lambda: pool.run(slow))
     assert seen == []
     for _ in range(3):
         pool.run(lambda counter, worker: seen.append(worker))
     assert seen[0] == "slow" and sorted(seen[1:]) == [0, 0, 0, 1, 1, 1]
+    pool.close()
 
 
-def test_a_job_whose_caller_was_interrupted_before_anybody_heard_of_it_is_finished_too(monkeypatch) -> None:
-    monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: 8)
+def test_a_job_whose_caller_was_interrupted_before_anybody_heard_of_it_is_finished_too(
+    many_cores, monkeypatch
+) -> None:
     pool, seen = Pool(3, nice=0), []
+    work = pool._work
+
+    def interrupted(job, worker):
+        if worker == 0:
+            raise KeyboardInterrupt
+        work(job, worker)
+
     time.sleep(0.05)  # all sleep
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(pool, "_work", _interrupted)
-        pool.run(lambda counter, worker: seen.append("lost"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "_work", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            pool.run(lambda counter, worker: seen.append("lost"))
+    assert seen == ["lost"] * 2
     pool.run(lambda counter, worker: seen.append(worker))
-    assert seen[:2] == ["lost"] * 2 and sorted(seen[2:]) == [0, 1, 2]
+    assert sorted(seen[2:]) == [0, 1, 2]
+    pool.close()
 
 
-def _interrupted(job, worker):
-    raise KeyboardInterrupt
+def test_a_job_that_was_never_told_of_is_not_done(many_cores, monkeypatch) -> None:
+    pool, seen = Pool(2, nice=0), []
+
+    def interrupted(board, number):
+        raise KeyboardInterrupt
+
+    for _ in range(2):  # the first job and a later one
+        with monkeypatch.context() as patch:
+            patch.setattr("edge_server.fields.kernels.pool.offer", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                pool.run(lambda counter, worker: seen.append("lost"))
+        pool.run(lambda counter, worker: seen.append(worker))
+    assert sorted(seen) == [0, 0, 1, 1]
+    pool.close()
+
+
+def test_a_worker_that_wakes_a_caller_late_wakes_no_other(many_cores, monkeypatch) -> None:
+    """The caller is gone when the worker, which has told that it is done, comes to wake it."""
+    pool, seen, late = Pool(2, nice=0), [], threading.Event()
+
+    def attend_and_wait(*args):
+        found = attend(*args)
+        if found == RELEASE:
+            late.set()
+            time.sleep(0.1)
+        return found
+
+    def slow(counter, worker):
+        if worker == 1:
+            time.sleep(0.2)
+
+    def both(counter, worker):
+        time.sleep(0.3 * worker)
+        seen.append(worker)
+
+    pool.run(lambda counter, worker: None)
+    with monkeypatch.context() as patch:
+        patch.setattr("edge_server.fields.kernels.pool.attend", attend_and_wait)
+        _interrupted_after(0.1, lambda: pool.run(slow))
+        assert late.wait(1.0)
+        for k in range(1, 3):
+            pool.run(both)
+            assert sorted(seen) == sorted(k * [0, 1]), "it was not waited for worker 1"
+    pool.close()
+
+
+@pytest.mark.parametrize("nice", [0, 5])
+@pytest.mark.parametrize("cores", [1, 8])
+def test_a_pool_that_rests_keeps_no_arrays(nice, cores, monkeypatch) -> None:
+    """Not those of a worker either that was done long before the others."""
+    monkeypatch.setattr("edge_server.fields.kernels.pool._own_cores", lambda: cores)
+    pool = Pool(3, nice)
+
+    def unequal(counter, worker, array):
+        time.sleep(0.05 * (worker == 0))
+
+    for _ in range(3):
+        array = np.zeros(8)
+        alive = weakref.ref(array)
+        pool.run(unequal, array)
+        del array
+        deadline = time.monotonic() + 5.0
+        while alive() is not None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        assert alive() is None
+    pool.close()
+
+
+def test_what_a_pool_itself_needs_fails_where_it_is_asked_for(many_cores, monkeypatch) -> None:
+    def full():
+        raise OSError("no space left on device")
+
+    for nice in (0, 5):
+        pool, done = Pool(2, nice), np.zeros(8, np.int64)
+        with monkeypatch.context() as patch:
+            patch.setattr("edge_server.fields.kernels.pool.looks", full)
+            with pytest.raises(OSError, match="no space"):
+                pool.run(_count, done)
+        pool.run(_count, done)
+        assert (done == 1).all()
+        pool.close()
 
 
 def test_a_pool_is_shared_by_equal_settings() -> None:

@@ -382,41 +382,57 @@ def test_a_tile_lists_the_gaussians_that_have_a_pixel_in_it_and_hardly_another(l
     assert beside[~over_64].sum() < 0.03 * touched.sum()
 
 
+@pytest.mark.parametrize("count", [0, 1, 300])
 @pytest.mark.parametrize("share", [1.0, 0.3])
 @pytest.mark.parametrize("longest", [0.08, 3.0])
-def test_lists_do_not_depend_on_how_many_bands_there_are(longest: float, share: float) -> None:
-    """Bands without a row among them, and every pair dealt to one tile, those of a Gaussian side by side."""
-    lens, params = Pinhole(150, 50, 160.0, 160.0, 74.0, 27.0), _cloud(300, seed=6)
+def test_lists_do_not_depend_on_how_many_bands_there_are(longest: float, share: float, count: int) -> None:
+    """Bands without a row among them, and every pair dealt to one tile, those of a Gaussian side by side. Two
+    cameras, the picture of one smaller than a tile."""
+    lenses = (Pinhole(150, 50, 160.0, 160.0, 74.0, 27.0), Pinhole(5, 3, 6.0, 6.0, 2.0, 1.0))
+    params = _cloud(300, seed=6)[:count].copy()
     params[:, SCALE:QUATERNION] = np.log([0.01, 0.02, longest])
-    total = -(-lens.width // TILE) * -(-lens.height // TILE)
-    wanted = (np.random.default_rng(2).random(total) < share).astype(np.uint8)
+    total = [-(-lens.width // TILE) * -(-lens.height // TILE) for lens in lenses]
+    wanted = (np.random.default_rng(2).random(total[0]) < share).astype(np.uint8)
     found = []
-    for threads in (1, 2, 3, 9):
+    for threads in (1, 2, 3, 5, 9):
         passes = Passes(Pool(threads, 0))
-        passes.look(_camera(lens), _still(params, 1), [wanted if share < 1.0 else None])
-        lists, first = passes.lists, passes.lists.first[0, : total + 1]
-        pairs, own_first, own_count = int(lists.needed[0]), lists.own_first[0, :300], lists.own_count[0, :300]
-        assert first[0] == 0 and first[-1] == pairs == own_count.sum() > 400
-        assert not np.diff(first)[wanted == 0].any() and np.diff(first).max() == lists.longest[0].max()
-        assert (np.sort(lists.pair[0, :pairs]) == np.arange(pairs)).all()
-        assert (lists.owner[0, :pairs] == np.repeat(np.arange(300), own_count)).all()
-        assert (own_first[own_count > 0] == (np.cumsum(own_count) - own_count)[own_count > 0]).all()
-        found.append((first.copy(), lists.pair[0, :pairs].copy()))
+        cams = np.concatenate([_camera(lens) for lens in lenses])
+        passes.look(cams, _still(params, 1), [wanted if share < 1.0 else None, None])
+        lists, made = passes.lists, []
+        for b, tiles in enumerate(total):
+            first, pairs = lists.first[b, : tiles + 1], int(lists.needed[b])
+            own_first, own_count = lists.own_first[b, :count], lists.own_count[b, :count]
+            assert first[0] == 0 and first[-1] == pairs == own_count.sum()
+            assert np.diff(first).max() == lists.longest[b].max()
+            assert (np.sort(lists.pair[b, :pairs]) == np.arange(pairs)).all()
+            assert (lists.owner[b, :pairs] == np.repeat(np.arange(count), own_count)).all()
+            assert (own_first[own_count > 0] == (np.cumsum(own_count) - own_count)[own_count > 0]).all()
+            made += [first.copy(), lists.pair[b, :pairs].copy()]
+        assert share == 1.0 or not np.diff(made[0])[wanted == 0].any()
+        found.append(made)
+    assert count < 300 or (found[0][0][-1] > 400 and found[0][2][-1] > 0)
     for other in found[1:]:
         assert all((a == b).all() for a, b in zip(found[0], other))
 
 
-def test_pairs_beyond_what_memory_is_for_are_left_out_and_nothing_else(monkeypatch) -> None:
-    monkeypatch.setattr(splat_passes, "PAIRS_MOST", 2500)
+def test_gaussians_beyond_what_memory_is_for_are_left_out_and_nothing_else(monkeypatch) -> None:
     params = _cloud(600, seed=6)
     params[:, SCALE:QUATERNION] = np.log(0.3)
     total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
+    everything = Passes(CallerPool())
+    everything.look(_camera(), _still(params, 1), [None])
+    whole = everything.lists.own_count[0, :600].astype(np.int64)
+    monkeypatch.setattr(splat_passes, "PAIRS_MOST", 2500)
     for threads in (1, 3):
         passes = Passes(Pool(threads, 0))
         passes.look(_camera(), _still(params, 1), [None])
-        lists = passes.lists
-        listed = int(lists.first[0, total])
-        assert lists.needed[0] > lists.pair.shape[1] >= listed == lists.own_count[0, :600].sum() > 2000
+        lists, made = passes.lists, 0
+        room, listed = lists.pair.shape[1], int(lists.first[0, total])
+        assert lists.needed[0] == whole.sum() > room >= listed == lists.own_count[0, :600].sum() > 2000
+        for i, pairs in enumerate(whole):
+            fits = made + pairs <= room
+            assert lists.own_count[0, i] == (pairs if fits else 0)
+            made += pairs * fits
         assert (np.sort(lists.pair[0, :listed]) == np.arange(listed)).all()
 
 
