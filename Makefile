@@ -27,7 +27,11 @@ SELECT ?= not slow
 PYTEST ?=
 
 PY := .venv/bin/python
-# Byte code is made by the first import of what is used: compiling all of it ahead doubles the set-up's time.
+# Byte code is made by the first import of what is used: compiling all of it ahead doubles the set-up's time. It
+# lies in .venv, also where the environment wants none beside the sources: hundreds of processes are started,
+# and without it torch and numba take three seconds instead of one in each.
+export PYTHONPYCACHEPREFIX := $(abspath .venv)/byte-code
+unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
 WARM_UP := from edge_server.fields.registry import make_field; make_field("ngp", {"device": "cpu"}).warm_up()
 # The line of pyproject.toml that starts with a name.
