@@ -38,6 +38,12 @@ class VoxelSettings(TrainerSettings):
     epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
     l1: float = option(0.003, "pull of density towards zero, in rates: empties what no picture needs")
     outline: float = option(0.25, "weight of the error of opacity, which alpha or a plain background tells")
+    diffuse: float = option(
+        1.0, "share of the way to its neighbours' mean that a vertex takes every fourth step; 0: none"
+    )
+    diffuse_edge: float = option(
+        0.025, "difference of two neighbours, of the largest possible, of which no more counts for that"
+    )
     first: float = option(0.1, "optical depth of one step before anything is known")
     prune: float = option(0.2, "optical depth of one step below which a cell is taken to be empty")
     prune_from: int = option(15, "step from which on empty cells are left out")
@@ -56,6 +62,8 @@ class VoxelSettings(TrainerSettings):
             ("growth", 0.0, 1e3),
             ("l1", 0.0, 1e2),
             ("outline", 0.0, 1e2),
+            ("diffuse", 0.0, 1.0),
+            ("diffuse_edge", 0.0, 1.0),
             ("prune", 0.0, 4.0),
             ("prune_from", 0, 1 << 30),
             ("soften", 0.0, 4.0),

@@ -1,4 +1,5 @@
-"""What happens to a voxel grid between steps: Adam where there was a gradient, refinement, occupancy."""
+"""What happens to a voxel grid between steps: Adam where there was a gradient, diffusion, refinement,
+occupancy."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.kernels.adam import GRADIENT_LIMIT
 from edge_server.fields.kernels.intrinsics import fetch_add, is_finite
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.kernels.jit import kernel, part
 from edge_server.fields.kernels.voxel import SEGMENT
 from edge_server.fields.kernels.voxel_quads import cell_value
 
@@ -59,10 +60,10 @@ def voxel_adam(counter, worker, table, v, gradient, dirty, rule, dropped):
         for flag in range(task * PART, min((task + 1) * PART, flags)):
             found = 0
             a, b = flag * width, (flag + 1) * width
-            for part in range(parts):
-                if dirty[part, flag] != 0:
-                    dirty[part, flag] = 0
-                    g = flat_g[part, a:b]
+            for buffer in range(parts):
+                if dirty[buffer, flag] != 0:
+                    dirty[buffer, flag] = 0
+                    g = flat_g[buffer, a:b]
                     if found == 0:
                         for k in range(width):
                             total[k] = g[k]
@@ -89,6 +90,73 @@ def voxel_adam(counter, worker, table, v, gradient, dirty, rule, dropped):
                 q = min(max(q if use else p[k], _F0), each[3 * WIDTH + k])
                 p[k] = q if is_finite(p[k]) else _F0
         dropped[task] = bad
+
+
+class DiffusionRule(NamedTuple):
+    """edge: float32 (4,), of the difference between two neighbours in density and each colour so much counts
+    at most: what differs by more is an edge, and is drawn together no faster. share: float32, of the sum of a
+    vertex's six differences by which it moves; up to 1/6 no pattern between neighbours can swing."""
+
+    edge: NDArray[np.float32]
+    share: np.float32
+
+
+@kernel
+def diffuse(counter, worker, turn, voxels, away, cells, rule):
+    """Draw vertices together with their six neighbours, in cells where away (see ``Clearing``) is 0: a step
+    down the grid's total variation, made smooth where it is small (Huber 1964; diffusion that stops at edges,
+    Perona and Malik 1990).
+
+    Only every second layer moves, those of turn 0 or 1: the layers beside it stand still meanwhile, and the
+    result is the same however many work at once. The grid's outermost vertices stay.
+    """
+    size, share = voxels.size, rule.share
+    flat, plane, row = voxels.table.reshape(-1), 4 * size * size, 4 * size
+    edges = np.empty(row, np.float32)  # flat, as everything here: LLVM vectorises this alone
+    for k in range(row):
+        edges[k] = rule.edge[k & 3]
+    tops = np.full(row, _F1)
+    tops[::4] = DENSEST
+    before = np.empty(row, np.float32)
+    starts = np.empty(cells + 1, np.int64)  # the first vertex of each cell that may move
+    for c in range(cells + 1):
+        starts[c] = min(max((c * (size - 1) + cells - 1) // cells, 1), size - 1)
+    while True:
+        z = 2 * fetch_add(counter, 1) + 1 + turn
+        if z >= size - 1:
+            return
+        layer = cells * cells * (z * cells // (size - 1))
+        for y in range(1, size - 1):
+            cell = layer + cells * (y * cells // (size - 1))
+            c = 0
+            while c < cells:
+                if away[cell + c] != 0:
+                    c += 1
+                    continue
+                end = c + 1
+                while end < cells and away[cell + end] == 0:
+                    end += 1
+                a = 4 * (starts[c] + size * (y + size * z))
+                n = 4 * (starts[end] - starts[c])
+                c = end
+                old, edge, top = before[: n + 8], edges[:n], tops[:n]
+                old[:] = flat[a - 4 : a + n + 4]
+                p = flat[a : a + n]
+                south, north = flat[a - row : a - row + n], flat[a + row : a + row + n]
+                below, above = flat[a - plane : a - plane + n], flat[a + plane : a + plane + n]
+                for k in range(n):
+                    q, e = old[k + 4], edge[k]
+                    way = _bounded(old[k] - q, e) + _bounded(old[k + 8] - q, e)
+                    way += _bounded(south[k] - q, e) + _bounded(north[k] - q, e)
+                    way += _bounded(below[k] - q, e) + _bounded(above[k] - q, e)
+                    p[k] = min(max(q + share * way, _F0), top[k])
+
+
+@part
+def _bounded(d, edge):
+    """d between -edge and edge; NaN counts as -edge, so that it does not spread."""
+    d = d if d > -edge else -edge
+    return d if d < edge else edge
 
 
 @kernel

@@ -20,11 +20,20 @@ def test_a_long_fit_is_no_worse_than_a_short_one() -> None:
     few, others = SEEN[::2], SEEN[1::2]  # few views are soon known by heart
     gains = []
     for settle in (SMALL.settle, 0.0):
-        short, long = (VoxelField(replace(SMALL, settle=settle)) for _ in range(2))
+        short, long = (VoxelField(replace(SMALL, settle=settle, diffuse=0.0)) for _ in range(2))
         short.fit(few, Budget(steps=150))
         long.fit(few, Budget(steps=1200))
         gains.append(mean_psnr(long, others) - mean_psnr(short, others))
     assert gains[0] > -0.25 and gains[1] < -0.5
+
+
+def test_a_diffused_grid_repeats_itself_and_shows_better_what_it_has_not_seen() -> None:
+    few, others = SEEN[::2], SEEN[1::2]
+    fields = [VoxelField(replace(SMALL, threads=n, diffuse=s)) for n, s in ((1, 1.0), (3, 1.0), (2, 0.0))]
+    for field in fields:
+        field.fit(few, Budget(steps=400))
+    same_state(fields[0], fields[1])
+    assert mean_psnr(fields[0], others) > mean_psnr(fields[2], others) + 0.3
 
 
 def test_upsampling_hardly_changes_the_picture() -> None:

@@ -17,9 +17,11 @@ from edge_server.fields.kernels.voxel import SEGMENT, Clearing, Voxels, spread, 
 from edge_server.fields.kernels.voxel_update import (
     DENSEST,
     FARTHEST,
+    DiffusionRule,
     VoxelRule,
     clear,
     densest,
+    diffuse,
     each_of,
     refine,
     voxel_adam,
@@ -303,6 +305,66 @@ def test_adam_grows_pulls_projects_and_drops_what_is_not_finite() -> None:
     np.testing.assert_allclose(table[1], [0.5 - 0.011, 0.0, 1.0, 0.5], rtol=1e-5)
     np.testing.assert_array_equal(table[2:], 0.5)
     assert dropped[0] == 2 and np.isfinite(second).all()
+
+
+def _diffused(voxels: Voxels, away: NDArray[np.uint8], rule: DiffusionRule) -> NDArray[np.float32]:
+    """The grid (SIZE, SIZE, SIZE, 4) after one pass: z, y, x."""
+    own = Voxels(SIZE, voxels.table.copy())
+    for turn in (0, 1):
+        CallerPool().run(diffuse, turn, own, away, CELLS, rule)
+    np.testing.assert_array_equal(own.table[SIZE**3 :], voxels.table[SIZE**3 :])
+    return own.table[: SIZE**3].reshape(SIZE, SIZE, SIZE, 4)
+
+
+def _diffused_by_numpy(voxels: Voxels, away: NDArray[np.uint8], rule: DiffusionRule) -> NDArray[np.float64]:
+    grid = voxels.table[: SIZE**3].reshape(SIZE, SIZE, SIZE, 4).astype(np.float64)
+    empty = away.reshape(CELLS, CELLS, CELLS) != 0
+    for z in (*range(1, SIZE - 1, 2), *range(2, SIZE - 1, 2)):
+        for y in range(1, SIZE - 1):
+            new = grid[z, y].copy()
+            for x in range(1, SIZE - 1):
+                near = grid[z, y, x - 1], grid[z, y, x + 1], grid[z, y - 1, x], grid[z, y + 1, x]
+                around = np.stack([*near, grid[z - 1, y, x], grid[z + 1, y, x]])
+                way = np.clip(around - grid[z, y, x], -rule.edge, rule.edge).sum(axis=0)
+                if not empty[tuple(c * CELLS // (SIZE - 1) for c in (z, y, x))]:
+                    new[x] = np.clip(grid[z, y, x] + rule.share * way, 0.0, [DENSEST, 1.0, 1.0, 1.0])
+            grid[z, y] = new
+    return grid
+
+
+@pytest.mark.parametrize("empty", [0.0, 0.3, 1.0])
+def test_diffusion_is_that_of_numpy_and_leaves_empty_cells_alone(empty: float) -> None:
+    voxels = _voxels(2)
+    away = (np.random.default_rng(9).random(CELLS**3) < empty).astype(np.uint8)
+    rule = DiffusionRule(np.float32([0.3, 0.05, 0.1, 1e9]), np.float32(1 / 6))
+    got = _diffused(voxels, away, rule)
+    np.testing.assert_allclose(got, _diffused_by_numpy(voxels, away, rule), atol=2e-6)
+    assert (got != voxels.table[: SIZE**3].reshape(got.shape)).any() == (empty < 1.0)
+
+
+def test_diffusion_keeps_what_is_even_and_what_is_steep() -> None:
+    """A ramp has no curvature. A step many times ``edge`` high moves by ``edge`` at most."""
+    ramp, away = _voxels(), np.zeros(CELLS**3, np.uint8)
+    x = np.arange(SIZE**3) % SIZE
+    ramp.table[: SIZE**3] = 0.1 * x[:, None]
+    rule = DiffusionRule(np.full(4, 0.2, np.float32), np.float32(1 / 6))
+    kept = ramp.table[: SIZE**3].reshape(SIZE, SIZE, SIZE, 4)
+    np.testing.assert_allclose(_diffused(ramp, away, rule), kept, atol=1e-6)
+    step = Voxels(SIZE, ramp.table.copy())
+    step.table[: SIZE**3] = np.where(x[:, None] < 4, 0.0, 1.0)
+    rule = DiffusionRule(np.full(4, 0.02, np.float32), np.float32(1 / 6))
+    moved = np.abs(_diffused(step, away, rule) - step.table[: SIZE**3].reshape(kept.shape))
+    assert 0.0 < moved.max() <= 0.02
+
+
+def test_what_is_not_finite_does_not_spread_by_diffusion() -> None:
+    voxels, away = _voxels(), np.zeros(CELLS**3, np.uint8)
+    middle = 4 + SIZE * (4 + SIZE * 4)
+    voxels.table[middle] = (np.nan, np.inf, -np.inf, np.nan)
+    rule = DiffusionRule(np.float32([0.1, 0.025, 0.025, 0.025]), np.float32(1 / 6))
+    got = _diffused(voxels, away, rule).reshape(-1, 4)
+    assert np.isfinite(np.delete(got, middle, axis=0)).all()
+    assert got[:, 1:].min() >= 0.0 or not np.isfinite(got[middle]).all()
 
 
 def test_a_finer_grid_has_the_same_values_between_its_vertices() -> None:
