@@ -47,7 +47,7 @@ from freshfield.geometry import Pinhole
 
 PHASES = 4  # looks until every cell has been looked at
 EVERY = 5  # steps between looks at where there is density
-DIFFUSE_EVERY = 4  # steps between passes of diffusion, each over the whole grid
+DIFFUSED = 4  # steps in which all layers diffuse once: an equal share of each step, for budgets to be kept
 FADE = 0.75  # of a cell's density per look
 BETA2 = 0.95  # Adam's memory in steps that touch a vertex: a fit has a hundred of them, not thousands
 WARM = 1.5  # of the steps until the grid has its last size: from then on a fit is a warm start
@@ -325,12 +325,12 @@ class VoxelField:
         self.pool.run(
             voxel_adam, self._voxels.table, self._v, self._gradient, self._dirty, rule, self._bad_gradients
         )
-        if s.diffuse > 0.0 and self.step % DIFFUSE_EVERY == 0 and self.step >= s.prune_from:
+        if s.diffuse > 0.0 and self.step >= s.prune_from:
             # As strong as the rates, which it holds the balance to. A colour is at most 1, a density DENSEST.
             edge = np.array([DENSEST, 1.0, 1.0, 1.0], np.float32) * np.float32(s.diffuse_edge)
             draw = DiffusionRule(edge, np.float32(fall * s.diffuse / 6.0))
-            for turn in (0, 1):
-                self.pool.run(diffuse, turn, self._voxels, self._away, occupancy.cells, draw)
+            turn = self.step % DIFFUSED
+            self.pool.run(diffuse, turn, DIFFUSED, self._voxels, self._away, occupancy.cells, draw)
         self.step += 1
         return float(self._loss.sum()) / (3 * s.rays)
 

@@ -39,14 +39,14 @@ class VoxelSettings(TrainerSettings):
     l1: float = option(0.003, "pull of density towards zero, in rates: empties what no picture needs")
     outline: float = option(0.25, "weight of the error of opacity, which alpha or a plain background tells")
     diffuse: float = option(
-        1.0, "share of the way to its neighbours' mean that a vertex takes every fourth step; 0: none"
+        1.0, "share of the way to its neighbours' mean that a vertex goes in four steps at full rates"
     )
     diffuse_edge: float = option(
         0.025, "difference of two neighbours, of the largest possible, of which no more counts for that"
     )
     first: float = option(0.1, "optical depth of one step before anything is known")
     prune: float = option(0.2, "optical depth of one step below which a cell is taken to be empty")
-    prune_from: int = option(15, "step from which on empty cells are left out")
+    prune_from: int = option(15, "step from which on empty cells are left out, and the others diffuse")
     cells: int = option(48, "cells a side of the occupancy grid, a multiple of 4")
     device: str = option("auto", "cpu or auto: it runs on CPUs only")
     parts: int = option(2, "gradient buffers: so many cores train at once; results depend on it")

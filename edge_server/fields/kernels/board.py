@@ -155,4 +155,5 @@ def looks() -> int:
         start = time.perf_counter()
         attend(board, states, 0, 0, 0, _TRIED)
         took_s = min(took_s, time.perf_counter() - start)
-    return int(SEARCH_S / took_s * _TRIED) + 1
+    # Looking ends with taking the GIL back, which other threads may hold: then it seems to be far slower.
+    return max(int(SEARCH_S / took_s * _TRIED), _TRIED) + 1

@@ -65,7 +65,9 @@ class _Job:
         self.number = 0  # on the board, if it stands there
         # 1 where a worker has it, and is done with it: worker 0 is who waits for the others.
         self.taken, self.finished = bytearray(threads), bytearray(threads)
-        self.done, self.over = threading.Semaphore(0), threading.Semaphore(0)
+        # Queues, not semaphores: an interrupt may leave those locked, being Python.
+        self.done, self.over = SimpleQueue[None](), SimpleQueue[None]()
+        self.ended = False
         self.error: BaseException | None = None
 
 
@@ -109,12 +111,17 @@ class Pool:
                 self._check_open()
                 self._queues[0].put(job)
             try:
-                job.over.acquire()
+                job.over.get()
             except BaseException:
-                job.over.acquire()  # its arrays are the caller's
+                while not job.ended:  # its arrays are the caller's
+                    time.sleep(1e-3)
                 raise
-        if job.error is not None:
-            raise job.error
+        if (error := job.error) is not None:
+            job.error = None
+            try:
+                raise error
+            finally:
+                del error, job  # or its arrays would live in its traceback
 
     def close(self) -> None:
         """End the workers once they have finished what was begun."""
@@ -141,9 +148,9 @@ class Pool:
             self._work(job, 0)
             if not searching:
                 for _ in range(self.threads - 1):
-                    job.done.acquire()
+                    job.done.get()
             elif not await_others(self._board, self.threads - 1, searching):
-                job.done.acquire()
+                job.done.get()
         except BaseException:
             self._finish_abandoned()
             raise
@@ -174,24 +181,25 @@ class Pool:
                         self._lead(job)
                 except BaseException as error:  # of a kernel's compilation, say
                     job.error = job.error or error
-                job.over.release()
+                job.ended = True
+                job.over.put(None)
                 del job  # or the last job's arrays would live until the next one comes
             with self._seat:  # what a caller has begun goes before the end
                 self._wake_others(worker, None)
             return
-        last, done = 0, threading.Semaphore(0)
+        last, done = 0, SimpleQueue[None]()
         while (job := self._next(worker, last, done)) is not None:
             self._work(job, worker)
             last, done = job.number, job.done
             job.finished[worker] = 1
             if not self._boards:
-                done.release()
+                done.put(None)
             del job
         self._wake_others(worker, None)
 
-    def _next(self, worker: int, last: int, done: threading.Semaphore) -> _Job | None:
+    def _next(self, worker: int, last: int, done: SimpleQueue[None]) -> _Job | None:
         """What this worker is to do next, None: to end. last: the number of what it has just done, whose
-        caller may sleep until ``done`` is released; 0 at first."""
+        caller may sleep until there is something in ``done``; 0 at first."""
         others = self.threads - 1
         while self._boards and last > 0:
             found = attend(self._board, self._states, worker, last, others, looks())
@@ -203,7 +211,7 @@ class Pool:
                 assert job is not None
                 job.taken[worker] = 1
                 return job
-            done.release()
+            done.put(None)
         return self._woken(worker)
 
     def _woken(self, worker: int) -> _Job | None:

@@ -95,20 +95,21 @@ def voxel_adam(counter, worker, table, v, gradient, dirty, rule, dropped):
 class DiffusionRule(NamedTuple):
     """edge: float32 (4,), of the difference between two neighbours in density and each colour so much counts
     at most: what differs by more is an edge, and is drawn together no faster. share: float32, of the sum of a
-    vertex's six differences by which it moves; up to 1/6 no pattern between neighbours can swing."""
+    vertex's six differences by which it moves; up to 1/6 no pattern between neighbours grows."""
 
     edge: NDArray[np.float32]
     share: np.float32
 
 
 @kernel
-def diffuse(counter, worker, turn, voxels, away, cells, rule):
+def diffuse(counter, worker, turn, turns, voxels, away, cells, rule):
     """Draw vertices together with their six neighbours, in cells where away (see ``Clearing``) is 0: a step
     down the grid's total variation, made smooth where it is small (Huber 1964; diffusion that stops at edges,
     Perona and Malik 1990).
 
-    Only every second layer moves, those of turn 0 or 1: the layers beside it stand still meanwhile, and the
-    result is the same however many work at once. The grid's outermost vertices stay.
+    Only every ``turns``-th layer moves (2 or more): the layers beside it stand still meanwhile, and the
+    result is the same however many work at once. After all turns, 0 to turns - 1, each layer has moved once;
+    the grid's outermost vertices stay.
     """
     size, share = voxels.size, rule.share
     flat, plane, row = voxels.table.reshape(-1), 4 * size * size, 4 * size
@@ -122,13 +123,14 @@ def diffuse(counter, worker, turn, voxels, away, cells, rule):
     for c in range(cells + 1):
         starts[c] = min(max((c * (size - 1) + cells - 1) // cells, 1), size - 1)
     while True:
-        z = 2 * fetch_add(counter, 1) + 1 + turn
+        z = turns * fetch_add(counter, 1) + 1 + turn
         if z >= size - 1:
             return
         layer = cells * cells * (z * cells // (size - 1))
         for y in range(1, size - 1):
             cell = layer + cells * (y * cells // (size - 1))
-            c = 0
+            line = 4 * size * (y + size * z)
+            c, copied = 0, False
             while c < cells:
                 if away[cell + c] != 0:
                     c += 1
@@ -136,11 +138,12 @@ def diffuse(counter, worker, turn, voxels, away, cells, rule):
                 end = c + 1
                 while end < cells and away[cell + end] == 0:
                     end += 1
-                a = 4 * (starts[c] + size * (y + size * z))
-                n = 4 * (starts[end] - starts[c])
-                c = end
-                old, edge, top = before[: n + 8], edges[:n], tops[:n]
-                old[:] = flat[a - 4 : a + n + 4]
+                if not copied:
+                    before[:] = flat[line : line + row]
+                    copied = True
+                x, n = 4 * starts[c], 4 * (starts[end] - starts[c])
+                a, c = line + x, end
+                old, edge, top = before[x - 4 : x + n + 4], edges[:n], tops[:n]
                 p = flat[a : a + n]
                 south, north = flat[a - row : a - row + n], flat[a + row : a + row + n]
                 below, above = flat[a - plane : a - plane + n], flat[a + plane : a + plane + n]
