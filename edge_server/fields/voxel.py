@@ -102,12 +102,15 @@ class VoxelField:
             share = s.warm if self.step >= WARM * max(s.refine_at, default=s.prune_from) else 1.0
             # Steps at full rates: a grid that meets the same pixels over and over learns them by heart.
             full = s.settle * (len(data.drawn) or len(data.pixels)) / s.rays or np.inf
+            # A prior counts the less the more has been seen; a camera that stands still sees no more.
+            places = len(np.unique(data.origin, axis=0))
+            diffuse_by = s.diffuse * min(s.diffuse_views / max(places, 1), 1.0)
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
         while (progress := pace.begin(self._usual)) is not None:
             with self._turn.mine():
                 fall = s.rate_end**progress * min(full / max(pace.steps, 1), 1.0)
-                losses.append(self._one_step(data, share * fall))
+                losses.append(self._one_step(data, share * fall, diffuse_by))
                 rays += self.settings.rays
                 samples += int(self._samples.sum())
                 dropped += int(self._bad_rays.sum() + self._bad_gradients.sum())
@@ -287,8 +290,9 @@ class VoxelField:
         # of them would hold these back for as long as its memory lasts.
         self._take(size, grid)
 
-    def _one_step(self, data: Views, fall: float) -> float:
-        """One optimiser step; returns its mean squared error. fall: share of the rates."""
+    def _one_step(self, data: Views, fall: float, diffuse_by: float) -> float:
+        """One optimiser step; returns its mean squared error. fall: share of the rates. diffuse_by: share of
+        the way to its neighbours' mean that a vertex goes in ``DIFFUSED`` steps at full rates."""
         self._grow(self.step)
         s, length = self.settings, self._step_length()
         key, occupancy, outline = step_key(s.seed, self.step), self._occupancy, np.float32(s.outline)
@@ -325,10 +329,10 @@ class VoxelField:
         self.pool.run(
             voxel_adam, self._voxels.table, self._v, self._gradient, self._dirty, rule, self._bad_gradients
         )
-        if s.diffuse > 0.0 and self.step >= s.prune_from:
+        if diffuse_by > 0.0 and self.step >= s.prune_from:
             # As strong as the rates, which it holds the balance to. A colour is at most 1, a density DENSEST.
             edge = np.array([DENSEST, 1.0, 1.0, 1.0], np.float32) * np.float32(s.diffuse_edge)
-            draw = DiffusionRule(edge, np.float32(fall * s.diffuse / 6.0))
+            draw = DiffusionRule(edge, np.float32(fall * diffuse_by / 6.0))
             turn = self.step % DIFFUSED
             self.pool.run(diffuse, turn, DIFFUSED, self._voxels, self._away, occupancy.cells, draw)
         self.step += 1

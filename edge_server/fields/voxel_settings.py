@@ -44,6 +44,9 @@ class VoxelSettings(TrainerSettings):
     diffuse_edge: float = option(
         0.025, "difference of two neighbours, of the largest possible, of which no more counts for that"
     )
+    diffuse_views: int = option(
+        32, "places seen from, of which more weaken ``diffuse``: by so many to all of them"
+    )
     first: float = option(0.1, "optical depth of one step before anything is known")
     prune: float = option(0.2, "optical depth of one step below which a cell is taken to be empty")
     prune_from: int = option(15, "step from which on empty cells are left out, and the others diffuse")
@@ -64,6 +67,7 @@ class VoxelSettings(TrainerSettings):
             ("outline", 0.0, 1e2),
             ("diffuse", 0.0, 1.0),
             ("diffuse_edge", 0.0, 1.0),
+            ("diffuse_views", 1, 1 << 20),
             ("prune", 0.0, 4.0),
             ("prune_from", 0, 1 << 30),
             ("soften", 0.0, 4.0),

@@ -61,7 +61,7 @@ CHOICES: tuple[Choice, ...] = (
         ("tile", "tile, six", "lego", "kitchen, six", "room"),
     ),
     Choice("smoothness", {"smooth": 0.0}, {"smooth": 3e-3}, ("tile", "room")),
-    Choice("diffusion", {"diffuse": 0.0}, {"diffuse": 1.0}, ("tile", "room", "kitchen")),
+    Choice("diffusion", {"diffuse": 0.0}, {"diffuse": 1.0}, ("tile", "room", "kitchen", "lego")),
     Choice("appearance", {"appearance": 0}, {"appearance": 8}, ("room, gains", "room")),
     Choice("outlines", {"outline": 0.0}, {"outline": 0.25}, ("tile", "room")),
     Choice("weighed by age", {"age_tau_ms": 0.0}, {"age_tau_ms": 100.0}, ("room, late", "room, moving")),

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget
+from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 from edge_server.fields.voxel import VoxelField
 from edge_server.fields.voxel_settings import EFFORTS, help_text, make_settings
@@ -34,6 +35,20 @@ def test_a_diffused_grid_repeats_itself_and_shows_better_what_it_has_not_seen() 
         field.fit(few, Budget(steps=400))
     same_state(fields[0], fields[1])
     assert mean_psnr(fields[0], others) > mean_psnr(fields[2], others) + 0.3
+
+
+def test_diffusion_counts_the_less_the_more_places_were_seen_from() -> None:
+    def fitted(views: list[View], **changed: Any) -> VoxelField:
+        field = VoxelField(replace(SMALL, **changed))
+        field.fit(views, Budget(steps=40))
+        return field
+
+    same_state(fitted(SEEN, diffuse_views=len(SEEN) // 2), fitted(SEEN, diffuse=0.5))
+    twice = [*SEEN, *(replace(view, camera=f"{view.camera}, beside itself") for view in SEEN)]
+    assert len(twice) == 24 and len({tuple(view.camera_to_world[:3, 3]) for view in twice}) == 12
+    same_state(fitted(twice, diffuse_views=12), fitted(twice, diffuse_views=1000))
+    with pytest.raises(AssertionError):
+        same_state(fitted(SEEN, diffuse_views=11), fitted(SEEN))
 
 
 def test_upsampling_hardly_changes_the_picture() -> None:
