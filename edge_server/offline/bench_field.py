@@ -27,6 +27,7 @@ from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
 from edge_server.offline.fitting import evaluate
 from edge_server.offline.kept import Kept, settled
+from edge_server.offline.speed import Speed, told
 from edge_server.offline.still import Still, open_still, smallest_angle_deg, synthetic
 from edge_server.offline.usage import Usage, peak_rss_mb
 from freshfield.geometry import Pinhole
@@ -121,8 +122,10 @@ def _recorded_scenes() -> Iterable[tuple[str, Still]]:
 
 def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
     """Compile times and memory, each in a process of its own, cold with an empty kernel cache."""
+    speed = Speed()
+    speed.look()
     usage = Usage("bench")
-    figures = {}
+    figures: dict[str, Any] = {}
     if not quick:
         cold = _child(field, folder)
         figures["jit_cold_s"], figures["jit_cold_cpu_s"] = cold["jit_s"], cold["jit_cpu_s"]
@@ -133,6 +136,9 @@ def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
     figures["jit_cached_s"], figures["jit_cached_cpu_s"] = cached["jit_s"], cached["jit_cpu_s"]
     figures["peak_rss_mb"] = cached["peak_rss_mb"]
     figures["machine_cores_busy"] = usage.row(0.0).get("machine", {}).get("cpu")
+    speed.look()
+    figures["machine"] = speed.row()
+    speed.close()
     return figures
 
 
@@ -148,8 +154,9 @@ def _curve(field: str, still: Still, planned_s: Sequence[float], seeds: int, lpi
     """Fidelity against seconds from scratch: medians over seeds, and the first planned time whose median
     reaches each quality (None: none did)."""
     make_field(field).warm_up()
-    usage, series = Usage("bench"), []
+    usage, speed, series = Usage("bench"), Speed(), []
     for seconds in planned_s:
+        speed.look()
         points = [_point(field, still, seconds, seed, lpips) for seed in range(seeds)]
         row: dict[str, Any] = {"seconds": seconds}
         for name in ("fitted_s", "steps", "psnr_db", "ssim", "lpips"):
@@ -158,12 +165,14 @@ def _curve(field: str, still: Still, planned_s: Sequence[float], seeds: int, lpi
         row["psnr_db_range"] = max(p["psnr_db"] for p in points) - min(p["psnr_db"] for p in points)
         series.append(row)
         print(f"  {field:10} {still.name:8} {seconds:6.2f} s  PSNR {row['psnr_db']:5.2f} dB", flush=True)
+    speed.close()
     return {
         "seeds": seeds,
         "series": {f"{row['seconds']:g}_s": row for row in series},
         "seconds_to_db": _seconds_to_db(series),
         "best_db": max(row["psnr_db"] for row in series),
         "outside_cores": usage.outside(usage.row(0.0)),
+        "machine": speed.row(),
     }
 
 
@@ -189,15 +198,19 @@ def _rates(field: str, still: Still, repeats: int) -> dict[str, Any]:
     """Rates of a field that has settled, and milliseconds of a rendering."""
     model = make_field(field)
     model.fit(still.training, Budget(seconds=3.0))
-    usage = Usage("bench")
-    reports = [model.fit(still.training, Budget(seconds=1.0)) for _ in range(repeats)]
+    usage, speed, reports = Usage("bench"), Speed(), []
+    for _ in range(repeats):
+        speed.look()
+        reports.append(model.fit(still.training, Budget(seconds=1.0)))
     outside = usage.outside(usage.row(0.0))
+    speed.close()
     pose, lens = still.held_out[0].camera_to_world, still.held_out[0].intrinsics
     return {
         "steps_per_s": statistics.median(r.steps / r.seconds for r in reports),
         "rays_per_s": statistics.median(r.rays / r.seconds for r in reports),
         "samples_per_s": statistics.median(r.samples / r.seconds for r in reports),
         "rates_outside_cores": outside,
+        "rates_machine": speed.row(),
         **{f"render_{w}_ms": _render_ms(model, pose, lens.scaled(w / lens.width)) for w in (128, 256)},
     }
 
@@ -263,29 +276,48 @@ def table(figures: dict[str, Any]) -> str:
             scene, name, str(rows["seeds"]),
             ", ".join(f"{r['seconds']:g}: {r['psnr_db']:.1f}" for r in rows["series"].values()),
             ", ".join(_n(rows["seconds_to_db"][f"{db}_db"]) for db in TARGETS_DB), _n(rows["outside_cores"]),
+            told(rows.get("machine")),
         )
         for scene, name, rows in found
     ]  # fmt: skip
     of_rates = ("steps_per_s", "rays_per_s", "samples_per_s", "render_128_ms", "render_256_ms")
     rates = [
-        (scene, name, *(_n(rows[key]) for key in of_rates), _n(rows["rates_outside_cores"]))
+        (
+            scene,
+            name,
+            *(_n(rows[key]) for key in of_rates),
+            _n(rows["rates_outside_cores"]),
+            told(rows.get("rates_machine")),
+        )
         for scene, name, rows in found
         if "steps_per_s" in rows
     ]
     compiled = ("jit_cold_s", "jit_cold_cpu_s", "jit_cached_s", "jit_cached_cpu_s")
     keys = (*compiled, "peak_rss_mb", "machine_cores_busy")
-    starts = [(name, *(_n(row.get(key)) for key in keys)) for name, row in figures.get("start", {}).items()]
+    starts = [
+        (name, *(_n(row.get(key)) for key in keys), told(row.get("machine")))
+        for name, row in figures.get("start", {}).items()
+    ]
     targets = ", ".join(str(db) for db in TARGETS_DB)
+    busy = "outside cores|the machine"
     tables = {
         "scene|held-out camera from any other, degrees|mean colour dB|nearest view dB": least,
-        f"scene|representation|seeds|seconds: PSNR dB|seconds to {targets} dB|outside cores": curves,
-        "scene|representation|steps/s|rays/s|samples/s|128 x 128 in ms|256 x 256 in ms|outside cores": rates,
-        "representation|JIT cold s|of CPU s|JIT cached s|of CPU s|peak memory MB|cores busy": starts,
+        f"scene|representation|seeds|seconds: PSNR dB|seconds to {targets} dB|{busy}": curves,
+        f"scene|representation|steps/s|rays/s|samples/s|128 x 128 in ms|256 x 256 in ms|{busy}": rates,
+        "representation|JIT cold s|of CPU s|JIT cached s|of CPU s|peak MB|cores busy|the machine": starts,
     }
-    told = [_markdown(head.split("|"), rows) for head, rows in tables.items() if rows]
+    texts = [_markdown(head.split("|"), rows) for head, rows in tables.items() if rows]
     if any(name == "splat" for _, name, *_ in rates):
-        told.append("Rays of `splat` are pixels, its samples pairs of a Gaussian and a tile of 8 x 8 pixels.")
-    return "\n\n".join(told)
+        texts.append(
+            "Rays of `splat` are pixels, its samples pairs of a Gaussian and a tile of 8 x 8 pixels."
+        )
+    if found:
+        texts.append(
+            "The machine: how fast it was meanwhile, all cores together: billions of multiply-adds in "
+            "registers and millions of random reads from 4 MB a second (medians). On one that is shared both "
+            "may halve for an hour, which no load of its own tells."
+        )
+    return "\n\n".join(texts)
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -11,7 +11,6 @@ marching, branches and waiting. Of ``ngp`` and ``splat``: the default and the fa
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -35,7 +34,6 @@ from edge_server.fields.kernels.probe import (
     copies,
     divisions,
     random_adds,
-    random_reads,
 )
 from edge_server.fields.kernels.splat_project import BASE, HALF_HEIGHT, MY, TILE
 from edge_server.fields.kernels.splat_strips import KEPT, STRIP, STRIPS, SUMS
@@ -44,6 +42,7 @@ from edge_server.fields.ngp_schedule import active_levels
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_settings import SplatSettings
+from edge_server.offline.speed import median_s, reads
 from edge_server.offline.still import synthetic
 from edge_server.offline.usage import Usage
 
@@ -138,42 +137,30 @@ def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
     rng = np.random.default_rng(0)
     for megabytes in TABLES_MB:
         vertices = megabytes * 2**20 // (4 * FEATURES)
+        # Reading: from one table, as the hash tables are. Adding: to a table each, since no two workers of
+        # the gradient's kernel share one either.
         tables = np.zeros((pool.threads, vertices, FEATURES), np.float32)
         rows = rng.integers(0, vertices, PER_TASK).astype(np.uint32)
-        out = np.zeros((pool.threads, FEATURES), np.float32)
-        # Reading: one table for all, as the hash tables are. Adding: a table each, since no two workers of
-        # the gradient's kernel share one either.
-        read_s = _median_s(repeats, partial(pool.run, random_reads, tables[0], rows, out))
-        add_s = _median_s(repeats, partial(pool.run, random_adds, tables, rows))
-        limits[f"reads_{megabytes}mb_m_per_s"] = TASKS * PER_TASK / read_s / 1e6
+        add_s = median_s(repeats, partial(pool.run, random_adds, tables, rows))
+        limits[f"reads_{megabytes}mb_m_per_s"] = reads(pool, megabytes, repeats)
         limits[f"adds_{megabytes}mb_m_per_s"] = TASKS * PER_TASK / add_s / 1e6
     for name, (m, k, n) in {"gemm": (2048, 2048, 2048), "narrow_gemm": (65536, 32, 32)}.items():
         a, b = rng.random((m, k), np.float32), rng.random((k, n), np.float32)
-        limits[f"{name}_g_per_s"] = m * k * n / _median_s(repeats, partial(np.matmul, a, b)) / 1e9
+        limits[f"{name}_g_per_s"] = m * k * n / median_s(repeats, partial(np.matmul, a, b)) / 1e9
     limits |= {"multiply_adds_g_per_s": 0.0, "operations_g_per_s": 0.0}
     totals = np.zeros(pool.threads, np.float32)
     for run, (lanes, multiply_adds, additions) in zip(arithmetic, CHAINS, strict=True):
-        vectors = TASKS * CHAINED * lanes / _median_s(repeats, partial(pool.run, run, totals)) / 1e9
+        vectors = TASKS * CHAINED * lanes / median_s(repeats, partial(pool.run, run, totals)) / 1e9
         for name, chains in {"multiply_adds": multiply_adds, "operations": multiply_adds + additions}.items():
             limits[f"{name}_g_per_s"] = max(limits[f"{name}_g_per_s"], chains * vectors)
     x, y = rng.random((2, 2048), np.float32) + np.float32(1.0)
     out = np.zeros((pool.threads, x.size), np.float32)
     memory = np.zeros((pool.threads, 2 * PER_TASK), np.float32)
-    divide_s = _median_s(repeats, partial(pool.run, divisions, x, y, out))
-    copy_s = _median_s(repeats, partial(pool.run, copies, memory))
+    divide_s = median_s(repeats, partial(pool.run, divisions, x, y, out))
+    copy_s = median_s(repeats, partial(pool.run, copies, memory))
     limits["divisions_g_per_s"] = TASKS * ROUNDS * x.size / divide_s / 1e9
     limits["copies_gb_per_s"] = TASKS * PER_TASK * 4 / copy_s / 1e9
     return limits
-
-
-def _median_s(repeats: int, work: Callable[[], Any]) -> float:
-    work()  # compiles, and warms the caches
-    spent = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        work()
-        spent.append(time.perf_counter() - began)
-    return statistics.median(spent)
 
 
 def _of_ngp(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) -> dict[str, Any]:
