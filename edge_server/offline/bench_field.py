@@ -314,8 +314,9 @@ def table(figures: dict[str, Any]) -> str:
     if found:
         texts.append(
             "The machine: how fast it was just before each time or rate was measured, all cores together: "
-            "billions of multiply-adds in registers and millions of random reads from 4 MB a second (medians). "
-            "On one that is shared both may halve, for an hour or for a second, which no load of its own tells."
+            "billions of multiply-adds in registers and millions of random reads from 4 MB a second "
+            "(medians). On one that is shared both may halve, for an hour or for a second, which no load of "
+            "its own tells."
         )
     return "\n\n".join(texts)
 
