@@ -25,12 +25,10 @@ from edge_server.fields import Budget, FitReport, View
 from edge_server.fields.kernels.grid import FEATURES
 from edge_server.fields.kernels.pool import Pool
 from edge_server.fields.kernels.probe import (
-    CHAINED,
     CHAINS,
     PER_TASK,
     ROUNDS,
     TASKS,
-    arithmetic,
     copies,
     divisions,
     random_adds,
@@ -42,7 +40,7 @@ from edge_server.fields.ngp_schedule import active_levels
 from edge_server.fields.ngp_settings import NgpSettings
 from edge_server.fields.splat import SplatField
 from edge_server.fields.splat_settings import SplatSettings
-from edge_server.offline.speed import median_s, reads
+from edge_server.offline.speed import in_chains, median_s, reads
 from edge_server.offline.still import synthetic
 from edge_server.offline.usage import Usage
 
@@ -148,9 +146,8 @@ def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
         a, b = rng.random((m, k), np.float32), rng.random((k, n), np.float32)
         limits[f"{name}_g_per_s"] = m * k * n / median_s(repeats, partial(np.matmul, a, b)) / 1e9
     limits |= {"multiply_adds_g_per_s": 0.0, "operations_g_per_s": 0.0}
-    totals = np.zeros(pool.threads, np.float32)
-    for run, (lanes, multiply_adds, additions) in zip(arithmetic, CHAINS, strict=True):
-        vectors = TASKS * CHAINED * lanes / median_s(repeats, partial(pool.run, run, totals)) / 1e9
+    for k, (_, multiply_adds, additions) in enumerate(CHAINS):
+        vectors = in_chains(pool, k, repeats)
         for name, chains in {"multiply_adds": multiply_adds, "operations": multiply_adds + additions}.items():
             limits[f"{name}_g_per_s"] = max(limits[f"{name}_g_per_s"], chains * vectors)
     x, y = rng.random((2, 2048), np.float32) + np.float32(1.0)

@@ -57,12 +57,17 @@ def told(row: Row | None) -> str:
 
 def multiply_adds(pool: Pool, repeats: int) -> float:
     """Billions of float32 multiply-adds a second: the most of the widths of vector that processors have."""
-    totals, found = np.zeros(pool.threads, np.float32), 0.0
-    for run, (lanes, chains, additions) in zip(arithmetic, CHAINS, strict=True):
-        if not additions:
-            spent = median_s(repeats, partial(pool.run, run, totals))
-            found = max(found, TASKS * CHAINED * lanes * chains / spent / 1e9)
-    return found
+    return max(
+        chains * in_chains(pool, k, repeats)
+        for k, (_, chains, additions) in enumerate(CHAINS)
+        if not additions
+    )
+
+
+def in_chains(pool: Pool, k: int, repeats: int) -> float:
+    """Billions of float32 operations a second in each of the chains of kernel ``arithmetic[k]``."""
+    totals = np.zeros(pool.threads, np.float32)
+    return TASKS * CHAINED * CHAINS[k][0] / median_s(repeats, partial(pool.run, arithmetic[k], totals)) / 1e9
 
 
 def reads(pool: Pool, megabytes: int, repeats: int) -> float:
