@@ -1,7 +1,8 @@
 """Image <-> bytes, and every limit on what may cross the wire, in one place.
 
-Limits are checked on headers *before* anything is inflated: a 109 kB PNG can claim 2.7 GB of pixels, and
-a zstandard frame that declares its size ignores ``max_output_size``.
+Limits are checked on headers *before* anything is inflated: a 109 kB PNG can claim 2.7 GB of pixels, OpenCV
+makes room for as many bytes as a PNG's chunk says it has (one flipped bit: 4 GB, 5 s), and a zstandard frame
+that declares its size ignores ``max_output_size``.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import struct
 
 MAX_MESSAGE_BYTES = 8 * 2**20
 MAX_IMAGE_SIDE = 4096
+MAX_PNG_CHUNKS = 10_000  # of a message's 8 MB; encoders write 8 kB or more into one
 MAX_ID_CHARS = 64
 MAX_FUTURE_NS = 250_000_000  # a capture may not lie further ahead of the edge's clock than this
 MAX_PAST_NS = 3600 * 10**9  # nor further behind: an hour-old frame is a broken clock, not a slow link
@@ -67,8 +69,8 @@ def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> 
 def check(payload: bytes, codec: str, width: int, height: int) -> None:
     """Refuse, by headers alone, what must not be decoded. Costs microseconds.
 
-    Raises PayloadError: ``too_large``, ``unknown_codec``, ``bad_payload`` (no such format), or
-    ``size_mismatch`` (the image is not width x height as announced).
+    Raises PayloadError: ``too_large``, ``unknown_codec``, ``bad_payload`` (no such format, or a png that ends
+    early), or ``size_mismatch`` (the image is not width x height as announced).
     """
     if len(payload) > MAX_MESSAGE_BYTES:
         raise PayloadError("too_large", f"payload of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
@@ -89,7 +91,7 @@ def check(payload: bytes, codec: str, width: int, height: int) -> None:
     else:
         raise PayloadError("unknown_codec", f"codec {codec!r} is not one of {', '.join(CODECS)}")
     if found is None:
-        raise PayloadError("bad_payload", f"no {codec} header found in {len(payload)} bytes")
+        raise PayloadError("bad_payload", f"{len(payload)} bytes without the headers of a {codec}")
     if found != (width, height):
         raise PayloadError("size_mismatch", f"image is {found[0]} x {found[1]}, announced {width} x {height}")
 
@@ -123,10 +125,20 @@ def decode(payload: bytes, codec: str, width: int, height: int) -> NDArray[np.ui
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:
+    """Size in the header; None unless every chunk up to the last one lies within the data."""
     if len(data) < 33 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
         return None
-    width, height = struct.unpack(">II", data[16:24])
-    return int(width), int(height)
+    at, width, height = 8, *struct.unpack(">II", data[16:24])
+    for _ in range(MAX_PNG_CHUNKS):
+        if at + 12 > len(data):
+            return None
+        (length,) = struct.unpack_from(">I", data, at)
+        at += 12 + length
+        if at > len(data):
+            return None
+        if data[at - length - 8 : at - length - 4] == b"IEND":
+            return int(width), int(height)
+    return None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
