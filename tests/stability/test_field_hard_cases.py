@@ -37,6 +37,10 @@ CASES = {
     "nerfacto": Case(*with_networks.TINY["nerfacto"], with_networks.healthy),
 }
 every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+# Of what takes a minute, one is for every day (and splat's own is); the others are for CI.
+long = pytest.mark.parametrize(
+    "case", [pytest.param(c, id=k, marks=[pytest.mark.slow] * (k != "ngp")) for k, c in CASES.items()]
+)
 
 
 @every
@@ -113,7 +117,7 @@ def test_views_that_contradict_each_other(case: Case) -> None:
     assert mean_psnr(field, VIEWS) > 16.0
 
 
-@every
+@long
 def test_a_thousand_updates_do_not_drift_or_grow(case: Case) -> None:
     """A moving ball, a new selection of views each time, warm starts only."""
     rng = np.random.default_rng(1)

@@ -58,9 +58,8 @@ FIELDS: list[tuple[Any, Any]] = [
     (VoxelField, VOXEL),
     (NerfactoField, NERFACTO),
 ]
-every = pytest.mark.parametrize(
-    ("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "splat", "voxel", "nerfacto"]
-)
+NAMES = ["ngp", "tensorf", "splat", "voxel", "nerfacto"]
+every = pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=NAMES)
 
 STEPS, WARM, AFTER = 4, 40, 50  # of an update; updates before and after the poison
 WITHIN_DB = 0.5
@@ -118,6 +117,18 @@ PICTURES: list[Poison] = [_noise, _black, _inverted, _another_scene]
 POSES: list[Poison] = [_a_metre_off, _turned, _in_millimetres]
 
 
+def each_with(poisons: list[Poison], soon: list[Poison]) -> pytest.MarkDecorator:
+    """Every field with every poison. Networks take ten times as long as the others, and share what refuses
+    views: with a poison that is not in ``soon``, theirs are slow tests."""
+    cases = []
+    for name, (kind, settings) in zip(NAMES, FIELDS):
+        for poison in poisons:
+            slow = kind not in (SplatField, VoxelField) and poison not in soon
+            marks = [pytest.mark.slow] if slow else []
+            cases.append(pytest.param(kind, settings, poison, id=f"{name}-{poison.__name__}", marks=marks))
+    return pytest.mark.parametrize(("kind", "settings", "poison"), cases)
+
+
 class Deployment:
     """A field and cameras that go on sending: every update has new frames, equal where nothing changed."""
 
@@ -165,9 +176,8 @@ def _finite(field: Any) -> None:
     assert all(np.isfinite(a).all() for a in field.state().values() if a.dtype.kind == "f")
 
 
-@pytest.mark.parametrize("updates", [1, 10])
-@pytest.mark.parametrize("poison", PICTURES + POSES)
-@every
+@pytest.mark.parametrize("updates", [1, pytest.param(10, marks=pytest.mark.slow)])
+@each_with(PICTURES + POSES, soon=[_noise, _a_metre_off])
 def test_a_poisoned_view_is_survived(kind: Any, settings: Any, poison: Poison, updates: int) -> None:
     deployment = _deployment(kind, settings)
     deployment.update(updates, poison)
@@ -177,8 +187,7 @@ def test_a_poisoned_view_is_survived(kind: Any, settings: Any, poison: Poison, u
     assert expected > 22.0 and deployment.score() > expected - WITHIN_DB
 
 
-@pytest.mark.parametrize("poison", PICTURES + POSES)
-@every
+@each_with(PICTURES + POSES, soon=[_in_millimetres])
 def test_poison_in_the_very_first_update_is_survived(kind: Any, settings: Any, poison: Poison) -> None:
     """Before anything is known, and where the scene's box is found."""
     deployment = Deployment(kind(settings))
@@ -187,8 +196,7 @@ def test_poison_in_the_very_first_update_is_survived(kind: Any, settings: Any, p
     assert deployment.score() > _unharmed(kind, settings, 1 + AFTER, warm=False) - WITHIN_DB
 
 
-@pytest.mark.parametrize("poison", [_noise, _black, _inverted])
-@every
+@each_with([_noise, _black, _inverted], soon=[_inverted])
 def test_wrong_pictures_are_refused_while_they_last(kind: Any, settings: Any, poison: Poison) -> None:
     """What is shown meanwhile is not spoilt either; and without refusals it would be."""
     without = replace(settings, refuse_beyond=0.0)

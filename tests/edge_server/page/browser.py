@@ -72,7 +72,7 @@ _FIND_INPUT = """
   if (!input) return null;
   input.scrollIntoView({block: 'center'});
   const r = input.getBoundingClientRect();
-  return [r.x + r.width / 2, r.y + r.height / 2, input.value];
+  return [r.x + r.width / 2, r.y + r.height / 2, input.value, input === document.activeElement];
 }
 """
 
@@ -236,7 +236,8 @@ class Browser:
         """Open the dropdown with this label and click an option."""
         self.click(*self._input(label)[:2])
         query = f"[...document.querySelectorAll('[role=option]')].find(e => e.innerText.trim() == {option!r})"
-        self.wait_for(lambda: self.evaluate(f"!!{query}"), f"the option {option!r}")
+        shown = f"!!({query})?.checkVisibility()"  # it may stay in the page while the list is closed
+        self.wait_for(lambda: self.evaluate(shown), f"the option {option!r}")
         middle = (f"(() => {{const r = {query}.getBoundingClientRect();"
                   "return [r.x + r.width / 2, r.y + r.height / 2]})()")  # fmt: skip
         box: list[float] = []
@@ -250,12 +251,20 @@ class Browser:
         time.sleep(0.3)
         self.wait_for(rests, f"the rest of the list with {option!r}")
         self.click(*box)
+        # It fades over the inputs below, and would take their clicks.
+        self.wait_for(lambda: not self.evaluate(shown), f"the end of the list with {option!r}")
 
     def type_number(self, label: str, text: str) -> None:
         """Replace what the input holds, and leave it."""
-        x, y, old = self._input(label)
-        self.click(x, y)
-        self.evaluate("document.activeElement.select && document.activeElement.select()")
+
+        def focused() -> bool:
+            """What is above it may grow before the click arrives, which then meets something else."""
+            self.click(*self._input(label)[:2])
+            return self._input(label)[3]
+
+        self.wait_for(focused, f"the focus of {label!r}")
+        old = self.input_value(label)
+        self.evaluate("document.activeElement.select()")
         for _ in range(len(old) + 1):
             self._key("Backspace", 8)
         self.call("Input.insertText", text=text)

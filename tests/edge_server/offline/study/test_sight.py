@@ -32,12 +32,11 @@ def test_the_area_is_the_share_of_pairs_in_the_right_order():
 def moments():
     setting = dataclasses.replace(workshop(1.0), parts=("age", "pose"))
     with Crew(Folders()) as crew:
-        return setting, [m for e in crew.draw(setting, seeds(3, "test", 6)[2:]) for m in e]
+        return Sight(setting), [m for e in crew.draw(setting, seeds(3, "test", 6)[2:]) for m in e]
 
 
 def test_cameras_of_one_side_see_it_and_no_others(moments):
-    setting, drawn = moments
-    sight, sides = Sight(setting), set()
+    (sight, drawn), sides = moments, set()
     for moment in drawn:
         shares = sight.shares(moment)
         seeing = {c for c, share in shares.items() if share > SEES}
@@ -51,8 +50,7 @@ def test_cameras_of_one_side_see_it_and_no_others(moments):
 
 
 def test_an_embedding_that_tells_is_told_from_one_that_does_not(moments):
-    setting, drawn = moments
-    sight, rng = Sight(setting), np.random.default_rng(0)
+    (sight, drawn), rng = moments, np.random.default_rng(0)
 
     def seen_as(signal: float) -> list:
         found = []
