@@ -32,9 +32,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # What computes, in virtual time or none: whoever runs beside it changes nothing but how long it takes. All
 # else meets clocks, ports or whole deployments and has the machine to itself.
 _SIDE_BY_SIDE = (
-    "camera_node/calibrate", "camera_node/world", "edge_server/embed", "edge_server/export",
-    "edge_server/fidelity", "edge_server/fields", "edge_server/offline", "edge_server/report",
-    "edge_server/scheduler", "edge_server/surface", "edge_server/treatments", "stability",
+    "camera_node/calibrate", "camera_node/pose/test_path.py", "camera_node/world", "edge_server/embed",
+    "edge_server/export", "edge_server/fidelity", "edge_server/fields", "edge_server/offline",
+    "edge_server/report", "edge_server/scheduler", "edge_server/surface", "edge_server/treatments",
+    "stability",
     *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
     *(f"channel_emu/test_{name}.py" for name in (
         "accuracy", "chain", "chain_statistics", "closed_forms", "config", "faults", "fit", "link", "server",

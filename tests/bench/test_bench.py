@@ -113,6 +113,7 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
     assert json.loads(path.read_text())["fidelity"] == before
 
 
+@pytest.mark.slow
 def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch):
     """And of another effort; everything else is taken for known."""
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)

@@ -56,6 +56,7 @@ def test_nine_small_cameras_cost_little(tmp_path):
     assert share < 0.15
 
 
+@pytest.mark.slow
 def test_one_large_camera_stays_small(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     world = write_scenario(

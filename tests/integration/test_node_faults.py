@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
 import yaml
 
 from freshfield import ledger
@@ -59,6 +60,7 @@ def test_a_peer_that_comes_late_and_dies_again_and_again(tmp_path):
     assert sorted(late_ms)[len(late_ms) // 2] < 100 and max(late_ms) < 1000
 
 
+@pytest.mark.slow
 def test_endless_reconnecting_does_not_grow(tmp_path):
     async def scene():
         peer = await Peer().start()

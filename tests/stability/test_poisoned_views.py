@@ -119,11 +119,11 @@ POSES: list[Poison] = [_a_metre_off, _turned, _in_millimetres]
 
 def each_with(poisons: list[Poison], soon: list[Poison]) -> pytest.MarkDecorator:
     """Every field with every poison. Networks take ten times as long as the others, and share what refuses
-    views: with a poison that is not in ``soon``, theirs are slow tests."""
+    views: theirs are slow tests but for ngp's with a poison in ``soon``."""
     cases = []
     for name, (kind, settings) in zip(NAMES, FIELDS):
         for poison in poisons:
-            slow = kind not in (SplatField, VoxelField) and poison not in soon
+            slow = kind not in (SplatField, VoxelField, NgpField) or (kind is NgpField and poison not in soon)
             marks = [pytest.mark.slow] if slow else []
             cases.append(pytest.param(kind, settings, poison, id=f"{name}-{poison.__name__}", marks=marks))
     return pytest.mark.parametrize(("kind", "settings", "poison"), cases)

@@ -92,7 +92,11 @@ def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
     assert found["chamfer_mm"] < 3.0 and found["complete"] > 0.7
 
 
-@pytest.mark.parametrize("name", field_names())
+# nerfacto and tensorf are written as ngp is, and take the longest.
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in ("nerfacto", "tensorf"))) for n in field_names()],
+)
 def test_every_representation_comes_back_as_it_was(tmp_path, name):
     field = saved(tmp_path, name)
     source = open_source(tmp_path)

@@ -35,6 +35,7 @@ def moments():
         return Sight(setting), [m for e in crew.draw(setting, seeds(3, "test", 6)[2:]) for m in e]
 
 
+@pytest.mark.slow
 def test_cameras_of_one_side_see_it_and_no_others(moments):
     (sight, drawn), sides = moments, set()
     for moment in drawn:
@@ -49,6 +50,7 @@ def test_cameras_of_one_side_see_it_and_no_others(moments):
     assert len(sides) > 1  # it is on another side in another episode
 
 
+@pytest.mark.slow
 def test_an_embedding_that_tells_is_told_from_one_that_does_not(moments):
     (sight, drawn), rng = moments, np.random.default_rng(0)
 
