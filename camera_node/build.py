@@ -12,7 +12,7 @@ from camera_node.sources import open_sources
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
-    from camera_node.world.effects import Effects
+    from camera_node.synthetic.effects import Effects
 
 
 def build_cameras(
@@ -37,7 +37,7 @@ def load(scenario: Scenario, config: SourceConfig, camera: str) -> Effects | Non
     """The effects of one camera, or None, for which nothing at all is imported. Raises ScenarioError."""
     if not config.effects:
         return None
-    from camera_node.world.effects import EffectError, load_effects
+    from camera_node.synthetic.effects import EffectError, load_effects
 
     try:
         effects = load_effects(

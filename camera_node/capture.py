@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
+from camera_node.capture_schedule import Pace, Paced, Ticks
 from camera_node.clocks import Drifting, NodeClock
 from camera_node.config import SourceConfig
-from camera_node.pace import Pace, Paced, Ticks
 from camera_node.sources import Source
 from freshfield import payload
 from freshfield.clock import Clock

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camera_node import lab
-from camera_node.calibrate import CalibrationError
-from camera_node.calibrate import command as calibrate
+from camera_node.robot import arm_cli
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import command as calibrate
 from freshfield import scenario, transport
 
 if TYPE_CHECKING:
@@ -60,15 +60,15 @@ def main(arguments: list[str] | None = None) -> int:
     )
     commands.add_parser("sources", help="list kinds of sources and the keys they take")
     commands.add_parser("effects", help="list effects and their parameters")
-    lab.add_commands(commands)
+    arm_cli.add_commands(commands)
     args = parser.parse_args(arguments)
     try:
         if args.command == "run":
             return _run(args)
         if args.command == "prepare":
             return _prepare(args)
-        if args.command in lab.COMMANDS:
-            return lab.run(args)
+        if args.command in arm_cli.COMMANDS:
+            return arm_cli.run(args)
         if args.command == "calibrate":
             return calibrate.run(args)
         from camera_node import listing

@@ -96,7 +96,7 @@ class ArmConfig:
     joint states a second, 10 to 500. pairing: nearest or interpolated. max_gap_ms: a frame farther than this
     from a joint state is not sent. path: the tour of ``camera-node drive-arm``. simulated: deploy/up.py
     starts ``camera-node simulate-arm`` at ``host`` (an address of this machine, 127.0.0.2 and up) and drives
-    it. teleop: keys of ``camera_node.teleop.settings.TeleopConfig``, for ``camera-node teleop``.
+    it. teleop: keys of ``camera_node.robot.teleop.settings.TeleopConfig``, for ``camera-node teleop``.
     """
 
     host: str

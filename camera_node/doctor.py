@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.config import ArmConfig, LiveConfig, RecordedConfig, SourceConfig, find_data, source_config
+from camera_node.sources import source_module
 from camera_node.sources.playback import rate
 from freshfield import transport
 from freshfield.clock import OffsetEstimator, WallClock
@@ -218,7 +219,7 @@ def _scenario(name: str, opened: list[tuple[Scenario, SourceConfig]]) -> str:
 
 
 def _calibration(scenario: Scenario, config: LiveConfig) -> str:
-    from camera_node.sources.live import calibrations
+    from camera_node.sources.devices.device import calibrations
 
     known = calibrations(scenario, config)
     missing = [camera for camera in scenario.cameras if camera not in known]
@@ -229,9 +230,9 @@ def _calibration(scenario: Scenario, config: LiveConfig) -> str:
 
 def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
     """Open it, take frames until at least five should have come, close it."""
-    from camera_node.sources.live import DEFAULT_FPS, calibrations
+    from camera_node.sources.devices.device import DEFAULT_FPS, calibrations
 
-    module: Any = importlib.import_module(f"camera_node.sources.{config.kind}")
+    module: Any = importlib.import_module(source_module(config.kind))
     clock = WallClock()
     asked_hz = config.fps or DEFAULT_FPS
     listen_s = min(max(_LISTEN_S, _JUDGED_FRAMES / asked_hz), _LISTEN_AT_MOST_S)
@@ -269,7 +270,7 @@ def _camera(scenario: Scenario, camera: str, config: LiveConfig) -> str:
 def _hand_eye(scenario: Scenario, arm: ArmConfig) -> str:
     import numpy as np
 
-    from camera_node.pose.mounted import arm_model, hand_eyes
+    from camera_node.robot.arm.camera_poses import arm_model, hand_eyes
 
     model = arm_model(scenario, arm)
     mounts = hand_eyes(scenario, arm, arm.cameras)
@@ -289,7 +290,7 @@ def _hand_eye(scenario: Scenario, arm: ArmConfig) -> str:
 
 
 def _arm(scenario: Scenario, arm: ArmConfig) -> str:
-    from camera_node.pose.arm import ArmStream
+    from camera_node.robot.arm.joint_states import ArmStream
 
     stream = ArmStream(arm.host, WallClock(), arm.frequency_hz)
     stream.start()
@@ -311,9 +312,9 @@ def _arm(scenario: Scenario, arm: ArmConfig) -> str:
 
 
 def _path(scenario: Scenario, arm: ArmConfig) -> str:
-    from camera_node.pose.mount import EYE_TO_HAND
-    from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
-    from camera_node.pose.path import tour, viewpoints
+    from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
+    from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
+    from camera_node.robot.arm.viewpoint_tour import tour, viewpoints
 
     assert arm.path is not None
     carried = [m for m in hand_eyes(scenario, arm, arm.cameras).values() if m.setup != EYE_TO_HAND]

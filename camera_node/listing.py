@@ -27,7 +27,7 @@ def sources() -> str:
 
 def effects() -> str:
     """Every effect with its parameters and their defaults."""
-    from camera_node.world.effects import NAMES
+    from camera_node.synthetic.effects import NAMES
 
     lines = ["source: {effects: {NAME: {parameters}}}; held-out cameras are spared unless in_truth: true"]
     for name in NAMES:
@@ -38,7 +38,7 @@ def effects() -> str:
 
 
 def _effect_class(name: str) -> Any:
-    module = importlib.import_module(f"camera_node.world.effects.{name}")
+    module = importlib.import_module(f"camera_node.synthetic.effects.{name}")
     own = [c for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module.__name__]
     return next(c for c in own if hasattr(c, "kind"))
 

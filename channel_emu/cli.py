@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from channel_emu import spell
-from channel_emu.config import SCOPES, ChannelConfig, channel_from_mapping
-from channel_emu.link import DISCIPLINES
-from channel_emu.observed import ROW_DISCIPLINES
-from channel_emu.presets import PRESETS
-from channel_emu.server import ORDERS
+from channel_emu import cli_syntax
+from channel_emu.estimate.recording import ROW_DISCIPLINES
+from channel_emu.model.config import SCOPES, ChannelConfig, channel_from_mapping
+from channel_emu.model.link import DISCIPLINES
+from channel_emu.model.presets import PRESETS
+from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
 
 DESCRIPTION = """\
@@ -85,10 +85,10 @@ def _add_run(commands: Any) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from channel_emu import trace
-    from channel_emu.lane import HardLimit
-    from channel_emu.priority import raise_priority
-    from channel_emu.proxy import EmulatorFailed, Proxy, ProxyOptions
+    from channel_emu.live import trace
+    from channel_emu.live.camera_lane import HardLimit
+    from channel_emu.live.frame_proxy import EmulatorFailed, Proxy, ProxyOptions
+    from channel_emu.live.priority import raise_priority
 
     plan = scenario.load(args.scenario, args.seed)
     config = channel_from_mapping(plan.channel, f"{plan.path}: channel")
@@ -160,7 +160,7 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from channel_emu.simulate import OUTCOMES, simulate
+    from channel_emu.virtual.simulate import OUTCOMES, simulate
 
     result = simulate(
         _config_of(args), args.cameras, args.seconds, args.seed, engine=args.engine,
@@ -190,14 +190,14 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _config_of(args: argparse.Namespace) -> ChannelConfig:
     if args.service and args.service_by_state:
-        raise spell.SpellingError("--service and --service-by-state exclude each other")
+        raise cli_syntax.SpellingError("--service and --service-by-state exclude each other")
     section: dict[str, Any] = {"preset": args.preset}
     if args.scenario:
         section = dict(scenario.load(args.scenario).channel)
     given = {
-        "arrivals": spell.arrivals(args.arrivals) if args.arrivals else None,
-        "service": spell.service(args.service) if args.service else None,
-        "chain": spell.chain(args.chain) if args.chain else None,
+        "arrivals": cli_syntax.arrivals(args.arrivals) if args.arrivals else None,
+        "service": cli_syntax.service(args.service) if args.service else None,
+        "chain": cli_syntax.chain(args.chain) if args.chain else None,
         "service_state": args.service_state,
         "discipline": args.discipline,
     }
@@ -208,7 +208,7 @@ def _config_of(args: argparse.Namespace) -> ChannelConfig:
         base = {"process": base} if isinstance(base, str) else base
         given["arrivals"] = {**(given["arrivals"] or base), "spread": True}
     if args.service_by_state:
-        given["service"] = spell.service_by_state(args.service_by_state)
+        given["service"] = cli_syntax.service_by_state(args.service_by_state)
     return channel_from_mapping({**section, **{k: v for k, v in given.items() if v is not None}}, "channel")
 
 
@@ -224,7 +224,7 @@ def _add_replay(commands: Any) -> None:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from channel_emu.trace import compare, read
+    from channel_emu.live.trace import compare, read
 
     result = compare(read(args.trace))
     if args.json:
@@ -260,10 +260,10 @@ def _add_proxy(commands: Any) -> None:
 
 
 def _proxy(args: argparse.Namespace) -> int:
-    from channel_emu import trace
-    from channel_emu.generic import GenericOptions, GenericProxy, Report, show
-    from channel_emu.lane import HardLimit
-    from channel_emu.priority import raise_priority
+    from channel_emu.live import trace
+    from channel_emu.live.camera_lane import HardLimit
+    from channel_emu.live.generic_proxy import GenericOptions, GenericProxy, Report, show
+    from channel_emu.live.priority import raise_priority
 
     config = _config_of(args)
     if args.hard_limit_ms is not None:
@@ -313,8 +313,8 @@ def _add_fit(commands: Any) -> None:
 
 
 def _fit(args: argparse.Namespace) -> int:
-    from channel_emu import fitshow
-    from channel_emu.fit import fit
+    from channel_emu.estimate import report as fitshow
+    from channel_emu.estimate.fit import fit
 
     result = fit(args.trace, args.states, discipline=args.discipline, scope=args.scope,
                  use_states=args.use_states)  # fmt: skip
@@ -351,19 +351,19 @@ def _add_bench(commands: Any) -> None:
 
 def _bench(args: argparse.Namespace) -> int:
     if args.cost:
-        from channel_emu.bench_virtual import bench_cost, show_cost
+        from channel_emu.virtual.benchmark import bench_cost, show_cost
 
         rows = bench_cost()
         print(json.dumps(rows) if args.json else show_cost(rows))
         return 0
     if args.simulate:
-        from channel_emu.bench_virtual import LOOPS, bench_simulate, show_simulate
+        from channel_emu.virtual.benchmark import LOOPS, bench_simulate, show_simulate
 
         seconds = 2000.0 if args.seconds is None else args.seconds
         found = [bench_simulate(args.cameras, seconds, preset=preset) for preset in LOOPS]
         print(json.dumps(found) if args.json else "\n".join(show_simulate(each) for each in found))
         return 0
-    from channel_emu.bench import bench, show
+    from channel_emu.live.benchmark import bench, show
 
     seconds = 15.0 if args.seconds is None else args.seconds
     result = bench(args.cameras, args.rate, args.bytes, seconds, args.load, not args.no_priority)
@@ -385,7 +385,7 @@ def _add_accuracy(commands: Any) -> None:
 
 
 def _accuracy(args: argparse.Namespace) -> int:
-    from channel_emu.accuracy import measure, show, write
+    from channel_emu.virtual.accuracy_cost import measure, show, write
 
     if args.out:  # before measuring: it takes minutes
         args.out.mkdir(parents=True, exist_ok=True)

@@ -75,19 +75,26 @@ _OFFLINE = {
     "train-perceptual": "fit the stand-in for LPIPS to real LPIPS on our own distorted renderings",
     "fetch-lpips": "fetch LPIPS weights with the public package and convert them to our weights folder",
 }
-# Of a command whose module is not called as it is.
+# command -> its module
 _PLACES = {
-    "fetch-lpips": "fetch_lpips",
-    "train-detector": "detector.command",
-    "train-perceptual": "detector.perceptual",
-    "train-scheduler": "train_scheduler",
+    "bench": "experiments.bench.command",
+    "explain": "scheduler.learned.explain_command",
+    "export": "export.command",
+    "fetch-lpips": "fidelity.fetch_lpips",
+    "fit": "experiments.fitting.command",
+    "frontier": "experiments.frontier.command",
+    "simulate": "experiments.virtual.simulate",
+    "study": "experiments.studies",
+    "train-detector": "experiments.training.detector.command",
+    "train-perceptual": "experiments.training.detector.perceptual",
+    "train-scheduler": "experiments.training.scheduler.command",
 }
 
 
 def _offline(name: str, words: list[str]) -> int:
     import importlib
 
-    return importlib.import_module(f"edge_server.offline.{_PLACES.get(name, name)}").main(words)
+    return importlib.import_module(f"edge_server.{_PLACES[name]}").main(words)
 
 
 def _add_run(commands: argparse._SubParsersAction) -> None:
@@ -133,8 +140,8 @@ def _run(args: argparse.Namespace) -> int:
 
     from edge_server.config import PolicyConfig, read_config
     from edge_server.fidelity.lpips_weights import weights_folder
+    from edge_server.live.server import EdgeServer, Options
     from edge_server.scheduler import read_policy
-    from edge_server.server import EdgeServer, Options
 
     scenario = load(args.scenario, args.seed)
     config = read_config(scenario)

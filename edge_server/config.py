@@ -58,7 +58,7 @@ class ComputeConfig:
 
 @dataclass(frozen=True)
 class KeyframesConfig:
-    """Earlier viewpoints of cameras that move, for ``edge_server.keyframes``. most: of each camera. apart_m,
+    """Earlier viewpoints of cameras that move, for ``live.keyframes``. most: of each camera. apart_m,
     apart_deg: a viewpoint is another one if it lies so far from all that are kept, or is turned so far."""
 
     most: int = 32

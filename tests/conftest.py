@@ -32,15 +32,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # What computes, in virtual time or none: whoever runs beside it changes nothing but how long it takes. All
 # else meets clocks, ports or whole deployments and has the machine to itself.
 _SIDE_BY_SIDE = (
-    "camera_node/calibrate", "camera_node/pose/test_path.py", "camera_node/world", "edge_server/embed",
-    "edge_server/export", "edge_server/fidelity", "edge_server/fields", "edge_server/offline",
+    "camera_node/robot/calibration", "camera_node/robot/arm/test_viewpoint_tour.py", "camera_node/synthetic",
+    "channel_emu/estimate", "channel_emu/model", "channel_emu/virtual", "edge_server/embed",
+    "edge_server/experiments", "edge_server/export", "edge_server/fidelity", "edge_server/fields",
     "edge_server/report", "edge_server/scheduler", "edge_server/surface", "edge_server/treatments",
     "stability",
     *(f"freshfield/test_{name}.py" for name in ("frame", "geometry", "payload", "scenario")),
-    *(f"channel_emu/test_{name}.py" for name in (
-        "accuracy", "chain", "chain_statistics", "closed_forms", "config", "faults", "fit", "link", "server",
-        "simulate", "traffic", "uniforms",
-    )),
 )  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""Camera poses: fixed, recorded, or paired with a stream of pose samples."""

@@ -17,7 +17,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.rig import Paired, PoseGapError, find
+from camera_node.pose.providers import Paired, PoseGapError, find
 from freshfield.geometry import Pose, se3_inverse, so3_exp, so3_log
 
 T = TypeVar("T")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import Scenario
 
 if TYPE_CHECKING:
-    from camera_node.world.effects import Effects
+    from camera_node.synthetic.effects import Effects
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,24 @@ class Source(Protocol):
         ...
 
 
+# kind of the scenario's source -> the module that opens it
+_MODULES = {
+    "world": "camera_node.synthetic.source",
+    "mcap": "camera_node.sources.mcap",
+    **{kind: f"camera_node.sources.devices.{kind}" for kind in ("oak", "realsense")},
+    "camera": "camera_node.sources.devices.opencv",
+    **{
+        kind: f"camera_node.sources.datasets.{kind}_source"
+        for kind in ("transforms", "video", "dynerf", "zju", "eyeful", "colmap")
+    },
+}
+
+
+def source_module(kind: str) -> str:
+    """Name of the module that opens sources of ``kind``."""
+    return _MODULES[kind]
+
+
 def open_sources(
     scenario: Scenario,
     config: SourceConfig,
@@ -73,14 +91,14 @@ def open_sources(
 ) -> dict[str, Source]:
     """The sources of ``cameras``, sharing what can be shared, with each camera's effects. Only the file of
     the kind in use is imported. Raises ScenarioError or DatasetError."""
-    module = importlib.import_module(f"camera_node.sources.{config.kind}")
+    module: Any = importlib.import_module(source_module(config.kind))
     effects = effects or {}
     if config.kind == "world":
         return module.open_sources(scenario, config, cameras, data, effects)
     sources: dict[str, Source] = module.open_sources(scenario, config, cameras, data)
     for camera, made in effects.items():
         if made is not None and (made.image or made.pose):
-            from camera_node.sources.affected import AffectedSource
+            from camera_node.sources.with_effects import AffectedSource
 
             sources[camera] = AffectedSource(sources[camera], made, config.codec)
     return sources

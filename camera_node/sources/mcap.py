@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from camera_node.capture_schedule import Once, Pace, Round
 from camera_node.config import McapConfig, SourceConfig, find_data
-from camera_node.pace import Once, Pace, Round
 from camera_node.sources import Shot, Source
-from camera_node.sources.assign import assigned
-from camera_node.sources.records import DatasetError
+from camera_node.sources.assignment import assigned
+from camera_node.sources.datasets.records import DatasetError
 from freshfield.frame import pose_and_lens
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError

@@ -35,7 +35,7 @@ MAX_ELEMENTS = 2**26
 MAX_SIDE = 2048
 # The size that these detectors are trained at where a file does not say another.
 USUAL_SIDE = 640
-# Written by edge_server.offline.detector.export: mean (C,) and axes (C, K) of the pooled features.
+# Written by experiments.training.detector.export: mean (C,) and axes (C, K) of the pooled features.
 PROJECTION_KEY = "freshfield.projection"
 
 _ENLARGE = ("Resize", "Upsample")

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.buffer import Buffered
-from edge_server.views import Decoder
+from edge_server.live.buffer import Buffered
+from edge_server.live.view_decoder import Decoder
 
 # Frames whose embeddings are kept: several rounds of the largest rigs. A kilobyte each at most.
 CAPACITY = 1024

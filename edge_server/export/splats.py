@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from edge_server.export import ExportError
 from edge_server.export.ply import write_table
-from edge_server.fields.kernels.splat_project import (
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.splat.kernels.project import (
     BASE,
     COLOR,
     OPACITY,
@@ -24,8 +25,7 @@ from edge_server.fields.kernels.splat_project import (
     SCALE_LOW,
     Gaussians,
 )
-from edge_server.fields.scene_box import SceneBox
-from edge_server.fields.splat_planar import directed
+from edge_server.fields.splat.planar import directed
 
 Y0 = 0.28209479177387814
 # Signs of harmonics 1 to 8: Kerbl et al. negate those of odd order.

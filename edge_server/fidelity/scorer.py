@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fidelity.images import BLACK, Colour, Image, ImageError, same_size, to_unit
-from edge_server.fidelity.moving import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags, moving_mask
+from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import TAPS, ssim
 

@@ -11,11 +11,11 @@ from edge_server.fields.option_types import checked
 
 # name -> "module:function"; the function takes (options, seed) and raises ValueError for a wrong option
 _FIELDS: dict[str, str] = {
-    "ngp": "edge_server.fields.ngp:make",
-    "nerfacto": "edge_server.fields.nerfacto:make",
-    "tensorf": "edge_server.fields.tensorf:make",
-    "splat": "edge_server.fields.splat:make",
-    "voxel": "edge_server.fields.voxel:make",
+    "ngp": "edge_server.fields.ngp.field:make",
+    "nerfacto": "edge_server.fields.nerfacto.field:make",
+    "tensorf": "edge_server.fields.tensorf.field:make",
+    "splat": "edge_server.fields.splat.field:make",
+    "voxel": "edge_server.fields.voxel.field:make",
 }
 
 
@@ -28,7 +28,7 @@ def option_help(name: str) -> dict[str, str]:
     """What each option of a representation means. ValueError: there is no such representation."""
     if name not in _FIELDS:
         raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
-    found: dict[str, str] = import_module(f"edge_server.fields.{name}_settings").help_text()
+    found: dict[str, str] = import_module(f"edge_server.fields.{name}.settings").help_text()
     return found
 
 
@@ -36,7 +36,7 @@ def efforts_of(name: str) -> Mapping[str, Mapping[str, Any]]:
     """The presets of a representation by name. ValueError: there is no such representation."""
     if name not in _FIELDS:
         raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
-    found: Mapping[str, Mapping[str, Any]] = import_module(f"edge_server.fields.{name}_settings").EFFORTS
+    found: Mapping[str, Mapping[str, Any]] = import_module(f"edge_server.fields.{name}.settings").EFFORTS
     return found
 
 
@@ -51,13 +51,13 @@ def make_field(name: str, options: Mapping[str, Any] | None = None, seed: int = 
 def settings_of(name: str, options: Mapping[str, Any] | None = None) -> Any:
     """What options come to, defaults and effort among them: a dataclass. ValueError as ``make_field``."""
     given = _checked(name, options or {})
-    return import_module(f"edge_server.fields.{name}_settings").make_settings(given)
+    return import_module(f"edge_server.fields.{name}.settings").make_settings(given)
 
 
 def _checked(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     if name not in _FIELDS:
         raise ValueError(f"no field is called {name!r}; there are: {', '.join(_FIELDS)}")
-    settings = getattr(import_module(f"edge_server.fields.{name}_settings"), f"{name.capitalize()}Settings")
+    settings = getattr(import_module(f"edge_server.fields.{name}.settings"), f"{name.capitalize()}Settings")
     given = checked(name, settings, options)
     if not isinstance(given.get("effort", ""), str):
         raise ValueError(f"{name}: effort must be a name, not {given['effort']!r}")

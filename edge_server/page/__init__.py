@@ -16,11 +16,11 @@ from typing import Any
 import rich
 import viser
 
+from edge_server.live.state import EdgeState
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
 from edge_server.page.timelines import History
-from edge_server.state import EdgeState
 
 __all__ = ["Page", "PageError", "start_page"]
 

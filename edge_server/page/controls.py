@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import viser
 
+from edge_server.live.state import EdgeState
 from edge_server.page.markup import note
 from edge_server.scheduler import help_of, make_policy
-from edge_server.state import EdgeState
 
 log = logging.getLogger(__name__)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from edge_server.live.state import CameraView
 from edge_server.page.colours import (
     AGAINST,
     FOR,
@@ -18,7 +19,6 @@ from edge_server.page.colours import (
     css,
     scale_colour,
 )
-from edge_server.state import CameraView
 
 if TYPE_CHECKING:  # loaded only where a policy was learnt
     from edge_server.scheduler.learned.explain import Explanation

@@ -9,12 +9,12 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
+from edge_server.page.decision_explanation import Why
 from edge_server.page.surface import SurfaceLayer
 from edge_server.page.timelines import History, Timelines
-from edge_server.page.why import Why
-from edge_server.state import CameraView, Comparison, EdgeState, Publication
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Rendering
+from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
 from edge_server.page import PageError, start_page
 from edge_server.scheduler import POLICIES, Epoch, Policy, make_policy
-from edge_server.state import CameraView, Comparison, Controls, EdgeState, Publication
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Renderer, Rendering
+from edge_server.live.state import EdgeState
 from edge_server.page.viewpoint import band, visitor_camera
-from edge_server.state import EdgeState
 from freshfield.geometry import Pinhole
 
 log = logging.getLogger(__name__)

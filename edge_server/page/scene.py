@@ -12,9 +12,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from edge_server.live.state import CameraView, EdgeState
 from edge_server.page.colours import HELD_OUT, RGB, age_colour
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint, initial_viewpoint
-from edge_server.state import CameraView, EdgeState
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pose

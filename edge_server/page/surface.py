@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from edge_server.state import EdgeState
+from edge_server.live.state import EdgeState
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class SurfaceLayer:
         import numpy as np
         import trimesh
 
-        from edge_server.fields.kernels.pool import SERVER_NICE, shared_pool
+        from edge_server.fields.common.kernels.thread_pool import SERVER_NICE, shared_pool
         from edge_server.surface import SurfaceError
         from edge_server.surface.reconstruct import MeshSettings, grid_for, maps_of, mesh_of_maps
 

@@ -10,9 +10,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from edge_server.live.state import CameraView, Publication
 from edge_server.page.colours import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
 from edge_server.page.markup import chart_caption
-from edge_server.state import CameraView, Publication
 
 WINDOW_S = 120.0
 LINE_PX = 1.6

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge_server.report.records import Records, Row
+from edge_server.report.run_files import Records, Row
 from edge_server.report.style import (
     BLUE,
     GREEN,

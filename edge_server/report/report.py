@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.report.books import close_books
+from edge_server.report.frame_accounting import close_books
 from edge_server.report.machine import machine, outside_load, versions
-from edge_server.report.records import Records, Row, read_records
+from edge_server.report.run_files import Records, Row, read_records
 from freshfield.files import write_json, write_text
 
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields import Budget, Renderer, View
-from edge_server.fields.kernels.pool import Pool
-from edge_server.fields.scene_box import SceneBox
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.scene_box import SceneBox
 from edge_server.surface.depth import DepthMap
 
 STEPS = 600  # of 8192 rays
@@ -41,8 +41,8 @@ def carved(
 ) -> Renderer:
     """Voxels fitted to ``views`` in ``steps`` steps, the same whatever the number of threads. background:
     the colour (3,) in [0, 1] behind the scene; None: found from the pictures."""
-    from edge_server.fields.voxel import VoxelField
-    from edge_server.fields.voxel_settings import make_settings
+    from edge_server.fields.voxel.field import VoxelField
+    from edge_server.fields.voxel.settings import make_settings
 
     options: dict[str, Any] = {
         "centre_m": box.centre_m, "radius_m": box.radius_m, "near_m": box.near_m, "contracted": False,

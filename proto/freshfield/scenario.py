@@ -7,7 +7,7 @@ The file is YAML::
     seed: 7
     cameras: {count: 13, held_out: [cam00]}     # or ids: [a, b, c]
     source:  {...}     # camera_node.config reads this
-    channel: {...}     # channel_emu.config
+    channel: {...}     # channel_emu.model.config
     edge:    {...}     # edge_server.config
 
 ``read_section`` turns a mapping into a dataclass and refuses, in one line naming file, key and what was

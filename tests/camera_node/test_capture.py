@@ -15,7 +15,7 @@ from freshfield import ledger
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
-from tests.camera_node.photos import photo_scenario, write_photos
+from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 
 POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8, 60)
 

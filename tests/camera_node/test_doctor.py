@@ -13,9 +13,9 @@ from camera_node import doctor
 from camera_node.cli import main
 from freshfield.clock import WallClock
 from freshfield.scenario import load
-from tests.camera_node.pose.simulated import own_address, require_ur_rtde, simulated_arm
-from tests.camera_node.sources.mjpeg import NetworkCamera
-from tests.camera_node.sources.test_live import CALIBRATION
+from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.sources.devices.mjpeg import NetworkCamera
+from tests.camera_node.sources.devices.test_device import CALIBRATION
 
 
 def examined(capsys, *arguments):

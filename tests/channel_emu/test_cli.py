@@ -11,11 +11,11 @@ from pathlib import Path
 import grpc
 import pytest
 
-from channel_emu import spell
+from channel_emu import cli_syntax
 from channel_emu.cli import main
 from freshfield import ledger
 from freshfield.transport import Transport
-from tests.channel_emu.test_trace import record
+from tests.channel_emu.live.test_trace import record
 from tests.integration.peer import Peer
 from tests.ports import free_port
 
@@ -78,7 +78,7 @@ def test_delays_from_a_file(capsys, tmp_path: Path) -> None:
     ("text", "value"), [("30ms", 30), ("3s", 3000), ("250us", 0.25), ("7", 7), ("1.5min", 90_000)]
 )
 def test_spans(text: str, value: float) -> None:
-    assert spell.span_ms(text) == pytest.approx(value)
+    assert cli_syntax.span_ms(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_spans(text: str, value: float) -> None:
     [("1/30ms", 1 / 30), ("1/30", 1 / 30), ("0.5/ms", 0.5), ("33/s", 0.033), ("2/1s", 0.002)],
 )
 def test_rates(text: str, value: float) -> None:
-    assert spell.rate_per_ms(text) == pytest.approx(value)
+    assert cli_syntax.rate_per_ms(text) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_mistakes_get_one_line(capsys, words: list[str], why: str) -> None:
 
 
 def test_replay_says_whether_decisions_agree(capsys, tmp_path: Path) -> None:
-    from channel_emu.config import channel_from_mapping
+    from channel_emu.model.config import channel_from_mapping
 
     path = tmp_path / "t.jsonl"
     record(path, channel_from_mapping({"preset": "ch5"}), frames=50)
@@ -152,7 +152,7 @@ def test_run_as_a_process_ends_cleanly_when_told(scenario: Path, tmp_path: Path)
 
 def test_a_killed_emulator_leaves_readable_books(scenario: Path, tmp_path: Path) -> None:
     """SIGKILL in the middle of traffic: every whole line is there, the account is not closed."""
-    from tests.channel_emu.live import Camera
+    from tests.channel_emu.live.emulator import Camera
 
     out, port = tmp_path / "out", free_port()
 
@@ -186,7 +186,7 @@ def test_bench_loses_nothing_and_reports_its_errors(capsys) -> None:
     assert found["lost"] == 0 and found["sent"] == found["arrived"] > 30
     assert found["delay_error_ms"]["count"] == found["sent"]
     assert 0 < found["delay_error_ms"]["p50"] <= found["arrival_error_ms"]["p50"]
-    from channel_emu.bench import show
+    from channel_emu.live.benchmark import show
 
     assert "delay error" in show(found)
 
@@ -225,7 +225,7 @@ def test_proxy_puts_a_service_behind_a_link_until_told(tmp_path: Path) -> None:
 
 
 def test_bare_mmpp_is_the_thesiss() -> None:
-    assert spell.arrivals("mmpp") == spell.arrivals("mmpp:1/120ms,1/30ms")
+    assert cli_syntax.arrivals("mmpp") == cli_syntax.arrivals("mmpp:1/120ms,1/30ms")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from pathlib import Path
 import grpc
 import pytest
 
-from channel_emu import trace
+from channel_emu.live import trace
 from channel_emu.testing import EmulatedLink, channel, put_behind
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from freshfield.scenario import load
-from tests.camera_node.pose.simulated import own_address, require_ur_rtde
+from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.deploy.test_up import Up
 
 CELL = load("cell")

@@ -9,10 +9,10 @@ import pytest
 
 from camera_node.cli import main as camera_node
 from camera_node.config import source_config
-from camera_node.pose.mounted import arm_model, base_matrix, hand_eyes
-from camera_node.pose.path import tour, viewpoints
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
+from camera_node.robot.arm.viewpoint_tour import tour, viewpoints
 from channel_emu.cli import main as channel_emu
-from channel_emu.config import channel_from_mapping
+from channel_emu.model.config import channel_from_mapping
 from edge_server.cli import main as edge_server
 from edge_server.config import read_config
 from edge_server.fields.registry import make_field

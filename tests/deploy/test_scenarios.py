@@ -9,7 +9,7 @@ import pytest
 
 from camera_node.config import source_config
 from camera_node.sources import open_sources
-from channel_emu.config import channel_from_mapping
+from channel_emu.model.config import channel_from_mapping
 from edge_server.config import read_config
 from edge_server.fields.registry import make_field
 from edge_server.scheduler import make_policy
@@ -43,7 +43,7 @@ def test_every_camera_has_a_first_image(file: Path) -> None:
     scenario = load(file)
     config = source_config(scenario)
     if getattr(config, "arm", None) is not None:
-        pytest.skip("needs an arm: tests/camera_node/sources/test_on_arm.py has one")
+        pytest.skip("needs an arm: tests/camera_node/robot/test_hand_camera.py has one")
     folder = getattr(config, "data", "")
     data = data_dir(folder.split("/")[0]).parent if folder else None
     # One trained and one held-out camera: a world takes a while to prepare each.

@@ -13,14 +13,14 @@ import grpc
 import numpy as np
 import pytest
 
-from channel_emu import ages
+from channel_emu.model import ages
 from channel_emu.testing import channel
 from freshfield import ledger
 from freshfield.clock import OffsetEstimator, WallClock
 from freshfield.frame import to_request
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
-from tests.channel_emu.live import Edge, frame_of
+from tests.channel_emu.live.emulator import Edge, frame_of
 
 assert channel  # the fixture
 

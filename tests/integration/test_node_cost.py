@@ -14,7 +14,7 @@ import psutil
 import pytest
 import yaml
 
-from tests.camera_node.test_video import write_rig
+from tests.camera_node.sources.datasets.test_video import write_rig
 from tests.integration.peer import Peer
 
 

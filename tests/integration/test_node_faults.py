@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from freshfield import ledger
-from tests.camera_node.photos import write_photos
+from tests.camera_node.sources.datasets.photos import write_photos
 from tests.integration.peer import Peer, answer
 from tests.integration.test_node_stream import books, check_books, make_node, run_while
 
@@ -159,11 +159,11 @@ from camera_node.cli import main
 code = main(["run", sys.argv[1], "--all", "--to", sys.argv[2], "--seconds", "0.5", "-q"])
 heavy = {
     "torch", "numba", "scipy", "edge_server", "channel_emu", "matplotlib", "depthai", "pyrealsense2",
-    "rtde_receive", "rtde_control", "camera_node.pose.kinematics", "camera_node.pose.arm",
-    "camera_node.pose.pairing", "camera_node.pose.controller", "camera_node.sources.live",
-    "camera_node.doctor",
+    "rtde_receive", "rtde_control", "camera_node.robot.arm.kinematics", "camera_node.robot.arm.joint_states",
+    "camera_node.pose.pairing", "camera_node.robot.simulated_controller",
+    "camera_node.sources.devices.device", "camera_node.doctor",
 } & set(sys.modules)
-world = [m for m in sys.modules if m.startswith("camera_node.world")]
+world = [m for m in sys.modules if m.startswith("camera_node.synthetic")]
 print(code, sorted(heavy), sorted(world))
 """
 
@@ -184,5 +184,7 @@ print(code, sorted(heavy), sorted(world))
     yield_lines: list[str] = []
     assert asyncio.run(scene()) > 10
     assert yield_lines[0] == "0 [] []"  # recorded data, no effects: not even the world is imported
-    assert yield_lines[1].startswith("0 []") and "camera_node.world.effects.sensor_noise" in yield_lines[1]
+    assert (
+        yield_lines[1].startswith("0 []") and "camera_node.synthetic.effects.sensor_noise" in yield_lines[1]
+    )
     assert "clock_drift" not in yield_lines[1] and "motion_blur" not in yield_lines[1]

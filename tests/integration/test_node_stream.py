@@ -20,7 +20,7 @@ from freshfield import ledger, payload
 from freshfield.clock import WallClock
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
-from tests.camera_node.photos import photo_scenario, picture, write_photos
+from tests.camera_node.sources.datasets.photos import photo_scenario, picture, write_photos
 from tests.integration.peer import Peer, answer, silence, wrong_number
 
 

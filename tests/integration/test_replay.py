@@ -17,11 +17,11 @@ import pytest
 from camera_node.build import build_cameras
 from camera_node.config import source_config
 from camera_node.node import Node, NodeOptions
-from edge_server.buffer import FrameBuffer
 from edge_server.config import read_config
-from edge_server.ingest import Ingest
-from edge_server.recorder import Recorder
-from edge_server.server import EdgeServer, Options
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.ingest import Ingest
+from edge_server.live.recorder import Recorder
+from edge_server.live.server import EdgeServer, Options
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
@@ -30,7 +30,7 @@ from freshfield.ledger import Ledger
 from freshfield.scenario import ScenarioError, parse
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
-from tests.camera_node.photos import photo_scenario, write_photos
+from tests.camera_node.sources.datasets.photos import photo_scenario, write_photos
 from tests.edge_server.fields_for_tests import TINY
 from tests.integration.peer import Peer
 from tests.ports import free_port
@@ -247,5 +247,5 @@ def test_what_to_install_is_said(tmp_path):
 
 
 def test_nothing_is_loaded_where_nothing_is_recorded():
-    code = "import sys, edge_server.server, edge_server.cli, camera_node.build; print('mcap' in sys.modules)"
+    code = "import sys, edge_server.live.server, camera_node.build; print('mcap' in sys.modules)"
     assert run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

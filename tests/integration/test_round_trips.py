@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.pose.rig import read_tum
-from camera_node.sources.formats import open_dataset
+from camera_node.pose.providers import read_tum
+from camera_node.sources.datasets.formats import open_dataset
+from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import Shot
 from edge_server.export.colmap import Cloud, write_model
-from edge_server.export.source import write_images
+from edge_server.export.run_source import write_images
 from edge_server.export.trajectory import write_tum
 from edge_server.export.transforms import write_transforms
-from edge_server.offline.recorded import load_recorded
 from freshfield.geometry import Pinhole, Pose, se3_inverse
-from tests.camera_node import sets
+from tests.camera_node.sources.datasets import sets
 
 BENT = Pinhole(64, 48, 60.0, 61.0, 31.2, 24.9, (-0.08, 0.02, 0.002, -0.003))
 NEAR_PX = 0.01

@@ -7,30 +7,31 @@ import warnings
 import numpy as np
 import pytest
 
-from camera_node.calibrate import CalibrationError, simulate
-from camera_node.calibrate.handeye import calibrate, distance_mm
-from camera_node.calibrate.motions import Samples, diversity, inverse
-from camera_node.calibrate.refine import refine
-from camera_node.calibrate.solve import METHODS, solve
-from camera_node.pose.mount import EYE_IN_HAND, EYE_TO_HAND
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.hand_eye import simulated
+from camera_node.robot.calibration.hand_eye.calibrate import calibrate, distance_mm
+from camera_node.robot.calibration.hand_eye.closed_form import METHODS, solve
+from camera_node.robot.calibration.hand_eye.joint_refinement import refine
+from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, inverse
 from freshfield.geometry import so3_exp
 
-X = simulate.CAMERA_IN_HAND
+X = simulated.CAMERA_IN_HAND
 SETUPS = (EYE_IN_HAND, EYE_TO_HAND)
 
 
 def of_turns(turns, setup=EYE_IN_HAND, noise=(0.002, 0.0005)) -> Samples:
     """Samples of a hand turned by rotation vectors (N, 3) from where it began, somewhere else each time."""
     rng = np.random.default_rng(0)
-    base = simulate.random_hands(1, rng)[0]
+    base = simulated.random_hands(1, rng)[0]
     hands = np.array([base] * len(turns))
     for hand, turn in zip(hands, turns):
         hand[:3, :3] = hand[:3, :3] @ so3_exp(turn)
         hand[:3, 3] += rng.normal(0, 0.05, 3)
-    targets = simulate.seen_targets(hands)
+    targets = simulated.seen_targets(hands)
     if setup == EYE_TO_HAND:
         hands = inverse(hands)
-    return Samples(simulate.disturbed(hands, rng, *noise), targets, setup)
+    return Samples(simulated.disturbed(hands, rng, *noise), targets, setup)
 
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -78,7 +79,7 @@ def test_motions_that_turn_by_nearly_half_a_turn_among_others_do_no_harm():
 
 def test_a_target_seen_at_exactly_half_a_turn():
     """T_i with rotations by pi about any axis: the closed forms and the refinement agree with the truth."""
-    hands = simulate.random_hands(10, np.random.default_rng(1))
+    hands = simulated.random_hands(10, np.random.default_rng(1))
     target_in_base = X.copy()
     targets = inverse(X) @ inverse(hands) @ (hands[0] @ X @ np.diag([1.0, -1.0, -1.0, 1.0]))
     assert np.trace(targets[0][:3, :3]) == pytest.approx(-1.0)
@@ -90,7 +91,7 @@ def test_a_target_seen_at_exactly_half_a_turn():
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_poses_in_other_units_scale_the_answer(factor):
     """All lengths in kilometres or millimetres: the same calibration in that unit."""
-    samples = simulate.samples(12, np.random.default_rng(2))
+    samples = simulated.samples(12, np.random.default_rng(2))
     hand, target = samples.hand.copy(), samples.target.copy()
     hand[:, :3, 3] *= factor
     target[:, :3, 3] *= factor
@@ -102,14 +103,14 @@ def test_poses_in_other_units_scale_the_answer(factor):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_numbers_that_are_none_are_refused(value):
-    samples = simulate.samples(8, np.random.default_rng(2))
+    samples = simulated.samples(8, np.random.default_rng(2))
     samples.hand[3, 0, 3] = value
     with pytest.raises(CalibrationError, match="finite"):
         Samples(samples.hand, samples.target)
 
 
 def test_the_same_pose_again_and_again_changes_nothing_but_the_weight():
-    samples = simulate.samples(10, np.random.default_rng(3))
+    samples = simulated.samples(10, np.random.default_rng(3))
     often = samples.take([*range(10), *[4] * 30])
     found = refine(often)
     assert np.isfinite(found.covariance).all() and distance_mm(found.x, X) < 3.0
@@ -118,18 +119,18 @@ def test_the_same_pose_again_and_again_changes_nothing_but_the_weight():
 def test_nothing_overflows_or_divides_by_zero_on_exact_data():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = calibrate(simulate.samples(12, np.random.default_rng(4), 0.0, 0.0))
+        found = calibrate(simulated.samples(12, np.random.default_rng(4), 0.0, 0.0))
     assert distance_mm(found.transform, X) < 1e-6
     assert found.left_out_mm < 1e-3
 
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
 def test_wrong_samples_up_to_three_in_ten(share):
-    good = simulate.samples(30, np.random.default_rng(6))
+    good = simulated.samples(30, np.random.default_rng(6))
     rng = np.random.default_rng(7)
     bad = rng.choice(30, int(30 * share), replace=False)
     target = good.target.copy()
-    target[bad] = simulate.disturbed(target[bad], rng, 0.5, 0.1)
+    target[bad] = simulated.disturbed(target[bad], rng, 0.5, 0.1)
     found = refine(Samples(good.hand, target))
     assert set(bad) == set(found.outliers)
     assert distance_mm(found.x, X) < 1.5
@@ -140,6 +141,6 @@ def test_arms_from_superb_to_hopeless(rad, metres):
     """The error stays what the answer says of itself."""
     ratios = []
     for k in range(12):
-        found = refine(simulate.samples(20, np.random.default_rng([8, k]), rad, metres))
+        found = refine(simulated.samples(20, np.random.default_rng([8, k]), rad, metres))
         ratios.append(distance_mm(found.x, X) / found.std_mm)
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from channel_emu.chain import Chain, ChainError, two_state_generator
-from channel_emu.channel import Channel
-from channel_emu.config import channel_from_mapping
-from channel_emu.instants import NEVER_NS
-from channel_emu.link import DISCIPLINES, Kind
-from channel_emu.simulate import simulate
-from channel_emu.uniforms import Uniforms
+from channel_emu.model.chain import Chain, ChainError, two_state_generator
+from channel_emu.model.channel import Channel
+from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.counter_rng import Uniforms
+from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.link import DISCIPLINES, Kind
+from channel_emu.virtual.simulate import simulate
 
 MS = 10**6
 ENGINES = ["python", "kernel"]
@@ -163,7 +163,7 @@ def test_frames_of_the_same_instant() -> None:
 
 def test_ages_keep_nanoseconds_after_a_year() -> None:
     """Float64 of absolute nanoseconds would be off by 4 ns at 10^16 and by 100 at 10^18."""
-    from channel_emu import ages
+    from channel_emu.model import ages
 
     start = 10**18
     saw = ages.sawtooth(np.array([start + 3, start + 10]), np.array([start, start + 5]), start + 13)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from edge_server.experiments.scenes.multiview_sequence import synthetic_film
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget
-from edge_server.fields.splat import SplatField
-from edge_server.fields.splat_settings import SplatSettings
-from edge_server.offline.film import synthetic_film
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.splat.settings import SplatSettings
 
 UPDATES, FRESH_TIMES, NEAR_DB = 300, 15, 0.5
 LAST = range(UPDATES - 9, UPDATES + 1)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from edge_server.buffer import FrameBuffer
-from edge_server.ingest import Gate
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.ingest import Gate
 from edge_server.scheduler import POLICIES, Epoch, make_policy
 from freshfield.frame import FrameRejected
 from tests.edge_server.frames import frame

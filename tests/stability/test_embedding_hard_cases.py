@@ -8,11 +8,11 @@ import pytest
 pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
 pytest.importorskip("onnx", reason="the extra embed is not installed")
 
-from edge_server.buffer import Buffered
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.embed.letterbox import GREY, letterbox
-from edge_server.views import Decoder
+from edge_server.live.buffer import Buffered
+from edge_server.live.view_decoder import Decoder
 from freshfield import payload
 from freshfield.geometry import Pinhole
 from tests.edge_server.embed.graphs import CHANNELS, detector

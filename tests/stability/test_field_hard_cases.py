@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.voxel import VoxelField
+from edge_server.fields.voxel.field import VoxelField
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring
 from tests.stability import test_field_voxel

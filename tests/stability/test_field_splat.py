@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.kernels.splat_project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.kernels.splat_update import OPACITY_LIMIT, POSITION_LIMIT
-from edge_server.fields.splat import SplatField
-from edge_server.fields.splat_settings import SplatSettings
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.splat.kernels.optimizer_step import OPACITY_LIMIT, POSITION_LIMIT
+from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
+from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import look_at
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring

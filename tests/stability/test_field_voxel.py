@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from edge_server.fields import View
-from edge_server.fields.kernels.voxel_update import DENSEST
-from edge_server.fields.voxel import VoxelField
-from edge_server.fields.voxel_settings import VoxelSettings
+from edge_server.fields.voxel.field import VoxelField
+from edge_server.fields.voxel.kernels.update import DENSEST
+from edge_server.fields.voxel.settings import VoxelSettings
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import ring
 from tests.stability.damage import counts_and_heals, overflows_and_begins_anew

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.kernels.adam import PARAMETER_LIMIT
-from edge_server.fields.nerfacto import NerfactoField
-from edge_server.fields.nerfacto_settings import NerfactoSettings
-from edge_server.fields.ngp import NgpField
-from edge_server.fields.ngp_settings import NgpSettings
-from edge_server.fields.tensorf import TensorfField
-from edge_server.fields.tensorf_settings import TensorfSettings
-from edge_server.fields.trained_field import TrainedField
+from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
+from edge_server.fields.common.trained_field import TrainedField
+from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.nerfacto.settings import NerfactoSettings
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.tensorf.field import TensorfField
+from edge_server.fields.tensorf.settings import TensorfSettings
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import ring
 from tests.stability.damage import counts_and_heals, overflows_and_begins_anew

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.pose.kinematics import UR3E
+from camera_node.robot.arm.kinematics import UR3E
 from freshfield.geometry import so3_exp
 
 DISTANCES = [0.0, 1e-300, 1e-16, 1e-12, 1e-10, 1e-9, 1e-8, 1e-6, 1e-4, 1e-2]

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera_node.pose.pairing import PoseBuffer, SampleBuffer, along_line, along_screw, tidy
-from camera_node.pose.rig import PoseGapError, Trajectory
+from camera_node.pose.providers import PoseGapError, Trajectory
 from freshfield.geometry import (
     Pose,
     matrix_to_quaternion,

@@ -14,23 +14,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera_node.world import make_scene
-from edge_server.fields import Budget, View, splat
-from edge_server.fields.kernels.splat_project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.nerfacto import NerfactoField
-from edge_server.fields.nerfacto_settings import NerfactoSettings
-from edge_server.fields.ngp import NgpField
-from edge_server.fields.ngp_settings import NgpSettings
-from edge_server.fields.scene_box import scene_box
-from edge_server.fields.splat import SplatField
-from edge_server.fields.splat_growth import Cloud
-from edge_server.fields.splat_motion import Moved
-from edge_server.fields.splat_settings import SplatSettings
-from edge_server.fields.tensorf import TensorfField
-from edge_server.fields.tensorf_settings import TensorfSettings
-from edge_server.fields.trust import PATIENCE
-from edge_server.fields.voxel import VoxelField
-from edge_server.fields.voxel_settings import VoxelSettings
+from camera_node.synthetic import make_scene
+from edge_server.fields import Budget, View
+from edge_server.fields.common.scene_box import scene_box
+from edge_server.fields.common.view_outliers import PATIENCE
+from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.nerfacto.settings import NerfactoSettings
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.splat import field as splat
+from edge_server.fields.splat.densification import Cloud
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
+from edge_server.fields.splat.motion import Moved
+from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.tensorf.field import TensorfField
+from edge_server.fields.tensorf.settings import TensorfSettings
+from edge_server.fields.voxel.field import VoxelField
+from edge_server.fields.voxel.settings import VoxelSettings
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import picture, psnr, ring
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Batch, Diagnostics, Learner
 from edge_server.scheduler.learned.problem import collect
-from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, regret, state, teach
 

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.pose.kinematics import UR3E
-from camera_node.teleop.settings import TeleopConfig
-from camera_node.teleop.stylus import StylusSample
-from camera_node.teleop.teleoperator import SILENT, Command, Teleoperator
-from tests.camera_node.teleop.checks import HOME, assert_within_limits, drive, sample
+from camera_node.robot.arm.kinematics import UR3E
+from camera_node.robot.teleop.settings import TeleopConfig
+from camera_node.robot.teleop.stylus import StylusSample
+from camera_node.robot.teleop.teleoperator import SILENT, Command, Teleoperator
+from tests.camera_node.robot.teleop.checks import HOME, assert_within_limits, drive, sample
 
 CONFIG = TeleopConfig(solver="dls", scale=(3.0, 3.0, 3.0), rate_hz=100.0)
 TICK_NS = 10_000_000

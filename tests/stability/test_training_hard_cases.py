@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_server.offline.training.choosing import choices, named
-from edge_server.offline.training.contest import hold, rivals, rows
-from edge_server.offline.training.crew import Crew
-from edge_server.offline.training.setting import Setting, seeds
-from edge_server.offline.training.trainer import Course, TrainingError, read_log, train
+from edge_server.experiments.training.scheduler.choices import choices, named
+from edge_server.experiments.training.scheduler.evaluation import hold, rivals, rows
+from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.trainer import Course, TrainingError, read_log, train
+from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward, make_reward
-from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
-from tests.edge_server.offline.training.small import NOTHING, scenario, setting
+from tests.edge_server.experiments.training.scheduler.small import NOTHING, scenario, setting
 
 REWARD = make_reward("set", distance=0.0)
 SELECT = Spec("select", StateLayout(("age", "pose")), hidden=8)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.ngp_torch_field import NgpTorchField
-from edge_server.fields.splat import SplatField
-from edge_server.fields.voxel import VoxelField
+from edge_server.fields.ngp.torch_field import NgpTorchField
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.voxel.field import VoxelField
 from tests.edge_server.fields.scenes import mean_psnr, ring
 from tests.stability import test_field_splat, test_field_voxel
 from tests.stability import test_fields_with_networks as with_networks

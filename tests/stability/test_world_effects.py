@@ -10,9 +10,9 @@ import typing
 import numpy as np
 import pytest
 
-from camera_node.world import effects as fx
-from camera_node.world import make_scene
-from camera_node.world.cache import FrameCache
+from camera_node.synthetic import effects as fx
+from camera_node.synthetic import make_scene
+from camera_node.synthetic.frame_cache import FrameCache
 from freshfield.geometry import Pose
 
 SCENE = {"width": 16, "height": 12, "supersample": 1, "speed_m_per_s": 8.0}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.world import SCENES, make_scene
-from camera_node.world.cache import FrameCache
-from camera_node.world.effects import NAMES, load_effects
+from camera_node.synthetic import SCENES, make_scene
+from camera_node.synthetic.effects import NAMES, load_effects
+from camera_node.synthetic.frame_cache import FrameCache
 from freshfield.geometry import Pinhole, Pose, look_at
 
 SMALL = {"width": 40, "height": 40, "supersample": 1}

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.scheduler import Epoch, Plan, freshest
-from edge_server.scheduler.learned.decide import Actor
+from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.state import State
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler.learned.decide import Actor
+from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.state import State
 
 Embed = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.learner_spec import Spec
 
 Weights = dict[str, Any]
 """Name -> array of numpy or tensor of torch."""

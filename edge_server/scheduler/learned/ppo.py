@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.decide import KIND, MOST_BYTES, Actor, read_spec
-from edge_server.scheduler.learned.spec import Spec
+from edge_server.scheduler.learned.actor import KIND, MOST_BYTES, Actor, read_spec
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State
 
 # exp of more is no probability ratio any more; the clip has long since said what it has to say.

@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.kernels.intrinsics import fetch_add
-from edge_server.fields.kernels.jit import kernel
+from edge_server.fields.common.kernels.jit import kernel
+from edge_server.fields.common.kernels.simd import fetch_add
 
 TAPS = 5  # pixels a side of a patch
 REACH = TAPS // 2

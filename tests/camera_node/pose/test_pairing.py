@@ -15,7 +15,7 @@ from camera_node.pose.pairing import (
     between_joints,
     tidy,
 )
-from camera_node.pose.rig import PoseGapError
+from camera_node.pose.providers import PoseGapError
 from freshfield.geometry import Pose, so3_exp
 
 MS = 1_000_000

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.buffer import Buffered
 from edge_server.embed.cache import EmbeddingCache
-from edge_server.views import Decoder
+from edge_server.live.buffer import Buffered
+from edge_server.live.view_decoder import Decoder
 from freshfield import payload
 from tests.edge_server.frames import frame
 

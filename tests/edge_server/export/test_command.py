@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.export.source import open_source, poses_of
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.export.run_source import open_source, poses_of
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import field_names, make_field
-from edge_server.offline.still import synthetic
 from freshfield.geometry import Pose, look_at
 
 OPTIONS = {
@@ -78,8 +78,8 @@ def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
 
 def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    from edge_server.offline.mesh_truth import measured
-    from edge_server.offline.scan import exact_depth, scan
+    from edge_server.experiments.scenes.mesh_truth import measured
+    from edge_server.experiments.scenes.tile_scan import exact_depth, scan
     from edge_server.surface.depth import depth_map
     from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
 
@@ -126,7 +126,7 @@ def test_a_camera_that_moved_has_its_whole_way(run, tmp_path, capsys):
 
 def test_a_run_writes_down_where_its_cameras_were(tmp_path):
     from edge_server.fields import View
-    from edge_server.journal import Journal
+    from edge_server.live.journal import Journal
     from freshfield.geometry import Pinhole
 
     lens, picture = Pinhole.from_fov(8, 8, 50), np.zeros((8, 8, 3), np.uint8)
@@ -184,7 +184,7 @@ def test_nothing_asked_for_is_an_error(run, capsys):
 
 
 def test_voxels_are_carved_for_a_mesh_and_only_unless_told_otherwise():
-    from edge_server.offline.export import Export, _parser
+    from edge_server.export.command import Export, _parser
 
     def carves(*words: str) -> bool:
         return Export(_parser().parse_args(["run", *words]))._settings().carve

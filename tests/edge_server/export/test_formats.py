@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
+from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import ExportError, Shot, file_names, glb, ply
-from edge_server.export.cloud import cloud_of
 from edge_server.export.colmap import Cloud, write_model
-from edge_server.export.source import write_images
+from edge_server.export.point_cloud import cloud_of
+from edge_server.export.run_source import write_images
 from edge_server.export.splats import Y0, write_splats
 from edge_server.export.trajectory import write_tum
 from edge_server.export.transforms import write_transforms
-from edge_server.fields.kernels.composite import harmonic
-from edge_server.fields.kernels.splat_project import Gaussians
-from edge_server.fields.scene_box import SceneBox
-from edge_server.offline.recorded import load_recorded
+from edge_server.fields.common.kernels.volume_rendering import harmonic
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.splat.kernels.project import Gaussians
 from freshfield.geometry import Pose, quaternion_to_matrix, se3_inverse
 from tests.edge_server.surface.shapes import BENT, LENS, ball_maps
 

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields import View
-from edge_server.fields.nerfacto import NerfactoField
-from edge_server.fields.nerfacto_settings import NerfactoSettings
-from edge_server.fields.ngp import NgpField
-from edge_server.fields.ngp_settings import NgpSettings
-from edge_server.fields.splat import SplatField
-from edge_server.fields.splat_settings import SplatSettings
-from edge_server.fields.tensorf import TensorfField
-from edge_server.fields.tensorf_settings import TensorfSettings
-from edge_server.fields.voxel import VoxelField
-from edge_server.fields.voxel_settings import VoxelSettings
+from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.nerfacto.settings import NerfactoSettings
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.tensorf.field import TensorfField
+from edge_server.fields.tensorf.settings import TensorfSettings
+from edge_server.fields.voxel.field import VoxelField
+from edge_server.fields.voxel.settings import VoxelSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
 
 NGP = NgpSettings(

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.kernels.pool import CallerPool
-from edge_server.fields.nerfacto import NerfactoField
-from edge_server.fields.ngp import NgpField
-from edge_server.fields.ngp_schedule import Pace, Usual
-from edge_server.fields.splat import SplatField
-from edge_server.fields.tensorf import TensorfField
-from edge_server.fields.voxel import VoxelField
+from edge_server.fields.common.kernels.thread_pool import CallerPool
+from edge_server.fields.common.training_schedule import Pace, Usual
+from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.tensorf.field import TensorfField
+from edge_server.fields.voxel.field import VoxelField
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
 

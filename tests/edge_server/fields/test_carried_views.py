@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from edge_server.fields import Budget
-from edge_server.fields.kernels.splat_project import TIME
-from edge_server.fields.splat import SplatField
-from edge_server.fields.splat_settings import SplatSettings
-from edge_server.fields.trust import weights
+from edge_server.fields.common.view_outliers import weights
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.splat.kernels.project import TIME
+from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import ring
 
 MS = 1_000_000

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, Field
-from edge_server.fields.nerfacto import NerfactoField
-from edge_server.fields.ngp import NgpField
-from edge_server.fields.splat import SplatField
-from edge_server.fields.tensorf import TensorfField
-from edge_server.fields.voxel import VoxelField
+from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.tensorf.field import TensorfField
+from edge_server.fields.voxel.field import VoxelField
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
 
@@ -25,7 +25,7 @@ State = dict[str, Any]
 
 def _torch() -> Field:
     pytest.importorskip("torch", reason="torch is not installed")
-    from edge_server.fields.ngp_torch_field import NgpTorchField
+    from edge_server.fields.ngp.torch_field import NgpTorchField
 
     return NgpTorchField(replace(NGP, rays=64), device="cpu")
 

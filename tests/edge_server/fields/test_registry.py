@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from edge_server.fields import Budget
-from edge_server.fields.gpu import driver_present
-from edge_server.fields.ngp import NgpField
-from edge_server.fields.ngp_settings import EFFORTS, NgpSettings, help_text, make_settings
+from edge_server.fields.ngp.cuda_driver import driver_present
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import EFFORTS, NgpSettings, help_text, make_settings
 from edge_server.fields.registry import field_names, make_field, option_help
 
 
@@ -148,13 +148,14 @@ def test_a_driver_is_known_by_its_devices_or_its_library(tmp_path: Path) -> None
 
 
 def test_where_a_gpu_can_be_torch_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    from edge_server.fields import ngp, ngp_torch_field
+    from edge_server.fields.ngp import field as ngp
+    from edge_server.fields.ngp import torch_field
 
-    in_torch = ngp_torch_field.NgpTorchField
-    monkeypatch.setattr(ngp_torch_field, "NgpTorchField", partial(in_torch, device="cpu"))
+    in_torch = torch_field.NgpTorchField
+    monkeypatch.setattr(torch_field, "NgpTorchField", partial(in_torch, device="cpu"))
     monkeypatch.setattr(ngp, "driver_present", lambda: True)
     for cuda, kind in ((True, in_torch), (False, NgpField)):
-        monkeypatch.setattr(ngp_torch_field, "cuda_present", lambda cuda=cuda: cuda)
+        monkeypatch.setattr(torch_field, "cuda_present", lambda cuda=cuda: cuda)
         assert type(make_field("ngp", {"log2_table": 9})) is kind
 
 
@@ -164,10 +165,11 @@ def test_where_a_gpu_can_be_torch_is_asked(monkeypatch: pytest.MonkeyPatch) -> N
 def test_what_only_the_kernels_do_is_not_lost_on_a_gpu(
     option: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from edge_server.fields import ngp, ngp_torch_field
+    from edge_server.fields.ngp import field as ngp
+    from edge_server.fields.ngp import torch_field
 
     monkeypatch.setattr(ngp, "driver_present", lambda: True)
-    monkeypatch.setattr(ngp_torch_field, "cuda_present", lambda: True)
+    monkeypatch.setattr(torch_field, "cuda_present", lambda: True)
     assert type(make_field("ngp", {"log2_table": 9, **option})) is NgpField
     with pytest.raises(ValueError, match=f"{next(iter(option))} needs device cpu"):
         make_field("ngp", {"log2_table": 9, "device": "cuda", **option})

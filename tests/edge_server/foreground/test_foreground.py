@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from edge_server.config import read_config
+from edge_server.experiments.virtual.from_scenario import deploy
+from edge_server.experiments.virtual.virtual_deployment import Terms
 from edge_server.foreground import ForegroundConfig, ForegroundError, read_foreground
 from edge_server.foreground.foreground import make_foreground
-from edge_server.offline.deployment import deploy
-from edge_server.offline.virtual import Terms
 from freshfield.scenario import ScenarioError, load, parse
 from tests.conftest import ROOT, data_dir
 from tests.edge_server.foreground.pictures import (
@@ -212,7 +212,7 @@ def test_a_scenario_turns_it_on_and_nothing_is_imported_where_it_does_not(tmp_pa
     (tmp_path / "cut.yaml").write_text(text)
     assert read_config(load(str(tmp_path / "cut.yaml"))).foreground.segment == "box"
     code = (
-        "import sys; import edge_server.server, edge_server.offline.deployment; "
+        "import sys; import edge_server.live.server, edge_server.experiments.virtual.from_scenario; "
         "sys.exit(any(name.startswith('edge_server.foreground') for name in sys.modules))"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Rendering
+from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
 from edge_server.page import Page, PageError, page_url, start_page
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.preview import BallScene, Preview
 from edge_server.page.rendering import DEPTH_ROWS, FAR_M, presentable
 from edge_server.page.scene import thumbnail
-from edge_server.state import CameraView, Comparison, Controls, EdgeState, Publication
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.page.visitor import Visitor
 

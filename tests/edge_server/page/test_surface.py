@@ -66,9 +66,9 @@ def test_a_field_that_has_seen_nothing_has_no_mesh(server):
 
 def test_nothing_of_it_is_loaded_before_it_is_asked_for():
     code = (
-        "import sys, edge_server.page, edge_server.server\n"
+        "import sys, edge_server.page, edge_server.live.server\n"
         "loaded = [m for m in sys.modules if m.startswith(('edge_server.surface', 'skimage'))"
-        " or m == 'edge_server.fields.splat_planar']\n"
+        " or m == 'edge_server.fields.splat.planar']\n"
         "assert not loaded, loaded"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from edge_server.live.state import CameraView
 from edge_server.page.timelines import MAX_POINTS, History, _filled, _in_force, _steps, _thin
-from edge_server.state import CameraView
 
 
 def views(*ages: float | None) -> list[CameraView]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge_server.journal import Journal
-from edge_server.state import Publication
+from edge_server.live.journal import Journal
+from edge_server.live.state import Publication
 from tests.edge_server.report.ledgers import write
 
 CAMERAS = ("cam00", "cam01", "cam02", "cam03")

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from edge_server.experiments.scenes.tile_scan import exact_depth, scan
 from edge_server.fields import View
-from edge_server.fields.kernels.pool import Pool
-from edge_server.fields.scene_box import SceneBox
-from edge_server.offline.scan import exact_depth, scan
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.scene_box import SceneBox
 from edge_server.surface import SurfaceError, reconstruct
 from edge_server.surface.carve import KNOWN, LEAST_VIEWS, REST, box_of, carved, completed
 from edge_server.surface.depth import depth_map

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from edge_server.offline.scan import exact_depth, scan, truth_of
+from edge_server.experiments.scenes.tile_scan import exact_depth, scan, truth_of
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import depth_map
 from edge_server.surface.mesh import Mesh

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.fields.supervision import check_view
+from edge_server.fields.common.supervision import check_view
 from edge_server.scheduler import TREATMENTS, make_policy, treatment_of
 from freshfield.geometry import look_at
 from tests.edge_server.treatments.pictures import HEIGHT, MS, POSE, WIDTH, picture, seen, view

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.buffer import FrameBuffer
 from edge_server.config import read_config
-from edge_server.loop import Updates
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.loop import Updates
 from edge_server.scheduler import Epoch, help_of, make_live_policy, make_policy, read_policy
 from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.learned.spec import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
 from freshfield import scenario
 from tests.edge_server.fields_for_tests import tiny_field

@@ -10,10 +10,10 @@ import pytest
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.decide import MOST_BYTES, Actor
+from edge_server.scheduler.learned.actor import MOST_BYTES, Actor
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.problem import collect
-from edge_server.scheduler.learned.spec import Spec
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, FreshOnes, Waits, regret, state, teach
 
 

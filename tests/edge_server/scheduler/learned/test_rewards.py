@@ -6,10 +6,10 @@ import math
 
 import pytest
 
+from edge_server.experiments.training.scheduler.episode import Outcome
 from edge_server.fidelity.scorer import Score
-from edge_server.offline.training.episode import Outcome
+from edge_server.live.state import Publication
 from edge_server.scheduler.learned.rewards import REWARDS, make_reward
-from edge_server.state import Publication
 
 
 def score(psnr_db=25.0, psnr_moving_db=20.0, ssim=0.9, lpips=0.2):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.buffer import Buffered
-from edge_server.scheduler.learned.observe import observe
+from edge_server.live.buffer import Buffered
+from edge_server.scheduler.learned.observation import observe
 from edge_server.scheduler.learned.state import State, StateLayout
 from freshfield.geometry import Pose, look_at, so3_exp
 from tests.edge_server.frames import frame

@@ -1,0 +1,1 @@
+"""Camera nodes on a robot arm: driver, kinematics, simulated controller, calibration, teleoperation."""

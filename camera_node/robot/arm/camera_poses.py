@@ -1,0 +1,104 @@
+"""From a scenario's ``arm`` to pose providers for the cameras that it carries or looks at."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.config import ArmConfig
+from camera_node.pose.providers import FixedPose, PoseProvider
+from camera_node.robot.arm.hand_eye_mount import (
+    EYE_IN_HAND,
+    EYE_TO_HAND,
+    HandEye,
+    HandEyeError,
+    read_hand_eye,
+)
+from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, calibrated
+from freshfield.clock import Clock, WallClock
+from freshfield.geometry import Pose
+from freshfield.scenario import Scenario, ScenarioError
+
+log = logging.getLogger("camera-node")
+
+
+def arm_model(scenario: Scenario, config: ArmConfig) -> ArmModel:
+    """The arm, with its own deviations where a file is named. Raises ScenarioError."""
+    model = MODELS[config.robot]
+    if config.calibration is None:
+        return model
+    try:
+        return calibrated(model, beside(scenario, config.calibration))
+    except KinematicsError as error:
+        raise ScenarioError(f"{scenario.path}: source.arm.calibration: {error}") from None
+
+
+def base_matrix(config: ArmConfig) -> NDArray[np.float64]:
+    """World-from-base (4, 4)."""
+    yaw = np.deg2rad(config.base_yaw_deg)
+    out = np.eye(4)
+    out[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    out[:3, 3] = config.base_m
+    return out
+
+
+def hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> dict[str, HandEye]:
+    """The hand-eye calibration of those of ``cameras`` that the arm has to do with. Raises ScenarioError."""
+    where = f"{scenario.path}: source.arm.cameras"
+    for camera in config.cameras:
+        if camera not in scenario.cameras:
+            raise ScenarioError(f"{where}: {camera!r} is not one of the scenario's cameras")
+    found = {}
+    for camera in cameras:
+        if camera not in config.cameras:
+            continue
+        file = config.cameras[camera]
+        if file is None:
+            found[camera] = HandEye(EYE_IN_HAND, np.eye(4))
+            continue
+        try:
+            found[camera] = read_hand_eye(beside(scenario, file))
+        except HandEyeError as error:
+            raise ScenarioError(f"{where}.{camera}: {error}") from None
+    return found
+
+
+def camera_poses(
+    scenario: Scenario, config: ArmConfig | None, cameras: Iterable[str], clock: Clock | None = None
+) -> dict[str, PoseProvider]:
+    """Poses of ``cameras``, as far as an arm gives them. Connects to the arm where a camera is on its hand.
+
+    Raises ScenarioError, and ArmError where the arm cannot be had.
+    """
+    if config is None:
+        return {}
+    mounts = hand_eyes(scenario, config, cameras)
+    model, base = arm_model(scenario, config), base_matrix(config)
+    moving = [camera for camera, mount in mounts.items() if mount.setup != EYE_TO_HAND]
+    poses: dict[str, PoseProvider] = {
+        camera: FixedPose(Pose.from_matrix(base @ mount.transform))
+        for camera, mount in mounts.items()
+        if camera not in moving
+    }
+    if moving:
+        from camera_node.robot.arm.joint_states import ArmStream, HandPoses
+
+        stream = ArmStream(
+            config.host, clock or WallClock(), config.frequency_hz,
+            config.pairing == "interpolated", config.max_gap_ms,
+        )  # fmt: skip
+        stream.start()
+        log.info("arm at %s: connected; it carries %s", config.host, ", ".join(moving))
+        hand = HandPoses(stream, model, base)
+        poses.update({camera: mounts[camera].camera_poses(hand) for camera in moving})
+    return poses
+
+
+def beside(scenario: Scenario, name: str) -> Path:
+    """A file that a scenario names, relative to the scenario."""
+    path = Path(name).expanduser()
+    return path if path.is_absolute() else scenario.path.parent / path

@@ -1,0 +1,116 @@
+"""The arm as capsules: how near its parts come to each other and to the floor, many postures at once.
+
+The upper arm and the forearm stand beside the lines that the Denavit-Hartenberg parameters connect; their
+offsets along the elbow's axis are those of the manufacturer's description (ur_description, ur3e). Radii are
+read off the data sheet's drawing and rounded up. Parts that share a joint, and those whose distance no joint
+changes, are not compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.robot.arm.kinematics import ArmModel
+
+Array = NDArray[np.float64]
+
+PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
+PAIRS = (
+    (0, 3), (0, 4), (0, 5), (0, 6), (0, 7),
+    (1, 3), (1, 4), (1, 5), (1, 6), (1, 7),
+    (2, 4), (2, 5), (2, 6), (2, 7),
+    (3, 6), (3, 7),
+    (4, 7),
+)  # fmt: skip
+ABOVE_FLOOR = (3, 4, 5, 6, 7)
+_UPPER_ARM_M, _FOREARM_M = 0.1198, 0.0273
+_RADII_M = (0.064, 0.055, 0.046, 0.04, 0.036, 0.036, 0.033)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Capsules of one arm with its tool. tool_m, tool_radius_m: along the flange's axis, from the flange."""
+
+    arm: ArmModel
+    tool_m: float
+    tool_radius_m: float
+
+    def flange(self, joints: Array) -> Array:
+        """Positions (T, 3) of the flange for joints (T, 6), in base axes, metres."""
+        return links(self.arm, joints)[:, 6, :3, 3]
+
+    def segments(self, frames: Array) -> tuple[Array, Array]:
+        """Ends (T, 8, 3), (T, 8, 3) of the parts' axes for ``links`` (T, 7, 4, 4) of the arm's ``body``, in
+        the order of PARTS."""
+        at, z = frames[:, :, :3, 3], frames[:, :, :3, 2]
+        upper, fore = _UPPER_ARM_M * z[:, 1], _FOREARM_M * z[:, 1]
+        zero = np.zeros_like(at[:, 0])
+        # A capsule's round end reaches a radius beyond its axis: the tool's begins at the flange, not before.
+        near = at[:, 6] + self.tool_radius_m * z[:, 6]
+        far = at[:, 6] + max(self.tool_m - self.tool_radius_m, self.tool_radius_m) * z[:, 6]
+        a = [zero, at[:, 1], at[:, 1] + upper, at[:, 2] + fore, at[:, 3] + fore, at[:, 4], at[:, 5], near]
+        b = [at[:, 1], at[:, 1] + upper, at[:, 2] + upper, at[:, 3] + fore, at[:, 4], at[:, 5], at[:, 6], far]
+        return np.stack(a, axis=1), np.stack(b, axis=1)
+
+    @property
+    def radii(self) -> Array:
+        """(8,) metres, in the order of PARTS."""
+        return np.array([*_RADII_M, self.tool_radius_m])
+
+    def clearance(self, frames: Array) -> tuple[Array, Array]:
+        """Of ``links`` of the arm's ``body``: (T, pairs) metres between the surfaces of PAIRS, negative where
+        they overlap, and (T,) the height of the lowest point of what lies beyond the upper arm."""
+        a, b = self.segments(frames)
+        first, second = np.array(PAIRS).T
+        radii = self.radii
+        apart = distance(a[:, first], b[:, first], a[:, second], b[:, second])
+        beyond = list(ABOVE_FLOOR)
+        lowest = np.minimum(a[:, beyond, 2], b[:, beyond, 2]) - radii[beyond]
+        return apart - (radii[first] + radii[second]), lowest.min(axis=1)
+
+
+def links(arm: ArmModel, joints: Array) -> Array:
+    """``ArmModel.links`` of many postures: (T, 7, 4, 4) for joints (T, 6)."""
+    count = len(joints)
+    theta = joints + np.array(arm.theta_rad)
+    cos, sin = np.cos(theta), np.sin(theta)
+    out = np.zeros((count, 7, 4, 4))
+    out[:, 0] = np.eye(4)
+    step = np.zeros((count, 4, 4))
+    step[:, 3, 3] = 1.0
+    for i in range(6):
+        ca, sa = np.cos(arm.alpha_rad[i]), np.sin(arm.alpha_rad[i])
+        c, s = cos[:, i], sin[:, i]
+        step[:, 0, 0], step[:, 0, 1], step[:, 0, 2], step[:, 0, 3] = c, -s * ca, s * sa, arm.a_m[i] * c
+        step[:, 1, 0], step[:, 1, 1], step[:, 1, 2], step[:, 1, 3] = s, c * ca, -c * sa, arm.a_m[i] * s
+        step[:, 2, 1], step[:, 2, 2], step[:, 2, 3] = sa, ca, arm.d_m[i]
+        np.matmul(out[:, i], step, out=out[:, i + 1])
+    return out
+
+
+def distance(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """Distances (...) between segments a-b and c-d, each end (..., 3); either may be a point.
+
+    Ericson, Real-Time Collision Detection, 5.1.9.
+    """
+    u, v, r = b - a, d - c, a - c
+    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
+    ur, vr = _dot(u, r), _dot(v, r)
+    tiny = 1e-18
+    denominator = uu * vv - uv * uv
+    # Of parallel segments any point of one will do; the other's nearest is then found and clamped.
+    s = np.where(
+        denominator > 1e-12 * uu * vv, (uv * vr - ur * vv) / np.maximum(denominator, tiny), 0.0
+    ).clip(0.0, 1.0)
+    t = np.where(vv > tiny, (uv * s + vr) / np.maximum(vv, tiny), 0.0)
+    clamped = t.clip(0.0, 1.0)
+    s = np.where(uu > tiny, (clamped * uv - ur) / np.maximum(uu, tiny), 0.0).clip(0.0, 1.0)
+    between = r + s[..., None] * u - clamped[..., None] * v
+    return np.sqrt(_dot(between, between))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.einsum("...i,...i->...", a, b)

@@ -1,0 +1,236 @@
+"""How far the poses that an arm's joint states give are from the truth, while a simulated arm moves.
+
+    camera-node simulate-arm cell & camera-node drive-arm cell &
+    python -m camera_node.robot.arm.pose_error cell [--seconds 45] [--out DIR] [--json]
+
+At random instants the pose of the hand is compared with where the simulated controller says that it really
+was: nearest joint state and interpolated, at several rates of joint states, all in the same run. Errors are
+told by rate, and by the gap to the nearest joint state and the hand's speed just then: an arm that starts and
+stops at viewpoints has all speeds up to its fastest (``source.arm.path.speed_rad_s``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from camera_node.pose.providers import PoseGapError
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix
+from camera_node.robot.arm.joint_states import ArmStream, HandPoses
+from camera_node.robot.hand_camera import Truth
+from camera_node.robot.simulated_controller.command import arm_of
+from freshfield.clock import WallClock
+from freshfield.geometry import so3_log
+from freshfield.scenario import load
+
+RATES_HZ = (500.0, 125.0, 20.0)
+PAIRINGS = ("nearest", "interpolated")
+GAPS_MS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+SPEEDS_M_PER_S = (0.01, 0.05, 0.1, 0.2, 0.4, 1.6)
+LEAST_INSTANTS = 5  # of a median that is shown
+_LATER_S = 0.1  # by when the sample after an instant has come even at the lowest rate
+_SPEED_OVER_NS = 5_000_000
+_EACH_S, _INSTANTS = 0.2, 6  # so many instants are looked at together
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Error:
+    """One pose that joint states of one stream gave at one instant, held against the truth. gap_ms: to the
+    nearest joint state. speed_m_per_s: of the hand, then."""
+
+    pairing: str
+    rate_hz: float
+    gap_ms: float
+    speed_m_per_s: float
+    mm: float
+    deg: float
+
+
+def measure(scenario: str, seconds: float, seed: int = 0) -> list[Error]:
+    """Of every instant and stream. Raises ScenarioError, ArmError, PoseGapError."""
+    plan = load(scenario)
+    config = arm_of(plan)
+    model, base, clock, truth = arm_model(plan, config), base_matrix(config), WallClock(), Truth(config.host)
+    streams = {
+        (pairing, rate): ArmStream(config.host, clock, rate, pairing == "interpolated", max_gap_ms=200.0)
+        for rate in RATES_HZ
+        for pairing in PAIRINGS
+    }
+    errors = []
+    rng = np.random.default_rng(seed)
+    try:
+        for stream in streams.values():
+            stream.start()
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            begin_ns = clock.now_ns()
+            time.sleep(_EACH_S + _LATER_S)
+            for after_ns in np.sort(rng.uniform(0.0, _EACH_S * 1e9, _INSTANTS)):
+                t_ns = begin_ns + int(after_ns)
+                true = base @ model.forward(truth.joints(t_ns))
+                before = base @ model.forward(truth.joints(t_ns - _SPEED_OVER_NS))
+                speed = float(np.linalg.norm(true[:3, 3] - before[:3, 3])) / (_SPEED_OVER_NS * 1e-9)
+                for (pairing, rate), stream in streams.items():
+                    try:
+                        claimed = HandPoses(stream, model, base, 0.0).at(t_ns)
+                    except PoseGapError:
+                        continue  # it would not be sent either
+                    pose = claimed.pose.matrix()
+                    apart_mm = 1e3 * float(np.linalg.norm(true[:3, 3] - pose[:3, 3]))
+                    turned_rad = float(np.linalg.norm(so3_log(true[:3, :3].T @ pose[:3, :3])))
+                    gap_ms = claimed.gap_ns / 1e6
+                    errors.append(
+                        Error(pairing, rate, gap_ms, speed, apart_mm, float(np.rad2deg(turned_rad)))
+                    )
+    finally:
+        for stream in streams.values():
+            stream.stop()
+    return errors
+
+
+def by_rate(errors: Sequence[Error]) -> list[Row]:
+    """Errors by rate of joint states and pairing, at all speeds: median and 95th percentile."""
+    rows = []
+    for rate, pairing in itertools.product(RATES_HZ, PAIRINGS):
+        chosen = [e for e in errors if e.rate_hz == rate and e.pairing == pairing]
+        if chosen:
+            rows.append({"pairing": pairing, "rate_hz": rate, **_figures(chosen)})
+    return rows
+
+
+def by_gap_and_speed(errors: Sequence[Error]) -> list[Row]:
+    """Errors by pairing, gap and speed, of all rates together; cells of fewer than five instants are left
+    out."""
+    rows = []
+    gaps, speeds = itertools.pairwise(GAPS_MS), itertools.pairwise(SPEEDS_M_PER_S)
+    for pairing, gap, speed in itertools.product(PAIRINGS, gaps, speeds):
+        chosen = [
+            e
+            for e in errors
+            if e.pairing == pairing and gap[0] <= e.gap_ms < gap[1] and speed[0] <= e.speed_m_per_s < speed[1]
+        ]
+        if len(chosen) >= LEAST_INSTANTS:
+            rows.append({
+                "pairing": pairing, "gap_ms_from": gap[0], "gap_ms_to": gap[1],
+                "m_per_s_from": speed[0], "m_per_s_to": speed[1],
+                "gap_ms": float(np.median([e.gap_ms for e in chosen])),
+                "m_per_s": float(np.median([e.speed_m_per_s for e in chosen])),
+                **_figures(chosen),
+            })  # fmt: skip
+    return rows
+
+
+def _figures(errors: Sequence[Error]) -> dict[str, float]:
+    mm, deg = [e.mm for e in errors], [e.deg for e in errors]
+    return {
+        "instants": float(len(errors)),
+        "median_mm": float(np.median(mm)), "p95_mm": float(np.percentile(mm, 95)),
+        "median_deg": float(np.median(deg)), "p95_deg": float(np.percentile(deg, 95)),
+    }  # fmt: skip
+
+
+def show_rates(rows: Sequence[Row]) -> str:
+    """``by_rate`` as text."""
+    lines = [f"{'':26} {'mm: median':>11} {'p95':>7} {'degrees: median':>16} {'p95':>7}"]
+    lines += [
+        f"{row['pairing']} at {row['rate_hz']:g} Hz".ljust(26)
+        + f" {row['median_mm']:11.3f} {row['p95_mm']:7.3f} {row['median_deg']:16.4f} {row['p95_deg']:7.4f}"
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def show_gaps(rows: Sequence[Row]) -> str:
+    """``by_gap_and_speed`` as text: medians in mm, a line a gap, a column a speed, nearest / interpolated."""
+    cell = {(r["pairing"], r["gap_ms_from"], r["m_per_s_from"]): f"{r['median_mm']:.3f}" for r in rows}
+    ranges = [f"{a:g} to {b:g} m/s" for a, b in itertools.pairwise(SPEEDS_M_PER_S)]
+    lines = ["median mm, nearest / interpolated", f"{'gap':>14}" + "".join(f"{each:>18}" for each in ranges)]
+    for low, high in itertools.pairwise(GAPS_MS):
+        pairs = (
+            " / ".join(cell.get((pairing, low, speed), "-") for pairing in PAIRINGS)
+            for speed in SPEEDS_M_PER_S[:-1]
+        )
+        lines.append(f"{f'{low:g} to {high:g} ms':>14}" + "".join(f"{each:>18}" for each in pairs))
+    return "\n".join(lines)
+
+
+def write(rates: Sequence[Row], gaps: Sequence[Row], folder: Path) -> None:
+    """Both tables as CSV, and the second as a picture where matplotlib is there. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, rows in (("rates", rates), ("gaps", gaps)):
+        with (folder / f"{name}.csv").open("w", newline="") as file:
+            table = csv.DictWriter(file, list(rows[0]) if rows else [])
+            table.writeheader()
+            table.writerows(rows)
+    if gaps:
+        _draw(gaps, folder / "gaps.png")
+
+
+def _draw(rows: Sequence[Row], path: Path) -> None:
+    try:
+        import matplotlib
+    except ImportError:
+        return
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", sharex=True, sharey=True)
+    for pairing, panel in zip(PAIRINGS, panels):
+        for k, (low, high) in enumerate(itertools.pairwise(GAPS_MS)):
+            chosen = [r for r in rows if r["pairing"] == pairing and r["gap_ms_from"] == low]
+            at = [r["m_per_s"] for r in chosen]
+            label = f"{low:g} to {high:g} ms"
+            panel.loglog(at, [r["median_mm"] for r in chosen], "o-", color=f"C{k}", label=label)
+        panel.set(title=pairing, xlabel="speed of the hand (m/s)")
+        panel.set_xticks([], minor=True)
+        panel.set_xticks([0.03, 0.1, 0.3, 1.0], ["0.03", "0.1", "0.3", "1"])
+    panels[0].set(ylabel="hand's place, median (mm)")
+    panels[1].legend(title="gap to the nearest joint state")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m camera_node.robot.arm.pose_error", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("scenario", help="a scenario whose simulated arm is running and moving")
+    parser.add_argument("--seconds", type=float, default=45.0)
+    parser.add_argument("--out", type=Path, metavar="DIR", help="tables as CSV, and a picture")
+    parser.add_argument("--json", action="store_true", help="for scripts")
+    args = parser.parse_args(arguments)
+    try:
+        errors = measure(args.scenario, args.seconds)
+        rates, gaps = by_rate(errors), by_gap_and_speed(errors)
+        if args.out is not None:
+            write(rates, gaps, args.out)
+    except (ValueError, OSError) as error:
+        print(f"measure: {error}", file=sys.stderr)
+        return 2
+    speeds = [e.speed_m_per_s for e in errors] or [0.0]
+    speed = {"median_m_per_s": float(np.median(speeds)), "most_m_per_s": float(np.max(speeds))}
+    if args.json:
+        print(json.dumps({"speed": speed, "rates": rates, "gaps": gaps}, indent=1))
+        return 0
+    print(
+        f"the flange moves at {speed['median_m_per_s']:.3f} m/s (median), {speed['most_m_per_s']:.3f} at most"
+    )
+    print(f"{show_rates(rates)}\n\n{show_gaps(gaps)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

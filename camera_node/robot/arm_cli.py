@@ -1,0 +1,133 @@
+"""The commands of the bench: simulate an arm, drive one, examine a set-up. Imports none of what they use."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from camera_node.config import ROBOTS
+
+COMMANDS = ("simulate-arm", "drive-arm", "teleop", "doctor")
+
+
+def add_commands(commands: Any) -> None:
+    """Add their parsers to the sub-commands ``commands``."""
+    simulate = commands.add_parser(
+        "simulate-arm", help="a simulated UR controller that real client programs connect to",
+        description="Serves the ports of a Universal Robots controller whose arm is simulated: state and "
+        "registers (30004), dashboard (29999), programs (30001-30003). Of a program's commands it knows "
+        "moveJ, servoJ, servoStop, speedJ, speedStop, stopJ, setWatchdog, kickWatchdog and stopScript; "
+        "others (moveL, forceMode, getForwardKinematics, ...), and what a real arm refuses, stop the program "
+        "with a warning.",
+    )  # fmt: skip
+    add = simulate.add_argument
+    add("scenario", nargs="?", help="take address, robot and calibration from this scenario's source.arm")
+    add(
+        "--host", metavar="ADDRESS",
+        help="address to serve at (default 127.0.0.2); clients know the ports by heart, so a second arm "
+        "needs a second address, such as 127.0.0.3",
+    )  # fmt: skip
+    add("--robot", choices=ROBOTS, default=ROBOTS[0], help="which arm (default %(default)s)")
+    add("--calibration", type=Path, metavar="FILE", help="a robot's own calibration.conf")
+    add("--joints", metavar="DEG,...", help="where it stands at first: six angles in degrees")
+    add("--drift-ppm", type=float, default=0.0, metavar="PPM", help="how much too fast its clock runs")
+    add("--noise-rad", type=float, default=0.0, metavar="RAD", help="noise of its encoders, one sigma")
+    add("--seed", type=int, default=0, metavar="N", help="of that noise")
+
+    drive = commands.add_parser(
+        "drive-arm", help="take the camera on an arm round its target",
+        description="Moves the arm of a scenario along the viewpoints of its source.arm.path, there and "
+        "back, until Ctrl-C. Prints the joint angles first, and asks before it moves a real arm.",
+    )  # fmt: skip
+    drive.add_argument("scenario", help="a scenario whose source.arm has a path")
+    drive.add_argument(
+        "--rounds", type=int, default=0, metavar="N", help="tours to make (default 0: on and on)"
+    )
+    drive.add_argument(
+        "--show",
+        action="store_true",
+        help="print what would be driven from where the arm stands, and do not move",
+    )
+    drive.add_argument(
+        "--joints", metavar="DEG,...", help="of --show: from there instead, six angles in degrees"
+    )
+    drive.add_argument("--yes", action="store_true", help="the arm's space is clear: do not ask")
+
+    _add_teleop(commands)
+
+    doctor = commands.add_parser(
+        "doctor", help="examine this machine's part of a set-up: what is wrong, and what to do about it",
+        description="Tests, one after the other, the packages, cameras, arm, clock, network, disk and files "
+        "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
+    )  # fmt: skip
+    doctor.add_argument("scenario", nargs="?", help="without one, only what every scenario needs is tested")
+    doctor.add_argument("--to", metavar="HOST:PORT", help="the channel emulator or edge server to reach")
+    doctor.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    doctor.add_argument(
+        "--out", type=Path, default=Path("runs"), metavar="DIR", help="where runs will be written"
+    )
+    doctor.add_argument("--json", action="store_true", help="one JSON object for scripts")
+
+
+TELEOP = """\
+Moves the arm of a scenario as an operator moves a stylus, while its clutch is pressed: scaled, filtered, and
+within limits of workspace, joints, speed, acceleration and distance between the arm's parts at every tick,
+whatever the stylus does. With no message for watchdog_ms the arm comes to rest. Limits and scale are keys of
+the scenario's source.arm.teleop.
+
+  camera-node simulate-arm cell &                                   an arm on this machine
+  camera-node teleop cell --stylus keyboard                         keys are listed when it starts
+  camera-node teleop cell --stylus gamepad                          hold the south button (A, cross) to move
+  camera-node teleop cell --stylus network:7010                     a driver sends what the stylus does
+  camera-node teleop cell --stylus network:7010 --dry-run path.csv  no arm: joints a tick, to a file
+
+A network stylus sends UDP datagrams of JSON to the port, 50 to 1000 a second:
+
+  {"t_ns": 1234567890, "p": [x, y, z], "q": [w, x, y, z], "clutch": true}
+
+t_ns: when it was measured (any clock); p: metres, z up; q: orientation; clutch: follow while true, once it
+has been false. For a 3D Systems Touch: p = [x, -z, y] / 1000 of HD_CURRENT_TRANSFORM, clutch from
+HD_CURRENT_BUTTONS.
+"""
+
+
+def _add_teleop(commands: Any) -> None:
+    teleop = commands.add_parser(
+        "teleop", help="move an arm by keyboard, gamepad or a stylus on the network", description=TELEOP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    add = teleop.add_argument
+    add("scenario", help="a scenario with a source.arm")
+    add(
+        "--stylus", required=True, metavar="WHICH",
+        help="keyboard, gamepad[:/dev/input/eventN], network:[HOST:]PORT (HOST: 127.0.0.1)",
+    )  # fmt: skip
+    add("--dry-run", type=Path, metavar="FILE", help="write the trajectory there (CSV) and move nothing")
+    add("--seconds", type=float, metavar="S", help="end after so long")
+    add("--yes", action="store_true", help="the arm's space is clear: do not ask")
+    add("--json", action="store_true", help="counts at the end as one JSON object")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run one of ``COMMANDS``. Raises ScenarioError."""
+    try:
+        if args.command == "simulate-arm":
+            from camera_node.robot.simulated_controller import command
+
+            return command.run(args)
+        if args.command == "drive-arm":
+            from camera_node.robot.arm import drive
+
+            return drive.run(args)
+        if args.command == "teleop":
+            from camera_node.robot.teleop import command as teleop
+
+            return teleop.run(args)
+        from camera_node import doctor
+
+        return doctor.run(args)
+    except ValueError as error:  # what an arm or a file has to say, in one line
+        print(f"camera-node: {error}", file=sys.stderr)
+        return 2

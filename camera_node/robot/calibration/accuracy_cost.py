@@ -1,0 +1,267 @@
+"""What accuracy costs in time, for poses: three tables, measured on a simulated hand with the truth known.
+
+- ``pairing``: error of the camera's pose (4.7) against how often the arm reports and how fast it moves,
+  taking the nearest sample (thesis 4.3.3), a straight line with slerp, or the screw between two; and what a
+  pair costs in processor time.
+- ``poses``: error of the hand-eye calibration against the number of poses, by method, beside the Cramer-Rao
+  bound; noise on the arm's side, .5 mm and .002 rad an axis. ``rms_mm_std``, ``rms_deg_std``: standard
+  deviations of the errors over so many trials: an error below its bound is chance, and these say how much of
+  it to expect. ``planned``: the refinement, with poses after
+  the first four where the guided session proposes them; its bound is that of its own poses.
+- ``offset``: error of the time offset between arm and camera against the length of the recording and speed.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from camera_node.pose.pairing import Counts, Mix, PoseBuffer, along_line, along_screw
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, HandEye
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.files import Track
+from camera_node.robot.calibration.hand_eye import simulated
+from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, REFINED, angle_deg, distance_mm
+from camera_node.robot.calibration.hand_eye.closed_form import solve
+from camera_node.robot.calibration.hand_eye.joint_refinement import bound, refine
+from camera_node.robot.calibration.hand_eye.next_pose import propose
+from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse
+from camera_node.robot.calibration.hand_eye.time_offset import calibrate_streams
+from freshfield.geometry import Pose
+
+Rows = list[dict[str, Any]]
+
+MIXES: dict[str, Mix[Pose] | None] = {"nearest": None, "line": along_line, "screw": along_screw}
+PERIODS_MS = (2.0, 8.0, 20.0, 50.0, 100.0, 200.0)
+SPEEDS_M_PER_S = (0.05, 0.1, 0.25, 0.5, 1.0)
+COUNTS = (4, 6, 8, 10, 15, 20, 30, 50)
+PLANNED = "planned"
+_NOISE = (simulated.ARM_RAD, simulated.ARM_M)
+_FRAMES_PER_S = 30.0
+# What a detector leaves of a target's pose at this distance (measured with rendered pictures).
+_SEEN_RAD, _SEEN_M = 0.0005, 0.0003
+
+
+def measure(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]:
+    """The three tables, each when it is there. quick: fewer frames and trials, for seconds instead of two
+    minutes."""
+    periods_ms, speeds = (PERIODS_MS[::2], SPEEDS_M_PER_S[1::2]) if quick else (PERIODS_MS, SPEEDS_M_PER_S)
+    yield "pairing", pairing(4.0 if quick else 20.0, periods_ms, speeds, seed)
+    yield "poses", poses(COUNTS[::2] if quick else COUNTS, 10 if quick else 100, seed)
+    yield "offset", offset(1 if quick else 5, (5.0, 20.0) if quick else (5.0, 10.0, 20.0, 40.0), seed)
+
+
+def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, ...], seed: int = 0) -> Rows:
+    """Errors of the camera's pose, and their gaps, over frames at 30 a second whose stamps owe nothing to
+    the arm's. The arm's poses are exact: what is left is the pairing."""
+    rng = np.random.default_rng([seed, 1])
+    mount = HandEye(EYE_IN_HAND, simulated.CAMERA_IN_HAND)
+    rows = []
+    for speed in speeds:
+        sweep = simulated.Sweep(speed)
+        frames_s = np.sort(rng.uniform(1.0, 1.0 + seconds, int(seconds * _FRAMES_PER_S)))
+        truth = sweep.cameras(frames_s)
+        for period_ms in periods_ms:
+            times_s = np.arange(0.0, seconds + 2.0, period_ms / 1e3)
+            hands = [Pose.from_matrix(h) for h in sweep.hands(times_s)]
+            for name, mix in MIXES.items():
+                hand = PoseBuffer(mix, max_gap_ns=10**9, keep_ns=10**12)
+                for t_s, pose in zip(times_s, hands):
+                    hand.add(round(t_s * 1e9), pose)
+                camera = mount.camera_poses(hand)
+                begun = time.process_time()
+                paired = [camera.at(round(t_s * 1e9)) for t_s in frames_s]
+                spent = time.process_time() - begun
+                found = [p.pose.matrix() for p in paired]
+                mm = np.array([distance_mm(a, b) for a, b in zip(found, truth)])
+                deg = np.array([angle_deg(a, b) for a, b in zip(found, truth)])
+                rows.append({
+                    "speed_m_per_s": speed, "arm_period_ms": period_ms, "pairing": name,
+                    "gap_ms_mean": float(np.mean([p.gap_ns for p in paired])) / 1e6,
+                    "mm_p50": float(np.median(mm)), "mm_p95": float(np.quantile(mm, 0.95)),
+                    "deg_p50": float(np.median(deg)), "deg_p95": float(np.quantile(deg, 0.95)),
+                    "us_a_pair": spent / len(frames_s) * 1e6,
+                })  # fmt: skip
+    return rows
+
+
+def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
+    """Root mean square errors over trials; ``failed`` counts those in which a method found nothing."""
+    rows = []
+    x, y = simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE
+    methods: dict[str, Callable[[Samples], Any]] = {
+        name: partial(solve, method=name) for name in ALL_METHODS if name != REFINED
+    }
+    methods[REFINED] = methods[PLANNED] = lambda samples: refine(samples).x
+    for count in counts:
+        errors: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
+        bounds: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
+        spent = dict.fromkeys(methods, 0.0)
+        for trial in range(trials):
+            rng = np.random.default_rng([seed, 2, count, trial])
+            of = {"random": _seen(simulated.random_hands(count, rng), rng), "planned": _planned(count, rng)}
+            for name, method in methods.items():
+                exact, samples = of["planned" if name == PLANNED else "random"]
+                bounds[name].append(bound(exact, x, y, _NOISE))
+                begun = time.process_time()
+                try:
+                    found = method(samples)
+                    errors[name].append((angle_deg(found, x), distance_mm(found, x)))
+                except CalibrationError:
+                    pass
+                spent[name] += time.process_time() - begun
+        for name in methods:
+            (deg, mm), (deg_std, mm_std) = rms(np.reshape(errors[name], (-1, 2)))
+            least = np.sqrt(np.mean(np.square(bounds[name]), axis=0))
+            rows.append({
+                "poses": count, "method": name, "trials": trials,
+                "rms_mm": float(mm), "rms_mm_std": float(mm_std), "bound_mm": float(least[1]),
+                "rms_deg": float(deg), "rms_deg_std": float(deg_std), "bound_deg": float(least[0]),
+                "failed": trials - len(errors[name]), "ms": spent[name] / trials * 1e3,
+            })  # fmt: skip
+    return rows
+
+
+def rms(errors: Array) -> tuple[Array, Array]:
+    """Root mean squares of the columns of (N, K), and their standard deviations from the scatter of the
+    squares; nan where there are too few rows to tell."""
+    squares = np.square(errors)
+    count = len(squares)
+    nothing = np.full(squares.shape[1], np.nan)
+    found = np.sqrt(squares.mean(axis=0)) if count else nothing
+    if count < 2:
+        return found, nothing
+    # d sqrt(m) = dm / (2 sqrt(m)); a mean of N squares deviates by their own deviation / sqrt(N).
+    deviation = squares.std(axis=0, ddof=1) / np.sqrt(count)
+    return found, np.divide(deviation, 2.0 * found, out=np.zeros_like(found), where=found > 0.0)
+
+
+def _seen(hands: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:
+    """Exact samples, and those with the arm's noise."""
+    targets = simulated.seen_targets(hands)
+    return Samples(hands, targets), Samples(simulated.disturbed(hands, rng, *_NOISE), targets)
+
+
+def _planned(count: int, rng: np.random.Generator) -> tuple[Samples, Samples]:
+    """The same for hands that go, after the first four, where they are proposed."""
+    hands = simulated.random_hands(min(count, 4), rng)
+    middle = (inverse(simulated.TARGET_IN_BASE) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
+    while len(hands) < count:
+        so_far = Samples(hands, simulated.seen_targets(hands))
+        next_hand = propose(
+            so_far, simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE, _NOISE, middle, rng
+        ).hand
+        hands = np.concatenate([hands, next_hand[None]])
+    return _seen(hands, rng)
+
+
+def offset(trials: int, durations_s: tuple[float, ...], seed: int = 0) -> Rows:
+    """The arm at 125 Hz with its noise, a camera at 15 Hz with a detector's; true offsets up to a second."""
+    rows = []
+    for speed in (0.05, 0.1, 0.25):
+        for duration_s in durations_s:
+            errors, coarse, said, mm, spent = [], [], [], [], 0.0
+            failed = 0
+            for trial in range(trials):
+                rng = np.random.default_rng([seed, 3, int(duration_s), int(speed * 1000), trial])
+                true_s = float(rng.uniform(-1.0, 1.0))
+                hand, target = streams(simulated.Sweep(speed), duration_s, true_s, rng)
+                begun = time.process_time()
+                try:
+                    found = calibrate_streams(hand, target, EYE_IN_HAND)
+                except CalibrationError:
+                    failed += 1
+                    continue
+                spent += time.process_time() - begun
+                errors.append(found.offset_s - true_s)
+                coarse.append(found.coarse_s - true_s)
+                said.append(found.std_s)
+                mm.append(distance_mm(found.refined.x, simulated.CAMERA_IN_HAND))
+            rows.append({
+                "speed_m_per_s": speed, "seconds": duration_s, "failed": failed, "coarse_ms": _rms_ms(coarse),
+                "error_ms": _rms_ms(errors), "said_std_ms": _rms_ms(said),
+                "camera_mm": float(np.sqrt(np.mean(np.square(mm)))) if mm else float("nan"),
+                "cpu_s": spent / max(1, len(errors)),
+            })  # fmt: skip
+    return rows
+
+
+def streams(
+    sweep: simulated.Sweep, seconds: float, offset_s: float, rng: np.random.Generator, noise: float = 1.0
+) -> tuple[Track, Track]:
+    """Hand at 125 Hz and target at 15 Hz, whose stamps of one instant differ by ``offset_s``; noise: factor
+    on both sides' own."""
+    hand_s = np.arange(0.0, seconds, 1 / 125.0)
+    seen_s = np.arange(0.1, seconds - 0.1, 1 / 15.0) + float(rng.uniform(0.0, 0.05))
+    hands = simulated.disturbed(sweep.hands(hand_s), rng, simulated.ARM_RAD * noise, simulated.ARM_M * noise)
+    targets = inverse(simulated.CAMERA_IN_HAND) @ inverse(sweep.hands(seen_s)) @ simulated.TARGET_IN_BASE
+    targets = simulated.disturbed(targets, rng, _SEEN_RAD * noise, _SEEN_M * noise)
+    return (
+        Track(np.round((hand_s + offset_s) * 1e9).astype(np.int64), hands, Counts(samples=len(hand_s))),
+        Track(np.round(seen_s * 1e9).astype(np.int64), targets, Counts(samples=len(seen_s))),
+    )
+
+
+def show(name: str, rows: Rows) -> str:
+    """A table as text."""
+    keys = list(rows[0])
+    width = {k: max(len(k), *(len(_cell(row[k])) for row in rows)) for k in keys}
+    lines = ["  ".join(f"{k:>{width[k]}}" for k in keys)]
+    lines += ["  ".join(f"{_cell(row[k]):>{width[k]}}" for k in keys) for row in rows]
+    return "\n".join([name, *lines, ""])
+
+
+def write(name: str, rows: Rows, folder: Path) -> None:
+    """A table as CSV. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f"{name}.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+
+
+def draw(tables: dict[str, Rows], path: Path) -> None:
+    """Pairing and number of poses as a picture, where matplotlib is there. Raises OSError."""
+    try:
+        import matplotlib
+    except ImportError:
+        return
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    rows = tables["pairing"]
+    speed = sorted({r["speed_m_per_s"] for r in rows})[len({r["speed_m_per_s"] for r in rows}) // 2]
+    for name in MIXES:
+        chosen = [r for r in rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
+        left.loglog([r["arm_period_ms"] for r in chosen], [r["mm_p95"] for r in chosen], "o-", label=name)
+    left.set(xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s")
+    left.legend()
+    rows = tables["poses"]
+    for name in (*ALL_METHODS, PLANNED):
+        chosen = [r for r in rows if r["method"] == name]
+        right.loglog([r["poses"] for r in chosen], [r["rms_mm"] for r in chosen], "o-", label=name)
+        if name in (REFINED, PLANNED):
+            right.loglog([r["poses"] for r in chosen], [r["bound_mm"] for r in chosen], "k--", linewidth=0.8)
+    right.set_xticks([4, 6, 10, 20, 50], ["4", "6", "10", "20", "50"], minor=False)
+    right.set_xticks([], minor=True)
+    right.set(
+        xlabel="poses", ylabel="camera in hand, rms (mm)", title="arm noise .5 mm, .002 rad (dashed: bounds)"
+    )
+    right.legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _rms_ms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) * 1e3 if values else float("nan")
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,309 @@
+"""``camera-node calibrate``: hand-eye, intrinsics, a target to print, and what accuracy costs."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from camera_node import stdout
+from camera_node.robot.calibration import CalibrationError
+
+if TYPE_CHECKING:
+    from camera_node.robot.calibration.hand_eye.calibrate import Calibration
+
+EXAMPLES = """examples:
+  camera-node calibrate target charuco:7x5:30mm:22mm --out board.png        print it, measure it, fix it flat
+  camera-node calibrate intrinsics pictures/ --board charuco:7x5:30mm:22mm --out lens.json
+  camera-node calibrate intrinsics --live bench.yaml --camera hand --board charuco:7x5:30mm:22mm
+  camera-node calibrate hand-eye handeye/ --board chessboard:9x6:23.6mm     ViSP's layout: pictures and poses
+  camera-node calibrate hand-eye --pairs samples.json --json                MoveIt's: [hand, target] pairs
+  camera-node calibrate hand-eye --hand arm.csv --target seen.csv           streams, time offset unknown
+  camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --out hand.yaml
+  camera-node calibrate hand-eye --live cell.yaml --camera cam00 --board charuco:7x5:30mm:22mm --drive
+  camera-node calibrate accuracy --quick                                    what poses and gaps are worth
+"""
+
+HAND_EYE = """Estimates where a camera sits on a hand (or in the base of the arm, --eye-to-hand), T_EE^C of
+the thesis (4.2), by Tsai-Lenz and four other closed forms and by a joint refinement that takes the arm for as
+inexact as it turns out to be. Motions that do not determine it are refused with the reason.
+
+from, one of:
+  FOLDER         pictures NAME-3.png with NAME_3.yaml, the hand's pose (rows: 6, cols: 1, data: [tx ty tz and
+                 theta u], metres and radians)
+  --pairs FILE   JSON list of [end-effector in base, target in camera], 4 x 4 each
+  --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, metres); the time offset is estimated too
+  --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when it is
+                 enough; with --drive the arm moves by itself. The hand's poses are those that the camera's
+                 source gives (without hand_eye), or --hand CSV of them, by seconds since the first frame
+"""
+
+
+MAX_GAP_MS, WANT_MM = 50.0, 0.5
+# Option -> what it goes with: said with anything else, it would be ignored.
+_GO_WITH = {
+    "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
+    **dict.fromkeys(
+        ("camera", "data", "want_mm", "moving", "drive", "yes", "samples", "preview", "seconds", "tracks"),
+        ("live",),
+    ),
+}  # fmt: skip
+_SPELT = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Fill in ``camera-node calibrate``."""
+    what = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
+    raw = argparse.RawDescriptionHelpFormatter
+    _add_hand_eye(what.add_parser("hand-eye", help="where the camera sits on the hand", description=HAND_EYE,
+                                  epilog=EXAMPLES, formatter_class=raw))  # fmt: skip
+    lens = what.add_parser("intrinsics", help="a camera's lens from pictures of a target", epilog=EXAMPLES,
+                           formatter_class=raw)  # fmt: skip
+    lens.add_argument(
+        "folder", type=Path, nargs="?", metavar="FOLDER",
+        help="10 to 20 pictures, the target tilted and in every corner",
+    )  # fmt: skip
+    lens.add_argument(
+        "--live", metavar="SCENARIO",
+        help="instead, guided, with its --camera: where to show the target next, and when it is enough",
+    )  # fmt: skip
+    _add_board(lens, required=True)
+    lens.add_argument("--camera", default="cam00", metavar="ID", help="its name in the file (%(default)s)")
+    lens.add_argument(
+        "--out", type=Path, metavar="FILE", help="calibration JSON, as the video source reads it"
+    )
+    lens.add_argument("--json", action="store_true", help="print what --out writes")
+    live = lens.add_argument_group("with --live").add_argument
+    live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    live("--moving", action="store_true", help="take pictures while the target moves too: short exposures")
+    live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
+    live("--seconds", type=float, metavar="S", help="end after so long with what there is")
+    target = what.add_parser("target", help="a picture of a target, to print", epilog=EXAMPLES,
+                             formatter_class=raw)  # fmt: skip
+    target.add_argument("board", metavar="SPEC", help="see hand-eye --board")
+    target.add_argument("--out", type=Path, required=True, metavar="FILE.png")
+    target.add_argument("--dpi", type=float, default=300.0, help="dots an inch (default %(default)g)")
+    study = what.add_parser("accuracy", help="what gaps, speed and number of poses cost", epilog=EXAMPLES,
+                            formatter_class=raw)  # fmt: skip
+    study.add_argument("--quick", action="store_true", help="seconds instead of minutes")
+    study.add_argument("--seed", type=int, default=0, metavar="N", help="(default %(default)s)")
+    study.add_argument("--out", type=Path, metavar="DIR", help="tables as CSV, and a picture")
+    study.add_argument("--json", action="store_true", help="print the tables as JSON")
+
+
+def _add_board(parser: argparse.ArgumentParser, required: bool) -> None:
+    parser.add_argument(
+        "--board", required=required, metavar="SPEC",
+        help="charuco:7x5:30mm:22mm[:4X4_50], chessboard:9x6:23.6mm (inner corners), apriltag:36h11:0:80mm, "
+        "qr:60mm[:TEXT]",
+    )  # fmt: skip
+
+
+# fmt: off
+def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("folder", type=Path, nargs="?", metavar="FOLDER")
+    add("--pairs", type=Path, metavar="FILE")
+    add("--hand", type=Path, metavar="CSV")
+    add("--target", type=Path, metavar="CSV")
+    add("--live", metavar="SCENARIO")
+    _add_board(parser, required=False)
+    add("--lens", type=Path, metavar="FILE",
+        help="calibration JSON or ViSP's XML (default: the folder's XML, the live camera's own)")
+    add("--eye-to-hand", action="store_true", help="the camera stands, the hand holds the target")
+    add("--method", default="refined", metavar="NAME",
+        help="whose answer is given: tsai, park, horaud, andreff, daniilidis or refined (default)")
+    add("--max-gap-ms", type=float, metavar="MS",
+        help=f"of streams: what is farther from a hand pose is not used (default {MAX_GAP_MS:g})")
+    add("--json", action="store_true",
+        help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
+    add("--out", type=Path, metavar="FILE.yaml", help="for the node (source.trajectory.hand_eye)")
+    add("--plot", type=Path, metavar="FILE.png", help="residuals, axes of the turns, scatter of the target")
+    live = parser.add_argument_group("with --live").add_argument
+    live("--camera", metavar="ID", help="of the scenario")
+    live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    live("--want-mm", type=float, metavar="MM",
+         help=f"enough when the standard deviation is below this (default {WANT_MM:g})")
+    live("--moving", action="store_true", help="take pictures while the hand moves too; with an arm, the "
+         "time offset between its stamps and the camera's is estimated from the motion")
+    live("--drive", action="store_true", help="once it has seen the target, the scenario's arm goes by "
+         "itself where it is wanted, as fast as source.arm.path says and above its floor_m; asks first")
+    live("--yes", action="store_true", help="of --drive: the arm's space is clear: do not ask")
+    live("--tracks", type=Path, metavar="DIR",
+         help="with --moving and an arm: keeps both streams, hand.csv and target.csv, for --hand, --target")
+    live("--samples", type=Path, metavar="FILE",
+         help="keeps each sample as --pairs reads it; goes on with those that are there")
+    live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
+    live("--seconds", type=float, metavar="S", help="end after so long with what there is")
+# fmt: on
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry a command out. Raises CalibrationError (exit code 2: it says what to change)."""
+    if args.what == "target":
+        return _target(args)
+    try:
+        import scipy  # noqa: F401
+    except ImportError:
+        raise CalibrationError("calibration needs scipy (pip install 'freshfield[calibrate]')") from None
+    try:
+        with stdout.only_ours() if args.what == "hand-eye" and args.drive else contextlib.nullcontext():
+            return {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "accuracy": _accuracy}[args.what](args)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+
+
+def _hand_eye(args: argparse.Namespace) -> int:
+    given = {
+        name for name in ("folder", "pairs", "hand", "target", "live") if getattr(args, name) is not None
+    }
+    if given not in ({"folder"}, {"pairs"}, {"hand", "target"}, {"live"}, {"live", "hand"}):
+        raise CalibrationError(
+            "expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO"
+        )
+    for option, goes_with in _GO_WITH.items():
+        if getattr(args, option) not in (None, False) and not given & set(goes_with):
+            places = " or ".join(_SPELT[each] for each in goes_with)
+            raise CalibrationError(f"--{option.replace('_', '-')}: goes with {places}")
+    args.max_gap_ms = MAX_GAP_MS if args.max_gap_ms is None else args.max_gap_ms
+    args.want_mm = WANT_MM if args.want_mm is None else args.want_mm
+    from camera_node.robot.calibration.hand_eye import calibrate as handeye
+    from camera_node.robot.calibration.hand_eye import report
+
+    if args.method not in handeye.ALL_METHODS:
+        raise CalibrationError(f"--method: expected one of {', '.join(handeye.ALL_METHODS)}")
+    found = _found(args)
+    if args.json:
+        for warning in found.warnings:
+            _say(f"note: {warning}")
+    # First of all, or a file that cannot be written would take a session's answer with it.
+    print(json.dumps(found.answer()) if args.json else report.show(found), flush=True)
+    if args.out is not None:
+        report.write_yaml(found, args.out)
+    if args.plot is not None:
+        report.plot(found, args.plot)
+    return 0
+
+
+def _found(args: argparse.Namespace) -> Calibration:
+    from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
+    from camera_node.robot.calibration import files as folder
+    from camera_node.robot.calibration.hand_eye import calibrate as handeye
+    from camera_node.robot.calibration.targets import parse
+
+    setup = EYE_TO_HAND if args.eye_to_hand else EYE_IN_HAND
+    if args.pairs is not None:
+        return handeye.calibrate(folder.read_pairs(args.pairs, setup), args.method)
+    if not args.max_gap_ms > 0:
+        raise CalibrationError("--max-gap-ms: expected a positive number")
+    if args.live is None and args.hand is not None:
+        hand, target = folder.read_track(args.hand), folder.read_track(args.target)
+        for name, track in (("hand", hand), ("target", target)):
+            if track.counts.duplicates or track.counts.reordered:
+                _say(f"{name}: {track.counts.duplicates} stamps came twice (the first is used), "
+                     f"{track.counts.reordered} out of order (sorted)")  # fmt: skip
+        return handeye.calibrate_tracks(hand, target, setup, args.method, args.max_gap_ms / 1e3)
+    if args.board is None:
+        raise CalibrationError("--board SPEC: say what the target is")
+    if args.live is not None and args.camera is None:
+        raise CalibrationError("--camera ID: say which of the scenario's cameras")
+    board = parse(args.board)
+    lens = None if args.lens is None else folder.read_lens(args.lens)
+    if args.live is not None:
+        from camera_node.robot.calibration.hand_eye.live import calibrate_live
+
+        return calibrate_live(args, board, lens, setup)
+    samples, measured = folder.read_visp_folder(args.folder, board, lens, setup, _counting("pictures"))
+    for name, why in measured.unused.items():
+        _say(f"{name}: {why}")
+    return handeye.calibrate(samples, args.method)
+
+
+def _intrinsics(args: argparse.Namespace) -> int:
+    from camera_node.robot.calibration.files import pictures
+    from camera_node.robot.calibration.lens.solve import calibrate_folder
+    from camera_node.robot.calibration.targets import parse
+    from freshfield import files
+
+    if (args.folder is None) == (args.live is None):
+        raise CalibrationError("expected one of FOLDER, --live SCENARIO")
+    if args.folder is not None:
+        for option in ("data", "moving", "preview", "seconds"):
+            if getattr(args, option) not in (None, False):
+                raise CalibrationError(f"--{option}: goes with {_SPELT['live']}")
+        lens = calibrate_folder(pictures(args.folder), parse(args.board), _counting("pictures"))
+    else:
+        from camera_node.robot.calibration.lens.live import calibrate_live
+
+        lens = calibrate_live(args, parse(args.board))
+    data = lens.calibration(args.camera)
+    if args.out is not None:
+        try:
+            files.write_json(args.out, data, indent=1)
+        except OSError as error:
+            raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
+    print(json.dumps(data) if args.json else lens.show())
+    return 0
+
+
+def _target(args: argparse.Namespace) -> int:
+    import cv2
+    import numpy as np
+
+    from camera_node.robot.calibration.targets import parse
+
+    board = parse(args.board)
+    width, height = (round(side_m / 0.0254 * args.dpi) for side_m in board.size_m)
+    if not 64 <= width <= 32_000:
+        raise CalibrationError(f"--dpi: makes a picture {width} pixels wide, expected 64 to 32000")
+    # Drawn finer, in whole pixels a module, and brought to size: rounding each module would add up over them.
+    fine = board.draw(board.modules * math.ceil(2 * width / board.modules))
+    picture = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
+    # Detectors need white around what they look for.
+    border = max(8, width // 10)
+    if not cv2.imwrite(str(args.out), np.pad(picture, border, constant_values=255)):
+        raise CalibrationError(f"--out: {args.out} cannot be written (does its folder exist? .png?)")
+    print(
+        f"{args.out}: print it at {args.dpi:g} dpi without scaling; without its white border it must measure "
+        f"{board.pattern_m[0] * 1e3:.1f} x {board.pattern_m[1] * 1e3:.1f} mm"
+    )
+    return 0
+
+
+def _accuracy(args: argparse.Namespace) -> int:
+    from camera_node.robot.calibration import accuracy_cost
+
+    if args.seed < 0:
+        raise CalibrationError("--seed: expected a whole number from 0")
+    tables = {}
+    try:
+        for name, rows in accuracy_cost.measure(args.quick, args.seed):
+            tables[name] = rows
+            if not args.json:
+                print(accuracy_cost.show(name, rows), flush=True)
+            if args.out is not None:
+                accuracy_cost.write(name, rows, args.out)
+        if args.out is not None:
+            accuracy_cost.draw(tables, args.out / "accuracy.png")
+    except OSError as error:
+        raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
+    if args.json:
+        print(json.dumps(tables))
+    return 0
+
+
+def _counting(what: str):  # type: ignore[no-untyped-def]
+    def progress(done: int) -> None:
+        if sys.stderr.isatty():
+            print(f"\r{done} {what} ", end="", file=sys.stderr, flush=True)
+
+    return progress
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)

@@ -1,0 +1,1 @@
+"""Hand-eye calibration: where a camera sits on an arm (thesis 4.3)."""

@@ -1,0 +1,188 @@
+"""Hand-eye calibration from samples or streams to a result: every method, and what the answer is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from camera_node.robot.arm.hand_eye_mount import MAX_OFFSET_S
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.files import Track
+from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, residuals, solve
+from camera_node.robot.calibration.hand_eye.joint_refinement import Refined, left_out, refine
+from camera_node.robot.calibration.hand_eye.samples import (
+    Array,
+    Diversity,
+    Samples,
+    angles,
+    mismatch_deg,
+    refuse_degenerate,
+)
+from camera_node.robot.calibration.hand_eye.time_offset import Timed, calibrate_streams
+
+REFINED = "refined"
+ALL_METHODS = (*METHODS, REFINED)
+# With fewer, the spread between methods is as large as what they disagree about.
+_GOOD_POSES = 10
+_LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
+_STRANGE_DEG = 1.0
+# Beyond these it is no calibration: poses the wrong way round, in millimetres, or of something else.
+_WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
+_ADVICE = (
+    "are the poses hand in base and target in camera, not their inverses, in metres, and is the set-up right?"
+)
+# As good as exact beside any camera.
+EXACT_ARM = (1e-6, 1e-6)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method's answer. transform: None where it found none, with the error. from_refined_deg, _mm: how
+    far it is from the refinement's."""
+
+    method: str
+    transform: Array | None
+    residuals: Residuals | None
+    from_refined_deg: float = 0.0
+    from_refined_mm: float = 0.0
+    error: str = ""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """transform: X (4, 4) of the method asked for. rows: every method's. left_out_deg, left_out_mm: deviation
+    over leaving out samples in turn (``groups`` of them). exact_arm: the refinement with the arm taken as
+    exact, where the target's own uncertainty is known. timed: of two streams. warnings: one line each."""
+
+    samples: Samples
+    method: str
+    transform: Array
+    residuals: Residuals
+    rows: tuple[Row, ...]
+    refined: Refined
+    left_out_deg: float
+    left_out_mm: float
+    groups: int
+    diversity: Diversity
+    exact_arm: Row | None = None
+    timed: Timed | None = None
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def time_offset_s(self) -> float:
+        return 0.0 if self.timed is None else self.timed.offset_s
+
+    def answer(self) -> dict[str, Any]:
+        """For scripts: {transform, time_offset_s, residual_mm, residual_deg, method}, and what the answer is
+        worth: {std_mm, std_deg, warnings}."""
+        return {
+            "transform": self.transform.tolist(),
+            "time_offset_s": self.time_offset_s,
+            "residual_mm": self.residuals.rms_mm,
+            "residual_deg": self.residuals.rms_deg,
+            "method": self.method,
+            "std_mm": self.refined.std_mm,
+            "std_deg": self.refined.std_deg,
+            "warnings": list(self.warnings),
+        }
+
+
+def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
+    """Raises CalibrationError with the reason where the samples do not determine X."""
+    spread = refuse_degenerate(samples)
+    return _calibration(samples, method, refine(samples), spread, None)
+
+
+def calibrate_tracks(
+    hand: Track, target: Track, setup: str, method: str = REFINED, max_gap_s: float | None = None
+) -> Calibration:
+    """From two streams with an unknown time offset. Raises CalibrationError."""
+    timed = calibrate_streams(hand, target, setup, **({} if max_gap_s is None else {"max_gap_s": max_gap_s}))
+    return _calibration(timed.samples, method, timed.refined, refuse_degenerate(timed.samples), timed)
+
+
+def angle_deg(a: Array, b: Array) -> float:
+    """Angle between the rotations of two transforms (4, 4)."""
+    return float(np.degrees(angles(a[:3, :3].T @ b[:3, :3])))
+
+
+def distance_mm(a: Array, b: Array) -> float:
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]) * 1e3)
+
+
+def _calibration(
+    samples: Samples, method: str, refined: Refined, spread: Diversity, timed: Timed | None
+) -> Calibration:
+    def row(name: str, find: Callable[[], Array]) -> Row:
+        try:
+            x = find()
+        except CalibrationError as error:
+            return Row(name, None, None, error=str(error))
+        away = angle_deg(refined.x, x), distance_mm(refined.x, x)
+        return Row(name, x, residuals(samples, x), *away)
+
+    rows = [row(name, lambda name=name: solve(samples, name)) for name in METHODS]  # type: ignore[misc]
+    rows.append(row(REFINED, lambda: refined.x))
+    chosen = next(r for r in rows if r.method == method)
+    if chosen.transform is None or chosen.residuals is None:
+        raise CalibrationError(chosen.error)
+    _refuse_nonsense(chosen.transform, chosen.residuals)
+    exact = None
+    if samples.covariance is not None:
+        start = (refined.x, refined.y)
+        exact = row("exact arm", lambda: refine(samples, start, robot_noise=EXACT_ARM).x)
+    left_deg, left_mm, groups = left_out(samples, refined)
+    return Calibration(
+        samples, method, chosen.transform, chosen.residuals, tuple(rows), refined, left_deg, left_mm, groups,
+        spread, exact, timed, tuple(_warnings(samples, refined, chosen.residuals, spread, timed)),
+    )  # fmt: skip
+
+
+def _refuse_nonsense(transform: Array, off: Residuals) -> None:
+    """Raises CalibrationError for what a script must not take for an answer. Medians: a few wild samples
+    among good ones do no harm."""
+    median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
+    away_m = float(np.linalg.norm(transform[:3, 3]))
+    if median_mm > _WORST_MM or median_deg > _WORST_DEG:
+        raise CalibrationError(
+            f"the poses do not fit together (residuals {median_mm:.0f} mm, {median_deg:.1f} degrees in the "
+            f"median): {_ADVICE}"
+        )
+    if away_m > _FARTHEST_M:
+        raise CalibrationError(f"the camera would be {away_m:.1f} m away: {_ADVICE}")
+
+
+def _warnings(
+    samples: Samples, refined: Refined, off: Residuals, spread: Diversity, timed: Timed | None
+) -> list[str]:
+    out = []
+    if len(samples) < _GOOD_POSES:
+        out.append(f"{len(samples)} poses: {_GOOD_POSES} to 20 well spread ones are worth their time")
+    if spread.half_turns:
+        out.append(
+            f"{spread.half_turns} of {spread.motions} motions turn by nearly 180 degrees, which upsets "
+            "Tsai-Lenz"
+        )
+    median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
+    if median_mm > _LARGE_RESIDUAL_MM or median_deg > _LARGE_RESIDUAL_DEG:
+        out.append(
+            f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
+        )
+    strange = mismatch_deg(samples)
+    threshold = max(_STRANGE_DEG, 5 * float(np.median(strange)))
+    for i in sorted({*refined.outliers, *map(int, np.flatnonzero(strange > threshold))})[:5]:
+        out.append(
+            f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
+            f"degrees) and counts for {min(1.0, refined.weights[i]):.2f}"
+        )
+    if timed is not None and abs(timed.offset_s) >= MAX_OFFSET_S:
+        out.append(
+            f"the time offset is {timed.offset_s:.0f} s: the two streams count from different beginnings, "
+            "and no node can use it: give both on the clocks that it will meet"
+        )
+    if timed is not None and timed.unpaired:
+        out.append(f"{timed.unpaired} target poses have no hand pose near enough in time and are not used")
+    return out

@@ -1,0 +1,130 @@
+"""Closed forms of A X = X B (4.6): Tsai-Lenz, which the thesis uses, and four others, as OpenCV has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.hand_eye.samples import (
+    Array,
+    Rotation,
+    Samples,
+    angles,
+    inverse,
+    transform_of,
+)
+
+METHODS = {
+    "tsai": cv2.CALIB_HAND_EYE_TSAI,
+    "park": cv2.CALIB_HAND_EYE_PARK,
+    "horaud": cv2.CALIB_HAND_EYE_HORAUD,
+    "andreff": cv2.CALIB_HAND_EYE_ANDREFF,
+    "daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
+}
+# OpenCV pairs every sample with every other: beyond this it takes seconds and gains nothing.
+MAX_CLOSED_FORM = 60
+# Random subsets that the start of the refinement may come from, so that a few wrong samples do not spoil it.
+_SUBSETS, _SUBSET_SIZE = 24, 5
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """How far each sample's target is from the mean of all, where it does not move: (N,) each."""
+
+    mm: Array
+    deg: Array
+
+    @property
+    def rms_mm(self) -> float:
+        return float(np.sqrt(np.mean(self.mm**2)))
+
+    @property
+    def rms_deg(self) -> float:
+        return float(np.sqrt(np.mean(self.deg**2)))
+
+
+def solve(samples: Samples, method: str) -> Array:
+    """X (4, 4) by one closed form. Raises CalibrationError where it finds none."""
+    few = samples.spread(MAX_CLOSED_FORM)
+    moved, target = few.moved, few.target
+    try:
+        # By keyword: given by position, the method is taken for an output and Tsai-Lenz runs.
+        rotation, translation = cv2.calibrateHandEye(
+            list(moved[:, :3, :3]), list(moved[:, :3, 3]), list(target[:, :3, :3]), list(target[:, :3, 3]),
+            method=METHODS[method],
+        )  # fmt: skip
+    except cv2.error as error:
+        raise CalibrationError(f"{method}: found no solution ({error.err})") from None
+    found = transform_of(np.asarray(rotation), np.asarray(translation).ravel())
+    if not np.isfinite(found).all():
+        raise CalibrationError(f"{method}: found no solution (the motions do not determine one)")
+    u, _, vt = np.linalg.svd(found[:3, :3])
+    found[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return found
+
+
+def still(samples: Samples, x: Array) -> Array:
+    """(N, 4, 4): where each sample puts the target in the frame in which it stands still, G_i X T_i."""
+    return np.asarray(samples.moved @ x @ samples.target)
+
+
+def mean_transform(transforms: Array) -> Array:
+    """Chordal mean of rotations and mean of translations."""
+    rotation = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
+    return transform_of(np.asarray(rotation), transforms[:, :3, 3].mean(axis=0))
+
+
+def residuals(samples: Samples, x: Array) -> Residuals:
+    """Of any X: distances of ``still`` from its mean."""
+    return residuals_from(still(samples, x), None)
+
+
+def residuals_from(places: Array, centre: Array | None) -> Residuals:
+    y = mean_transform(places) if centre is None else centre
+    turned = angles(y[:3, :3].T @ places[:, :3, :3])
+    off = np.linalg.norm(places[:, :3, 3] - y[:3, 3], axis=1)
+    return Residuals(off * 1e3, np.degrees(turned))
+
+
+def predicted_hand(samples: Samples, x: Array, y: Array) -> Array:
+    """(N, 4, 4): where the hand must be for the camera to see what it sees."""
+    if samples.setup == EYE_IN_HAND:
+        return np.asarray(y @ inverse(samples.target) @ inverse(x))
+    return np.asarray(x @ samples.target @ inverse(y))
+
+
+def robust_start(samples: Samples) -> tuple[Array, Array]:
+    """X and Y (4, 4) to refine from: of the closed forms on everything and of Park's on small subsets, the
+    one with the least median residual. The subsets are the same in every run. Raises CalibrationError."""
+    few = samples.spread(MAX_CLOSED_FORM)
+    rng = np.random.default_rng(0)
+    subsets = []
+    if len(few) > _SUBSET_SIZE + 1:
+        subsets = [rng.choice(len(few), _SUBSET_SIZE, replace=False) for _ in range(_SUBSETS)]
+    tried = [(few, "park"), (few, "daniilidis"), *((few.take(s), "park") for s in subsets)]
+    best: tuple[float, Array, Array] | None = None
+    for chosen, method in tried:
+        try:
+            x = solve(chosen, method)
+        except CalibrationError:
+            continue
+        places = still(few, x)
+        y = _median_transform(places)
+        off = residuals_from(places, y)
+        # One degree counts as much as it moves a point at arm's length of a third of a metre.
+        score = float(np.median(off.mm + np.deg2rad(off.deg) * 330.0))
+        if best is None or score < best[0]:
+            best = score, x, y
+    if best is None:
+        raise CalibrationError("no closed form finds a solution: are the poses those of one hand and target?")
+    return best[1], best[2]
+
+
+def _median_transform(places: Array) -> Array:
+    """The sample that is nearest to all others: a centre that outliers do not move."""
+    distance = np.linalg.norm(places[:, None, :3, :] - places[None, :, :3, :], axis=(2, 3))
+    return places[int(np.argmin(np.median(distance, axis=1)))]

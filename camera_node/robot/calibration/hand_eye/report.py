@@ -1,0 +1,144 @@
+"""A calibration for people: a table, a YAML that the node loads, a picture."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, MAX_OFFSET_S
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.hand_eye.calibrate import Calibration, Row
+from camera_node.robot.calibration.hand_eye.closed_form import still
+from camera_node.robot.calibration.hand_eye.samples import Rotation, rotation_vectors
+from freshfield import files
+
+_BLUE, _RED, _GREY = "#0072B2", "#D55E00", "#999999"
+
+
+def show(found: Calibration) -> str:
+    """Every method's figures, the answer, what it is worth, warnings."""
+    what = "camera in hand" if found.samples.setup == EYE_IN_HAND else "camera in base"
+    spread = found.diversity
+    lines = [
+        f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} "
+        f"degrees, axes spread by {spread.spread_deg:.0f} degrees (35 where they point everywhere alike)",
+        "",
+        f"{'method':12} {'residual mm':>12} {'degrees':>9}   {'from refined mm':>16} {'degrees':>9}",
+        *(_row(row) for row in found.rows),
+        "",
+        f"{what} ({found.method}): "
+        f"x {_metres(found, 0)}  y {_metres(found, 1)}  z {_metres(found, 2)} m, "
+        f"turned {_turn(found)}",
+        f"  standard deviation {found.refined.std_mm:.3f} mm, {found.refined.std_deg:.4f} degrees; "
+        f"leaving out one of {found.groups}: {found.left_out_mm:.3f} mm, {found.left_out_deg:.4f} degrees",
+        f"  the arm's noise, estimated: {found.refined.robot_m * 1e3:.3f} mm, "
+        f"{np.degrees(found.refined.robot_rad):.4f} degrees an axis",
+    ]
+    if found.exact_arm is not None and found.exact_arm.transform is not None:
+        lines.append(
+            f"  were the arm taken as exact, it would come out {found.exact_arm.from_refined_mm:.2f} mm, "
+            f"{found.exact_arm.from_refined_deg:.3f} degrees elsewhere"
+        )
+    if found.timed is not None:
+        lines.append(
+            f"time offset: {found.timed.offset_s * 1e3:.3f} ms (standard deviation "
+            f"{found.timed.std_s * 1e3:.3f} ms) to add to the camera's stamps to have the arm's; correlation "
+            f"of the angular speeds {found.timed.correlation:.3f}"
+        )
+    return "\n".join([*lines, *(f"note: {warning}" for warning in found.warnings)])
+
+
+def to_yaml(found: Calibration) -> str:
+    """What ``camera_node.robot.arm.hand_eye_mount.read_hand_eye`` reads, and how it was found."""
+    answer = found.answer()
+    warnings = answer.pop("warnings")
+    data = {
+        "setup": found.samples.setup,
+        "transform": [[round(v, 9) for v in row] for row in answer.pop("transform")],
+        **answer,
+        "poses": len(found.samples),
+        "leave_out_mm": found.left_out_mm,
+        "leave_out_deg": found.left_out_deg,
+        "arm_noise_mm": found.refined.robot_m * 1e3,
+        "arm_noise_deg": float(np.degrees(found.refined.robot_rad)),
+        "warnings": warnings,
+    }
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
+
+
+def write_yaml(found: Calibration, path: Path) -> None:
+    """Raises CalibrationError, also for what the node would refuse."""
+    if abs(found.time_offset_s) >= MAX_OFFSET_S:
+        raise CalibrationError(
+            f"--out: {path} is not written: the node would refuse a time offset of "
+            f"{found.time_offset_s:.0f} s: give both streams on clocks with one beginning"
+        )
+    try:
+        files.write_text(path, to_yaml(found))
+    except OSError as error:
+        raise CalibrationError(f"--out: {path}: {error.strerror}") from None
+
+
+def plot(found: Calibration, path: Path) -> None:
+    """Each pose's residual, the axes about which the hand turned, and where each pose puts the target."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise CalibrationError("--plot needs matplotlib (pip install 'freshfield[calibrate]')") from None
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (bars, ball, places) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    count = np.arange(1, len(found.samples) + 1)
+    bars.bar(count, found.residuals.mm, color=_BLUE)
+    for i in found.refined.outliers:
+        bars.bar(count[i], found.residuals.mm[i], color=_RED)
+    bars.set(xlabel="pose", ylabel="residual (mm; red: not believed)")
+    right = bars.twinx()
+    right.plot(count, found.residuals.deg, ".", color="black")
+    right.set_ylabel("residual (degrees, dots)")
+
+    rotation = found.samples.spread(40).moved[:, :3, :3]
+    pairs = list(itertools.combinations(range(len(rotation)), 2))
+    turns = rotation_vectors(np.array([rotation[i].T @ rotation[j] for i, j in pairs]))
+    angle = np.linalg.norm(turns, axis=1)
+    axes = turns / np.maximum(angle, 1e-12)[:, None]
+    axes *= np.where(axes[:, 2:] < 0, -1.0, 1.0)  # an axis and its opposite are one
+    drawn = ball.scatter(axes[:, 0], axes[:, 1], c=np.degrees(angle), s=8, vmin=0, vmax=180)
+    ball.add_patch(plt.Circle((0, 0), 1.0, fill=False, color=_GREY))
+    ball.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1), aspect="equal", xlabel="x", ylabel="y",
+             title="axes of the turns, seen along z")  # fmt: skip
+    figure.colorbar(drawn, ax=ball, label="turn (degrees)")
+
+    put = still(found.samples, found.transform)[:, :3, 3]
+    put = (put - put.mean(axis=0)) * 1e3
+    drawn = places.scatter(put[:, 0], put[:, 1], c=put[:, 2], s=25)
+    places.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", title="where each pose puts the target")
+    figure.colorbar(drawn, ax=places, label="z (mm)")
+    try:
+        figure.savefig(path, dpi=110)
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"--plot: {path}: {error}") from None
+    finally:
+        plt.close(figure)
+
+
+def _row(row: Row) -> str:
+    if row.residuals is None:
+        return f"{row.method:12} {row.error}"
+    return (
+        f"{row.method:12} {row.residuals.rms_mm:12.3f} {row.residuals.rms_deg:9.4f}   "
+        f"{row.from_refined_mm:16.3f} {row.from_refined_deg:9.4f}"
+    )
+
+
+def _metres(found: Calibration, axis: int) -> str:
+    return f"{found.transform[axis, 3]:.5f}"
+
+
+def _turn(found: Calibration) -> str:
+    vector = np.asarray(Rotation.from_matrix(found.transform[:3, :3]).as_rotvec())
+    return f"({', '.join(f'{v:.5f}' for v in vector)}) rad"

@@ -1,0 +1,201 @@
+"""Samples of a hand-eye calibration, their relative motions (4.4), (4.5), and whether they determine it.
+
+Both setups are one problem, G_i X T_i = Y, with T_i the target in the camera: for eye-in-hand G_i = H_i (hand
+in base), X = camera in hand, Y = target in base; for eye-to-hand G_i = H_i^-1, X = camera in base, Y = target
+in hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
+from camera_node.robot.calibration import CalibrationError
+
+Array = NDArray[np.float64]
+
+MIN_POSES = 3
+# A turn smaller than this has an axis made of noise; one nearer than this to half a turn has two.
+MIN_TURN_DEG, HALF_TURN_MARGIN_DEG = 5.0, 10.0
+# Axes that lie within a cone of about this half angle leave a translation along them undetermined.
+MIN_SPREAD_DEG = 8.0
+# Pairs of samples looked at: all of 80 samples' are 3160.
+_MAX_SAMPLES = 80
+
+
+@dataclass(frozen=True)
+class Samples:
+    """hand: (N, 4, 4) hand in base. target: (N, 4, 4) target in camera. covariance: (N, 6, 6) of the target's
+    rotation (radians, about the target's own axes) and translation (metres, camera axes); None: exact.
+    names: for messages."""
+
+    hand: Array
+    target: Array
+    setup: str = EYE_IN_HAND
+    covariance: Array | None = None
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.setup not in SETUPS:
+            raise CalibrationError(f"setup: expected {' or '.join(SETUPS)}, got {self.setup!r}")
+        for name, value in (("hand", self.hand), ("target", self.target)):
+            if value.ndim != 3 or value.shape[1:] != (4, 4) or not np.isfinite(value).all():
+                raise CalibrationError(f"{name}: expected finite 4 x 4 matrices, got shape {value.shape}")
+        if len(self.hand) != len(self.target):
+            raise CalibrationError(f"{len(self.hand)} poses of the hand, {len(self.target)} of the target")
+
+    def __len__(self) -> int:
+        return len(self.hand)
+
+    @property
+    def moved(self) -> Array:
+        """G_i, (N, 4, 4): the hand in base, or base in hand."""
+        return self.hand if self.setup == EYE_IN_HAND else inverse(self.hand)
+
+    def name(self, index: int) -> str:
+        return self.names[index] if self.names else f"pose {index + 1}"
+
+    def take(self, chosen: Sequence[int] | NDArray[np.intp]) -> Samples:
+        at = np.asarray(chosen, dtype=np.intp)
+        return replace(
+            self,
+            hand=self.hand[at],
+            target=self.target[at],
+            covariance=None if self.covariance is None else self.covariance[at],
+            names=tuple(self.names[i] for i in at) if self.names else (),
+        )
+
+    def spread(self, most: int) -> Samples:
+        """At most so many of them, evenly over the recording."""
+        if len(self) <= most:
+            return self
+        return self.take(np.linspace(0, len(self) - 1, most).round().astype(np.intp))
+
+
+@dataclass(frozen=True)
+class Diversity:
+    """What the motions between the samples are good for. motions: all pairs; usable: those that turn by
+    neither too little nor nearly half a turn. largest_turn_deg; spread_deg: how far the axes of usable
+    motions stand from being parallel (35 where they point everywhere alike). reason: why nothing can be
+    calibrated from them, or None. missing: the axis (3,), in the hand's or the base's axes, about which the
+    hand has turned least."""
+
+    motions: int
+    usable: int
+    half_turns: int
+    largest_turn_deg: float
+    spread_deg: float
+    reason: str | None
+    missing: Array
+
+
+def inverse(transforms: Array) -> Array:
+    """Inverses of rigid transforms (..., 4, 4)."""
+    out = np.zeros_like(transforms)
+    rotation = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = -(rotation @ transforms[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def transform_of(rotation: Array, translation_m: Array) -> Array:
+    """Transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    out = np.zeros((*rotation.shape[:-2], 4, 4))
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = translation_m
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def rotation_vectors(rotations: Array) -> Array:
+    """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
+
+
+def angles(rotations: Array) -> Array:
+    """Angles (N,) in radians of rotation matrices (N, 3, 3); from the chord, which costs less than a
+    rotation vector and keeps small angles exact (near half a turn it loses half of the digits)."""
+    chord = np.linalg.norm(rotations - np.eye(3), axis=(-2, -1)) / np.sqrt(8.0)
+    return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
+
+
+def diversity(samples: Samples) -> Diversity:
+    """Judge the motions between all pairs of samples (at most 80 of these)."""
+    chosen = samples.spread(_MAX_SAMPLES)
+    nothing = np.array([0.0, 0.0, 1.0])
+    if len(chosen) < 2:
+        return Diversity(0, 0, 0, 0.0, 0.0, _too_few(len(samples)), nothing)
+    first, second = np.triu_indices(len(chosen), 1)
+    rotation = chosen.moved[:, :3, :3]
+    turns = rotation_vectors(np.swapaxes(rotation[first], 1, 2) @ rotation[second])
+    angles_deg = np.degrees(np.linalg.norm(turns, axis=1))
+    small, half = angles_deg < MIN_TURN_DEG, angles_deg > 180.0 - HALF_TURN_MARGIN_DEG
+    usable = ~small & ~half
+    axes = turns[usable] / np.linalg.norm(turns[usable], axis=1, keepdims=True)
+    # Axes u and -u are one: the mean of u u^T knows that. Its second eigenvalue is sin^2 of the half angle
+    # of the fan in which the axes lie, and 1/3 where they point everywhere alike.
+    values, vectors = np.linalg.eigh(axes.T @ axes / max(1, len(axes)))
+    spread_deg = float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0))))) if len(axes) else 0.0
+    if len(samples) < MIN_POSES:
+        reason: str | None = _too_few(len(samples))
+    elif usable.sum() >= 2 and spread_deg >= MIN_SPREAD_DEG:
+        reason = None
+    elif usable.sum() >= 2:
+        reason = (
+            f"the hand has turned about parallel axes only (they spread by {spread_deg:.1f} degrees, at "
+            f"least {MIN_SPREAD_DEG:g} are needed): the translation along them stays unknown; tilt the "
+            "hand about another axis too"
+        )
+    elif half.sum() >= small.sum():
+        reason = (
+            f"{_all_but(int(usable.sum()))} turns are near 180 degrees, where the axis' sign is lost; add "
+            "poses turned by 20 to 90 degrees"
+        )
+    else:
+        reason = (
+            f"the hand has hardly turned (by {angles_deg.max():.1f} degrees at most, {MIN_TURN_DEG:g} are "
+            "needed): moving without turning says nothing about the translation; turn it by 20 to 90 degrees"
+        )
+    return Diversity(
+        len(angles_deg), int(usable.sum()), int(half.sum()), float(angles_deg.max()), spread_deg, reason,
+        vectors[:, 0] if len(axes) else nothing,
+    )  # fmt: skip
+
+
+def refuse_degenerate(samples: Samples) -> Diversity:
+    """Their diversity. Raises CalibrationError where no calibration can come from the samples."""
+    found = diversity(samples)
+    if found.reason is not None:
+        raise CalibrationError(found.reason)
+    return found
+
+
+def mismatch_deg(samples: Samples) -> Array:
+    """(N,): median over the other samples of | angle of A_ij - angle of B_ij |. The two are equal whatever X
+    is (4.6), so what is large here was detected or paired wrongly."""
+    chosen = np.arange(len(samples))
+    if len(chosen) > _MAX_SAMPLES:
+        chosen = np.linspace(0, len(samples) - 1, _MAX_SAMPLES).round().astype(np.intp)
+    hand, target = samples.hand[:, :3, :3], samples.target[:, :3, :3]
+    out = np.empty(len(samples))
+    for i in range(len(samples)):
+        others = chosen[chosen != i]
+        a = angles(np.swapaxes(hand[others], 1, 2) @ hand[i])
+        b = angles(np.swapaxes(target[others], 1, 2) @ target[i])
+        out[i] = math.degrees(float(np.median(np.abs(a - b)))) if len(others) else 0.0
+    return out
+
+
+def _all_but(count: int) -> str:
+    return f"all but {count} of the" if count else "all"
+
+
+def _too_few(count: int) -> str:
+    return f"too few poses: {count}, at least {MIN_POSES} are needed and 10 to 20 are good"

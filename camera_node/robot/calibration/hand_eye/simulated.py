@@ -1,0 +1,155 @@
+"""A hand with a camera that moves over a target, with the truth known: what calibration and pairing are
+measured on. The place is that of a UR3e's table: everything is within half a metre of its base."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
+from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, inverse, transform_of
+from camera_node.robot.calibration.targets import Grey, Target
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.render import CameraRenderer, Part, World
+from camera_node.synthetic.shapes import Quad
+from camera_node.synthetic.textures import Plain
+from freshfield.geometry import Pinhole, look_at, se3_inverse, so3_exp
+
+# The arm's noise that the project's figures are given for (issue: simulated UR3e).
+ARM_RAD, ARM_M = 0.002, 0.0005
+REACH_M = 0.5
+
+_PLATE_MARGIN_M = 0.02
+
+
+def _rigid(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> Array:
+    return transform_of(so3_exp(turn), np.array(shift))
+
+
+# Camera in hand, and target in base: lying on the table, its picture upwards (z into the table).
+CAMERA_IN_HAND = _rigid((0.02, -0.03, 1.55), (0.055, -0.035, 0.045))
+TARGET_IN_BASE = _rigid((np.pi, 0.0, 0.0), (0.14, 0.02, 0.0))
+TARGET_MIDDLE = (0.22, -0.04, 0.0)
+
+
+def random_hands(count: int, rng: np.random.Generator, tilt_deg: float = 50.0) -> Array:
+    """(N, 4, 4) hand in base, the camera looking at the target from all sides, turned about its axis."""
+    out: list[Array] = []
+    while len(out) < count:
+        azimuth, slope = rng.uniform(-np.pi, np.pi), np.deg2rad(tilt_deg) * np.sqrt(rng.uniform())
+        camera = _camera(azimuth, slope, rng.uniform(0.17, 0.30), rng.uniform(-0.9, 0.9))
+        camera[:3, 3] += rng.normal(0.0, 0.01, 3)
+        hand = camera @ inverse(CAMERA_IN_HAND)
+        if np.linalg.norm(hand[:3, 3]) < REACH_M:
+            out.append(hand)
+    return np.array(out)
+
+
+def _camera(azimuth: float, slope: float, distance_m: float, roll: float) -> Array:
+    middle = np.array(TARGET_MIDDLE)
+    to = [np.sin(slope) * np.cos(azimuth), np.sin(slope) * np.sin(azimuth), np.cos(slope)]
+    out = look_at(middle + distance_m * np.array(to), middle, up=(1.0, 0.0, 0.0))
+    out[:3, :3] = out[:3, :3] @ so3_exp([0.0, 0.0, roll])
+    return out
+
+
+def seen_targets(hands: Array) -> Array:
+    """(N, 4, 4) target in camera, exact."""
+    return np.asarray(inverse(CAMERA_IN_HAND) @ inverse(hands) @ TARGET_IN_BASE)
+
+
+def disturbed(poses: Array, rng: np.random.Generator, rad: float, metres: float) -> Array:
+    """Poses with Gaussian noise: a rotation vector about the body's own axes, and a translation."""
+    turns = Rotation.from_rotvec(rng.normal(0.0, rad, (len(poses), 3))).as_matrix()
+    shifts = rng.normal(0.0, metres, (len(poses), 3))
+    return transform_of(poses[:, :3, :3] @ turns, poses[:, :3, 3] + shifts)
+
+
+def samples(
+    count: int,
+    rng: np.random.Generator,
+    rad: float = ARM_RAD,
+    metres: float = ARM_M,
+    setup: str = EYE_IN_HAND,
+) -> Samples:
+    """Samples with the noise on the arm's side. For eye-to-hand, hand and camera change places: X is the
+    same (4, 4), the camera in the base."""
+    hands = random_hands(count, rng)
+    targets = seen_targets(hands)
+    if setup != EYE_IN_HAND:
+        hands = inverse(hands)
+    return Samples(disturbed(hands, rng, rad, metres), targets, setup)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A hand that sweeps over the target along incommensurate sines, so that no stretch is like another.
+
+    speed_m_per_s: mean speed of the camera. The path is the same at every speed.
+    """
+
+    speed_m_per_s: float = 0.1
+
+    # Metres of path a second at rate 1, measured over ten minutes of it.
+    _NATURAL_M_PER_S = 0.1036
+
+    def hands(self, t_s: NDArray[np.float64]) -> Array:
+        """(N, 4, 4) hand in base at instants (N,)."""
+        return np.asarray(self.cameras(t_s) @ inverse(CAMERA_IN_HAND))
+
+    def cameras(self, t_s: NDArray[np.float64]) -> Array:
+        """(N, 4, 4) camera in base."""
+        u = np.asarray(t_s) * (self.speed_m_per_s / self._NATURAL_M_PER_S)
+        x = 0.55 * np.sin(0.61 * u) + 0.22 * np.sin(1.37 * u + 0.4)
+        y = 0.50 * np.sin(0.83 * u + 1.1) + 0.20 * np.sin(1.73 * u)
+        distance_m = 0.235 + 0.045 * np.sin(0.47 * u + 0.7)
+        roll = 0.6 * np.sin(0.71 * u + 0.3) + 0.25 * np.sin(1.93 * u)
+        slope, azimuth = np.hypot(x, y), np.arctan2(y, x)
+        return np.array([_camera(*row) for row in zip(azimuth, slope, distance_m, roll)]).reshape(-1, 4, 4)
+
+
+def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> Grey:
+    """The picture (H, W) of the target on a white plate, on a table, by the project's own ray caster."""
+    width, height = target.size_m
+    picture = target.draw(max(256, round(width / 0.0002)))
+    # The caster's rectangle is seen from +z and has y up; a target's z goes into the paper and its y down.
+    flip = _rigid((np.pi, 0.0, 0.0), (width / 2, height / 2, 0.0))
+    parts = []
+    for depth_m, margin_m, texture in (
+        (0.0, 0.0, _Picture(picture, width, height)),
+        (0.0005, _PLATE_MARGIN_M, Plain((0.95, 0.95, 0.95))),
+        (0.001, 0.6, Plain((0.45, 0.42, 0.40))),
+    ):
+        below = flip.copy()
+        below[2, 3] = depth_m
+        parts.append(Part(Quad((width / 2 + margin_m, height / 2 + margin_m)), texture, below, False))
+    lamp = (width / 2, height / 2, -1.0)
+    light = Light(np.array([lamp]), 0.2, 2.0, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7), (1.0, 1.0, 1.0))
+    world = World(tuple(parts), (), light, (0.5, 0.5, 0.5))
+    image = CameraRenderer(world, lens, camera_in_target, supersample).image(0.0)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def camera_in_target(hand: Array) -> Array:
+    """(4, 4) for ``render``, of a hand in base."""
+    return np.asarray(se3_inverse(TARGET_IN_BASE) @ hand @ CAMERA_IN_HAND)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A grey picture on a rectangle, linear between its pixels."""
+
+    pixels: Grey
+    width_m: float
+    height_m: float
+
+    def __call__(self, uv: Array) -> Array:
+        rows, columns = self.pixels.shape
+        x = (uv[0] / self.width_m + 0.5) * columns - 0.5
+        y = (0.5 - uv[1] / self.height_m) * rows - 0.5
+        grey = map_coordinates(self.pixels.astype(np.float32), [y, x], order=1, mode="nearest")
+        return np.repeat(grey[None] / 255.0, 3, axis=0)

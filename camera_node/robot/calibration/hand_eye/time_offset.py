@@ -1,0 +1,187 @@
+"""The time offset between an arm's clock and a camera's, from how both saw the same motion.
+
+Whatever X is, hand and target turn by the same angles (4.6), so their angular speeds are one signal on two
+clocks. Their cross-correlation finds the offset to a fraction of a sample, over any range of offsets; then it
+is refined with X and Y in one likelihood (``refine``), where it counts by how fast the hand moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import correlate
+
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.files import Track
+from camera_node.robot.calibration.hand_eye.joint_refinement import Refined, refine
+from camera_node.robot.calibration.hand_eye.samples import (
+    Array,
+    Rotation,
+    Samples,
+    refuse_degenerate,
+    transform_of,
+)
+
+MAX_GAP_S = 0.05
+# Samples that the refinement uses: more are neighbours that say the same.
+MAX_SAMPLES = 400
+_STEP_S = 0.01
+# Angular speed over so long: shorter, and it is the noise of two poses; longer, and the motion is flat.
+_WINDOW_S = 0.25
+_LEAST_CORRELATION, _RIVAL = 0.5, 0.97
+_LEAST_OVERLAP_S = 2.0
+# Half of what the velocity of the hand is taken over.
+_HALF_S = 0.02
+_ROUNDS, _SETTLED_S = 10, 1e-6
+
+
+@dataclass(frozen=True)
+class Timed:
+    """samples: paired at the offset found. refined: X, Y and how sure they are. offset_s: hand's stamp minus
+    camera's of an instant. std_s: as the likelihood has it. correlation: of the angular speeds at the coarse
+    offset. unpaired: target poses with no hand pose near enough."""
+
+    samples: Samples
+    refined: Refined
+    offset_s: float
+    std_s: float
+    coarse_s: float
+    correlation: float
+    unpaired: int
+
+
+def calibrate_streams(hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S) -> Timed:
+    """Time offset and hand-eye calibration from two streams. Raises CalibrationError with the reason."""
+    coarse_s, correlation = coarse_offset(hand, target)
+    offset_s, start = coarse_s, None
+    for _ in range(_ROUNDS):
+        samples, velocity, unpaired = paired(hand, target, offset_s, setup, max_gap_s)
+        refuse_degenerate(samples)
+        found = refine(samples, start, velocity=velocity)
+        start = (found.x, found.y)
+        offset_s += found.offset_s
+        if abs(offset_s - coarse_s) > 2 * _WINDOW_S:
+            raise CalibrationError(
+                f"the time offset does not settle near {coarse_s:.3f} s, where the angular speeds agree: is "
+                "one of the streams that of another body, or an inverse?"
+            )
+        if abs(found.offset_s) < _SETTLED_S:
+            break
+    return Timed(samples, found, offset_s, found.offset_std_s, coarse_s, correlation, unpaired)
+
+
+def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
+    """Offset in seconds and the correlation there. Raises CalibrationError where the streams do not overlap,
+    the motion does not vary, or two offsets fit alike."""
+    a, b = _angular_speed(hand), _angular_speed(target)
+    for name, speed in (("hand", a), ("target", b)):
+        seen = speed[~np.isnan(speed)]
+        if seen.size * _STEP_S < _LEAST_OVERLAP_S:
+            raise CalibrationError(
+                f"the {name}'s stream has {seen.size * _STEP_S:.1f} s without gaps, at least "
+                f"{_LEAST_OVERLAP_S:g} s are needed to find the time offset"
+            )
+        if seen.max() < np.deg2rad(1.0):
+            raise CalibrationError(
+                f"the {name} hardly turns ({np.degrees(seen.max()):.2f} degrees a second at most): the time "
+                "offset cannot be found from its motion"
+            )
+    score, count = _masked_correlation(a, b)
+    enough = count * _STEP_S >= max(_LEAST_OVERLAP_S, 0.5 * _STEP_S * min(len(a), len(b)))
+    score[~enough] = -1.0
+    best = int(np.argmax(score))
+    if score[best] < _LEAST_CORRELATION:
+        raise CalibrationError(
+            f"hand and target do not turn alike at any time offset (correlation {score[best]:.2f} at best): "
+            "they are not of one motion, or it is too even to tell"
+        )
+    lag = best - (len(b) - 1)
+    away = int(2 * _WINDOW_S / _STEP_S)
+    peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:])) + 1
+    rivals = [p for p in peaks if abs(p - best) > away and score[p] > _RIVAL * score[best]]
+    if rivals:
+        other = (rivals[0] - best) * _STEP_S
+        raise CalibrationError(
+            f"the motion repeats itself: an offset {abs(other):.2f} s {'later' if other > 0 else 'earlier'} "
+            "fits as well; move the hand irregularly"
+        )
+    fraction = 0.0
+    if 0 < best < len(score) - 1:
+        left, middle, right = score[best - 1 : best + 2]
+        curve = left - 2 * middle + right
+        fraction = float(np.clip(0.5 * (left - right) / curve, -0.5, 0.5)) if curve < 0 else 0.0
+    starts_s = (int(hand.times_ns[0]) - int(target.times_ns[0])) / 1e9
+    return starts_s + (lag + fraction) * _STEP_S, float(score[best])
+
+
+def paired(
+    hand: Track, target: Track, offset_s: float, setup: str, max_gap_s: float
+) -> tuple[Samples, Array, int]:
+    """Samples at the target's stamps, the hand's velocity there (N, 6) in its own axes, and how many stamps
+    had no hand pose within the bound."""
+    at = target.times_ns + round(offset_s * 1e9)
+    half = round(_HALF_S * 1e9)
+    now, before, after = (interpolated(hand, at + d, max_gap_s) for d in (0, -half, half))
+    good = np.flatnonzero(now[1] & before[1] & after[1])
+    unpaired = len(at) - len(good)
+    if len(good) > MAX_SAMPLES:
+        good = good[np.linspace(0, len(good) - 1, MAX_SAMPLES).round().astype(np.intp)]
+    poses, early, late = now[0][good], before[0][good], after[0][good]
+    turns = Rotation.from_matrix(np.swapaxes(early[:, :3, :3], 1, 2) @ late[:, :3, :3]).as_rotvec()
+    shifts = (np.swapaxes(poses[:, :3, :3], 1, 2) @ (late[:, :3, 3:] - early[:, :3, 3:]))[..., 0]
+    names = tuple(f"{(int(target.times_ns[i]) - int(target.times_ns[0])) / 1e9:.2f} s" for i in good)
+    samples = Samples(poses, target.poses[good], setup, names=names)
+    return samples, np.concatenate([turns, shifts], axis=1) / (2 * _HALF_S), unpaired
+
+
+def interpolated(track: Track, at_ns: NDArray[np.int64], max_gap_s: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Poses (N, 4, 4) by slerp and straight lines, and whether each is within the bound of a sample."""
+    times = track.times_ns
+    after = np.clip(np.searchsorted(times, at_ns), 1, len(times) - 1)
+    before = after - 1
+    share = np.clip((at_ns - times[before]) / (times[after] - times[before]), 0.0, 1.0)
+    gap = np.minimum(np.abs(at_ns - times[before]), np.abs(times[after] - at_ns))
+    a, b = track.poses[before], track.poses[after]
+    turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).as_rotvec()
+    rotation = a[:, :3, :3] @ Rotation.from_rotvec(turns * share[:, None]).as_matrix()
+    shift = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
+    inside = (at_ns >= times[0]) & (at_ns <= times[-1]) & (gap <= max_gap_s * 1e9)
+    return transform_of(rotation, shift), inside
+
+
+def _angular_speed(track: Track) -> Array:
+    """Radians a second every ``_STEP_S`` from the first stamp on; NaN where a gap is in the window."""
+    start, end = int(track.times_ns[0]), int(track.times_ns[-1])
+    count = int((end - start) / 1e9 / _STEP_S)
+    if count > 10_000_000:
+        raise CalibrationError(
+            f"a stream spans {(end - start) / 1e9:.0f} s: is one of its stamps on another clock?"
+        )
+    at = start + np.arange(count, dtype=np.int64) * round(_STEP_S * 1e9)
+    half = round(_WINDOW_S / 2 * 1e9)
+    # Within a gap the speed would be its mean: as long as the window, and no longer, that changes little.
+    (a, there), (b, too) = (interpolated(track, at + d, _WINDOW_S / 2) for d in (-half, half))
+    turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).magnitude()
+    return np.where(there & too, turns / _WINDOW_S, np.nan)
+
+
+def _masked_correlation(a: Array, b: Array) -> tuple[Array, Array]:
+    """Pearson's correlation of a[k + lag] with b[k] over what both have, and how many those are, for lags
+    -(len(b) - 1) to len(a) - 1."""
+    ma, mb = (~np.isnan(v) for v in (a, b))
+    a, b = (np.where(m, v - v[m].mean(), 0.0) for v, m in ((a, ma), (b, mb)))
+    ma, mb = ma.astype(np.float64), mb.astype(np.float64)
+
+    def cross(u: Array, v: Array) -> Array:
+        return np.asarray(correlate(u, v, mode="full", method="fft"))
+
+    count = np.maximum(np.round(cross(ma, mb)), 0.0)
+    n = np.maximum(count, 1.0)
+    sum_a, sum_b = cross(a, mb), cross(ma, b)
+    top = cross(a, b) - sum_a * sum_b / n
+    below = (cross(a * a, mb) - sum_a**2 / n) * (cross(ma, b * b) - sum_b**2 / n)
+    # Rounding of the transforms leaves crumbs where nothing varies.
+    level = 1e-9 * max(float((a * a).sum() * (b * b).sum()), 1e-300)
+    return np.where(below > level, top / np.sqrt(np.maximum(below, level)), -1.0), count

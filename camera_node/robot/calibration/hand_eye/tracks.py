@@ -1,0 +1,117 @@
+"""Two streams of a guided calibration, for the time offset: the hand's poses, and the target's as seen.
+
+Each keeps its own stamps: what lies between them (the camera's own delay, the way of the joint states) is
+what ``calibrate.offset`` estimates from the motion. The files are as ``--hand`` and ``--target`` read them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from camera_node.pose.pairing import tidy
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.files import Track
+from camera_node.robot.calibration.hand_eye.samples import Array
+from camera_node.robot.calibration.hand_eye.session import GOOD_SPREAD_DEG, MIN_POSES, Step
+from freshfield import files
+from freshfield.geometry import Pose
+
+if TYPE_CHECKING:
+    from camera_node.config import ArmConfig
+    from camera_node.robot.arm.joint_states import ArmStream
+    from freshfield.scenario import Scenario
+
+HAND_FILE, TARGET_FILE = "hand.csv", "target.csv"
+# Of motion with the target in sight: the offset's deviation falls with its square root.
+LEAST_S = 10.0
+_GAP_NS = 125_000_000  # between two sightings; beyond, the motion between them is not known
+_HEADER = "t,x,y,z,qx,qy,qz,qw"
+
+
+class Tracks:
+    """Poses (4, 4) by stamp (ns). One thread may add hands, another targets."""
+
+    def __init__(self) -> None:
+        self._hands: list[tuple[int, Array]] = []
+        self._targets: list[tuple[int, Array]] = []
+        self._seen_ns = 0
+
+    def add_hand(self, t_ns: int, pose: Array) -> None:
+        """pose: hand in base."""
+        self._hands.append((t_ns, pose))
+
+    def add_target(self, t_ns: int, pose: Array) -> None:
+        """pose: target in camera."""
+        if self._targets:
+            gap_ns = t_ns - self._targets[-1][0]
+            self._seen_ns += gap_ns if 0 < gap_ns <= _GAP_NS else 0
+        self._targets.append((t_ns, pose))
+
+    @property
+    def seen_s(self) -> float:
+        """Seconds with the target in sight."""
+        return self._seen_ns / 1e9
+
+    def judged(self, step: Step) -> Step:
+        """The step, by what streams need: ``std_mm`` has no part in it, because an offset that is not known
+        yet counts as noise there."""
+        varied = step.count >= MIN_POSES and step.diversity.spread_deg >= GOOD_SPREAD_DEG
+        if not varied:
+            return step
+        if self.seen_s >= LEAST_S:
+            return replace(step, enough=True, advice="enough")
+        left = f"keep moving, irregularly, the target in sight: {LEAST_S - self.seen_s:.0f} s more"
+        return replace(step, enough=False, advice=left)
+
+    def hand(self) -> Track:
+        """Raises CalibrationError for fewer than two."""
+        return _track(list(self._hands), "joint states")
+
+    def target(self) -> Track:
+        """Raises CalibrationError for fewer than two."""
+        return _track(self._targets, "sightings of the target")
+
+    def write(self, folder: Path) -> None:
+        """``hand.csv`` and ``target.csv``. Raises CalibrationError."""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, rows in ((HAND_FILE, list(self._hands)), (TARGET_FILE, self._targets)):
+                files.write_text(folder / name, "\n".join([_HEADER, *(_line(*row) for row in rows), ""]))
+        except OSError as error:
+            raise CalibrationError(f"--tracks: {folder}: {error.strerror}") from None
+
+
+def follow_arm(scenario: Scenario, config: ArmConfig, tracks: Tracks) -> ArmStream:
+    """Joint states of the scenario's arm into ``tracks``, as poses of the hand in its base, until the stream
+    is stopped. Raises ScenarioError, ArmError."""
+    from camera_node.robot.arm.camera_poses import arm_model
+    from camera_node.robot.arm.joint_states import ArmStream
+    from freshfield.clock import WallClock
+
+    model = arm_model(scenario, config)
+
+    def each(t_ns: int, joints: Array) -> None:
+        tracks.add_hand(t_ns, model.forward(joints))
+
+    stream = ArmStream(config.host, WallClock(), config.frequency_hz, each=each)
+    stream.start()
+    return stream
+
+
+def _track(rows: list[tuple[int, Array]], what: str) -> Track:
+    times, poses, counts = tidy([t for t, _ in rows], [pose for _, pose in rows])
+    if len(times) < 2:
+        raise CalibrationError(f"{len(times)} {what}: a time offset needs many of a moving hand")
+    return Track(np.array(times, dtype=np.int64), np.array(poses), counts)
+
+
+def _line(t_ns: int, pose: Array) -> str:
+    made = Pose.from_matrix(pose)
+    w, *xyz = made.quaternion
+    # Whole nanoseconds: a float of seconds since 1970 keeps a quarter of a microsecond only.
+    stamp = f"{t_ns // 10**9}.{t_ns % 10**9:09d}"
+    return ",".join([stamp, *(f"{float(v):.9f}" for v in (*made.translation_m, *xyz, w))])

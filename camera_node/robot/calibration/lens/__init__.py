@@ -1,0 +1,1 @@
+"""Intrinsic calibration of a lens from pictures of a target."""

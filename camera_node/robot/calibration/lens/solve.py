@@ -1,0 +1,160 @@
+"""A camera's lens from pictures of a target (Zhang's method, OpenCV's solver), with how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.files import read_picture
+from camera_node.robot.calibration.hand_eye.samples import Array
+from camera_node.robot.calibration.targets import Corners, Target, opencv_lens
+from freshfield.geometry import Pinhole
+
+MIN_VIEWS = 4
+# All of the views flat against the sensor leave focal length and distance one unknown.
+MIN_TILT_DEG = 10.0
+MIN_CORNERS = 6
+_OUTLIER = 4.0
+# Focal lengths over the picture's longer side: 136 and 7 degrees of view. Pictures that determine nothing let
+# the solver run away beyond.
+_SHORTEST, _LONGEST = 0.2, 8.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """pinhole: this project's (corner origin). std: deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2.
+    error_px: root mean square of the reprojection. views: by picture, its own. tilt_deg: how differently the
+    target was tilted, largest angle between two views. covered: share of a 6 x 6 raster over the picture in
+    which corners were seen. unused: pictures and why not."""
+
+    pinhole: Pinhole
+    std: tuple[float, ...]
+    error_px: float
+    views: Mapping[str, float]
+    tilt_deg: float
+    covered: float
+    unused: Mapping[str, str]
+
+    def calibration(self, camera: str) -> dict[str, Any]:
+        """An entry of the calibration JSON that the video source and --lens read."""
+        matrix, distortion = opencv_lens(self.pinhole)
+        return {
+            camera: {
+                "width": self.pinhole.width,
+                "height": self.pinhole.height,
+                "K": matrix.tolist(),
+                "dist_k1k2p1p2": distortion.tolist(),
+                "error_px": self.error_px,
+                "std_fx_fy_cx_cy_k1_k2_p1_p2": list(self.std),
+            }
+        }
+
+    def show(self) -> str:
+        p, s = self.pinhole, self.std
+        lines = [
+            f"{len(self.views)} pictures of {p.width} x {p.height}; reprojection {self.error_px:.3f} px; the "
+            f"target tilted by up to {self.tilt_deg:.0f} degrees between them; corners over "
+            f"{100 * self.covered:.0f} % of the picture",
+            f"fx {p.fx:.2f} +- {s[0]:.2f}  fy {p.fy:.2f} +- {s[1]:.2f}  cx {p.cx:.2f} +- {s[2]:.2f}  "
+            f"cy {p.cy:.2f} +- {s[3]:.2f} px (corner origin)",
+            "k1 {:.4f} +- {:.4f}  k2 {:.4f} +- {:.4f}  p1 {:.5f} +- {:.5f}  p2 {:.5f} +- {:.5f}".format(
+                *(v for pair in zip(p.distortion, s[4:]) for v in pair)
+            ),
+            *(f"note: {name}: {why}" for name, why in self.unused.items()),
+        ]
+        if self.covered < 0.5:
+            lines.append("note: less than half of the picture was covered: distortion is guessed elsewhere")
+        return "\n".join(lines)
+
+
+def calibrate_folder(
+    files: Sequence[Path], target: Target, progress: Callable[[int], None] = lambda done: None
+) -> Lens:
+    """From picture files. Raises CalibrationError."""
+    found: dict[str, Corners] = {}
+    unused: dict[str, str] = {}
+    size: tuple[int, int] | None = None
+    for k, file in enumerate(files):
+        picture = read_picture(file)
+        this = picture.shape[1], picture.shape[0]
+        if size is not None and this != size:
+            raise CalibrationError(f"{file}: is {this[0]} x {this[1]}, the others {size[0]} x {size[1]}")
+        size = this
+        corners = target.find(picture)
+        if corners is None:
+            unused[file.name] = f"{target.name} not found"
+        else:
+            found[file.name] = corners
+        progress(k + 1)
+    if size is None:
+        raise CalibrationError("no pictures")
+    return calibrate(found, size, unused)
+
+
+def calibrate(views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]) -> Lens:
+    """From corners by picture name. Raises CalibrationError where they do not determine a lens."""
+    usable = {n: c for n, c in views.items() if len(c.points) >= MIN_CORNERS}
+    dropped = {n: f"only {len(c.points)} corners" for n, c in views.items() if n not in usable}
+    unused = {**unused, **dropped}
+    if len(usable) < MIN_VIEWS:
+        raise CalibrationError(
+            f"too few pictures show the target: {len(usable)} of {len(views) + len(unused) - len(dropped)}, "
+            f"at least {MIN_VIEWS} are needed and 10 to 20 are good"
+        )
+    lens, std, turns, errors = _solve(usable, size)
+    limit = _OUTLIER * float(np.median(errors))
+    bad = [name for name, error in zip(usable, errors) if error > limit]
+    if bad and len(usable) - len(bad) >= MIN_VIEWS:
+        unused = {**unused, **{n: "does not fit the others, left out" for n in bad}}
+        usable = {n: c for n, c in usable.items() if n not in bad}
+        lens, std, turns, errors = _solve(usable, size)
+    numbers = [lens.fx, lens.fy, *lens.distortion, *std]
+    possible = all(_SHORTEST < f / max(size) < _LONGEST for f in (lens.fx, lens.fy))
+    if not (np.isfinite(numbers).all() and possible and std[0] < 0.2 * lens.fx):
+        raise CalibrationError(
+            "the pictures do not determine a lens: show the target larger, tilted, everywhere"
+        )
+    normals = np.array([cv2.Rodrigues(t)[0][:, 2] for t in turns])
+    tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
+    if tilt_deg < MIN_TILT_DEG:
+        raise CalibrationError(
+            f"the target was held the same way in all pictures (tilts differ by {tilt_deg:.1f} degrees, at "
+            f"least {MIN_TILT_DEG:g} are needed): focal length and distance cannot be told apart; tilt it"
+        )
+    weights = [len(c.points) for c in usable.values()]
+    error_px = float(np.sqrt(np.average(np.square(errors), weights=weights)))
+    return Lens(lens, std, error_px, dict(zip(usable, errors)), tilt_deg, _covered(usable, size), unused)
+
+
+def _solve(
+    views: Mapping[str, Corners], size: tuple[int, int]
+) -> tuple[Pinhole, tuple[float, ...], list[Array], list[float]]:
+    points = [c.points.astype(np.float32) for c in views.values()]
+    pixels = [(c.pixels - 0.5).astype(np.float32) for c in views.values()]
+    try:
+        _, matrix, distortion, turns, _, std, _, errors = cv2.calibrateCameraExtended(
+            points, pixels, size, np.eye(3), np.zeros(4), flags=cv2.CALIB_FIX_K3
+        )
+    except cv2.error as error:
+        raise CalibrationError(f"the pictures do not determine a lens ({error.err})") from None
+    k1, k2, p1, p2 = map(float, distortion.ravel()[:4])
+    lens = Pinhole(
+        *size, float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]) + 0.5, float(matrix[1, 2]) + 0.5,
+        (k1, k2, p1, p2),
+    )  # fmt: skip
+    vectors: list[Array] = [np.asarray(t, dtype=np.float64) for t in turns]
+    return lens, tuple(map(float, std.ravel()[:8])), vectors, [float(e) for e in errors.ravel()]
+
+
+def _covered(views: Mapping[str, Corners], size: tuple[int, int]) -> float:
+    cells = np.zeros((6, 6), dtype=bool)
+    for corners in views.values():
+        at = np.clip(corners.pixels / size * 6, 0, 5).astype(int)
+        cells[at[:, 1], at[:, 0]] = True
+    return float(cells.mean())

@@ -1,0 +1,277 @@
+"""Targets that a camera can measure itself against, by name, and their pose from one picture.
+
+    charuco:7x5:30mm:22mm[:4X4_50]     squares across x down, their side, the markers' side, dictionary
+    chessboard:9x6:23.6mm              inner corners across x down, side of a square
+    apriltag:36h11:0:80mm              family (16h5, 25h9, 36h10, 36h11), number, side of the black square
+    qr:60mm[:TEXT]                     side of the code; what it must say, else any
+
+A target's axes: origin at the top left corner of its picture (of a chessboard: the first inner corner), x to
+the right, y down, z away from the viewer, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.square_corners import square_corners
+from freshfield.geometry import Pinhole
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+SPELLINGS = "charuco:7x5:30mm:22mm, chessboard:9x6:23.6mm, apriltag:36h11:0:80mm or qr:60mm"
+# Fewer corners than this of a board say too little about where it is turned.
+_MIN_CORNERS = 6
+# Of the two poses that explain a flat target, the second must be this much worse, or either may be true.
+_AMBIGUOUS = 1.5
+_FAMILIES = ("16h5", "25h9", "36h10", "36h11")
+_SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
+
+
+@dataclass(frozen=True)
+class Corners:
+    """pixels: (N, 2), corner origin as everywhere in this project. points: (N, 3) in the target's axes."""
+
+    pixels: Array
+    points: Array
+
+
+@dataclass(frozen=True)
+class Seen:
+    """pose: (4, 4) target in camera. error_px: root mean square of the reprojection. per_pixel: (6, 6), the
+    covariance of rotation (about the target's axes) and translation (camera axes) that one pixel of noise in
+    each coordinate makes. corners: what it rests on."""
+
+    pose: Array
+    error_px: float
+    per_pixel: Array
+    corners: Corners
+
+
+@dataclass(frozen=True)
+class Target:
+    """name: as it was spelled. size_m: of the picture, width and height. find: corners in a grey picture, or
+    None. draw: the picture, so many pixels wide; exact in multiples of ``modules``, of which it is so many
+    wide. pattern_m: what is not white of it, width and height."""
+
+    name: str
+    size_m: tuple[float, float]
+    find: Callable[[Grey], Corners | None]
+    draw: Callable[[int], Grey]
+    modules: int
+    pattern_m: tuple[float, float]
+
+
+def parse(spelling: str) -> Target:
+    """Raises CalibrationError saying how targets are spelled."""
+    kind, *rest = spelling.split(":")
+    makers: dict[str, Callable[..., Target]] = {
+        "charuco": _charuco,
+        "chessboard": _chessboard,
+        "apriltag": _apriltag,
+        "qr": _qr,
+    }
+    try:
+        if kind not in makers:
+            raise ValueError(f"no kind {kind!r}")
+        return makers[kind](spelling, *rest)
+    except (TypeError, ValueError, AttributeError) as error:
+        why = f" ({error})" if isinstance(error, ValueError) else ""
+        raise CalibrationError(f"target {spelling!r}: expected for example {SPELLINGS}{why}") from None
+
+
+def locate(corners: Corners, lens: Pinhole) -> Seen:
+    """Pose of a flat target from its corners. Raises CalibrationError where either of two poses may be true
+    (a small target seen straight on) or none is found."""
+    matrix, distortion = opencv_lens(lens)
+    # OpenCV counts from the centre of the first pixel.
+    pixels = np.ascontiguousarray(corners.pixels - 0.5)
+    count, turns, shifts, errors = cv2.solvePnPGeneric(
+        corners.points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not count or not np.isfinite(turns[0]).all() or shifts[0][2] <= 0:
+        raise CalibrationError("the target's pose cannot be found from its corners")
+    errors = np.ravel(errors)
+    if count > 1 and len(corners.points) < 12 and errors[1] < _AMBIGUOUS * max(float(errors[0]), 0.05):
+        raise CalibrationError("the target is seen so straight on that it may be tilted either way")
+    turn, shift = cv2.solvePnPRefineLM(corners.points, pixels, matrix, distortion, turns[0], shifts[0])
+    again, slopes = cv2.projectPoints(corners.points, turn, shift, matrix, distortion)
+    off = again.reshape(-1, 2) - pixels
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    # OpenCV's slopes are by the rotation vector; a turn about the target's own axes is wanted.
+    slopes = np.concatenate(
+        [slopes[:, :3] @ _by_own_turns(np.ravel(turn).astype(np.float64)), slopes[:, 3:6]], axis=1
+    )
+    error_px = float(np.sqrt(np.mean((off**2).sum(axis=1))))
+    return Seen(pose, error_px, np.linalg.pinv(slopes.T @ slopes, hermitian=True), corners)
+
+
+def opencv_lens(lens: Pinhole) -> tuple[Array, Array]:
+    """Matrix (3, 3) and (k1, k2, p1, p2) as OpenCV wants them: its pixel centres are whole numbers."""
+    matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
+    return matrix, np.array(lens.distortion)
+
+
+def grey(image: NDArray[np.uint8]) -> Grey:
+    """(H, W) of a grey, RGB or RGBA picture."""
+    if image.ndim == 2:
+        return image
+    code = cv2.COLOR_RGBA2GRAY if image.shape[2] == 4 else cv2.COLOR_RGB2GRAY
+    return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
+
+
+def _by_own_turns(vector: Array) -> Array:
+    """(3, 3): derivative of a rotation vector by turns of the body about its own axes, the inverse right
+    Jacobian of SO(3); the half angle's tangent keeps it exact at half a turn, where targets often are."""
+    angle = float(np.linalg.norm(vector))
+    k = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]])
+    factor = 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2)) if angle > 1e-4 else 1 / 12
+    return np.asarray(np.eye(3) + k / 2 + factor * k @ k)
+
+
+def _charuco(
+    name: str, squares: str, square: str, marker: str, dictionary: str = "4X4_50", *extra: str
+) -> Target:
+    across, down = _counts(squares)
+    side, inner = _metres(square), _metres(marker)
+    if not inner < side or extra:
+        raise ValueError("the markers must be smaller than the squares")
+    board = cv2.aruco.CharucoBoard((across, down), side, inner, _dictionary(f"DICT_{dictionary.upper()}"))
+    detector = cv2.aruco.CharucoDetector(board)
+    places = np.asarray(board.getChessboardCorners(), dtype=np.float64)
+
+    def find(picture: Grey) -> Corners | None:
+        pixels, numbers, _, _ = detector.detectBoard(picture)
+        if numbers is None or len(numbers) < _MIN_CORNERS:
+            return None
+        points = places[numbers.ravel()]
+        if min(len(np.unique(points[:, 0].round(6))), len(np.unique(points[:, 1].round(6)))) < 2:
+            return None  # all on one line
+        return Corners(pixels.reshape(-1, 2).astype(np.float64) + 0.5, points)
+
+    def draw(width: int) -> Grey:
+        return np.asarray(board.generateImage((width, round(width * down / across))), dtype=np.uint8)
+
+    size = across * side, down * side
+    return Target(name, size, find, draw, across, size)
+
+
+def _chessboard(name: str, corners: str, square: str) -> Target:
+    across, down = _counts(corners)
+    side = _metres(square)
+    if (across + down) % 2 == 0:
+        raise ValueError("one of the numbers of corners must be odd and the other even, or up looks as down")
+    y, x = np.mgrid[0:down, 0:across].reshape(2, -1) * side
+    points = np.stack([x, y, np.zeros_like(x)], axis=1)
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+
+    def find(picture: Grey) -> Corners | None:
+        found, pixels = cv2.findChessboardCorners(picture, (across, down), flags=flags)
+        if not found:
+            return None
+        pixels = pixels.reshape(down, across, 2)
+        # A third of the distance to the nearest neighbour, so that no other corner is in the window.
+        steps = [np.linalg.norm(np.diff(pixels, axis=k), axis=2).min() for k in (0, 1)]
+        window = int(np.clip(min(steps) / 3, 2, 11))
+        pixels = cv2.cornerSubPix(picture, pixels.reshape(-1, 1, 2), (window, window), (-1, -1), _SUBPIX)
+        pixels = pixels.reshape(down, across, 2).astype(np.float64)
+        # Found either way round: the square beside the first corner is the darker one of the two.
+        first = pixels[:2, :2].mean(axis=(0, 1))
+        last = pixels[-2:, -2:].mean(axis=(0, 1))
+        if _level(picture, first) > _level(picture, last):
+            pixels = pixels[::-1, ::-1]
+        return Corners(np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64), points)
+
+    def draw(width: int) -> Grey:
+        # White around the outer squares, which the detector needs.
+        cell = max(1, width // (across + 3))
+        board = (np.indices((down + 1, across + 1)).sum(axis=0) % 2 * 255).astype(np.uint8)
+        return np.pad(np.kron(board, np.ones((cell, cell), np.uint8)), cell, constant_values=255)
+
+    size, pattern = (((across + n) * side, (down + n) * side) for n in (3, 1))
+    return Target(name, size, find, draw, across + 3, pattern)
+
+
+def _apriltag(name: str, family: str, number: str, size: str) -> Target:
+    if family.lower() not in _FAMILIES:
+        raise ValueError(f"the families are {', '.join(_FAMILIES)}")
+    side, wanted = _metres(size), int(number)
+    dictionary = _dictionary(f"DICT_APRILTAG_{family.upper()}")
+    if not 0 <= wanted < len(dictionary.bytesList):
+        raise ValueError(f"family {family} has numbers 0 to {len(dictionary.bytesList) - 1}")
+    detector = cv2.aruco.ArucoDetector(dictionary)
+
+    def find(picture: Grey) -> Corners | None:
+        pixels, numbers, _ = detector.detectMarkers(picture)
+        at = [] if numbers is None else np.flatnonzero(numbers.ravel() == wanted)
+        if len(at) != 1:  # the same tag twice: which one is meant?
+            return None
+        corners = pixels[int(at[0])].reshape(4, 2).astype(np.float64)
+        return Corners(square_corners(picture, corners) + 0.5, _square(side))
+
+    def draw(width: int) -> Grey:
+        return np.asarray(cv2.aruco.generateImageMarker(dictionary, wanted, width), dtype=np.uint8)
+
+    return Target(name, (side, side), find, draw, dictionary.markerSize + 2, (side, side))
+
+
+def _qr(name: str, size: str, *text: str) -> Target:
+    side, wanted = _metres(size), ":".join(text)
+    detector = cv2.QRCodeDetector()
+
+    def find(picture: Grey) -> Corners | None:
+        said, pixels, _ = detector.detectAndDecode(picture)
+        if not said or pixels is None or (wanted and said != wanted):
+            return None
+        corners = pixels.reshape(4, 2).astype(np.float64)
+        return Corners(square_corners(picture, corners) + 0.5, _square(side))
+
+    code = cv2.QRCodeEncoder.create().encode(wanted or "freshfield")
+    # The encoder's own quiet zone is two modules wide, of which none belongs to the code's size.
+    dark = np.flatnonzero((code == 0).any(axis=0))
+    code = code[dark[0] : dark[-1] + 1, dark[0] : dark[-1] + 1]
+
+    def draw(width: int) -> Grey:
+        return np.asarray(cv2.resize(code, (width, width), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+
+    return Target(name, (side, side), find, draw, len(code), (side, side))
+
+
+def _square(side: float) -> Array:
+    return np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], dtype=np.float64)
+
+
+def _level(picture: Grey, at: Array) -> float:
+    x, y = np.rint(at).astype(int)
+    return float(picture[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].mean())
+
+
+def _dictionary(name: str) -> cv2.aruco.Dictionary:
+    if not hasattr(cv2.aruco, name):
+        raise ValueError(f"no dictionary {name.removeprefix('DICT_')}")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def _counts(text: str) -> tuple[int, int]:
+    across, down = (int(part) for part in text.lower().split("x"))
+    if not (3 <= across <= 100 and 3 <= down <= 100):
+        raise ValueError("sizes from 3x3 to 100x100")
+    return across, down
+
+
+def _metres(text: str) -> float:
+    units = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+    unit = next((u for u in units if text.endswith(u)), None)
+    if unit is None:
+        raise ValueError(f"{text!r} needs a unit: mm, cm or m")
+    value = float(text.removesuffix(unit)) * units[unit]
+    if not 1e-3 <= value <= 10.0:
+        raise ValueError(f"{text!r} is not within 1 mm to 10 m")
+    return value

@@ -1,0 +1,159 @@
+"""A camera in the synthetic world that a simulated arm carries (thesis 4.2, 4.3).
+
+It sees the world from where the arm really was when the frame was taken, which the simulated controller
+knows; the pose that goes with the frame is what a bench would make of it: joint states with their own stamps,
+paired by time, forward kinematics and the hand-eye calibration. Where the two differ, that is the pose error.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.config import ArmConfig
+from camera_node.pose.providers import Closing, PoseGapError, PoseProvider
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, hand_eyes
+from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.simulated_controller import TRUTH_PORT
+from camera_node.robot.simulated_controller.joint_motion import STEP_S
+from camera_node.sources import Shot, Source
+from camera_node.synthetic import Scene
+from camera_node.synthetic.effects import NO_EFFECTS, Effects
+from camera_node.synthetic.frame_cache import FrameCache
+from freshfield.geometry import Pinhole
+from freshfield.scenario import Scenario, ScenarioError
+
+Array = NDArray[np.float64]
+
+_ANSWER_S = 1.0
+_STRAY_NS = 2 * round(STEP_S * 1e9)  # between what is asked for and what the arm answers for
+
+
+class Truth:
+    """Where a simulated arm's joints really were at an instant; connects when asked, and anew when lost."""
+
+    def __init__(self, host: str) -> None:
+        self.host = host
+        self._link: socket.socket | None = None
+
+    def joints(self, t_ns: int) -> Array:
+        """Joint angles (6,) at ``t_ns``. Raises PoseGapError where nobody knows: no answer, or one for
+        another instant."""
+        try:
+            if self._link is None:
+                self._link = socket.create_connection((self.host, TRUTH_PORT), _ANSWER_S)
+            self._link.sendall(b"%d\n" % t_ns)
+            answer = b""
+            while not answer.endswith(b"\n"):
+                part = self._link.recv(4096)
+                if not part:
+                    raise OSError("it closed the connection")
+                answer += part
+        except OSError as error:
+            self.close()
+            raise PoseGapError(
+                f"simulated arm at {self.host}: {error}: is camera-node simulate-arm running there?"
+            ) from None
+        known = json.loads(answer)
+        away_ns = abs(known["t_ns"] - t_ns)
+        if away_ns > _STRAY_NS:
+            raise PoseGapError(
+                f"simulated arm at {self.host}: what it knows nearest is {away_ns / 1e6:.0f} ms away: is "
+                "this machine too busy to simulate it?"
+            )
+        return np.array(known["q"])
+
+    def close(self) -> None:
+        if self._link is not None:
+            with contextlib.suppress(OSError):
+                self._link.close()
+        self._link = None
+
+
+class HandCamera:
+    """One camera on the hand. mount: flange-from-camera, base: world-from-base (4, 4), as they really are."""
+
+    contents: int | None = None
+    """Never the same picture twice."""
+
+    def __init__(
+        self,
+        camera: str,
+        fps: Fraction,
+        scene: Scene,
+        lens: Pinhole,
+        effects: Effects,
+        poses: PoseProvider,
+        truth: Truth,
+        arm: ArmModel,
+        base: Array,
+        mount: Array,
+    ) -> None:
+        self.camera, self.fps = camera, fps
+        self.intrinsics = effects.claimed_lens(lens)
+        self._scene, self._lens, self._effects = scene, lens, effects
+        self._poses, self._truth = poses, truth
+        self._arm, self._base, self._mount = arm, base, mount
+
+    def content(self, tick: int) -> int:
+        return tick
+
+    def read(self, content: int) -> Shot:
+        """Cast what the camera sees at the tick's instant. Raises PoseGapError."""
+        t_ns = content * 10**9 * self.fps.denominator // self.fps.numerator
+        place = self._base @ self._arm.forward(self._truth.joints(t_ns)) @ self._mount
+        paired = self._poses.at(t_ns)
+        view = self._scene.view(self._lens, place)
+        image = view.image((t_ns % round(self._scene.period_s * 1e9)) * 1e-9)
+        if self._effects.image:
+            image = self._effects.apply(image, content, t_ns * 1e-9)
+        pose = self._effects.claimed_pose(paired.pose, content)
+        return Shot(image, pose, self.intrinsics, paired.gap_ns)
+
+    def prepare(self, stopped: Callable[[], bool]) -> None:
+        """Nothing can be cast before the arm is there."""
+
+    def release(self) -> None:
+        """Nothing is kept."""
+
+    def close(self) -> None:
+        """Let go of the arm."""
+        if isinstance(self._poses, Closing):
+            self._poses.close()
+        self._truth.close()
+
+
+def open_hand_cameras(
+    scenario: Scenario,
+    config: ArmConfig,
+    frames: Mapping[str, FrameCache],
+    effects: Mapping[str, Effects | None],
+) -> dict[str, Source]:
+    """The cameras of ``frames`` (those on the hand) with their poses from the arm, which is connected to.
+
+    Raises ScenarioError, or ArmError where there is no arm.
+    """
+    for camera in frames:
+        made = effects.get(camera)
+        if made is not None and made.exposure:
+            names = ", ".join(type(effect).__module__.rsplit(".", 1)[1] for effect in made.exposure)
+            raise ScenarioError(
+                f"{scenario.path}: source.effects: {names}: not for a camera that an arm carries ({camera}): "
+                "they take the camera to stand still while it exposes"
+            )
+    mounts = hand_eyes(scenario, config, frames)
+    poses = camera_poses(scenario, config, frames)
+    truth, arm, base = Truth(config.host), arm_model(scenario, config), base_matrix(config)
+    return {
+        camera: HandCamera(
+            camera, each.fps, each.scene, each.scene.cameras[each.camera_id][0],
+            effects.get(camera) or NO_EFFECTS, poses[camera], truth, arm, base, mounts[camera].transform,
+        )
+        for camera, each in frames.items()
+    }  # fmt: skip

@@ -1,0 +1,83 @@
+"""``camera-node simulate-arm``: the simulated controller as a process of its own."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import math
+import signal
+import sys
+
+import numpy as np
+
+from camera_node.config import ArmConfig, source_config
+from camera_node.robot.arm.camera_poses import arm_model
+from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, calibrated
+from camera_node.robot.simulated_controller.controller import HOME_RAD, Controller
+from camera_node.robot.simulated_controller.server import ControllerServer
+from freshfield.clock import WallClock
+from freshfield.scenario import Scenario, ScenarioError, load
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C or SIGTERM. Raises ScenarioError; 1 where a port is taken."""
+    host, arm = _which(args)
+    joints = np.array(HOME_RAD) if args.joints is None else read_joints(args.joints)
+    clock = WallClock()
+    try:
+        controller = Controller(arm, clock.now_ns(), joints, args.drift_ppm, args.noise_rad, args.seed)
+    except ValueError as error:
+        raise ScenarioError(f"--noise-rad: {error}") from None
+    server = ControllerServer(controller, host, clock)
+
+    async def serve() -> None:
+        stopping = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stopping.set)
+        await server.start()
+        print(f"a simulated {arm.name} stands at {host}; Ctrl-C ends it", flush=True)
+        await stopping.wait()
+        await server.stop()
+
+    try:
+        asyncio.run(serve())
+    except OSError as error:
+        print(
+            f"camera-node: {host}: {error.strerror}: is another arm simulated there? --host", file=sys.stderr
+        )
+        return 1
+    return 0
+
+
+def arm_of(scenario: Scenario) -> ArmConfig:
+    """The arm of a scenario that has one. Raises ScenarioError."""
+    arm = getattr(source_config(scenario), "arm", None)
+    if arm is None:
+        raise ScenarioError(f"{scenario.path}: source.arm: missing: this scenario has no arm")
+    config: ArmConfig = arm
+    return config
+
+
+def read_joints(text: str) -> np.ndarray:
+    """Six angles in degrees with commas, as radians (6,). Raises ScenarioError."""
+    try:
+        angles = [math.radians(float(part)) for part in text.split(",")]
+    except ValueError:
+        angles = []
+    if len(angles) != 6 or not all(abs(a) <= 2 * math.pi for a in angles):
+        raise ScenarioError(f"--joints: expected six angles within 360 degrees, with commas, got {text!r}")
+    return np.array(angles)
+
+
+def _which(args: argparse.Namespace) -> tuple[str, ArmModel]:
+    if args.scenario is not None:
+        scenario = load(args.scenario)
+        config = arm_of(scenario)
+        return args.host or config.host, arm_model(scenario, config)
+    model = MODELS[args.robot]
+    try:
+        model = model if args.calibration is None else calibrated(model, args.calibration)
+    except KinematicsError as error:
+        raise ScenarioError(f"--calibration: {error}") from None
+    return args.host or "127.0.0.2", model

@@ -1,0 +1,217 @@
+"""The ports of the simulated controller: those that a client of a real one connects to, and one for the
+truth.
+
+    30004  Real-Time Data Exchange: state out, registers in
+    29999  dashboard: a line in, a line out
+    30001, 30002, 30003  programs in (nothing is streamed out)
+    30010  the truth, which no real controller has: a line with an instant (ns) in, a line of JSON out with
+           the instant and the joint angles (rad) then. Simulated cameras see the arm where it really was.
+
+Clients know the port numbers by heart, so every simulated arm needs an address of its own: 127.0.0.2,
+127.0.0.3, ... are this machine too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import struct
+from collections.abc import Awaitable, Callable
+
+from camera_node.robot.simulated_controller import TRUTH_PORT
+from camera_node.robot.simulated_controller import rtde_protocol as rtde
+from camera_node.robot.simulated_controller.controller import Controller
+from camera_node.robot.simulated_controller.joint_motion import STEP_S
+from freshfield.clock import Clock
+
+log = logging.getLogger("camera-node.arm")
+
+Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+
+RTDE_PORT, DASHBOARD_PORT = 30004, 29999
+SCRIPT_PORTS = (30001, 30002, 30003)
+VERSION = (5, 12, 0, 0)
+_MAX_WAITING_BYTES = 1 << 20
+_IDLE_STEPS = 4
+_DASHBOARD = {
+    "polyscopeversion": "URSoftware 5.12.0.0 (simulated)", "get serial number": "20230000001",
+    "get robot model": "UR3", "is in remote control": "true", "robotmode": "Robotmode: RUNNING",
+    "safetystatus": "Safetystatus: NORMAL", "safetymode": "Safetymode: NORMAL",
+}  # fmt: skip
+
+
+class ControllerServer:
+    """Serves ``controller`` at ``host`` until stopped; its steps follow ``clock``."""
+
+    def __init__(self, controller: Controller, host: str, clock: Clock) -> None:
+        self.controller, self.host, self.clock = controller, host, clock
+        self.clients: set[_Client] = set()
+        self._servers: list[asyncio.Server] = []
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._task: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Open every port. Raises OSError if one is taken."""
+        handlers: dict[int, Handler] = {
+            RTDE_PORT: self._serve_rtde,
+            DASHBOARD_PORT: self._serve_dashboard,
+            TRUTH_PORT: self._serve_truth,
+            **dict.fromkeys(SCRIPT_PORTS, self._serve_script),
+        }
+        try:
+            for port, handler in handlers.items():
+                self._servers.append(await asyncio.start_server(self._guarded(handler), self.host, port))
+        except OSError:
+            await self.stop()
+            raise
+        self._task = asyncio.ensure_future(self._run())
+
+    async def stop(self) -> None:
+        """Close the ports and every connection."""
+        if self._task is not None:
+            self._task.cancel()
+        for server in self._servers:
+            server.close()
+        for writer in list(self._writers):
+            writer.close()
+        for server in self._servers:
+            with contextlib.suppress(asyncio.CancelledError):
+                await server.wait_closed()
+        self._servers.clear()
+
+    async def _run(self) -> None:
+        while True:
+            self.controller.advance_to(self.clock.now_ns(), self._publish)
+            # Nobody looks oftener than the fastest listener: steps between are made up for at once.
+            fastest = min((client.every for client in self.clients), default=_IDLE_STEPS)
+            await asyncio.sleep(STEP_S * min(fastest, _IDLE_STEPS))
+
+    def _publish(self) -> None:
+        due = [client for client in self.clients if client.due(self.controller.steps)]
+        if due:
+            values = self.controller.values()
+            for client in due:
+                client.send(values)
+
+    def _guarded(self, handler: Handler) -> Handler:
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            self._writers.add(writer)
+            try:
+                await handler(reader, writer)
+            except (OSError, asyncio.IncompleteReadError) as error:
+                log.debug("a client went: %s", error)
+            except (asyncio.LimitOverrunError, ValueError) as error:
+                log.warning("simulated arm: a client said what is not understood, and is let go: %s", error)
+            finally:
+                self._writers.discard(writer)
+                writer.close()
+
+        return serve
+
+    async def _serve_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        client = _Client(writer)
+        self.clients.add(client)
+        try:
+            while True:
+                size, kind = rtde.HEADER.unpack(await reader.readexactly(rtde.HEADER.size))
+                if not rtde.HEADER.size <= size <= rtde.MAX_PACKET:
+                    raise ValueError(f"a packet of {size} bytes")
+                payload = await reader.readexactly(size - rtde.HEADER.size)
+                try:
+                    given = client.handle(kind, payload)
+                except struct.error as error:
+                    if kind != rtde.DATA:
+                        raise ValueError(str(error)) from None
+                    # Of some of the library's calls, packets and recipes differ.
+                    self.controller.fault(f"registers that are not of the recipe ({error})")
+                    continue
+                if given:
+                    self.controller.advance_to(self.clock.now_ns(), self._publish)
+                    self.controller.take(given)
+        finally:
+            self.clients.discard(client)
+
+    async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"Connected: Universal Robots Dashboard Server\n")
+        while line := await reader.readline():
+            asked = line.decode(errors="replace").strip()
+            if asked == "quit":
+                break
+            writer.write(f"{self._answer(asked)}\n".encode())
+
+    def _answer(self, asked: str) -> str:
+        if asked == "stop":
+            self.controller.stop_program()
+            return "Stopped"
+        if asked in ("running", "programState"):
+            playing = self.controller.runtime_state == 2
+            state = "PLAYING" if playing else "STOPPED"
+            return f"Program running: {str(playing).lower()}" if asked == "running" else f"{state} simulated"
+        return _DASHBOARD.get(asked.lower(), f"could not understand: '{asked}'")
+
+    async def _serve_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # What the program says is not interpreted: a client's is known to listen to the registers.
+        while await reader.read(1 << 16):
+            self.controller.start_program()
+
+    async def _serve_truth(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while line := await reader.readline():
+            t_ns = int(line)
+            self.controller.advance_to(self.clock.now_ns(), self._publish)
+            known_ns, joints = self.controller.true_joints(t_ns)
+            writer.write(json.dumps({"t_ns": known_ns, "q": joints.tolist()}).encode() + b"\n")
+
+
+class _Client:
+    """One connection of the data exchange: its recipes, and whether it listens."""
+
+    def __init__(self, writer: asyncio.StreamWriter) -> None:
+        self._writer = writer
+        self._output: rtde.Recipe | None = None
+        self.every = 1
+        self._inputs: dict[int, rtde.Recipe] = {}
+        self._started = False
+
+    def due(self, step: int) -> bool:
+        return self._started and self._output is not None and step % self.every == 0
+
+    def send(self, values: dict) -> None:
+        assert self._output is not None
+        # A client that does not read must not fill this machine's memory: it loses samples instead.
+        if self._writer.transport.get_write_buffer_size() < _MAX_WAITING_BYTES:
+            self._reply(rtde.DATA, self._output.pack(values))
+
+    def handle(self, kind: int, payload: bytes) -> dict | None:
+        """Answer one packet; input registers are returned for the controller."""
+        if kind == rtde.REQUEST_VERSION:
+            self._reply(kind, bytes([struct.unpack(">H", payload)[0] == 2]))
+        elif kind == rtde.CONTROLLER_VERSION:
+            self._reply(kind, struct.pack(">4I", *VERSION))
+        elif kind == rtde.SETUP_OUTPUTS:
+            (frequency_hz,) = struct.unpack(">d", payload[:8])
+            recipe = rtde.Recipe.of(1, _names(payload[8:]))
+            if recipe.valid:
+                self._output = recipe
+                self.every = max(1, round(1.0 / (STEP_S * max(frequency_hz, 1.0))))
+            self._reply(kind, bytes([1 if recipe.valid else 0]) + ",".join(recipe.types).encode())
+        elif kind == rtde.SETUP_INPUTS:
+            recipe = rtde.Recipe.of(len(self._inputs) + 1, _names(payload))
+            if recipe.valid:
+                self._inputs[recipe.number] = recipe
+            number = recipe.number if recipe.valid else 0
+            self._reply(kind, bytes([number]) + ",".join(recipe.types).encode())
+        elif kind in (rtde.START, rtde.PAUSE):
+            self._started = kind == rtde.START and self._output is not None
+            self._reply(kind, bytes([kind == rtde.PAUSE or self._started]))
+        elif kind == rtde.DATA and payload and payload[0] in self._inputs:
+            return self._inputs[payload[0]].unpack(payload[1:])
+        return None
+
+    def _reply(self, kind: int, payload: bytes) -> None:
+        self._writer.write(rtde.packet(kind, payload))
+
+
+def _names(payload: bytes) -> list[str]:
+    return [name for name in payload.decode("ascii").split(",") if name]

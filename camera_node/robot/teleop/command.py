@@ -1,0 +1,202 @@
+"""``camera-node teleop``: an operator moves the arm of a scenario, or a trajectory file in its place."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from camera_node import stdout
+from camera_node.config import ArmConfig
+from camera_node.robot.arm.camera_poses import arm_model
+from camera_node.robot.arm.drive import agreed
+from camera_node.robot.arm.joint_states import STALE_S, ArmError, ArmStream
+from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.simulated_controller.command import arm_of
+from camera_node.robot.simulated_controller.controller import HOME_RAD
+from camera_node.robot.teleop import TeleopError
+from camera_node.robot.teleop.settings import TeleopConfig
+from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile, standing
+from camera_node.robot.teleop.stylus import Stylus
+from camera_node.robot.teleop.teleoperator import Teleoperator
+from freshfield.clock import Clock, WallClock
+from freshfield.scenario import Scenario, load, read_section
+
+log = logging.getLogger("camera-node.teleop")
+
+_SHOW_S = 0.5
+# Where nothing can be hit, a machine too busy to simulate is no reason to stop.
+_SIMULATED_STALE_S = 10.0
+# No stop takes longer within the limits of a TeleopConfig.
+_LONGEST_STOP_S = 3.0
+
+
+def run(args: argparse.Namespace) -> int:
+    """Until the operator ends it, Ctrl-C or ``--seconds``. Raises ScenarioError, TeleopError and ArmError
+    before anything moves; 1 where it had to be ended."""
+    with stdout.only_ours():
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
+    logging.basicConfig(
+        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
+    )
+    scenario = load(args.scenario)
+    arm_config = arm_of(scenario)
+    config = teleop_config(scenario, arm_config)
+    model = arm_model(scenario, arm_config)
+    if args.seconds is not None and not args.seconds > 0:
+        raise TeleopError("--seconds: expected a positive number")
+    clock = WallClock()
+    stream: ArmStream | None = None
+    stylus: Stylus | None = None
+    try:
+        joints = np.array(HOME_RAD)
+        if args.dry_run is None:
+            stream = _connect(arm_config, clock)
+            joints = standing(stream, clock)
+        operator = Teleoperator(model, config, joints)
+        asks = stream is not None and not (args.yes or arm_config.simulated)
+        if asks and not agreed(arm_config.host, "follow the stylus"):
+            return 2
+        # After the question: a keyboard as a stylus takes the terminal's line mode away.
+        stylus = open_stylus(args.stylus)
+        sink = _sink(args.dry_run, stream, model, clock, config)
+        status = _operate(operator, stylus, sink, clock, args.seconds, args.json)
+    finally:
+        if stylus is not None:
+            stylus.close()
+        if stream is not None:
+            stream.stop()
+    if status and stream is not None:
+        sys.stdout.flush()
+        os._exit(status)  # the library's destructor would wait for an arm that may be gone
+    return status
+
+
+def teleop_config(scenario: Scenario, arm: ArmConfig) -> TeleopConfig:
+    """The section ``source.arm.teleop``; raises ScenarioError."""
+    return read_section(TeleopConfig, dict(arm.teleop or {}), f"{scenario.path}: source.arm.teleop")
+
+
+def open_stylus(text: str) -> Stylus:
+    """``keyboard``, ``gamepad``, ``gamepad:/dev/input/eventN``, ``network:PORT`` or ``network:HOST:PORT``.
+    Raises TeleopError."""
+    kind, _, rest = text.partition(":")
+    if kind == "keyboard" and not rest:
+        from camera_node.robot.teleop.keyboard import KEYS, KeyboardStylus
+
+        keyboard = KeyboardStylus()
+        print(KEYS, file=sys.stderr)
+        return keyboard
+    if kind == "gamepad":
+        from camera_node.robot.teleop.gamepad import GamepadStylus
+
+        return GamepadStylus(rest or None)
+    if kind == "network":
+        from camera_node.robot.teleop.network_stylus import NetworkStylus
+
+        host, _, port = rest.rpartition(":")
+        if not port.isdigit() or not 0 < int(port) < 65536:
+            raise TeleopError(f"--stylus: expected network:PORT or network:HOST:PORT, got {text!r}")
+        stylus = NetworkStylus(host.strip("[]") or "127.0.0.1", int(port))
+        log.info("waiting for a stylus at UDP port %d", stylus.port)
+        return stylus
+    raise TeleopError(f"--stylus: expected keyboard, gamepad or network:PORT, got {text!r}")
+
+
+def _connect(config: ArmConfig, clock: Clock) -> ArmStream:
+    patience_s = _SIMULATED_STALE_S if config.simulated else STALE_S
+    stream = ArmStream(
+        config.host, clock, config.frequency_hz, False, max_gap_ms=1e3 * patience_s, stale_s=patience_s
+    )
+    stream.start()
+    return stream
+
+
+def _sink(
+    file: Path | None, stream: ArmStream | None, model: ArmModel, clock: Clock, config: TeleopConfig
+) -> Sink:
+    if stream is not None:
+        return ServoSink(stream, clock, 1.0 / config.rate_hz)
+    assert file is not None
+    try:
+        return TrajectoryFile(file, model)
+    except OSError as error:
+        raise TeleopError(f"--dry-run: {file}: {error.strerror}") from None
+
+
+def _operate(
+    operator: Teleoperator, stylus: Stylus, sink: Sink, clock: Clock, seconds: float | None, as_json: bool
+) -> int:
+    """Tick until asked to end, then come to rest within the limits."""
+    asked = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+            signal.signal(number, lambda *_: asked.set())
+    period_s = 1.0 / operator.config.rate_hz
+    status, started_s = 0, time.monotonic()
+    next_s, shown_s, late = started_s, started_s, 0
+    try:
+        while not asked.is_set() and not stylus.ended:
+            now_ns = clock.now_ns()
+            command = operator.tick(now_ns, stylus.poll(now_ns))
+            sink.send(operator.ticks * period_s, command)
+            now_s = time.monotonic()
+            if seconds is not None and now_s - started_s >= seconds:
+                break
+            if now_s - shown_s >= _SHOW_S and sys.stderr.isatty():
+                shown_s = now_s
+                print(f"\r{_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
+            next_s += period_s
+            if next_s < now_s:
+                # Ticks that were missed are not made up for: the arm would be told to hurry.
+                next_s, late = now_s, late + 1
+            else:
+                asked.wait(next_s - now_s)
+    except (ArmError, OSError) as error:
+        print(f"camera-node: {error}", file=sys.stderr)
+        status = 1
+    try:
+        _come_to_rest(operator, sink, period_s, send=status == 0)
+    except (ArmError, OSError) as error:
+        print(f"camera-node: {error}", file=sys.stderr)
+        status = 1
+    finally:
+        sink.close()
+    summary = {**operator.summary(), "late_ticks": late}
+    print(json.dumps(summary) if as_json else f"\n{_line(operator)}; {late} ticks late", file=sys.stdout)
+    return status
+
+
+def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float, send: bool) -> None:
+    for _ in range(round(_LONGEST_STOP_S / period_s)):
+        begun_s = time.monotonic()
+        command, still = operator.stop()
+        if not send:
+            return  # the sink has failed: closing it is all that can be done
+        sink.send(operator.ticks * period_s, command)
+        if still:
+            return
+        time.sleep(max(0.0, period_s - (time.monotonic() - begun_s)))
+
+
+def _line(operator: Teleoperator) -> str:
+    """The state in a line for people."""
+    x, y, z = operator.arm.forward(operator.limiter.q)[:3, 3]
+    counts = operator.mapping.counts
+    refused = {name: n for name, n in vars(operator.limiter.refused).items() if n}
+    held = f", held by {', '.join(f'{name} {n}' for name, n in refused.items())}" if refused else ""
+    return (
+        f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts.taken} messages, "
+        f"{counts.unsound + counts.backwards} refused, {counts.jumps} jumps{held}"
+    )

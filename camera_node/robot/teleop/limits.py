@@ -1,0 +1,176 @@
+"""The last word on every tick: joint speeds that keep all limits now, and from which the arm can always stop.
+
+Time advances in ticks of ``dt``. A state is (q, v); a tick chooses v' and sets q' = q + v' dt.
+
+*Each joint by itself.* Stopping from v takes ``stop_way(v) = dt (v + (v - a dt) + (v - 2 a dt) + ...)`` while
+positive, v itself being the first step. The rule is: choose v' with |v' - v| <= a dt, |v'| <= v_max, and
+``stop_way(v') <= upper - q`` (below likewise). It can always be kept: if it was kept by v, then v' = v - a dt
+(or 0, where that is less) has ``stop_way(v') = stop_way(v) - v dt <= upper - q_before - v dt = upper - q``.
+At rest it holds wherever q is within its limits. So by induction no joint ever leaves them.
+
+*All of them together.* Box, floor, the flange's speed and the distance between the arm's parts depend on all
+joints. There the stop itself is the proof: before v' is let through, every tick of the stop that would follow
+it (each joint at its full deceleration) is computed and examined. If one of them breaks a limit, less is
+tried, and at last the stop that the tick before was let through with. That one has been examined already.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from camera_node.robot.arm.capsules import PAIRS, PARTS, Shape, links
+from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.teleop import TeleopError
+from camera_node.robot.teleop.settings import TeleopConfig
+
+Array = NDArray[np.float64]
+
+# Sums over a stop round differently from one tick to the next: limits are kept this much tighter than asked.
+_ROUNDING = 1e-9
+_TRIED = (1.0, 0.5, 0.2)
+
+
+class JointLimits:
+    """Limits of the joints by themselves: radians and seconds, arrays (n,)."""
+
+    def __init__(
+        self, low: ArrayLike, high: ArrayLike, speed: float, acceleration: float, dt_s: float
+    ) -> None:
+        self.low = np.asarray(low, dtype=np.float64) + _ROUNDING
+        self.high = np.asarray(high, dtype=np.float64) - _ROUNDING
+        self.dt_s = dt_s
+        self._speed = speed * (1.0 - _ROUNDING)
+        self._change = acceleration * dt_s * (1.0 - _ROUNDING)
+
+    def within(self, q: Array, v: Array, wanted: Array) -> Array:
+        """Speeds (n,) that may be had next, as far towards ``wanted`` as they can be."""
+        up = np.minimum(self._speed, self._fastest(self.high - q))
+        down = np.maximum(-self._speed, -self._fastest(q - self.low))
+        change = np.minimum(np.maximum(wanted, down), up) - v
+        # All joints change alike, as far as the one that has most to change: the hand keeps its direction.
+        most = float(np.abs(change).max())
+        change *= min(1.0, self._change / most) if most > 0.0 else 1.0
+        allowed = np.minimum(np.maximum(v + change, down), up)
+        # Last, because the proof above says that it takes nothing away: only rounding does.
+        return np.minimum(np.maximum(allowed, v - self._change), v + self._change)
+
+    def stopping(self, v: Array) -> Array:
+        """Speeds (n,) of the first tick of a stop."""
+        return np.sign(v) * np.maximum(np.abs(v) - self._change, 0.0)
+
+    def stop(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Joints and speeds (T, n) of a stop from (q, v), the state itself first."""
+        ticks = int(np.ceil(np.abs(v).max() / self._change)) if v.any() else 0
+        left = np.abs(v) - self._change * np.arange(ticks + 1)[:, None]
+        speeds = np.sign(v) * np.maximum(left, 0.0)
+        ways = np.cumsum(speeds[1:], axis=0) * self.dt_s
+        return np.concatenate([q[None], q + ways]), speeds
+
+    def _fastest(self, room: Array) -> Array:
+        """The largest v with ``stop_way(v) <= room``. With n whole steps of deceleration in v, stop_way is
+        ``dt ((n + 1) v - a dt n (n + 1) / 2)``, and at v = n a dt it is ``a dt^2 n (n + 1) / 2``."""
+        room = np.maximum(room, 0.0)
+        unit = self._change * self.dt_s
+        n = np.floor((np.sqrt(1.0 + 8.0 * room / unit) - 1.0) / 2.0)
+        fastest: Array = room / ((n + 1.0) * self.dt_s) + self._change * n / 2.0
+        return fastest
+
+
+@dataclass
+class Refusals:
+    """Ticks in which less was let through than the joints by themselves could have done, and why; and those
+    in which what was wanted was no number."""
+
+    box: int = 0
+    floor: int = 0
+    speed: int = 0
+    near: int = 0
+    unsound: int = 0
+
+
+class Limiter:
+    """Joints (6,) and speeds (6,) that keep every limit of a TeleopConfig. Raises TeleopError where the arm
+    does not keep them standing still."""
+
+    def __init__(self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike) -> None:
+        self.config, self.dt_s = config, 1.0 / config.rate_hz
+        margin = config.joint_margin_rad
+        low, high = np.array(arm.lower_rad) + margin, np.array(arm.upper_rad) - margin
+        speed = min(config.speed_rad_s, *arm.speed_rad_s)
+        self.joint_limits = JointLimits(low, high, speed, config.acceleration_rad_s2, self.dt_s)
+        self.shape = Shape(arm, config.tool_m, config.tool_radius_m)
+        self.refused = Refusals()
+        self._low_m = np.array(config.workspace_low_m) + _ROUNDING
+        self._high_m = np.array(config.workspace_high_m) - _ROUNDING
+        self.q: Array = np.array(joints, dtype=np.float64)
+        self.v: Array = np.zeros(6)
+        self._check_start()
+
+    def step(self, wanted: ArrayLike) -> tuple[Array, Array]:
+        """One tick towards joint speeds ``wanted`` (6,), which may be anything: (joints, speeds) to send."""
+        speeds = np.asarray(wanted, dtype=np.float64)
+        if speeds.shape != (6,) or not np.isfinite(speeds).all():
+            self.refused.unsound += 1
+            speeds = np.zeros(6)
+        limits = self.joint_limits
+        asked, stopping = limits.within(self.q, self.v, speeds), limits.stopping(self.v)
+        chosen = stopping
+        for k, share in enumerate(_TRIED):
+            tried = stopping + share * (asked - stopping)
+            broken = self._broken(self.q + tried * self.dt_s, tried)
+            if broken is None:
+                chosen = tried
+                break
+            if k == 0:
+                setattr(self.refused, broken, getattr(self.refused, broken) + 1)
+        self.q, self.v = self.q + chosen * self.dt_s, chosen
+        return self.q.copy(), self.v.copy()
+
+    def _broken(self, q: Array, v: Array) -> str | None:
+        """The limit that stopping from (q, v) would break, if any."""
+        path, _ = self.joint_limits.stop(q, v)
+        arm = self.shape.arm
+        frames = links(arm, np.concatenate([self.q[None], path]))
+        flange = frames[:, 6, :3, 3]
+        if np.any(flange[1:] < self._low_m) or np.any(flange[1:] > self._high_m):
+            return "box"
+        steps = np.diff(flange, axis=0)
+        most = (self.config.speed_m_s * self.dt_s) ** 2 * (1.0 - _ROUNDING)
+        if np.einsum("ij,ij->i", steps, steps).max() > most:
+            return "speed"
+        apart, lowest = self.shape.clearance(frames[1:] if arm.body is arm else links(arm.body, path))
+        if lowest.min() < self.config.floor_m + _ROUNDING:
+            return "floor"
+        return "near" if apart.min() < self.config.margin_m + _ROUNDING else None
+
+    def _check_start(self) -> None:
+        """Say why the arm cannot be teleoperated from where it stands."""
+        c, q = self.config, self.q
+        if q.shape != (6,) or not np.isfinite(q).all():
+            raise TeleopError("the arm gives no joint angles")
+        limits = self.joint_limits
+        if np.any(q < limits.low) or np.any(q > limits.high):
+            joint = int(np.argmax(np.maximum(limits.low - q, q - limits.high)))
+            raise TeleopError(
+                f"joint {joint + 1} stands at {np.degrees(q[joint]):.1f} degrees, within joint_margin_rad of "
+                "its limit: turn it back with the pendant"
+            )
+        at = self.shape.flange(q[None])[0]
+        if np.any(at < self._low_m) or np.any(at > self._high_m):
+            raise TeleopError(
+                f"the flange stands at {np.round(at, 3).tolist()} m, outside the workspace "
+                f"{c.workspace_low_m} to {c.workspace_high_m}: move it inside, or change workspace_low_m and "
+                "workspace_high_m"
+            )
+        apart, lowest = self.shape.clearance(links(self.shape.arm.body, q[None]))
+        if lowest[0] < c.floor_m + _ROUNDING:
+            raise TeleopError(f"a part of the arm stands {lowest[0]:.3f} m high, below floor_m {c.floor_m:g}")
+        if apart.min() < c.margin_m + _ROUNDING:
+            a, b = PAIRS[int(apart[0].argmin())]
+            raise TeleopError(
+                f"{PARTS[a]} and {PARTS[b]} are {1e3 * apart.min():.0f} mm apart, nearer than margin_m "
+                f"{c.margin_m:g}: spread the arm, or lower the margin"
+            )

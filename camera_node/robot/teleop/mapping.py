@@ -1,0 +1,124 @@
+"""From the stylus to where the hand is to go: a scaled map with a clutch (4.1).
+
+``p_ee = p_ee0 + S R (p_h - p_h0)``: both references are taken when the clutch is pressed, the arm's being the
+pose it is at then. So pressing it commands no motion, wherever the stylus was carried meanwhile; so does a
+stylus that is found somewhere else from one message to the next, or one that was silent.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.robot.teleop.one_euro_filter import OneEuro
+from camera_node.robot.teleop.settings import TeleopConfig
+from camera_node.robot.teleop.stylus import StylusSample
+from freshfield.geometry import matrix_to_quaternion, quaternion_to_matrix
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Counts:
+    """What happened to the messages."""
+
+    taken: int = 0
+    unsound: int = 0
+    backwards: int = 0
+    jumps: int = 0
+    engaged: int = 0
+    silences: int = 0
+
+
+@dataclass
+class _Anchor:
+    """References of (4.1). hand: pose (4, 4) of the arm; the stylus's position and rotation."""
+
+    hand: Array
+    position: Array
+    rotation: Array
+
+
+@dataclass
+class Mapping:
+    """Turns samples into targets. ``target``: base-from-flange (4, 4) to go to, or None: stay."""
+
+    config: TeleopConfig
+    target: Array | None = None
+    counts: Counts = field(default_factory=Counts)
+
+    def __post_init__(self) -> None:
+        yaw = math.radians(self.config.yaw_deg)
+        c, s = math.cos(yaw), math.sin(yaw)
+        self._axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        self._scale = np.array(self.config.scale)
+        self._low, self._high = np.array(self.config.workspace_low_m), np.array(self.config.workspace_high_m)
+        self._filter = OneEuro(self.config.filter_hz, self.config.filter_hz_s_m)
+        self._anchor: _Anchor | None = None
+        self._last: tuple[int, Array, Array] | None = None
+        # A clutch that is held when the first message comes has not been pressed by anybody who saw the arm.
+        self._released = False
+
+    def take(self, sample: StylusSample, hand: Array) -> bool:
+        """A message that came while the arm's commanded pose was ``hand`` (4, 4); whether it counts as one.
+
+        What cannot be a pose, or is older than the last, is counted and changes nothing.
+        """
+        if not sample.sound():
+            self.counts.unsound += 1
+            return False
+        if self._last is not None and sample.t_ns <= self._last[0]:
+            self.counts.backwards += 1
+            return False
+        position, quaternion = sample.arrays()
+        jumped = self._last is not None and self._far(position, quaternion)
+        dt_s = 0.0 if self._last is None else (sample.t_ns - self._last[0]) / 1e9
+        self._last = (sample.t_ns, position, quaternion)
+        self.counts.taken += 1
+        if jumped:
+            self.counts.jumps += 1
+        if jumped or not sample.clutch:
+            self._let_go()
+        if not sample.clutch:
+            self._released = True
+        elif self._released:
+            self._follow(position, quaternion, dt_s, hand)
+        return True
+
+    def silence(self) -> None:
+        """Nothing has come for too long: let go. Following takes a new press of the clutch, and the stylus's
+        clock may begin anew."""
+        if self._last is not None:
+            self.counts.silences += 1
+        self._let_go()
+        self._last, self._released = None, False
+
+    def _let_go(self) -> None:
+        self._anchor = self.target = None
+        self._filter.reset()
+
+    def _far(self, position: Array, quaternion: Array) -> bool:
+        assert self._last is not None
+        _, before, turned = self._last
+        angle = 2.0 * math.acos(min(1.0, abs(float(turned @ quaternion))))
+        return bool(np.abs(position - before).max() > self.config.jump_m or angle > self.config.jump_rad)
+
+    def _follow(self, position: Array, quaternion: Array, dt_s: float, hand: Array) -> None:
+        position, quaternion = self._filter(position, quaternion, dt_s)
+        rotation = quaternion_to_matrix(quaternion)
+        if self._anchor is None:
+            self._anchor = _Anchor(hand.copy(), position.copy(), rotation)
+            self.counts.engaged += 1
+        anchor = self._anchor
+        target = anchor.hand.copy()
+        moved = anchor.hand[:3, 3] + self._scale * (self._axes @ (position - anchor.position))
+        # Beyond the box nothing can follow: the target waits at its wall, and comes back with the stylus.
+        target[:3, 3] = np.clip(moved, self._low, self._high)
+        if self.config.orientation:
+            turn = self._axes @ rotation @ anchor.rotation.T @ self._axes.T
+            # Products of rotations drift; a quaternion between keeps them exactly rigid.
+            target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ anchor.hand[:3, :3]
+        self.target = target

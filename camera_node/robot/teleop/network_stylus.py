@@ -1,0 +1,100 @@
+"""A stylus on the network: what a driver of a 3D Systems Touch, a VR controller or a script sends.
+
+One UDP datagram a message, JSON, at most 2048 bytes, at 50 to 1000 a second::
+
+    {"t_ns": 1234567890, "p": [x, y, z], "q": [w, x, y, z], "clutch": true}
+
+``t_ns``: when the pose was measured, nanoseconds of any clock that does not go back. ``p``: metres, in axes
+of the stylus's own; x, y and z are the arm's base's after ``yaw_deg``, so z up. ``q``: its orientation.
+``clutch``: whether the button is held; the arm follows only then. A driver of the Touch reads the three from
+``HD_CURRENT_TRANSFORM`` (millimetres, y up: p = [x, -z, y] / 1000) and ``HD_CURRENT_BUTTONS``.
+
+Only one sender is listened to: the first, until it has been silent for a second. Datagrams carry no secret
+and are not encrypted: the default address hears this machine alone.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import socket
+
+from camera_node.robot.teleop import TeleopError
+from camera_node.robot.teleop.stylus import StylusSample
+
+log = logging.getLogger("camera-node.teleop")
+
+MAX_BYTES = 2048
+# Of one poll: a flood must not keep the arm waiting.
+_MOST = 64
+_OWNED_NS = 1_000_000_000
+
+
+class NetworkStylus:
+    """Listens at ``host``:``port``; port 0 takes a free one (``port`` then says which). ``malformed``,
+    ``strangers``: datagrams that were no message, or another sender's. Raises TeleopError."""
+
+    ended = False
+
+    def __init__(self, host: str, port: int) -> None:
+        self.malformed = 0
+        self.strangers = 0
+        self._owner: tuple[str, int] | None = None
+        self._heard_ns = 0
+        try:
+            kind = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.socket(kind, socket.SOCK_DGRAM)
+            self._socket.bind((host, port))
+        except OSError as error:
+            raise TeleopError(
+                f"--stylus network: cannot listen at {host}:{port}: {error.strerror}; name another port"
+            ) from None
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+
+    def poll(self, now_ns: int) -> list[StylusSample]:
+        """See ``Stylus``."""
+        found = []
+        for _ in range(_MOST):
+            try:
+                data, sender = self._socket.recvfrom(MAX_BYTES + 1)
+            except OSError:
+                break  # nothing there
+            if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
+                self.strangers += 1
+                continue
+            sample = parse(data)
+            if sample is None:
+                self.malformed += 1
+                continue
+            if self._owner != sender[:2]:
+                log.info("stylus: messages come from %s:%d", *sender[:2])
+            self._owner, self._heard_ns = sender[:2], now_ns
+            found.append(sample)
+        return found
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def parse(data: bytes) -> StylusSample | None:
+    """A message, or None for what is none. Whether its numbers make a pose is looked at later."""
+    if len(data) > MAX_BYTES:
+        return None
+    try:
+        message = json.loads(data)
+        t_ns, clutch = message["t_ns"], message["clutch"]
+        position = tuple(float(v) for v in message["p"])
+        quaternion = tuple(float(v) for v in message["q"])
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        return None
+    whole = isinstance(t_ns, int) and not isinstance(t_ns, bool) and isinstance(clutch, bool)
+    if not whole or len(position) != 3 or len(quaternion) != 4:
+        return None
+    return StylusSample(t_ns, position, quaternion, clutch)
+
+
+def encode(sample: StylusSample) -> bytes:
+    """The datagram of a sample: what a sender in Python sends."""
+    message = {"t_ns": sample.t_ns, "p": sample.position_m, "q": sample.quaternion, "clutch": sample.clutch}
+    return json.dumps(message).encode()

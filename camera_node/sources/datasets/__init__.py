@@ -1,0 +1,1 @@
+"""Recorded data sets: one reader a format, streamed by live cameras or read offline."""

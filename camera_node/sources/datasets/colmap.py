@@ -1,0 +1,248 @@
+"""COLMAP models as text or binary (COLMAP's documentation, "Output Format"), with their images.
+
+Poses are world-to-camera with OpenCV axes, quaternions w-first, pixels counted from the image's corner, as
+here. The model lies in the folder itself or in ``sparse/0``, ``sparse``, ``colmap/sparse/0``; the images in
+``images`` beside it, or in a folder of smaller ones (``images_4``). Points are not read.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from camera_node.sources.datasets.lens import Lens
+from camera_node.sources.datasets.photo import Look, Photo, fitted, record_of
+from camera_node.sources.datasets.records import Dataset, DatasetError, Record
+from freshfield.geometry import GeometryError, quaternion_to_matrix, se3_inverse
+
+PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")
+# COLMAP's number and name of each model with the number of its parameters; those it has beside them are
+# refused.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+}
+
+
+@dataclass(frozen=True)
+class _Image:
+    """name: path below the folder of images. pose: quaternion (w-first) and translation, world to camera."""
+
+    name: str
+    camera: int
+    pose: tuple[float, ...]
+
+
+def find_model(path: Path) -> Path | None:
+    """The file of cameras of the model in or below a folder, or beside the file that is named; None: there is
+    none. Binary ones are preferred, as COLMAP does."""
+    folder = path if path.is_dir() else path.parent
+    for place in PLACES if path.is_dir() else ("",):
+        for ending in (path.suffix,) if path.is_file() else (".bin", ".txt"):
+            file = folder / place / f"cameras{ending}"
+            if file.is_file() and file.with_name(f"images{ending}").is_file():
+                return file
+    return None
+
+
+def load_dataset(path: Path, look: Look | None = None, images: str | None = None) -> Dataset:
+    """A record for each image of the model that has a file, in the order of their names.
+
+    path: the folder, or a file of the model. images: folder of images, beside the model or one or two folders
+    above it (default ``images``, else the data set's folder itself). Raises DatasetError.
+    """
+    file = find_model(path)
+    if file is None:
+        raise DatasetError(
+            f"{path}: no COLMAP model: expected cameras and images, .bin or .txt, in it or in sparse/0"
+        )
+    lenses, found = (_binary if file.suffix == ".bin" else _text)(file)
+    folder = _images(path if path.is_dir() else path.parent, file, images)
+    sized: dict[int, Lens] = {}
+    records: list[Record] = []
+    missing = 0
+    for image in sorted(found, key=lambda i: i.name):
+        where = f"{file.with_stem('images')}: {image.name}"
+        if image.camera not in lenses:
+            raise DatasetError(f"{where}: its camera {image.camera} is not in {file.name}")
+        if Path(image.name).is_absolute() or ".." in Path(image.name).parts:
+            raise DatasetError(f"{where}: leads out of the folder of images")
+        picture = folder / image.name
+        if not picture.is_file():
+            missing += 1
+            continue
+        if image.camera not in sized:
+            sized[image.camera] = fitted(lenses[image.camera], picture, where)
+        photo = Photo(picture, sized[image.camera], look or Look())
+        records.append(record_of(photo, image.name, _camera_to_world(image, where), where))
+    if not records:
+        raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
+    return Dataset(tuple(records), missing)
+
+
+def _images(given: Path, model: Path, images: str | None) -> Path:
+    above = list(dict.fromkeys([given, *model.parents[:4]]))
+    for folder in above:
+        if (folder / (images or "images")).is_dir():
+            return folder / (images or "images")
+    if images is not None:
+        raise DatasetError(f"{given}: no folder {images} beside the model or above it")
+    return given
+
+
+def _camera_to_world(image: _Image, where: str) -> np.ndarray:
+    world_to_camera = np.eye(4)
+    try:
+        world_to_camera[:3, :3] = quaternion_to_matrix(image.pose[:4])
+    except GeometryError as error:
+        raise DatasetError(f"{where}: {error}") from None
+    world_to_camera[:3, 3] = image.pose[4:]
+    return se3_inverse(world_to_camera)
+
+
+def _lens(model: str, width: int, height: int, p: list[float], where: str) -> Lens:
+    """Parameters in COLMAP's order as a lens. Raises DatasetError."""
+    counts = dict(_MODELS.values())
+    if model not in counts:
+        raise DatasetError(
+            f"{where}: camera model {model}: expected one of {', '.join(counts)}; undistort the images"
+        )
+    if len(p) != counts[model]:
+        raise DatasetError(f"{where}: {model} has {counts[model]} parameters, not {len(p)}")
+    if model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE"):
+        (fx, fy, cx, cy), rest = p[:4], p[4:]
+    else:
+        (fx, cx, cy), rest = p[:3], p[3:]
+        fy = fx
+    fisheye = model == "OPENCV_FISHEYE"
+    radial = rest[:2] if model == "OPENCV" else rest
+    tangential = (rest[2], rest[3]) if model == "OPENCV" else (0.0, 0.0)
+    try:
+        return Lens(width, height, fx, fy, cx, cy, tuple(radial), tangential, fisheye)
+    except DatasetError as error:
+        raise DatasetError(f"{where}: {error}") from None
+
+
+# --- text -----------------------------------------------------------------------------------------
+
+
+def _text(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
+    lenses: dict[int, Lens] = {}
+    for number, line in _lines(file):
+        if not line or line.startswith("#"):
+            continue
+        where, words = f"{file}:{number}", line.split()
+        try:
+            size, params = (int(words[2]), int(words[3])), [float(v) for v in words[4:]]
+            lenses[int(words[0])] = _lens(words[1], *size, params, where)
+        except (IndexError, ValueError) as error:
+            if isinstance(error, DatasetError):
+                raise
+            raise DatasetError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS...") from None
+    images: list[_Image] = []
+    lines = iter(_lines(file.with_stem("images")))
+    for number, line in lines:
+        if not line or line.startswith("#"):
+            continue
+        words = line.split(maxsplit=9)
+        try:
+            pose = tuple(float(v) for v in words[1:8])
+            images.append(_Image(words[9], int(words[8]), pose))
+        except (IndexError, ValueError):
+            raise DatasetError(
+                f"{file.with_stem('images')}:{number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            ) from None
+        if next(lines, None) is None:
+            raise DatasetError(
+                f"{file.with_stem('images')}:{number}: the line of {words[9]}'s points is missing: cut?"
+            )
+    return lenses, images
+
+
+def _lines(file: Path) -> list[tuple[int, str]]:
+    try:
+        return [(k + 1, line.strip()) for k, line in enumerate(file.read_text().split("\n"))]
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{file}: cannot be read: {error}") from None
+
+
+# --- binary ---------------------------------------------------------------------------------------
+
+
+class _Bytes:
+    """A binary file, little-endian, read from front to back."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        try:
+            self._data = file.read_bytes()
+        except OSError as error:
+            raise DatasetError(f"{file}: cannot be read: {error}") from None
+        self._at = 0
+
+    def take(self, layout: str) -> tuple:
+        """The next fields, as ``struct`` names them."""
+        size = struct.calcsize("<" + layout)
+        self._need(size)
+        values = struct.unpack_from("<" + layout, self._data, self._at)
+        self._at += size
+        return values
+
+    def name(self) -> str:
+        """Text up to a zero byte."""
+        end = self._data.find(b"\0", self._at)
+        self._need(1 if end >= 0 else len(self._data))
+        text = self._data[self._at : end]
+        self._at = end + 1
+        try:
+            return text.decode()
+        except UnicodeDecodeError:
+            raise DatasetError(f"{self.file}: a name at byte {self._at - len(text) - 1} is no text") from None
+
+    def skip(self, size: int) -> None:
+        self._need(size)
+        self._at += size
+
+    def done(self) -> None:
+        if self._at != len(self._data):
+            raise DatasetError(
+                f"{self.file}: {len(self._data) - self._at} bytes follow its last entry: no COLMAP model?"
+            )
+
+    def _need(self, size: int) -> None:
+        if size > len(self._data) - self._at:
+            raise DatasetError(
+                f"{self.file}: ends at byte {len(self._data)}, in the middle of an entry: cut short?"
+            )
+
+
+def _binary(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
+    lenses: dict[int, Lens] = {}
+    data = _Bytes(file)
+    for _ in range(data.take("Q")[0]):
+        number, model, width, height = data.take("iiQQ")
+        if model not in _MODELS:
+            known = ", ".join(name for name, _ in _MODELS.values())
+            raise DatasetError(
+                f"{file}: camera {number}: model {model}: expected one of {known}; undistort the images"
+            )
+        name, count = _MODELS[model]
+        lenses[number] = _lens(name, width, height, list(data.take(f"{count}d")), f"{file}: camera {number}")
+    data.done()
+    images: list[_Image] = []
+    data = _Bytes(file.with_stem("images"))
+    for _ in range(data.take("Q")[0]):
+        _, *pose, camera = data.take("I7dI")
+        name = data.name()
+        (points,) = data.take("Q")
+        data.skip(24 * points)  # two coordinates and the number of a point each
+        images.append(_Image(name, camera, tuple(pose)))
+    data.done()
+    return lenses, images

@@ -1,0 +1,88 @@
+"""DyNeRF (Neural 3D Video): ``camXX.mp4`` files and ``poses_bounds.npy``, which LLFF defined.
+
+A row a camera, in the order of the videos' names: a 3 x 5 matrix row by row, whose columns are the camera's
+down, right and backwards axes in the world, its position, and (height, width, focal length) of the images the
+focal length was found on; then the nearest and furthest depth, which nobody needs here. The principal point
+is the centre, there is no distortion.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from camera_node.sources.datasets.records import Dataset, DatasetError
+from camera_node.sources.datasets.video import VideoRig, rig_dataset
+from camera_node.sources.datasets.video_clip import Clip
+from camera_node.sources.rig_calibration import Calibrated
+from freshfield.geometry import GeometryError, Pinhole, Pose
+
+POSES = "poses_bounds.npy"
+# Of a video's shape against that of the images its focal length was found on: both are rounded to pixels.
+_SAME_SHAPE = 0.02
+
+
+def load_rig(path: Path) -> VideoRig:
+    """The rig of a folder, or of its ``poses_bounds.npy``. Raises DatasetError."""
+    file = path if path.is_file() else path / POSES
+    rows = _rows(file)
+    videos = sorted(file.parent.glob("cam*.mp4"))
+    if len(videos) != len(rows):
+        raise DatasetError(
+            f"{file}: has poses of {len(rows)} cameras, its folder {len(videos)} videos cam*.mp4: "
+            "they belong together in the order of their names"
+        )
+    cameras = {
+        video.stem: _camera(row, video, f"{file}: row {k}")
+        for k, (row, video) in enumerate(zip(rows, videos))
+    }
+    return VideoRig(cameras, {video.stem: video for video in videos})
+
+
+def load_dataset(path: Path, scale: float = 1.0) -> Dataset:
+    """Every frame of every video as a record. Raises DatasetError."""
+    return rig_dataset(load_rig(path), path, scale)
+
+
+def _rows(file: Path) -> np.ndarray:
+    if not file.is_file():
+        raise DatasetError(f"{file}: no such file")
+    try:
+        rows = np.load(file, allow_pickle=False)
+    except Exception as error:  # numpy reads a damaged header as Python, which raises anything
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise DatasetError(f"{file}: cannot be read as numbers of numpy: {why}; is it complete?") from None
+    if (
+        not isinstance(rows, np.ndarray)
+        or rows.ndim != 2
+        or rows.shape[1:] != (17,)
+        or rows.dtype.kind not in "fiu"
+    ):
+        shape = getattr(rows, "shape", "several arrays")
+        raise DatasetError(f"{file}: expected numbers of shape (cameras, 17), got {shape}")
+    rows = rows.astype(np.float64)
+    if not np.all(np.isfinite(rows)):
+        raise DatasetError(f"{file}: row {int(np.argmin(np.isfinite(rows).all(axis=1)))} is not finite")
+    return rows
+
+
+def _camera(row: np.ndarray, video: Path, where: str) -> Calibrated:
+    matrix = row[:15].reshape(3, 5)
+    height, width, focal = matrix[:, 4]
+    if min(height, width, focal) <= 0:
+        raise DatasetError(f"{where}: height, width, focal length are {height:g}, {width:g}, {focal:g}")
+    clip = Clip(video)
+    clip.close()
+    x, y = clip.width / width, clip.height / height
+    if abs(x / y - 1.0) > _SAME_SHAPE:
+        raise DatasetError(
+            f"{where}: is of images of {width:g} x {height:g}, {video.name} has {clip.width} x {clip.height}"
+        )
+    down, right, backwards, position = matrix[:, :4].T
+    try:
+        pose = Pose.from_matrix(np.stack([right, down, -backwards, position], axis=-1))
+    except GeometryError as error:
+        raise DatasetError(f"{where}: {error}") from None
+    lens = Pinhole(clip.width, clip.height, focal * x, focal * y, clip.width / 2.0, clip.height / 2.0)
+    return Calibrated(lens, pose)

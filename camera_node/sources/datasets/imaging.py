@@ -1,0 +1,70 @@
+"""Reading and shrinking images without colour fringes: area averages, alpha premultiplied."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.sources.datasets.records import DatasetError, Image
+from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
+from freshfield.geometry import Pinhole
+
+import cv2  # isort: skip
+
+
+def read_image(path: Path) -> Image:
+    """RGB (H, W, 3) or straight-alpha RGBA (H, W, 4), uint8. Raises DatasetError.
+
+    EXIF rotation is ignored: poses and intrinsics belong to the pixels as stored.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise DatasetError(f"{path}: not an image that OpenCV can read, or larger than its limit")
+    if image.dtype == np.uint16:
+        image = (image // 256).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise DatasetError(f"{path}: expected 8 or 16 bits a channel, got {image.dtype}")
+    if image.ndim == 2:
+        return as_image(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
+    return as_image(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB))
+
+
+def as_image(array: np.ndarray) -> Image:
+    """The same array, for type checkers: OpenCV's stubs do not say that uint8 in is uint8 out."""
+    return cast(Image, array)
+
+
+def resize(image: Image, width: int, height: int) -> Image:
+    """Area-averaged copy; colours are weighted with alpha, so that what hides under transparent pixels
+    does not bleed into the edges."""
+    if image.shape[:2] == (height, width):
+        return image
+    if image.shape[2] == 3:
+        return as_image(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    alpha = image[..., 3:].astype(np.float32)
+    premultiplied = np.concatenate([image[..., :3] * (alpha / 255.0), alpha], axis=-1)
+    small = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
+    weight = small[..., 3:] / 255.0
+    colour = np.where(weight > 0, small[..., :3] / np.maximum(weight, 1e-6), 0.0)
+    out = np.concatenate([colour, small[..., 3:]], axis=-1)
+    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
+
+
+def composite(image: Image, background: str) -> Image:
+    """RGBA over white or black as RGB; ``keep`` and images without alpha come back as they are."""
+    if background == "keep" or image.shape[2] == 3:
+        return image
+    alpha: NDArray[np.float32] = image[..., 3:].astype(np.float32) / 255.0
+    under = 255.0 if background == "white" else 0.0
+    out = image[..., :3] * alpha + under * (1.0 - alpha)
+    return np.rint(out).astype(np.uint8)
+
+
+def shrink(camera: Pinhole, scale: float) -> Pinhole:
+    """Intrinsics of images resized by 1 / ``scale``. Raises DatasetError for a scale below 1."""
+    if scale < 1:
+        raise DatasetError(f"scale is {scale:g}: expected 1 or more (2 halves the images)")
+    return camera if scale == 1 else camera.scaled(1.0 / scale)

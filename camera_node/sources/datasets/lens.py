@@ -1,0 +1,152 @@
+"""Lenses as data sets describe them, and their pictures as a pinhole camera sees them.
+
+Our cameras know OpenCV's k1, k2, p1, p2 and nothing more. A picture of a lens that needs more (k3, a fisheye)
+is straightened at the door: resampled to the widest undistorted camera of the same size in which every pixel
+shows something.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.sources.datasets.imaging import as_image
+from camera_node.sources.datasets.records import DatasetError, Image
+from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
+from freshfield.geometry import Pinhole, invertible
+
+import cv2  # isort: skip
+
+Array = NDArray[np.float64]
+
+# Of a straightened picture, to each side of its axis: beyond it a pinhole's corners are mostly stretching.
+_WIDEST_RAD = math.radians(60.0)
+# Focal lengths tried, as multiples of the lens's own, narrowest view first.
+_ZOOMS = 4.0 * 0.98 ** np.arange(180)
+_BORDER = 65
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera in pixels, their origin the image's corner.
+
+    radial: k1, k2, ... of r^2, r^4, ...; tangential: OpenCV's p1, p2. fisheye: equidistant, r is the angle
+    from the axis (OpenCV's and COLMAP's fisheye models where tangential is zero)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    radial: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: bool = False
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.radial, *self.tangential)
+        if not all(map(math.isfinite, numbers)) or min(self.width, self.height) < 1:
+            raise DatasetError("the camera's numbers are not finite, or it has no pixels")
+        if min(self.fx, self.fy) <= 0:
+            raise DatasetError(f"the focal lengths are {self.fx:g}, {self.fy:g}: expected positive ones")
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens for images of another size."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height,
+            fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y,
+        )  # fmt: skip
+
+    def project(self, points: NDArray) -> Array:
+        """Pixels (..., 2) of points (..., 3) in camera axes, in front of the camera."""
+        x, y = self._distort(points[..., 0] / points[..., 2], points[..., 1] / points[..., 2])
+        return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+
+    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+        if self.fisheye:
+            r = np.hypot(x, y)
+            bend = np.where(r > 1e-9, np.arctan(r) / np.maximum(r, 1e-9), 1.0)
+            x, y = x * bend, y * bend
+        r2 = x * x + y * y
+        factor, power = np.ones_like(r2), r2
+        for k in self.radial:
+            factor, power = factor + k * power, power * r2
+        p1, p2 = self.tangential
+        return (
+            x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+
+
+def pinhole(lens: Lens) -> Pinhole:
+    """Our camera for the lens's pictures: the same where it can be, else what ``straighten`` makes of them.
+    Raises DatasetError for coefficients that no lens has."""
+    return _as_it_is(lens) or _straight(lens)
+
+
+def exact(lens: Lens) -> bool:
+    """Whether ``pinhole(lens)`` is the lens itself, so that its pictures stay as they are."""
+    return _as_it_is(lens) is not None
+
+
+def straighten(lens: Lens, image: NDArray[np.uint8]) -> Image:
+    """A picture (H, W) or (H, W, C) of ``lens`` as ``pinhole(lens)`` sees it; itself where they are the
+    same."""
+    if exact(lens):
+        return image
+    return as_image(cv2.remap(image, *_maps(lens), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+@lru_cache(maxsize=256)
+def _as_it_is(lens: Lens) -> Pinhole | None:
+    if lens.fisheye or any(lens.radial[2:]):
+        return None
+    k1, k2 = (*lens.radial, 0.0, 0.0)[:2]
+    same = Pinhole(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, (k1, k2, *lens.tangential))
+    return same if invertible(same) else None
+
+
+@lru_cache(maxsize=256)
+def _straight(lens: Lens) -> Pinhole:
+    found: Pinhole | None = None
+    for zoom in _ZOOMS:
+        tried = Pinhole(lens.width, lens.height, zoom * lens.fx, zoom * lens.fy, lens.cx, lens.cy)
+        if not _filled(lens, tried):
+            break
+        found = tried
+    if found is None:
+        raise DatasetError(
+            "the distortion coefficients belong to no lens: not even the middle can be straightened"
+        )
+    return found
+
+
+def _filled(lens: Lens, straight: Pinhole) -> bool:
+    """Whether the lens has something to show at every pixel of ``straight``, and no part of it twice."""
+    side = np.linspace(0.0, 1.0, _BORDER)
+    u = np.concatenate([side, side, np.zeros(_BORDER), np.ones(_BORDER)]) * straight.width
+    v = np.concatenate([np.zeros(_BORDER), np.ones(_BORDER), side, side]) * straight.height
+    x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
+    furthest = float(np.hypot(x, y).max())
+    if furthest > math.tan(_WIDEST_RAD):
+        return False
+    along = np.linspace(0.0, furthest, _BORDER)
+    if np.any(np.diff(replace(lens, tangential=(0.0, 0.0))._distort(along, np.zeros(_BORDER))[0]) <= 0):
+        return False
+    at = lens.project(np.stack([x, y, np.ones_like(x)], axis=-1))
+    return bool(np.all((at >= 0.0) & (at <= (lens.width, lens.height))))
+
+
+# Some 22 MB for a camera of two thousand pixels: a rig's cameras take turns.
+@lru_cache(maxsize=8)
+def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    straight = _straight(lens)
+    u, v = np.meshgrid(np.arange(straight.width) + 0.5, np.arange(straight.height) + 0.5)
+    x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
+    at = lens.project(np.stack([x, y, np.ones_like(x)], axis=-1)) - 0.5  # OpenCV counts pixel centres
+    return at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)

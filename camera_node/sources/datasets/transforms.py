@@ -1,0 +1,159 @@
+"""Data sets described by a ``transforms.json``: nerfstudio, instant-ngp and NeRF-synthetic.
+
+Poses are camera-to-world with OpenGL camera axes and become OpenCV's here. Intrinsics stand per file or
+per frame (``fl_x fl_y cx cy w h k1 k2 p1 p2``, or ``camera_angle_x``); their pixel origin is the image's
+corner, as COLMAP's is. Where every frame has a ``time`` and a ``camera`` (or ``camera_label``) the set is a
+recording by several cameras of something that moves.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from camera_node.config import BACKGROUNDS
+from camera_node.sources.datasets.imaging import composite, read_image, resize, shrink
+from camera_node.sources.datasets.records import Dataset, DatasetError, Image, Record
+from freshfield.geometry import OPENGL_TO_OPENCV, GeometryError, Pinhole, Pose
+
+_EXTENSIONS = ("", ".png", ".jpg", ".jpeg")
+_FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO")
+
+
+def load_dataset(path: str | Path, scale: float = 1.0, background: str = "keep") -> Dataset:
+    """Records of a transforms JSON, or of the first one in a folder whose images exist.
+
+    scale: images (by area) and intrinsics are divided by it. background: white or black composites RGBA
+    images, keep leaves alpha. Entries without a file are left out and counted. Raises DatasetError.
+    """
+    if background not in BACKGROUNDS:
+        raise DatasetError(f"background is {background!r}: expected one of {', '.join(BACKGROUNDS)}")
+    tried = []
+    for file in _candidates(Path(path)):
+        dataset = _load(file, scale, background)
+        if dataset.records:
+            return dataset
+        tried.append(f"{file.name} (all {dataset.missing} images missing)")
+    raise DatasetError(f"{path}: no usable transforms JSON: {'; '.join(tried) or 'none found'}")
+
+
+def _candidates(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise DatasetError(f"{path}: no such file or folder")
+    preferred = [path / "transforms.json", path / "transforms_train.json"]
+    others = sorted(path.glob("transforms*.json"))
+    return [p for p in dict.fromkeys([*preferred, *others]) if p.is_file()]
+
+
+def _load(file: Path, scale: float, background: str) -> Dataset:
+    try:
+        data = json.loads(file.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
+        raise DatasetError(f"{file}: expected a mapping with a list 'frames'")
+    records, missing = [], 0
+    sizes: dict[str, tuple[int, int]] = {}
+    for number, frame in enumerate(frames):
+        where = f"{file}: frames[{number}]"
+        image = _find_image(file.parent, frame, where)
+        if image is None:
+            missing += 1
+            continue
+        camera = str(frame.get("camera", frame.get("camera_label", "")))
+        full = _intrinsics({**data, **frame}, image, sizes, camera, where)
+        records.append(
+            Record(
+                name=str(frame["file_path"]),
+                camera=camera,
+                time_s=_number(frame, "time", where) if "time" in frame else None,
+                camera_to_world=_pose(frame, where),
+                intrinsics=shrink(full, scale),
+                read=partial(_read, image, full, shrink(full, scale), background),
+                path=image if scale == 1 else None,
+            )
+        )
+    fps = _number(data, "fps", str(file)) if "fps" in data else None
+    return Dataset(tuple(records), missing, fps)
+
+
+def _find_image(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
+    name = frame.get("file_path")
+    if not isinstance(name, str) or not name:
+        raise DatasetError(f"{where}: 'file_path' is missing")
+    for extension in _EXTENSIONS:
+        path = folder / (name + extension)
+        if path.is_file():
+            return path
+    return None
+
+
+def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
+    try:
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+        if matrix.shape == (3, 4):
+            matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+        if matrix.shape != (4, 4):
+            raise ValueError(f"its shape is {matrix.shape}")
+        return Pose.from_matrix(matrix @ OPENGL_TO_OPENCV).matrix()
+    except KeyError:
+        raise DatasetError(f"{where}: 'transform_matrix' is missing") from None
+    except (GeometryError, ValueError, TypeError) as error:
+        raise DatasetError(f"{where}: transform_matrix is no camera-to-world matrix: {error}") from None
+
+
+def _intrinsics(
+    d: dict[str, Any], image: Path, sizes: dict[str, tuple[int, int]], camera: str, where: str
+) -> Pinhole:
+    if d.get("camera_model") in _FISHEYE:
+        raise DatasetError(f"{where}: camera_model {d['camera_model']} is no pinhole; undistort the images")
+    for name in ("k3", "k4", "k5", "k6"):
+        if d.get(name):
+            raise DatasetError(f"{where}: {name} is not zero; only k1, k2, p1, p2 are supported")
+    if "w" in d and "h" in d:
+        width, height = int(_number(d, "w", where)), int(_number(d, "h", where))
+    else:  # NeRF-synthetic: images of one camera have one size, which its first image tells
+        if camera not in sizes:
+            sizes[camera] = read_image(image).shape[1::-1]
+        width, height = sizes[camera]
+    if "fl_x" in d:
+        fx = _number(d, "fl_x", where)
+        fy = _number(d, "fl_y", where) if "fl_y" in d else fx
+    elif "camera_angle_x" in d:
+        angle = _number(d, "camera_angle_x", where)
+        if not 0 < angle < math.pi:
+            raise DatasetError(f"{where}: camera_angle_x is {angle:g}, expected radians from 0 to pi")
+        fx = fy = 0.5 * width / math.tan(0.5 * angle)
+    else:
+        raise DatasetError(f"{where}: neither 'fl_x' nor 'camera_angle_x' is given")
+    if width < 1 or height < 1 or not (fx > 0 and fy > 0):
+        raise DatasetError(f"{where}: size {width} x {height}, focal lengths {fx:g}, {fy:g} are impossible")
+    k1, k2, p1, p2 = (_number(d, name, where) if name in d else 0.0 for name in ("k1", "k2", "p1", "p2"))
+    cx = _number(d, "cx", where) if "cx" in d else width / 2.0
+    cy = _number(d, "cy", where) if "cy" in d else height / 2.0
+    return Pinhole(width, height, fx, fy, cx, cy, (k1, k2, p1, p2))
+
+
+def _number(d: dict[str, Any], key: str, where: str) -> float:
+    value = d[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise DatasetError(f"{where}: {key} is {value!r}, expected a number")
+    return float(value)
+
+
+def _read(path: Path, full: Pinhole, small: Pinhole, background: str) -> Image:
+    image = read_image(path)
+    if image.shape[:2] != (full.height, full.width):
+        raise DatasetError(
+            f"{path}: image is {image.shape[1]} x {image.shape[0]}, its transforms JSON says "
+            f"{full.width} x {full.height}"
+        )
+    return resize(composite(image, background), small.width, small.height)

@@ -1,0 +1,102 @@
+"""Synchronised videos with a calibration JSON as a data set: every frame of every camera a record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from camera_node.sources.datasets.imaging import shrink
+from camera_node.sources.datasets.records import Dataset, DatasetError, Record
+from camera_node.sources.datasets.video_clip import Clip
+from camera_node.sources.rig_calibration import Calibrated, load_calibration
+from freshfield.geometry import Pinhole
+
+_PLACES = ("videos/{}.mp4", "{}.mp4")
+
+
+@dataclass(frozen=True)
+class VideoRig:
+    """cameras: name -> calibration (full size). files: name -> video."""
+
+    cameras: dict[str, Calibrated]
+    files: dict[str, Path]
+
+
+def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
+    """The rig of a calibration JSON, or of the only one in a folder; cameras without a video are left out.
+
+    files: camera -> video, relative to the JSON. Raises DatasetError.
+    """
+    calibration = path if path.is_file() else _find_calibration(path)
+    cameras = load_calibration(calibration)
+    for name in files or {}:
+        if name not in cameras:
+            raise DatasetError(f"{calibration}: has no camera {name!r}, for which a video is named")
+    found: dict[str, Path] = {}
+    for name in cameras:
+        places = [(files or {})[name]] if name in (files or {}) else [p.format(name) for p in _PLACES]
+        video = next((calibration.parent / p for p in places if (calibration.parent / p).is_file()), None)
+        if video is not None:
+            found[name] = video
+        elif name in (files or {}):
+            raise DatasetError(f"{calibration.parent / places[0]}: no such video (camera {name})")
+    if not found:
+        raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
+    return VideoRig({name: cameras[name] for name in found}, found)
+
+
+def load_dataset(path: str | Path, scale: float = 1.0, files: Mapping[str, str] | None = None) -> Dataset:
+    """Every frame of every video as a record, read when asked for; cameras one after the other.
+
+    Poses are the calibration's. Videos of different lengths are cut to the shortest. Raises DatasetError.
+    """
+    return rig_dataset(load_rig(Path(path), files), Path(path), scale)
+
+
+def rig_dataset(rig: VideoRig, path: Path, scale: float = 1.0) -> Dataset:
+    """``load_dataset`` of a rig that is known already. path: for messages."""
+    clips = {name: open_clip(rig, name) for name in rig.cameras}
+    count = min(clip.count for clip in clips.values())
+    records: list[Record] = []
+    for name, clip in clips.items():
+        calibrated = rig.cameras[name]
+        if calibrated.pose is None:
+            raise DatasetError(f"{path}: {name}: R_world_to_cam is missing")
+        small = shrink(calibrated.intrinsics, scale)
+        matrix = calibrated.pose.matrix()
+        for index in range(count):
+            records.append(
+                Record(
+                    name=f"{name}/{index:04d}",
+                    camera=name,
+                    time_s=index / clip.fps,
+                    camera_to_world=matrix,
+                    intrinsics=small,
+                    read=partial(clip.frame, index, small.width, small.height),
+                )
+            )
+    return Dataset(tuple(records), 0, next(iter(clips.values())).fps)
+
+
+def open_clip(rig: VideoRig, name: str) -> Clip:
+    """The video of a camera. Raises DatasetError if its size is not the calibration's."""
+    clip = Clip(rig.files[name])
+    expected: Pinhole = rig.cameras[name].intrinsics
+    if (clip.width, clip.height) != (expected.width, expected.height):
+        raise DatasetError(
+            f"{clip.path}: video is {clip.width} x {clip.height}, calibrated for "
+            f"{expected.width} x {expected.height}"
+        )
+    return clip
+
+
+def _find_calibration(folder: Path) -> Path:
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: no such file or folder")
+    found = sorted(folder.glob("calib*.json"))
+    if len(found) != 1:
+        names = ", ".join(p.name for p in found) or "none"
+        raise DatasetError(f"{folder}: expected one calib*.json, found {names}; name the file itself")
+    return found[0]

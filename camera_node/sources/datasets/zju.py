@@ -1,0 +1,119 @@
+"""ZJU-MoCap: ``annots.npy`` and a folder of JPEGs a camera, as Neural Body's data has them.
+
+    annots.npy  {"cams": {"K": [3 x 3, ...], "D": [5, ...], "R": [3 x 3, ...], "T": [3, ...]},
+                 "ims": [{"ims": ["Camera_B1/000000.jpg", ...]}, ...]}
+
+each list of ``cams`` with an entry a camera, ``ims`` with one an instant, paths in the cameras' order. ``R``
+and ``T`` take world points to OpenCV camera axes; ``T`` is in millimetres. ``K`` counts pixel centres as
+whole numbers and gains 0.5 here; ``D`` is OpenCV's k1 k2 p1 p2 k3. Masks lie in folders of their own
+(``mask``, ``mask_cihp``), as PNG files named like the images.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from camera_node.sources.datasets.imaging import read_image
+from camera_node.sources.datasets.lens import Lens
+from camera_node.sources.datasets.npy import load_object
+from camera_node.sources.datasets.photo import Look, Photo, record_of
+from camera_node.sources.datasets.records import Dataset, DatasetError, Record
+from freshfield.geometry import se3_inverse
+
+ANNOTATIONS = "annots.npy"
+# The files do not say; what the studio's cameras are taken to run at where a scenario does not.
+FPS = 50.0
+_MM = 1e-3
+
+
+def load_dataset(
+    path: Path, look: Look | None = None, masks: str | None = None, fps: float | None = None
+) -> Dataset:
+    """A record for each image of each camera, at instants ``fps`` apart (default ``FPS``).
+
+    path: the folder, or its ``annots.npy``. masks: a folder beside the cameras' whose masks cut the
+    background out. Images without a file are left out and counted. Raises DatasetError."""
+    file = path if path.is_file() else path / ANNOTATIONS
+    look, rate = look or Look(), fps or FPS
+    annotations = load_object(file)
+    try:
+        cams, instants = annotations["cams"], [list(instant["ims"]) for instant in annotations["ims"]]
+        numbers = {key: [np.asarray(v, dtype=np.float64) for v in cams[key]] for key in "KDRT"}
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise DatasetError(f"{file}: expected 'cams' with K, D, R, T and 'ims': {error!r} is wrong") from None
+    count = len(numbers["K"])
+    counts = {key: len(values) for key, values in numbers.items()} | {
+        f"ims[{k}]": len(names) for k, names in enumerate(instants) if len(names) != count
+    }
+    if count < 1 or not instants or set(counts.values()) != {count}:
+        raise DatasetError(f"{file}: the numbers of cameras differ: {_said(counts)}")
+    folder = file.parent
+    if masks is not None and not (folder / masks).is_dir():
+        raise DatasetError(f"{folder / masks}: no such folder of masks")
+    missing = 0
+    records: list[Record] = []
+    for index in range(count):
+        lens: Lens | None = None
+        where = f"{file}: camera {index}"
+        pose = _pose(numbers["R"][index], numbers["T"][index], where)
+        names = [_path(instant[index], where) for instant in instants]
+        camera = names[0].parent.name
+        for k, name in enumerate(names):
+            if not (folder / name).is_file():
+                missing += 1
+                continue
+            if lens is None:  # the annotations do not tell the images' size, a camera's first one does
+                height, width = read_image(folder / name).shape[:2]
+                lens = _lens(numbers["K"][index], numbers["D"][index], width, height, where)
+            mask = None if masks is None else (folder / masks / name).with_suffix(".png")
+            if mask is not None and not mask.is_file():
+                raise DatasetError(f"{mask}: missing, the mask of {name}")
+            photo = Photo(folder / name, lens, look, mask)
+            records.append(record_of(photo, f"{camera}/{k:06d}", pose, where, camera, k / rate))
+    if not records:
+        raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
+    if len({r.camera for r in records}) != len({(r.camera, r.camera_to_world.tobytes()) for r in records}):
+        raise DatasetError(f"{file}: two of its cameras keep their images in one folder")
+    return Dataset(tuple(records), missing, rate)
+
+
+def _said(counts: dict[str, int]) -> str:
+    return ", ".join(f"{key} {n}" for key, n in list(counts.items())[:6])
+
+
+def _path(name: Any, where: str) -> Path:
+    text = str(name).replace("\\", "/")
+    path = Path(text)
+    if not text or path.is_absolute() or ".." in path.parts or len(path.parts) < 2:
+        raise DatasetError(f"{where}: {text!r} is no path of an image in a camera's folder")
+    return path
+
+
+def _pose(rotation: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
+    if rotation.shape != (3, 3) or translation.size != 3:
+        raise DatasetError(
+            f"{where}: R and T are {rotation.shape} and {translation.shape}, expected 3 x 3 and 3"
+        )
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = rotation
+    world_to_camera[:3, 3] = translation.ravel() * _MM
+    return se3_inverse(world_to_camera)
+
+
+def _lens(k: np.ndarray, distortion: np.ndarray, width: int, height: int, where: str) -> Lens:
+    d = np.zeros(5)
+    if k.shape != (3, 3) or distortion.size not in (0, 4, 5):
+        raise DatasetError(f"{where}: K and D are {k.shape} and {distortion.shape}, expected 3 x 3 and 5")
+    if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
+        raise DatasetError(f"{where}: K has skew, which no camera here has")
+    d[: distortion.size] = distortion.ravel()
+    try:
+        return Lens(
+            width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5,
+            (float(d[0]), float(d[1]), float(d[4])), (float(d[2]), float(d[3])),
+        )  # fmt: skip
+    except DatasetError as error:
+        raise DatasetError(f"{where}: {error}") from None

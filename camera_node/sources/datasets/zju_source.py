@@ -1,0 +1,24 @@
+"""ZJU-MoCap's images, streamed by live cameras at their own pace."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+from camera_node.config import SourceConfig, ZjuConfig, find_data
+from camera_node.sources import Source
+from camera_node.sources.datasets.photo import Look
+from camera_node.sources.datasets.streamer import streams
+from camera_node.sources.datasets.zju import load_dataset
+from freshfield.scenario import Scenario
+
+
+def open_sources(
+    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
+) -> dict[str, Source]:
+    """See ``camera_node.sources.open_sources``."""
+    config = cast(ZjuConfig, config)
+    look = Look(config.scale, config.background)
+    dataset = load_dataset(find_data(config.data, scenario, data), look, config.masks, config.recorded_fps)
+    return streams(scenario, config, cameras, dataset)

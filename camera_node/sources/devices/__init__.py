@@ -1,0 +1,1 @@
+"""Real cameras: OpenCV, Luxonis OAK, Intel RealSense."""

@@ -1,0 +1,203 @@
+"""Luxonis OAK cameras through depthai 3: colour frames with the instant of their exposure (thesis 4.3.1).
+
+The device's clock is kept in step with the host's by the library; a frame's stamp is taken at the middle of
+its exposure. Intrinsics come from the calibration that is burnt into the device, and a lens that can focus
+stays where it was then.
+"""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import os
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from camera_node.config import OakConfig, SourceConfig
+from camera_node.sources import Source
+from camera_node.sources.devices.device import (
+    CameraError,
+    Feed,
+    Image,
+    as_camera_error,
+    lens_or_why,
+    meant,
+    open_live,
+)
+from camera_node.sources.lens_coefficients import four_coefficients
+from freshfield.clock import Clock
+from freshfield.geometry import Pinhole
+from freshfield.scenario import Scenario, ScenarioError
+
+log = logging.getLogger("camera-node")
+
+_SEARCH_MS = "2000"
+# Beyond this, four coefficients do not describe the lens: better let the device straighten the picture.
+_WORST_LENS_PX = 1.0
+
+
+def library() -> Any:
+    """The module depthai. Raises CameraError saying what to install."""
+    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", _SEARCH_MS)  # its own is 11.5 s
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")
+    # Or it takes over the process's signals, so that a file that may not grow ends the node.
+    os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
+    try:
+        import depthai
+    except ImportError:
+        raise CameraError("OAK cameras need the package depthai: pip install 'freshfield[oak]'") from None
+    return depthai
+
+
+def find(camera: str, device: str | None) -> Any:
+    """The device of a serial number, or the only one. Raises CameraError naming those that are there."""
+    try:
+        there = library().Device.getAllAvailableDevices()
+        ids = [each.getDeviceId() for each in there]
+    except RuntimeError as error:  # while one is being plugged in
+        raise as_camera_error(camera, error) from None
+    if not there:
+        raise CameraError(
+            f"{camera}: no OAK camera found: is it plugged in (USB 3, its own supply), and may this "
+            "user open it (udev rule for vendor 03e7, see deploy/lab)?"
+        )
+    return there[meant(camera, "OAK", device, ids)]
+
+
+class OakFeed:
+    """A running pipeline of one camera."""
+
+    stamped_by = "the device, at the middle of the exposure"
+
+    def __init__(
+        self, camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock
+    ) -> None:
+        dai = library()
+        self._device: Any = None
+        self._pipeline: Any = None
+        try:
+            self._device = dai.Device(find(camera, device))
+            self._pipeline = dai.Pipeline(self._device)
+            socket = getattr(dai.CameraBoardSocket, config.socket)
+            node = self._pipeline.create(dai.node.Camera).build(socket)
+            calibration = self._device.readCalibration()
+            focus = calibrated_focus(calibration, socket)
+            if focus:
+                node.initialControl.setManualFocus(focus)
+            if config.exposure_us is not None:
+                node.initialControl.setManualExposure(config.exposure_us, config.iso)
+            output = node.requestOutput(
+                (config.width, config.height),
+                dai.ImgFrame.Type.BGR888i,
+                fps=float(fps),
+                enableUndistortion=config.rectify,
+            )
+            self._frames = Frames(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
+            self._pipeline.start()
+            size = (config.width, config.height)
+            self.intrinsics, self.no_lens = lens_or_why(
+                lambda: lens(camera, calibration, socket, size, config.rectify)
+            )
+        except Exception as error:
+            self.close()
+            if isinstance(error, CameraError):
+                raise
+            raise CameraError(
+                f"{camera}: the OAK camera could not be started: {_first_line(error)}"
+            ) from None
+
+    def grab(self, timeout_s: float) -> tuple[int, Image] | None:
+        """See ``Feed``."""
+        return self._frames.grab(timeout_s)
+
+    def close(self) -> None:
+        if self._pipeline is not None:
+            self._pipeline.stop()
+        if self._device is not None:
+            self._device.close()
+
+
+class Frames:
+    """Frames of a depthai queue, as ``Feed.grab`` gives them."""
+
+    def __init__(self, camera: str, queue: Any, clock: Clock) -> None:
+        self._camera, self._queue, self._clock = camera, queue, clock
+        self._dai = library()
+
+    def grab(self, timeout_s: float) -> tuple[int, Image] | None:
+        try:
+            frame = self._queue.get(datetime.timedelta(seconds=timeout_s))
+        except (RuntimeError, self._dai.MessageQueue.QueueException) as error:
+            raise CameraError(f"{self._camera}: the OAK camera is gone: {_first_line(error)}") from None
+        if frame is None:
+            return None
+        exposed = frame.getTimestamp(self._dai.CameraExposureOffset.MIDDLE)
+        age = self._dai.Clock.now() - exposed
+        captured_ns = self._clock.now_ns() - (age // datetime.timedelta(microseconds=1)) * 1000
+        return captured_ns, cast(Image, np.ascontiguousarray(frame.getCvFrame()[:, :, ::-1]))
+
+
+def calibrated_focus(calibration: Any, socket: Any) -> int:
+    """Position (1 to 255) of the lens at which the device was calibrated, 0 for one that does not move, or
+    was never calibrated. Wherever else autofocus puts it, its focal length is another."""
+    try:
+        return int(calibration.getLensPosition(socket))
+    except RuntimeError:
+        return 0
+
+
+def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rectified: bool) -> Pinhole:
+    """Intrinsics of pictures of ``size`` from the device's calibration; straightened ones have no distortion.
+
+    Raises CameraError for a device that was never calibrated, and for a lens model that is not OpenCV's.
+    """
+    width, height = size
+    try:
+        model = calibration.getDistortionModel(socket)
+        matrix = np.array(calibration.getCameraIntrinsics(socket, width, height))
+        distortion = [] if rectified else list(calibration.getDistortionCoefficients(socket))
+    except RuntimeError as error:
+        raise CameraError(
+            f"{camera}: the device holds no calibration of this camera ({_first_line(error)}): "
+            "calibrate it and name the file in source.calibration"
+        ) from None
+    if not rectified and model != library().CameraModel.Perspective:
+        raise CameraError(
+            f"{camera}: its lens is {model.name.lower()}: set source.rectify: true, or calibrate it and name "
+            "the file in source.calibration"
+        )
+    found, off_px = four_coefficients(width, height, matrix, distortion)
+    if off_px > _WORST_LENS_PX:
+        log.warning(
+            "%s: four coefficients describe this lens to %.1f px only: set source.rectify: true",
+            camera,
+            off_px,
+        )
+    return found
+
+
+def open_sources(
+    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
+) -> dict[str, Source]:
+    """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
+    config = cast(OakConfig, config)
+    sockets = library().CameraBoardSocket.__members__
+    if config.socket not in sockets:
+        raise ScenarioError(f"{scenario.path}: source.socket: expected one of {', '.join(sockets)}")
+    for camera in cameras:
+        find(camera, config.devices.get(camera))  # before an arm is connected to
+    return open_live(scenario, config, cameras, opener)
+
+
+def opener(
+    camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock
+) -> Callable[[], Feed]:
+    return lambda: OakFeed(camera, device, config, fps, clock)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().split("\n")[0]

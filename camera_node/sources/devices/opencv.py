@@ -1,0 +1,129 @@
+"""Any camera that OpenCV opens: USB cameras, and network cameras by address.
+
+Drivers of Linux (V4L2) stamp a frame when its transfer begins, on the machine's monotonic clock, and OpenCV
+hands that on; where the exposure was set, half of it is taken off. Other back ends give no stamp that can be
+trusted, so there the instant of arrival less ``latency_ms`` has to do. Which of the two it is, the first
+frame decides for as long as the camera is open. A thread reads without a pause, so that nothing waits in the
+driver and grows old.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+
+from camera_node.config import CameraConfig, SourceConfig
+from camera_node.sources import Source
+from camera_node.sources.devices.device import CameraError, Feed, Image, open_live
+from freshfield.clock import Clock
+from freshfield.geometry import Pinhole
+from freshfield.scenario import Scenario
+
+log = logging.getLogger("camera-node")
+
+_OPEN_MS = 2500
+_READ_MS = 2000
+# A stamp on the machine's own clock is younger than this; anything else is another clock.
+_PLAUSIBLE_NS = 1_000_000_000
+_BY_KERNEL, _BY_ARRIVAL = "the kernel", "their arrival, less latency_ms"
+_MANUAL = 1  # V4L2 calls it so
+
+
+class OpenCvFeed:
+    """An open capture. intrinsics: OpenCV knows none."""
+
+    intrinsics: Pinhole | None = None
+    stamped_by = ""
+
+    def __init__(
+        self, camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock
+    ) -> None:
+        self._camera, self._clock = camera, clock
+        self.no_lens = (
+            f"{camera}: this camera does not know its intrinsics: calibrate it (camera-node calibrate "
+            "intrinsics) and name the file in source.calibration"
+        )
+        self._latency_ns = round(config.latency_ms * 1e6)
+        self._half_exposure_ns = (config.exposure_us or 0) * 500
+        self._capture = _open(camera, "0" if device is None else device)
+        self._v4l2 = self._capture.getBackendName() == "V4L2"
+        for key, value in (
+            (cv2.CAP_PROP_FRAME_WIDTH, config.width),
+            (cv2.CAP_PROP_FRAME_HEIGHT, config.height),
+            (cv2.CAP_PROP_FPS, float(fps)),
+            (cv2.CAP_PROP_BUFFERSIZE, 1),
+        ):
+            self._capture.set(key, value)  # a camera that cannot keeps its own: the picture says which
+        if config.exposure_us is not None:
+            self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
+            self._capture.set(cv2.CAP_PROP_EXPOSURE, config.exposure_us / 100.0)  # V4L2 counts 100 us
+
+    def grab(self, timeout_s: float) -> tuple[int, Image] | None:
+        """See ``Feed``; waits as long as the driver does (network cameras: two seconds)."""
+        if not self._capture.grab():
+            raise CameraError(
+                f"{self._camera}: the camera gives no more frames: unplugged, or its stream ended"
+            )
+        age_ns = self._age_ns()
+        if age_ns is None:
+            return None
+        captured_ns = self._clock.now_ns() - age_ns
+        ok, picture = self._capture.retrieve()
+        if not ok or picture is None:
+            raise CameraError(f"{self._camera}: a frame could not be decoded")
+        return captured_ns, cast(Image, np.ascontiguousarray(picture[:, :, ::-1]))
+
+    def _age_ns(self) -> int | None:
+        """Of the frame that was just grabbed; None for one whose stamp is of another clock than the first
+        one's, so that nobody knows when it was."""
+        stamp_age_ns = None
+        if self._v4l2 and self.stamped_by != _BY_ARRIVAL:
+            stamp_age_ns = time.monotonic_ns() - round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+            if not 0 <= stamp_age_ns < _PLAUSIBLE_NS:
+                stamp_age_ns = None
+        if not self.stamped_by:
+            self.stamped_by = _BY_ARRIVAL if stamp_age_ns is None else _BY_KERNEL
+            log.info("%s: its frames are stamped by %s", self._camera, self.stamped_by)
+        if self.stamped_by == _BY_ARRIVAL:
+            return self._latency_ns
+        return None if stamp_age_ns is None else stamp_age_ns + self._half_exposure_ns
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def open_sources(
+    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
+) -> dict[str, Source]:
+    """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
+    return open_live(scenario, cast(CameraConfig, config), cameras, opener)
+
+
+def opener(
+    camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock
+) -> Callable[[], Feed]:
+    return lambda: OpenCvFeed(camera, device, config, fps, clock)
+
+
+def _open(camera: str, device: str) -> cv2.VideoCapture:
+    if "://" in device:
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
+        capture = cv2.VideoCapture(device, cv2.CAP_FFMPEG, limits)
+        advice = "is the address right, and does the camera answer there?"
+    else:
+        if device.isdecimal():
+            missing = not Path(f"/dev/video{device}").exists()
+            capture = cv2.VideoCapture() if missing else cv2.VideoCapture(int(device), cv2.CAP_V4L2)
+        else:
+            capture = cv2.VideoCapture(device, cv2.CAP_V4L2) if Path(device).exists() else cv2.VideoCapture()
+        advice = "is it plugged in, is the user in the group video, does another program hold it?"
+    if not capture.isOpened():
+        raise CameraError(f"{camera}: no camera at {device}: {advice}")
+    return capture

@@ -1,0 +1,195 @@
+"""Intel RealSense D400 cameras, the thesis's D435i among them: the colour stream (thesis 4.3.1).
+
+With the library's global time, a stamp is already the host's; where a device has none, its own clock is
+mapped to ours by the samples that took least. A stamp is of when a frame's readout began; where the frame's
+metadata say when the middle of its exposure was, it is moved there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from camera_node.clocks import ArrivalClock
+from camera_node.config import RealsenseConfig, SourceConfig
+from camera_node.sources import Source
+from camera_node.sources.devices.device import (
+    CameraError,
+    Feed,
+    Image,
+    as_camera_error,
+    lens_or_why,
+    meant,
+    open_live,
+)
+from camera_node.sources.lens_coefficients import four_coefficients
+from freshfield.clock import Clock
+from freshfield.geometry import Pinhole
+from freshfield.scenario import Scenario
+
+_LONGEST_EXPOSURE_US = 200_000  # a colour sensor of the series exposes no longer than 165 ms
+
+
+def library() -> Any:
+    """The module pyrealsense2. Raises CameraError saying what to install."""
+    try:
+        import pyrealsense2
+    except ModuleNotFoundError:
+        raise CameraError(
+            "RealSense cameras need the package pyrealsense2: pip install 'freshfield[realsense]'"
+        ) from None
+    except ImportError as error:  # it is there, and lacks a library of the system's
+        raise CameraError(
+            f"RealSense cameras: pyrealsense2 cannot be loaded: {error}; on Debian and Ubuntu: "
+            "apt install libusb-1.0-0"
+        ) from None
+    return pyrealsense2
+
+
+def find(camera: str, device: str | None) -> str:
+    """The serial number of the camera that is meant. Raises CameraError naming those that are there.
+
+    Asked of the context: a pipeline would look for a camera for 15 s.
+    """
+    rs = library()
+    try:
+        serials = [each.get_info(rs.camera_info.serial_number) for each in rs.context().query_devices()]
+    except RuntimeError as error:  # while one is being plugged in
+        raise as_camera_error(camera, error) from None
+    if not serials:
+        raise CameraError(
+            f"{camera}: no RealSense camera found: is it plugged in (USB 3), and may this user open it (udev "
+            "rules of librealsense, see deploy/lab)?"
+        )
+    return serials[meant(camera, "RealSense", device, serials)]
+
+
+class RealsenseFeed:
+    """A running pipeline of one camera's colour stream."""
+
+    stamped_by = "the device, at the middle of the exposure where it tells that"
+
+    def __init__(
+        self, camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock
+    ) -> None:
+        rs = library()
+        self._camera = camera
+        wanted = rs.config()
+        wanted.enable_device(find(camera, device))
+        wanted.enable_stream(rs.stream.color, config.width, config.height, rs.format.rgb8, round(fps))
+        self._pipeline = rs.pipeline()
+        try:
+            profile = self._pipeline.start(wanted)
+        except RuntimeError as error:
+            raise CameraError(
+                f"{camera}: the RealSense camera offers no colour stream of {config.width} x "
+                f"{config.height} at {round(fps)} a second: {error}"
+            ) from None
+        try:
+            found = self._set_up(profile, config)
+        except RuntimeError as error:
+            self.close()
+            raise as_camera_error(camera, error) from None
+        self.intrinsics, self.no_lens = lens_or_why(lambda: lens(camera, found))
+        self._stamps = Stamps(clock)
+
+    def _set_up(self, profile: Any, config: RealsenseConfig) -> Any:
+        """Stamps of the host's time and the exposure asked for; intrinsics as the library has them."""
+        rs = library()
+        for sensor in profile.get_device().query_sensors():
+            if sensor.supports(rs.option.global_time_enabled):
+                sensor.set_option(rs.option.global_time_enabled, 1)
+            if sensor.is_color_sensor() and config.exposure_us is not None:
+                sensor.set_option(rs.option.enable_auto_exposure, 0)
+                sensor.set_option(rs.option.exposure, config.exposure_us / 100.0)  # it counts 100 us
+        stream = profile.get_stream(rs.stream.color).as_video_stream_profile()
+        return stream.get_intrinsics()
+
+    def grab(self, timeout_s: float) -> tuple[int, Image] | None:
+        """See ``Feed``."""
+        try:
+            arrived, frames = self._pipeline.try_wait_for_frames(round(timeout_s * 1e3))
+        except RuntimeError as error:
+            raise CameraError(f"{self._camera}: the RealSense camera is gone: {error}") from None
+        frame = frames.get_color_frame() if arrived else None
+        return taken(frame, self._stamps) if frame else None
+
+    def close(self) -> None:
+        with contextlib.suppress(RuntimeError):  # it may be gone
+            self._pipeline.stop()
+
+
+class Stamps:
+    """A frame's stamp as nanoseconds of our clock. utc: the host's, which the library stamps by."""
+
+    def __init__(self, clock: Clock, utc: Callable[[], int] = time.time_ns) -> None:
+        self._clock, self._utc = clock, utc
+        self._device = ArrivalClock()
+
+    def captured_ns(self, frame: Any) -> int:
+        """Global and system time are the host's UTC, of which our clock is a steady copy: ages carry over."""
+        rs = library()
+        now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6) - _since_exposed_ns(frame)
+        if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
+            return self._device.ours_ns(stamp_ns, now_ns)
+        return now_ns - (self._utc() - stamp_ns)
+
+
+def _since_exposed_ns(frame: Any) -> int:
+    """From the middle of the exposure to the instant that the stamp is of, 0 where the frame does not say."""
+    value = library().frame_metadata_value
+    keys = (value.frame_timestamp, value.sensor_timestamp)
+    if not all(frame.supports_frame_metadata(key) for key in keys):
+        return 0
+    readout_us, exposed_us = (frame.get_frame_metadata(key) for key in keys)
+    return max(0, min(readout_us - exposed_us, _LONGEST_EXPOSURE_US)) * 1000
+
+
+def taken(frame: Any, stamps: Stamps) -> tuple[int, Image]:
+    """What ``Feed.grab`` gives of an RGB frame; a copy, because the library takes the memory back."""
+    return stamps.captured_ns(frame), cast(Image, np.array(frame.get_data(), dtype=np.uint8))
+
+
+def lens(camera: str, intrinsics: Any) -> Pinhole:
+    """Intrinsics as the library gives them. Raises CameraError for a lens model that is not OpenCV's."""
+    rs = library()
+    straight = intrinsics.model in (rs.distortion.none, rs.distortion.inverse_brown_conrady)
+    if not straight and intrinsics.model not in (
+        rs.distortion.brown_conrady,
+        rs.distortion.modified_brown_conrady,
+    ):
+        raise CameraError(
+            f"{camera}: lens model {intrinsics.model} is not supported: calibrate the camera and name "
+            "the file in source.calibration"
+        )
+    # Colour streams of the D400 come straightened; their coefficients describe the inverse, and are zero.
+    distortion = [] if straight and not any(intrinsics.coeffs) else list(intrinsics.coeffs)
+    if straight and distortion:
+        raise CameraError(
+            f"{camera}: its pictures are straightened by coefficients that cannot be undone here: calibrate "
+            "the camera and name the file in source.calibration"
+        )
+    matrix = [[intrinsics.fx, 0, intrinsics.ppx], [0, intrinsics.fy, intrinsics.ppy], [0, 0, 1]]
+    return four_coefficients(intrinsics.width, intrinsics.height, matrix, distortion)[0]
+
+
+def open_sources(
+    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
+) -> dict[str, Source]:
+    """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
+    config = cast(RealsenseConfig, config)
+    for camera in cameras:
+        find(camera, config.devices.get(camera))  # before an arm is connected to
+    return open_live(scenario, config, cameras, opener)
+
+
+def opener(
+    camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock
+) -> Callable[[], Feed]:
+    return lambda: RealsenseFeed(camera, device, config, fps, clock)

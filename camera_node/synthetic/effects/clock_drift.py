@@ -1,0 +1,55 @@
+"""Clock drift: the node's clock is offset from the true time and runs at another rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from camera_node.synthetic.effects import check_ranges
+
+
+@dataclass(frozen=True)
+class ClockDriftParameters:
+    """offset_ms and drift_ppm apply to every camera; the spreads are standard deviations of what is added
+    to them for each camera, so that cameras disagree."""
+
+    offset_ms: float = 0.0
+    drift_ppm: float = 0.0
+    offset_spread_ms: float = 0.0
+    drift_spread_ppm: float = 0.0
+    in_truth: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            offset_ms=(-1e10, 1e10),  # four months
+            drift_ppm=(-1e5, 1e5),
+            offset_spread_ms=(0.0, 1e9),
+            drift_spread_ppm=(0.0, 1e4),
+        )
+
+
+class ClockDrift:
+    """node = true + offset + drift * (true - start), where start is the first time that is asked for.
+
+    Whole nanoseconds throughout: a float64 holds today's time only to 256 ns. Well under a microsecond a
+    call. offset_ns, drift_ppb: what this camera drew.
+    """
+
+    kind: ClassVar[str] = "clock"
+    Parameters = ClockDriftParameters
+
+    def __init__(self, parameters: ClockDriftParameters, rng: np.random.Generator) -> None:
+        offset, drift = rng.standard_normal(2)
+        self.offset_ns = round((parameters.offset_ms + parameters.offset_spread_ms * float(offset)) * 1e6)
+        ppm = parameters.drift_ppm + parameters.drift_spread_ppm * float(drift)
+        self.drift_ppb = round(max(-2e5, min(2e5, ppm)) * 1e3)
+        self._start_ns: int | None = None
+
+    def node_ns(self, true_ns: int) -> int:
+        true_ns = int(true_ns)
+        if self._start_ns is None:
+            self._start_ns = true_ns
+        return true_ns + self.offset_ns + (true_ns - self._start_ns) * self.drift_ppb // 10**9

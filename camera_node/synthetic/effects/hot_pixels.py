@@ -1,0 +1,89 @@
+"""Hot pixels: what radiation does to a sensor, for good and in passing.
+
+Damaged pixels leak charge in every frame, more of them as the dose grows; particles leave charge in a
+pixel for one frame. Behind a colour filter one of a pixel's three values is hit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic.effects import check_ranges
+
+if TYPE_CHECKING:
+    from camera_node.synthetic.render import Image
+
+
+@dataclass(frozen=True)
+class HotPixelsParameters:
+    """hot_ppm: damaged pixels in a million, at the start. growth_ppm_per_h: how many join them in an hour.
+    hot_counts: mean of what one adds, of 255 counts. hits_per_megapixel: mean number of particles a frame.
+    hit_counts: mean of what one adds."""
+
+    hot_ppm: float = 300.0
+    growth_ppm_per_h: float = 0.0
+    hot_counts: float = 100.0
+    hits_per_megapixel: float = 50.0
+    hit_counts: float = 150.0
+    in_truth: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            hot_ppm=(0.0, 1e6),
+            growth_ppm_per_h=(0.0, 1e6),
+            hot_counts=(0.0, 1e6),
+            hits_per_megapixel=(0.0, 1e6),
+            hit_counts=(0.0, 1e6),
+        )
+
+
+class HotPixels:
+    """What is added is exponentially distributed and cut off at white; hits are a Poisson process. Which
+    pixels are damaged follows from the camera's stream, the hits of a frame from that and its number, so
+    frames may be asked for in any order."""
+
+    kind: ClassVar[str] = "image"
+    Parameters = HotPixelsParameters
+
+    def __init__(self, parameters: HotPixelsParameters, rng: np.random.Generator) -> None:
+        self._p = parameters
+        self._key, self._frame_key = rng.integers(0, 2**64, size=(2, 2), dtype=np.uint64)
+        self._damage: dict[tuple[int, ...], tuple[NDArray, NDArray, NDArray]] = {}
+
+    def apply(self, image: Image, index: int, t_s: float) -> Image:
+        hot_at, hot_counts = self._hot(image.shape, t_s)
+        hit_at, hit_counts = self._hits(image.shape, index)
+        at, which = np.unique(np.concatenate([hot_at, hit_at]), return_inverse=True)
+        added = np.bincount(which, np.concatenate([hot_counts, hit_counts]), at.size)
+        out = image.copy()
+        values = out.reshape(-1)
+        values[at] = np.minimum(np.rint(values[at] + added), 255.0).astype(np.uint8)
+        return out
+
+    def _hot(self, shape: tuple[int, ...], t_s: float) -> tuple[NDArray, NDArray]:
+        """Places in the flat image and counts of the pixels that are damaged by ``t_s``."""
+        p = self._p
+        if shape not in self._damage:
+            rng = np.random.Generator(np.random.Philox(key=self._key))
+            pixels = shape[0] * shape[1]
+            dose = rng.random(pixels)  # the share of damaged pixels at which each is one of them
+            order = np.argsort(dose) if p.growth_ppm_per_h else np.flatnonzero(dose < p.hot_ppm * 1e-6)
+            at = shape[2] * order + rng.integers(0, 3, pixels)[order]
+            self._damage[shape] = dose[order], at, rng.exponential(p.hot_counts, pixels)[order]
+        dose, at, counts = self._damage[shape]
+        if not p.growth_ppm_per_h:
+            return at, counts
+        damaged = np.searchsorted(dose, 1e-6 * (p.hot_ppm + p.growth_ppm_per_h * max(t_s, 0.0) / 3600.0))
+        return at[:damaged], counts[:damaged]
+
+    def _hits(self, shape: tuple[int, ...], index: int) -> tuple[NDArray, NDArray]:
+        rng = np.random.Generator(np.random.Philox(key=self._frame_key, counter=[0, 0, 0, index]))
+        pixels = shape[0] * shape[1]
+        hits = int(rng.poisson(self._p.hits_per_megapixel * 1e-6 * pixels))
+        at = shape[2] * rng.integers(0, pixels, hits) + rng.integers(0, 3, hits)
+        return at, rng.exponential(self._p.hit_counts, hits)

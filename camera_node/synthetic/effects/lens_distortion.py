@@ -1,0 +1,60 @@
+"""Lens distortion: cameras look through a lens with OpenCV's radial and tangential distortion.
+
+Images are rendered through that lens, ray by ray. What is sent of it is the truth, unless the cameras are
+not calibrated: then frames claim a lens without distortion.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from camera_node.synthetic.effects import EffectError, check_ranges
+from freshfield.geometry import Pinhole, invertible
+
+
+@dataclass(frozen=True)
+class LensDistortionParameters:
+    """k1, k2: radial, p1, p2: tangential, without unit, as in OpenCV's model. calibrated: whether the
+    coefficients are sent with the frames."""
+
+    k1: float = -0.15
+    k2: float = 0.03
+    p1: float = 0.001
+    p2: float = -0.0005
+    calibrated: bool = True
+    in_truth: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, k1=(-10.0, 10.0), k2=(-10.0, 10.0), p1=(-1.0, 1.0), p2=(-1.0, 1.0))
+
+
+class LensDistortion:
+    """Rendered ahead at no extra cost; nothing while streaming. Raises EffectError for a lens whose
+    distortion cannot be undone over the whole image, and where the scene's lenses have one already."""
+
+    kind: ClassVar[str] = "lens"
+    Parameters = LensDistortionParameters
+
+    def __init__(self, parameters: LensDistortionParameters, rng: np.random.Generator) -> None:
+        self._p = parameters
+
+    def through(self, camera: Pinhole) -> Pinhole:
+        p = self._p
+        if camera.distorted:
+            raise EffectError(
+                "effect lens_distortion: the scene's params have a distortion already: drop one"
+            )
+        lens = dataclasses.replace(camera, distortion=(p.k1, p.k2, p.p1, p.p2))
+        if not invertible(lens):
+            raise EffectError(
+                f"effect lens_distortion: k1 {p.k1:g}, k2 {p.k2:g}, p1 {p.p1:g}, p2 {p.p2:g} cannot be "
+                f"undone over the whole image at this field of view: take smaller ones or a longer lens"
+            )
+        return lens
+
+    def claimed(self, camera: Pinhole) -> Pinhole:
+        return camera if self._p.calibrated else dataclasses.replace(camera, distortion=(0.0,) * 4)

@@ -1,0 +1,80 @@
+"""Specular: highlights of the light on every surface, which move with the viewer.
+
+Everything gets a clear coat: a microfacet surface with the GGX distribution of slopes, Smith's masking for
+correlated heights and Fresnel's equations for unpolarised light (Walter et al., "Microfacet models for
+refraction through rough surfaces", EGSR 2007, equations 20, 22 and 33; Heitz, "Understanding the
+masking-shadowing function", JCGT 2014, equation 99).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.shapes import Array, normalise
+
+if TYPE_CHECKING:
+    from camera_node.synthetic.scene import Scene
+
+
+@dataclass(frozen=True)
+class SpecularParameters:
+    """refractive_index: of the coat (1 reflects nothing, 1.5 is varnish or plastic). roughness: the width of
+    GGX, from .02 (polished) to 1 (matt)."""
+
+    refractive_index: float = 1.5
+    roughness: float = 0.2
+    in_truth: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, refractive_index=(1.0, 50.0), roughness=(0.02, 1.0))
+
+
+@dataclass(frozen=True)
+class Coat:
+    """A camera_node.synthetic.lighting.Gloss."""
+
+    refractive_index: float
+    roughness: float
+
+    def share(self, to_light: Array, normals: Array, rays: Array) -> Array:
+        """pi times the reflectance (1/sr) times the cosine at the surface: in the unit in which a white
+        Lambert surface has the cosine alone."""
+        half = normalise(to_light - rays)
+        light = np.maximum((normals * to_light).sum(axis=0), 0.0)
+        view = np.maximum(-(normals * rays).sum(axis=0), 0.0)
+        a2 = self.roughness**2
+        across = np.clip((normals * half).sum(axis=0), 0.0, 1.0)
+        slopes = a2 / (across * across * (a2 - 1.0) + 1.0) ** 2  # pi times the distribution
+        masks = light * np.sqrt(view * view * (1.0 - a2) + a2) + view * np.sqrt(
+            light * light * (1.0 - a2) + a2
+        )
+        visibility = 0.5 / np.maximum(masks, 1e-9)  # masking over 4 cos cos
+        return slopes * visibility * self.fresnel(-(half * rays).sum(axis=0)) * light
+
+    def fresnel(self, cosine: Array) -> Array:
+        """Share of unpolarised light that a smooth facet reflects, by the cosine to its normal."""
+        c = np.clip(cosine, 0.0, 1.0)
+        g = np.sqrt(self.refractive_index**2 - 1.0 + c * c)
+        across = (g - c) / np.maximum(g + c, 1e-12)
+        along = (c * (g + c) - 1.0) / (c * (g - c) + 1.0)
+        return 0.5 * across**2 * (1.0 + along**2)
+
+
+class Specular:
+    """Rendered ahead; nothing while streaming. List it ``in_truth: true`` where the highlights belong to what
+    a field is to show."""
+
+    kind: ClassVar[str] = "world"
+    Parameters = SpecularParameters
+
+    def __init__(self, parameters: SpecularParameters, rng: np.random.Generator) -> None:
+        self._coat = Coat(parameters.refractive_index, parameters.roughness)
+
+    def extend(self, scene: Scene) -> Scene:
+        world = dataclasses.replace(scene.world, gloss=self._coat)
+        return scene.with_world(world, scene.period_s, scene.moving)

@@ -1,0 +1,50 @@
+"""Vignetting: images darken towards their corners, by the cosine law of natural vignetting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic.effects import check_ranges
+from freshfield.geometry import Pinhole
+
+if TYPE_CHECKING:
+    from camera_node.synthetic.effects import View
+    from camera_node.synthetic.render import Image, Rows
+
+
+@dataclass(frozen=True)
+class VignettingParameters:
+    """exponent: of the cosine of a ray's angle to the optical axis; 4 is a thin lens's, 0 none."""
+
+    exponent: float = 4.0
+    in_truth: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, exponent=(0.0, 64.0))
+
+
+class Vignetting:
+    """Every pixel's value times cos(angle)^exponent, for the angle under which the lens sees it, distorted or
+    not. Displayed values are scaled, as everywhere in this world. Rendered ahead; nothing while streaming."""
+
+    kind: ClassVar[str] = "exposure"
+    Parameters = VignettingParameters
+
+    def __init__(self, parameters: VignettingParameters, rng: np.random.Generator) -> None:
+        self._exponent = parameters.exponent
+        self._gains: tuple[Pinhole, NDArray[np.float32]] | None = None
+
+    def gain(self, camera: Pinhole) -> NDArray[np.float32]:
+        """(H, W, 1): what is left of each pixel's light; kept for the camera asked for last."""
+        if self._gains is None or self._gains[0] != camera:
+            cosine = camera.rays()[..., 2:]
+            self._gains = camera, (cosine**self._exponent).astype(np.float32)
+        return self._gains[1]
+
+    def expose(self, view: View, t_s: float, rows: Rows | None = None) -> Image:
+        first, stop = (0, view.camera.height) if rows is None else rows
+        return np.rint(view.image(t_s, rows) * self.gain(view.camera)[first:stop]).astype(np.uint8)

@@ -1,0 +1,294 @@
+"""Frames of a periodic scene, rendered ahead and kept on disk by content, so that streaming costs a look-up.
+
+The key of an entry is a hash of everything that decides its bytes: scene, parameters, the camera, frame
+rate, codec and quality, the effects that are rendered in, and the renderer's own source. An entry is
+therefore never stale, only unused; damaged or missing ones are rendered again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+import threading
+import zlib
+from collections.abc import Callable
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import freshfield.geometry
+from camera_node.synthetic.effects import NO_EFFECTS, Effects
+from camera_node.synthetic.motion import TICK_S
+from camera_node.synthetic.render import Image
+from camera_node.synthetic.scene import Scene
+from freshfield import payload
+
+# Beyond this many different frames a sequence counts as not repeating: rendered as it goes, kept nowhere.
+MAX_FRAMES = 3000
+MAX_DISK_BYTES = 2 << 30
+MAX_MEMORY_BYTES = 32 << 20
+_MAGIC = b"FFC1"
+_NAME = re.compile("[0-9a-f]{32}")  # of the folder of one camera's frames
+_TOOLS = (
+    "frame_cache.py",
+    "effect_costs.py",
+    "prerender.py",
+    "preview.py",
+    "source.py",
+)  # do not decide what a frame looks like
+
+
+def default_folder() -> Path:
+    """The folder ``frames`` of $XDG_CACHE_HOME/freshfield, or of ~/.cache/freshfield."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "freshfield" / "frames"
+
+
+class FrameCache:
+    """The frames of one camera at one rate. Frame k shows the scene at k / fps.
+
+    fps: frames a second, kept as a fraction (29.97 is 2997/100). effects: what load_effects gave. codec,
+    quality: of the encoded frames. folder: None keeps frames in memory only.
+
+    repeats_after: frames until the sequence starts again (1 for a static scene), None where there would
+    be more than MAX_FRAMES. contents: different outputs of ``read``, None where noise makes each unique.
+    disk_error: why the folder is not used, or None. Safe to use from several threads.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera_id: str,
+        fps: float | Fraction,
+        *,
+        effects: Effects = NO_EFFECTS,
+        codec: str = "jpeg",
+        quality: int = 92,
+        folder: Path | None = None,
+        on_disk: bool = True,
+    ) -> None:
+        self.scene = effects.extend(scene)
+        self.camera_id, self.codec, self.quality = camera_id, codec, quality
+        self.fps = Fraction(fps).limit_denominator(1001)
+        if self.fps <= 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        self.repeats_after = _repeats_after(self.scene, self.fps)
+        self.contents = None if effects.image else self.repeats_after
+        self.disk_error: str | None = None
+        self._effects = effects
+        # Frames that noise will be added to must be kept without loss.
+        self._stored_codec = "zstd" if effects.image else codec
+        self._memory: dict[int, bytes] = {}
+        self._memory_bytes = 0
+        self._lock = threading.Lock()
+        self._pruned = False
+        self._folder: Path | None = None
+        if on_disk and self.repeats_after is not None:
+            self._root = folder or default_folder()
+            self._folder = self._root / self.key()[:32]
+
+    @property
+    def on_disk(self) -> bool:
+        """Whether what is rendered outlives this process."""
+        return self._folder is not None
+
+    def content(self, tick: int) -> int:
+        """Which output of ``read`` tick number ``tick`` shows."""
+        return tick % self.contents if self.contents else tick
+
+    def read(self, content: int) -> Image | bytes:
+        """What the node sends: encoded bytes, or where effects act on each frame, an image (H, W, 3) that
+        is still to be encoded."""
+        if self._effects.image:
+            return self._effects.apply(self.frame(content), content, float(content / self.fps))
+        return self.encoded(content)
+
+    def frame(self, index: int) -> Image:
+        """Frame ``index`` before effects that act on each frame: uint8 (H, W, 3), exact."""
+        if self._stored_codec == "jpeg" or self.repeats_after is None:
+            return self._render(self._place(index))
+        camera, _ = self.scene.cameras[self.camera_id]
+        return payload.decode(self._stored(index), self._stored_codec, camera.width, camera.height)
+
+    def encoded(self, index: int) -> bytes:
+        """Frame ``index`` in the codec and quality given, before effects that act on each frame."""
+        if self._stored_codec != self.codec or self.repeats_after is None:
+            return payload.encode(self.frame(index), self.codec, self.quality)
+        return self._stored(index)
+
+    def fill(
+        self,
+        progress: Callable[[int, int], None] | None = None,
+        first: int = 0,
+        stop: Callable[[], bool] | None = None,
+    ) -> int:
+        """Make every frame that is not there yet, from ``first`` on and around, and return how many had to
+        be rendered. ``progress(done, total)`` is called after each; ``stop`` ends it early. Frames can be
+        read meanwhile: one that is missing is rendered at once."""
+        if self.repeats_after is None:
+            return 0
+        rendered = 0
+        for k in range(self.repeats_after):
+            if stop is not None and stop():
+                break
+            rendered += self._ensure(self._place(first + k))[1]
+            if progress is not None:
+                progress(k + 1, self.repeats_after)
+        return rendered
+
+    def key(self) -> str:
+        """Hash (hex) of all that decides the bytes of the frames."""
+        camera, pose = self.scene.cameras[self.camera_id]
+        what = {
+            "scene": self.scene.name,
+            "params": dataclasses.asdict(self.scene.params),
+            "camera": dataclasses.asdict(camera),
+            "pose": np.asarray(pose, dtype=np.float64).tolist(),
+            "fps": str(self.fps),
+            "effects": [[name, dataclasses.asdict(p)] for name, p in self._effects.rendered],
+            "codec": [self._stored_codec, self.quality if self._stored_codec == "jpeg" else None],
+            "renderer": renderer_version(),
+        }
+        # ``count`` decides which cameras there are, not what one of them sees.
+        what["params"].pop("count")
+        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+    def _place(self, index: int) -> int:
+        if index < 0:
+            raise ValueError(f"frame numbers start at 0, got {index}")
+        return index % self.repeats_after if self.repeats_after else index
+
+    def _render(self, place: int) -> Image:
+        view = self._effects.exposed(self.scene.renderer(self.camera_id))
+        return view.image(float(place / self.fps))
+
+    def _stored(self, index: int) -> bytes:
+        place = self._place(index)
+        data = self._memory.get(place)
+        return self._ensure(place)[0] if data is None else data
+
+    def _ensure(self, place: int) -> tuple[bytes, bool]:
+        """A frame's bytes, now in memory, and whether it had to be rendered."""
+        with self._lock:
+            if place in self._memory:
+                return self._memory[place], False
+            data = self._load(place)
+            fresh = data is None
+            if data is None:
+                data = payload.encode(self._render(place), self._stored_codec, self.quality)
+                self._save(place, data)
+            self._remember(place, data)
+            return data, fresh
+
+    def _remember(self, place: int, data: bytes) -> None:
+        while self._memory and self._memory_bytes + len(data) > MAX_MEMORY_BYTES:
+            oldest = next(iter(self._memory))
+            self._memory_bytes -= len(self._memory.pop(oldest))
+        self._memory[place] = data
+        self._memory_bytes += len(data)
+
+    def _path(self, place: int) -> Path:
+        assert self._folder is not None
+        return self._folder / f"{place:06d}.{self._stored_codec}"
+
+    def _load(self, place: int) -> bytes | None:
+        if self._folder is None:
+            return None
+        try:
+            raw = self._path(place).read_bytes()
+        except OSError:
+            return None
+        head, data = raw[:8], raw[8:]
+        if head[:4] != _MAGIC or head[4:] != zlib.crc32(data).to_bytes(4, "little"):
+            return None
+        return data
+
+    def _save(self, place: int, data: bytes) -> None:
+        if self._folder is None:
+            return
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            if not self._pruned:
+                self._pruned = True
+                os.utime(self._folder)
+                prune(self._root, keep=self._folder)
+            # Another process may write the same entry: each writes its own file and renames it.
+            handle, name = tempfile.mkstemp(dir=self._folder, prefix=".new-")
+            try:
+                with os.fdopen(handle, "wb") as file:
+                    file.write(_MAGIC + zlib.crc32(data).to_bytes(4, "little") + data)
+                os.replace(name, self._path(place))
+            except OSError:
+                Path(name).unlink(missing_ok=True)
+                raise
+        except OSError as error:
+            # A full or read-only disk costs time, not frames.
+            self.disk_error = f"{self._folder}: {error.strerror}"
+            self._folder = None
+
+
+def _repeats_after(scene: Scene, fps: Fraction) -> int | None:
+    if not scene.moving:
+        return 1
+    period = Fraction(round(scene.period_s / TICK_S)) * Fraction(TICK_S).limit_denominator(10)
+    # The numerator: so many frames take a whole number of periods.
+    frames = (period * fps).numerator
+    return frames if frames <= MAX_FRAMES else None
+
+
+@cache
+def renderer_version() -> str:
+    """Hash of the source files and libraries that decide what a frame looks like."""
+    here = Path(__file__).parent
+    files = [p for p in sorted(here.rglob("*.py")) if p.name not in _TOOLS]
+    files += [Path(freshfield.geometry.__file__), Path(payload.__file__)]
+    digest = hashlib.sha256(f"{np.__version__} {cv2.__version__}".encode())
+    for path in files:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def prune(root: Path, keep: Path | None = None, limit_bytes: int = MAX_DISK_BYTES) -> int:
+    """Delete the least recently used folders of ``root`` until it holds at most ``limit_bytes``; returns
+    the bytes freed. ``keep`` stays. Other processes may do the same at once."""
+    folders: list[tuple[float, int, Path]] = []
+    for folder in root.iterdir():
+        if not _NAME.fullmatch(folder.name):
+            continue  # none of ours
+        try:
+            sizes = [f.stat().st_size for f in os.scandir(folder) if f.is_file()]
+            folders.append((folder.stat().st_mtime, sum(sizes), folder))
+        except OSError:
+            continue  # somebody else deleted it
+    total, freed = sum(size for _, size, _ in folders), 0
+    for _, size, folder in sorted(folders):
+        if total - freed <= limit_bytes:
+            break
+        if folder != keep:
+            shutil.rmtree(folder, ignore_errors=True)
+            freed += size
+    return freed
+
+
+def render_ahead(caches: list[FrameCache], progress: Callable[[int, int], None] | None = None) -> int:
+    """Fill several caches, and return how many frames had to be rendered: for a command that prepares a
+    scenario before its cameras start. ``progress(done, total)`` counts the frames of all."""
+    total = sum(each.repeats_after or 0 for each in caches)
+    before = rendered = 0
+    for each in caches:
+
+        def report(done: int, _: int, before: int = before) -> None:
+            if progress is not None:
+                progress(before + done, total)
+
+        rendered += each.fill(report)
+        before += each.repeats_after or 0
+    return rendered

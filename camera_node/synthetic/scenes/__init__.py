@@ -1,0 +1,1 @@
+"""Synthetic scenes, one file each."""

@@ -1,5 +1,0 @@
-"""The synthetic world: analytic scenes with exact ground truth at any instant."""
-
-from camera_node.world.scene import SCENES, Scene, SceneError, make_scene
-
-__all__ = ["SCENES", "Scene", "SceneError", "make_scene"]

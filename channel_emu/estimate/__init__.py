@@ -1,0 +1,1 @@
+"""Estimates a channel from a recording."""

@@ -1,0 +1,1 @@
+"""The emulator on the wall clock: gRPC proxies, timers, traces."""

@@ -1,0 +1,1 @@
+"""The channel itself, without a clock: chain, traffic, service times, link, faults, closed forms."""

@@ -1,0 +1,278 @@
+"""The network's state: a continuous-time Markov chain of M states, sampled exactly (thesis 6.2.5).
+
+Every jump of the chain is drawn at its own instant, so a chain that switches many times within a frame's
+transit is right too. Where ``slot_ms`` is given the state is drawn anew at slot boundaries only and kept in
+between, as the thesis does (6.27): the same at the boundaries, but blind to what happens between them.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+
+import numpy as np
+from numpy.typing import NDArray
+
+from channel_emu.model.counter_rng import Uniforms
+from channel_emu.model.instants import NEVER_NS, later, saturate
+
+# A run of the emulator visits every jump. Beyond this many a millisecond that costs more than it tells.
+MAX_JUMPS_PER_MS = 1_000.0
+# From this relaxation rate on, states one nanosecond apart are independent to 2^-53: nothing is lost by
+# drawing each instant's state directly.
+WHITE_RATE_PER_MS = 4e7
+_CHECK_EVERY = 100_000
+
+
+class ChainError(ValueError):
+    """A generator that is none, or a chain that cannot be sampled; the message says why."""
+
+
+def two_state_generator(mu1_per_ms: float, mu2_per_ms: float) -> NDArray[np.float64]:
+    """Generator of the two-state chain (6.26): leaves the first state at mu1, the second at mu2."""
+    return np.array([[-mu1_per_ms, mu1_per_ms], [mu2_per_ms, -mu2_per_ms]], float)
+
+
+def check_generator(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A generator (6.25): square, rates >= 0 off the diagonal, rows summing to zero. Raises ChainError."""
+    q = np.asarray(generator_per_ms, float)
+    if q.ndim != 2 or q.shape[0] != q.shape[1] or q.shape[0] < 1:
+        raise ChainError(f"a generator is a square matrix, got shape {q.shape}")
+    if not np.isfinite(q).all():
+        raise ChainError("a generator's rates are finite")
+    off = q - np.diag(np.diag(q))
+    if (off < 0).any():
+        raise ChainError("a generator's rates from one state to another are not negative")
+    rates = off.sum(1)
+    if (np.abs(rates + np.diag(q)) > 1e-9 * np.maximum(rates, 1e-300)).any():
+        raise ChainError("a generator's rows sum to zero (diagonal = minus the sum of the row's rates)")
+    return off - np.diag(rates)
+
+
+def transition_matrix(generator_per_ms: NDArray[np.float64], span_ms: float) -> NDArray[np.float64]:
+    """P(u) = exp(Q u), u in ms (6.27): closed form for two states, else uniformisation and squaring.
+
+    Uniformisation adds only non-negative terms, so nothing cancels; rows are renormalised after each
+    squaring, so a stiff chain keeps its probabilities.
+    """
+    q = check_generator(generator_per_ms)
+    if span_ms < 0:
+        raise ChainError(f"a span of time is not negative, got {span_ms} ms")
+    if q.shape == (2, 2):
+        a, b = q[0, 1], q[1, 0]
+        if a + b == 0.0:
+            return np.eye(2)
+        moved = -math.expm1(-(a + b) * span_ms) / (a + b)
+        kept = math.exp(-(a + b) * span_ms)
+        # Sums, not one minus the others: a state that is hardly ever kept has digits too.
+        return np.array([[(b + a * kept) / (a + b), a * moved], [b * moved, (a + b * kept) / (a + b)]])
+    fastest = float(-q.diagonal().min())
+    if fastest * span_ms == 0.0:
+        return np.eye(len(q))
+    halvings = max(0, math.ceil(math.log2(fastest * span_ms)))
+    mass = fastest * span_ms * 2.0**-halvings
+    step = np.eye(len(q)) + q / fastest
+    term = np.eye(len(q)) * math.exp(-mass)
+    total = term.copy()
+    for k in range(1, 40):
+        term = term @ step * (mass / k)
+        total += term
+    for _ in range(halvings + 1):
+        total /= total.sum(1, keepdims=True)
+        if halvings:
+            halvings -= 1
+            total = total @ total
+    return total
+
+
+def stationary(generator_per_ms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Stationary distribution, (M,): for two states (mu2, mu1)/(mu1 + mu2). Raises ChainError if not unique.
+
+    Grassmann, Taksar and Heyman's elimination: no subtraction, so rates of 1e-9 beside 1e9 keep all digits.
+    """
+    q = check_generator(generator_per_ms)
+    keep = _recurrent(q)
+    work = (q - np.diag(np.diag(q)))[np.ix_(keep, keep)]
+    for n in range(len(work) - 1, 0, -1):
+        work[:n, n] /= work[n, :n].sum()
+        work[:n, :n] += np.outer(work[:n, n], work[n, :n])
+    weight = np.ones(len(work))
+    for n in range(1, len(work)):
+        weight[n] = weight[:n] @ work[:n, n]
+    share = np.zeros(len(q))
+    share[keep] = weight / weight.sum()
+    return share
+
+
+def _recurrent(q: NDArray[np.float64]) -> list[int]:
+    """States of the only closed class; ChainError if there are several."""
+    reach = (q > 0) | np.eye(len(q), dtype=bool)
+    for k in range(len(q)):
+        reach |= np.outer(reach[:, k], reach[k])
+    closed = {tuple(np.flatnonzero(reach[i])) for i in range(len(q)) if (reach[i] <= reach[:, i]).all()}
+    if len(closed) != 1:
+        raise ChainError("the chain ends in different states, so it has no single long-run distribution: "
+                         "name the state it starts in (initial)")  # fmt: skip
+    return [int(state) for state in closed.pop()]
+
+
+def leaving(transitions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Probability of leaving each state in one step, (M,): the sum of the row's other entries, which keeps
+    digits that one minus the diagonal has lost."""
+    return np.minimum((transitions - np.diag(np.diag(transitions))).sum(1), 1.0)
+
+
+class Chain:
+    """A path of the chain, extended on demand. Instants may be asked for in any order until forgotten.
+
+    generator_per_ms: (M, M). initial: the first state; drawn from the stationary distribution if None.
+    slot_ms: None follows every jump; a number samples the state every so many ms. A state then lasts a
+    geometric number of slots, which is one draw and the same in law as a draw a slot.
+    """
+
+    def __init__(
+        self,
+        generator_per_ms: NDArray[np.float64],
+        uniforms: Uniforms,
+        initial: int | None = None,
+        slot_ms: float | None = None,
+    ) -> None:
+        q = check_generator(generator_per_ms)
+        self.generator_per_ms = q
+        self.states = len(q)
+        self.shares = np.zeros(len(q))  # long-run shares, where there are such and they matter
+        self._uniforms = uniforms
+        self.slot_ns = 0 if slot_ms is None else round(slot_ms * 1e6)
+        if slot_ms is not None:
+            if self.slot_ns < 1:
+                raise ChainError(f"a slot lasts at least a nanosecond, got {slot_ms:g} ms")
+            q = transition_matrix(q, self.slot_ns / 1e6)
+        off = q - np.diag(np.diag(q))
+        leave = leaving(q) if self.slot_ns else off.sum(1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            jumps = np.cumsum(off / off.sum(1)[:, None], 1)
+            # Per state what the length of a sojourn follows from: its rate in 1/ms; in slots, the logarithm
+            # of the probability to stay for one more.
+            self.pace = np.log1p(-leave) if self.slot_ns else leave
+        # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
+        self.jumps = np.where(np.arange(self.states) >= self._last_targets(off)[:, None], 1.0, jumps)
+        self._jump_lists = self.jumps.tolist()
+        self._pace = [float(p) for p in self.pace]
+        self.white = not self.slot_ns and self._is_white()
+        self.initial = self._draw_initial() if initial is None else initial
+        self._starts = [0]
+        self._visited = [self.initial]
+        self._number = 0  # of the sojourn now last: its length and the jump at its end are that number's pair
+        self._until = self._sojourn_end(0, self.initial)
+        self._spent_ns = [0] * self.states  # in the part of the path that was forgotten
+
+    def segment(self, at_ns: int) -> tuple[int, int]:
+        """State at ``at_ns`` and the instant of its end (NEVER_NS if it has none)."""
+        if self.white:
+            return self._state_of_instant(at_ns), at_ns + 1
+        if self._until <= at_ns:
+            self._extend(at_ns)
+        starts = self._starts
+        if at_ns >= starts[-1]:
+            return self._visited[-1], self._until
+        i = bisect_right(starts, at_ns) - 1
+        if i < 0:
+            raise ChainError(f"the chain's state at {at_ns} ns was forgotten; it is kept from {starts[0]} ns")
+        return self._visited[i], starts[i + 1]
+
+    def state(self, at_ns: int) -> int:
+        return self.segment(at_ns)[0]
+
+    def recent(self, since_ns: int, until_ns: int) -> list[tuple[int, int]]:
+        """(start, state) of the sojourns that touch [since, until], as far as the path is still known."""
+        if self.white:
+            return []
+        self.segment(until_ns)
+        first = max(0, bisect_right(self._starts, since_ns) - 1)
+        last = bisect_right(self._starts, until_ns)
+        return list(zip(self._starts[first:last], self._visited[first:last]))
+
+    def occupancy(self, until_ns: int) -> list[float]:
+        """Share of [0, until) spent in each state."""
+        if self.white:
+            return [float(p) for p in self.shares]
+        if until_ns <= 0:
+            return [float(i == self.initial) for i in range(self.states)]
+        self.segment(until_ns)
+        spent = list(self._spent_ns)
+        for start, end, state in zip(self._starts, [*self._starts[1:], NEVER_NS], self._visited):
+            if start >= until_ns:
+                break
+            spent[state] += min(end, until_ns) - start
+        return [ns / until_ns for ns in spent]
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the path before an instant, so that a live chain does not grow."""
+        first = bisect_right(self._starts, before_ns) - 1
+        if first < 1024:  # not worth the copy
+            return
+        for i in range(first):
+            self._spent_ns[self._visited[i]] += self._starts[i + 1] - self._starts[i]
+        del self._starts[:first], self._visited[:first]
+
+    def _extend(self, at_ns: int) -> None:
+        """Jump until the path covers ``at_ns``."""
+        mark, mark_ns = self._number, self._until
+        while self._until <= at_ns:
+            start = self._until
+            if self._number - mark == _CHECK_EVERY:
+                # A rate that the stationary distribution did not foretell, as before an absorbing state.
+                if (start - mark_ns) * MAX_JUMPS_PER_MS * 10 < _CHECK_EVERY * 10**6:
+                    raise ChainError(
+                        "the chain switches more than 10000 times a ms: slow it down, or sample it at slot "
+                        "boundaries (sampled: slots)"
+                    )
+                mark, mark_ns = self._number, start
+            target = bisect_right(self._jump_lists[self._visited[-1]], self._uniforms.pair(self._number)[1])
+            self._number += 1
+            self._starts.append(start)
+            self._visited.append(target)
+            self._until = self._sojourn_end(start, target)
+
+    def _sojourn_end(self, start_ns: int, state: int) -> int:
+        pace = self._pace[state]
+        if pace == 0.0:
+            return NEVER_NS
+        logarithm = math.log(self._uniforms.pair(self._number)[0])
+        if not self.slot_ns:
+            return later(start_ns, saturate(-logarithm / pace * 1e6))
+        slots = logarithm / pace
+        if slots * self.slot_ns >= NEVER_NS:
+            return NEVER_NS
+        return later(start_ns, (int(slots) + 1) * self.slot_ns)
+
+    def _draw_initial(self) -> int:
+        shares = np.cumsum(stationary(self.generator_per_ms))
+        return min(int(np.searchsorted(shares, self._uniforms.uniform(0, 1), side="right")), self.states - 1)
+
+    def _is_white(self) -> bool:
+        """True for a two-state chain so fast that it is noise. Refuses what is too fast to follow."""
+        rates_per_ms = -self.generator_per_ms.diagonal()
+        if not rates_per_ms.all():
+            return False  # it comes to rest somewhere
+        try:
+            self.shares = stationary(self.generator_per_ms)
+        except ChainError:
+            return False
+        jumps_per_ms = float(self.shares @ rates_per_ms)
+        if jumps_per_ms <= MAX_JUMPS_PER_MS:
+            return False
+        if self.states == 2 and rates_per_ms.sum() >= WHITE_RATE_PER_MS:
+            return True
+        raise ChainError(
+            f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {MAX_JUMPS_PER_MS:g} are "
+            f"followed (two-state chains faster than {WHITE_RATE_PER_MS:g} a ms are treated as noise); or "
+            "sample it at slot boundaries (sampled: slots)"
+        )
+
+    def _state_of_instant(self, at_ns: int) -> int:
+        return 0 if self._uniforms.uniform(at_ns) < self.shares[0] else 1
+
+    @staticmethod
+    def _last_targets(off: NDArray[np.float64]) -> NDArray[np.intp]:
+        return np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])

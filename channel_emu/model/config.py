@@ -1,0 +1,323 @@
+"""The scenario's ``channel:`` section as data: strict, with every default visible.
+
+Rates are per millisecond and delays in milliseconds, as in the thesis. Where a value may follow the chain's
+state it is one number, or a list with one entry a state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from channel_emu.model import faults as fault_modules
+from channel_emu.model.chain import (
+    MAX_JUMPS_PER_MS,
+    ChainError,
+    check_generator,
+    leaving,
+    stationary,
+    transition_matrix,
+    two_state_generator,
+)
+from channel_emu.model.link import DISCIPLINES
+from channel_emu.model.presets import PRESETS
+from channel_emu.model.queue_server import ORDERS
+from freshfield.scenario import ScenarioError, read_section
+
+PROCESSES = ("as-offered", "periodic", "poisson")
+LAWS = ("none", "exponential", "deterministic", "gamma", "lognormal", "trace")
+SERVICE_STATES = ("at-start", "modulated")
+SCOPES = ("shared", "per-camera")
+SAMPLINGS = ("continuous", "slots")
+
+
+@dataclass(frozen=True)
+class ArrivalsConfig:
+    """When frames enter the link.
+
+    as-offered: whenever the camera offers one. periodic: the same on a live link (the camera keeps the
+    period); simulations make one frame every ``period_ms``. poisson: at the instants of a Poisson process the
+    newest offered frame is sampled; with a rate for each state this is an MMPP.
+    """
+
+    process: str = "as-offered"
+    period_ms: float | None = None
+    rate_per_ms: float | list[float] | None = None
+    spread: bool = False
+    """Simulations: periodic cameras take turns, evenly over the period, instead of all at one instant."""
+
+    def __post_init__(self) -> None:
+        _one_of("process", self.process, PROCESSES)
+        _belongs("period_ms", self.period_ms, self.process == "periodic", "process periodic")
+        _belongs("rate_per_ms", self.rate_per_ms, self.process == "poisson", "process poisson")
+        if self.period_ms is not None and not self.period_ms >= 1e-3:
+            raise ValueError(f"period_ms: expected at least 0.001, got {self.period_ms:g}")
+        if self.spread and self.process == "poisson":
+            raise ValueError("spread: belongs to process periodic or as-offered only")
+        if self.rate_per_ms is not None:
+            _not_negative("rate_per_ms", per_state(self.rate_per_ms))
+            if max(per_state(self.rate_per_ms)) <= 0:
+                raise ValueError("rate_per_ms: expected a rate above 0 in at least one state")
+
+
+@dataclass(frozen=True)
+class ChainConfig:
+    """The network's state (6.25). Two states by mu1_per_ms and mu2_per_ms (6.26), or any number by
+    ``generator_per_ms``, row by row. ``shared`` by all cameras, or each has its own (``per-camera``)."""
+
+    mu1_per_ms: float | None = None
+    mu2_per_ms: float | None = None
+    generator_per_ms: list[list[float]] | None = None
+    states: list[str] = field(default_factory=list)
+    """Names of the states; s1, s2, ... if not given."""
+    initial: str | None = None
+    """The state it starts in; drawn from the stationary distribution if not given."""
+    scope: str = "shared"
+    sampled: str = "continuous"
+    """continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
+    the slot, as the thesis does; ``channel-emu accuracy`` shows what that costs."""
+    slot_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        _one_of("scope", self.scope, SCOPES)
+        _one_of("sampled", self.sampled, SAMPLINGS)
+        _belongs("slot_ms", self.slot_ms, self.sampled == "slots", "sampled slots")
+        if self.slot_ms is not None and not 1e-3 <= self.slot_ms <= 1e9:
+            raise ValueError(f"slot_ms: expected 0.001 to 1e9, got {self.slot_ms:g}")
+        pair = (self.mu1_per_ms is not None) + (self.mu2_per_ms is not None)
+        if pair != (0 if self.generator_per_ms is not None else 2):
+            raise ValueError("expected mu1_per_ms and mu2_per_ms, or generator_per_ms")
+        _not_negative("mu1_per_ms and mu2_per_ms", [self.mu1_per_ms or 0.0, self.mu2_per_ms or 0.0])
+        try:
+            generator = self.generator()
+        except ValueError as error:
+            raise ValueError(f"generator_per_ms: {error}") from None
+        if self.states and len(self.states) != len(generator):
+            raise ValueError(f"states: expected {len(generator)} names, got {len(self.states)}")
+        if len(set(self.names())) != len(generator):
+            raise ValueError("states: the same name twice")
+        if self.initial is None:
+            try:
+                stationary(generator)
+            except ChainError as error:
+                raise ValueError(f"initial: {error}") from None
+        else:
+            _one_of("initial", self.initial, self.names())
+
+    def generator(self) -> NDArray[np.float64]:
+        """Q in 1/ms, (M, M)."""
+        if self.generator_per_ms is None:
+            return two_state_generator(self.mu1_per_ms or 0.0, self.mu2_per_ms or 0.0)
+        if len({len(row) for row in self.generator_per_ms} | {len(self.generator_per_ms)}) != 1:
+            raise ValueError("expected a square matrix, row by row")
+        return check_generator(np.array(self.generator_per_ms, float))
+
+    def switches_per_ms(self) -> float:
+        """How often the sampled state changes in the long run. Raises ChainError where there is none."""
+        generator = self.generator()
+        shares = stationary(generator)
+        if self.slot_ms is None:
+            return float(-shares @ generator.diagonal())
+        return float(shares @ leaving(transition_matrix(generator, self.slot_ms))) / self.slot_ms
+
+    def names(self) -> list[str]:
+        count = 2 if self.generator_per_ms is None else len(self.generator_per_ms)
+        return self.states or [f"s{i + 1}" for i in range(count)]
+
+
+@dataclass(frozen=True)
+class ServiceConfig:
+    """How long a frame takes. gamma: ``shape`` k (coefficient of variation 1/sqrt(k)); lognormal: ``sigma``
+    of the logarithm; both have the given mean. trace: ``delays_ms`` in turn, again and again."""
+
+    law: str = "none"
+    mean_ms: float | list[float] | None = None
+    shape: float | None = None
+    sigma: float | None = None
+    delays_ms: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        _one_of("law", self.law, LAWS)
+        _belongs("mean_ms", self.mean_ms, self.law not in ("none", "trace"), "a law with a mean")
+        _belongs("shape", self.shape, self.law == "gamma", "law gamma")
+        _belongs("sigma", self.sigma, self.law == "lognormal", "law lognormal")
+        _belongs("delays_ms", self.delays_ms, self.law == "trace", "law trace")
+        if self.mean_ms is not None:
+            _not_negative("mean_ms", per_state(self.mean_ms))
+        if self.shape is not None and not 1e-3 <= self.shape <= 1e6:
+            raise ValueError(f"shape: expected 0.001 to 1e6, got {self.shape:g}")
+        if self.sigma is not None and not 0 <= self.sigma <= 10:
+            raise ValueError(f"sigma: expected 0 to 10, got {self.sigma:g}")
+        if self.delays_ms is not None:
+            if not self.delays_ms:
+                raise ValueError("delays_ms: expected at least one delay")
+            _not_negative("delays_ms", self.delays_ms)
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """Who transmits. By default every camera has a line of its own. ``shared``: all cameras' frames compete
+    for one line; ``server`` says what each discipline and order then means. Cameras that capture at one
+    instant ask for the line in the order of their names: under drop-new the first of them keeps it."""
+
+    shared: bool = False
+    order: str = "fcfs"
+    """Whose waiting frame is next when the line falls free (newest-waits and fcfs)."""
+
+    def __post_init__(self) -> None:
+        _one_of("order", self.order, ORDERS)
+        if self.order != "fcfs" and not self.shared:
+            raise ValueError("order: belongs to a shared server only")
+
+
+@dataclass(frozen=True)
+class ChannelConfig:
+    """One channel; see ``presets`` for the thesis's."""
+
+    preset: str | None = None
+    arrivals: ArrivalsConfig = field(default_factory=ArrivalsConfig)
+    chain: ChainConfig | None = None
+    service: ServiceConfig = field(default_factory=ServiceConfig)
+    service_state: str = "at-start"
+    """at-start: the delay is drawn for the state in which transmission starts. modulated: the rate follows
+    the state while the frame is on its way."""
+    discipline: str = "drop-new"
+    server: ServerConfig = field(default_factory=ServerConfig)
+    queue_limit: int = 1024
+    """Most frames waiting (fcfs) or on their way at once (parallel), so that memory is bounded; of a shared
+    server, all cameras' together."""
+    hard_limit_ms: float | None = None
+    """Live only: end the emulator as soon as a frame leaves this much later than it was due."""
+    faults: dict[str, Any] = field(default_factory=dict)
+    """Parameters of the listed faults, by name."""
+
+    def __post_init__(self) -> None:
+        _one_of("service_state", self.service_state, SERVICE_STATES)
+        _one_of("discipline", self.discipline, DISCIPLINES)
+        if not 1 <= self.queue_limit <= 10**6:
+            raise ValueError(f"queue_limit: expected 1 to 1000000, got {self.queue_limit}")
+        if self.server.order != "fcfs" and self.discipline not in ("newest-waits", "fcfs"):
+            raise ValueError(f"server.order: nothing waits its turn under discipline {self.discipline}")
+        if self.hard_limit_ms is not None and self.hard_limit_ms <= 0:
+            raise ValueError(f"hard_limit_ms: expected more than 0, got {self.hard_limit_ms:g}")
+        states = 1 if self.chain is None else len(self.chain.names())
+        for key, value in (("arrivals.rate_per_ms", self.arrivals.rate_per_ms),
+                           ("service.mean_ms", self.service.mean_ms)):  # fmt: skip
+            if isinstance(value, list) and len(value) != states:
+                what = "there is no chain" if self.chain is None else f"the chain has {states} states"
+                raise ValueError(f"{key}: expected one number or one a state, got {len(value)}; {what}")
+        if isinstance(self.arrivals.rate_per_ms, list):
+            self._refuse_endless("arrivals.rate_per_ms", self.arrivals.rate_per_ms)
+        if isinstance(self.service.mean_ms, list) and self.service_state == "modulated":
+            rates = [1 / max(mean, 1e-300) for mean in self.service.mean_ms]
+            self._refuse_endless("service.mean_ms", rates)
+
+    def _refuse_endless(self, key: str, rates_per_ms: list[float]) -> None:
+        """Refuse what would have to follow the chain through millions of jumps for a single frame."""
+        if self.chain is None or len(set(rates_per_ms)) == 1:
+            return
+        generator = self.chain.generator()
+        try:
+            shares = stationary(generator)
+        except ChainError:
+            return  # it comes to rest, so no frame is followed for long
+        jumps = self.chain.switches_per_ms()
+        rate = max(r for r, share in zip(rates_per_ms, shares) if share > 1e-12)
+        if jumps > 1e5 * rate and jumps <= MAX_JUMPS_PER_MS:
+            raise ValueError(
+                f"{key}: the chain switches {jumps:.3g} times a ms, more than 100000 times while one frame "
+                "waits or is served; give one number for all states"
+            )
+
+    @property
+    def state_names(self) -> list[str]:
+        return ["-"] if self.chain is None else self.chain.names()
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The resolved section: reading it again gives this configuration."""
+        plain = _without_none(dataclasses.asdict(dataclasses.replace(self, preset=None, faults={})))
+        plain["faults"] = {name: _without_none(dataclasses.asdict(p)) for name, p in self.faults.items()}
+        return plain
+
+
+def channel_from_mapping(mapping: Any, where: str = "channel") -> ChannelConfig:
+    """Read a ``channel:`` section. An empty one is the ideal channel.
+
+    Keys beside ``preset`` override the preset's: mappings are merged key by key, unless they name another
+    process or law, which replaces the preset's whole. ``arrivals: as-offered`` and ``service: none`` may be
+    written as one word. Raises ScenarioError (a ValueError), one line that names the key.
+    """
+    if mapping is None:
+        mapping = {}
+    if not isinstance(mapping, dict):
+        raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
+    given = {key: _spelled_out(key, value) for key, value in mapping.items()}
+    name = given.get("preset", "ideal")
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ScenarioError(f"{where}.preset: expected one of {', '.join(PRESETS)}, got {name!r}")
+    merged: dict[str, Any] = dict(PRESETS[name])
+    for key, value in given.items():
+        base = merged.get(key)
+        merged[key] = _merge(base, value) if isinstance(base, dict) and isinstance(value, dict) else value
+    merged["preset"] = name
+    faults = merged.pop("faults", None) or {}
+    config = read_section(ChannelConfig, merged, where)
+    return dataclasses.replace(config, faults=_read_faults(faults, f"{where}.faults"))
+
+
+def per_state(value: float | list[float]) -> list[float]:
+    return list(value) if isinstance(value, list) else [value]
+
+
+def _spelled_out(key: Any, value: Any) -> Any:
+    names = {"arrivals": "process", "service": "law"}
+    return {names[key]: value} if key in names and isinstance(value, str) else value
+
+
+def _merge(base: dict[str, Any], value: dict[str, Any]) -> dict[str, Any]:
+    for kind in ("process", "law"):
+        if kind in value and value[kind] != base.get(kind):
+            return value
+    if "generator_per_ms" in value:
+        base = {k: v for k, v in base.items() if k not in ("mu1_per_ms", "mu2_per_ms", "states")}
+    return {**base, **value}
+
+
+def _read_faults(section: Any, where: str) -> dict[str, Any]:
+    if not isinstance(section, dict):
+        raise ScenarioError(f"{where}: expected a mapping of faults, got {section!r}")
+    read: dict[str, Any] = {}
+    for name, params in section.items():
+        if name not in fault_modules.NAMES:
+            known = ", ".join(fault_modules.NAMES)
+            raise ScenarioError(f"{where}.{name}: unknown fault; expected one of {known}")
+        read[name] = read_section(fault_modules.params_class(name), params, f"{where}.{name}")
+    return read
+
+
+def _one_of(key: str, value: str, allowed: Any) -> None:
+    if value not in allowed:
+        raise ValueError(f"{key}: expected one of {', '.join(allowed)}, got {value!r}")
+
+
+def _belongs(key: str, value: Any, wanted: bool, owner: str) -> None:
+    if value is None and wanted:
+        raise ValueError(f"{key}: missing ({owner} needs it)")
+    if value is not None and not wanted:
+        raise ValueError(f"{key}: belongs to {owner} only")
+
+
+def _not_negative(key: str, values: list[float]) -> None:
+    for value in values:
+        if not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{key}: expected finite numbers of at least 0, got {value:g}")
+
+
+def _without_none(mapping: dict[str, Any]) -> dict[str, Any]:
+    clean = {k: _without_none(v) if isinstance(v, dict) else v for k, v in mapping.items()}
+    return {k: v for k, v in clean.items() if v is not None and v != []}

@@ -1,0 +1,26 @@
+"""A line of finite rate: each frame's size adds to its delay, so big frames are slow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from channel_emu.model.faults import NoFault
+from channel_emu.model.instants import saturate
+from channel_emu.model.link import Transit
+
+
+@dataclass(frozen=True)
+class Params:
+    megabits_per_s: float
+
+    def __post_init__(self) -> None:
+        if self.megabits_per_s <= 0:
+            raise ValueError(f"megabits_per_s: expected more than 0, got {self.megabits_per_s:g}")
+
+
+class Effect(NoFault):
+    def __init__(self, params: Params, seed: int, camera: str) -> None:
+        self.ns_per_byte = 8e3 / params.megabits_per_s
+
+    def extra_ns(self, transit: Transit) -> int:
+        return saturate(transit.size_bytes * self.ns_per_byte)

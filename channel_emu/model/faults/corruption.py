@@ -1,0 +1,42 @@
+"""Flips bytes of the payload on the way: the edge must refuse the frame by its CRC."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from channel_emu.model.counter_rng import Uniforms
+from channel_emu.model.faults import NoFault, probability
+from channel_emu.model.link import Transit
+
+
+@dataclass(frozen=True)
+class Params:
+    probability: float
+    count: int = 1
+    """Bytes flipped in a damaged frame."""
+
+    def __post_init__(self) -> None:
+        probability("probability", self.probability)
+        if not 1 <= self.count <= 1000:
+            raise ValueError(f"count: expected 1 to 1000 bytes, got {self.count}")
+
+
+class Effect(NoFault):
+    def __init__(self, params: Params, seed: int, camera: str) -> None:
+        self.params = params
+        self.uniforms = Uniforms(seed, camera, "channel.corruption")
+
+    def flips(self, transit: Transit) -> tuple[tuple[float, int], ...]:
+        if self.uniforms.uniform(transit.number) >= self.params.probability:
+            return ()
+        pairs = (self.uniforms.pair(transit.number, 1 + i) for i in range(self.params.count))
+        return tuple((place, 1 + int(value * 255)) for place, value in pairs)
+
+
+def damage(payload: bytes, flips: tuple[tuple[float, int], ...]) -> bytes:
+    """The payload with its bytes flipped; an empty payload has none to flip."""
+    data = bytearray(payload)
+    for place, mask in flips:
+        if data:
+            data[int(place * len(data))] ^= mask
+    return bytes(data)

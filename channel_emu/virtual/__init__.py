@@ -1,0 +1,1 @@
+"""The same links in virtual time, and what their accuracy costs."""

@@ -1,0 +1,232 @@
+"""What accuracy costs in time, for the simulation itself: three trade-offs, measured against exact ages.
+
+- ``duration``: error of the mean age against seconds simulated and seconds of computing (thesis's chapter 5
+  channel, exact age by ``theory``).
+- ``slots``: bias of a slot grid against its length and speed: of the chain's sampling (exact and measured)
+  and of stepping time itself (``bench_virtual.periodic_loop``).
+- ``seeds``: width of a 95 % interval of the mean age against the number of seeds.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from channel_emu.model.closed_forms import drop_new_age_ms, slotted_drop_new_age_ms
+from channel_emu.model.config import ChannelConfig, channel_from_mapping
+from channel_emu.virtual.benchmark import periodic_loop
+from channel_emu.virtual.simulate import SimulationError, simulate
+
+Rows = list[dict[str, Any]]
+
+CAMERAS = 18
+_PERIOD_MS, _MEAN_MS = 30.0, 60.0
+# (name, mu1, mu2 in 1/ms, mean delays in ms by state, period in ms, slots in ms). The fast chain switches
+# many times a period, which is where a grid goes wrong; the thesis's does not.
+CHAINS = (
+    ("fast", 5.0, 5.0, (0.2, 2.0), 2.0, (0.01, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)),
+    ("thesis", 1 / 30, 1 / 30, (30.0, 60.0), 30.0, (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)),
+)
+LOOP_SLOTS_MS = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+
+
+def measure(quick: bool = False, seed: int = 0) -> dict[str, Rows]:
+    """The three tables; seeds count from ``seed`` on. quick: fewer seeds and shorter runs, for seconds
+    instead of a minute. Raises SimulationError where numba is missing."""
+    return {
+        "duration": duration(8 if quick else 24, 1000.0 if quick else 10_000.0, seed),
+        "slots": [*chain_slots(6 if quick else 20, 100_000 if quick else 400_000, seed),
+                  *loop_slots(3 if quick else 8, 40.0 if quick else 100.0, seed)],
+        "seeds": seeds(32 if quick else 256, 60.0, seed),
+    }  # fmt: skip
+
+
+def duration(repeats: int, longest_s: float, seed: int = 0) -> Rows:
+    """Root mean square error of the mean age of 18 cameras, over ``repeats`` seeds, against duration."""
+    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
+    config = channel_from_mapping({"preset": "ch5"})
+    _age(config, CAMERAS, 1.0, seed)  # compiles
+    rows = []
+    seconds = 1.0
+    while seconds <= longest_s:
+        begun = time.perf_counter()
+        found = np.array([_age(config, CAMERAS, seconds, seed + k) for k in range(repeats)])
+        rows.append({
+            "seconds": seconds, "cameras": CAMERAS, "repeats": repeats, "exact_ms": exact,
+            "rms_error_pct": 100 * float(np.sqrt(np.mean((found / exact - 1) ** 2))),
+            "wall_ms": (time.perf_counter() - begun) / repeats * 1e3,
+        })  # fmt: skip
+        seconds *= 10**0.5
+    return rows
+
+
+def chain_slots(repeats: int, frames: int, seed: int = 0) -> Rows:
+    """Bias of sampling the chain at slot boundaries: exact, measured with its 95 % interval, and speed.
+    slot_ms 0 is continuous time."""
+    rows = []
+    for name, mu1, mu2, means_ms, period_ms, slots_ms in CHAINS:
+        generator = np.array([[-mu1, mu1], [mu2, -mu2]])
+        exact = drop_new_age_ms(generator, np.array(means_ms), period_ms)
+        for slot_ms in (0.0, *slots_ms):
+            more = {"sampled": "slots", "slot_ms": slot_ms} if slot_ms else {}
+            config = channel_from_mapping({
+                "arrivals": {"process": "periodic", "period_ms": period_ms}, "service_state": "modulated",
+                "service": {"law": "exponential", "mean_ms": list(means_ms)},
+                "chain": {"mu1_per_ms": mu1, "mu2_per_ms": mu2, **more},
+            })  # fmt: skip
+            seconds = frames * period_ms / 1e3
+            begun = time.perf_counter()
+            found = np.array([_age(config, 1, seconds, seed + k) for k in range(repeats)])
+            predicted = drop_new_age_ms(generator, np.array(means_ms), period_ms, slot_ms or None)
+            rows.append({
+                "what": f"chain {name}", "slot_ms": slot_ms, "period_ms": period_ms,
+                "bias_exact_pct": 100 * (predicted / exact - 1),
+                "bias_measured_pct": 100 * (float(found.mean()) / exact - 1),
+                "half_width_pct": 100 * _half_width(found) / exact,
+                "camera_s_per_wall_s": repeats * seconds / (time.perf_counter() - begun),
+            })  # fmt: skip
+    return rows
+
+
+def loop_slots(repeats: int, seconds: float, seed: int = 0) -> Rows:
+    """The same for a loop over slots, which pays for every slot. Its ages are sampled just after deliveries:
+    half a slot is added to compare them with the time average."""
+    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
+    rows = []
+    for slot_ms in LOOP_SLOTS_MS:
+        begun = time.perf_counter()
+        found = np.array([periodic_loop(CAMERAS, seconds, seed + k, slot_ms) for k in range(repeats)])
+        found += slot_ms / 2
+        rows.append({
+            "what": "loop over slots", "slot_ms": slot_ms, "period_ms": _PERIOD_MS,
+            "bias_exact_pct": 100 * (slotted_drop_new_age_ms(_MEAN_MS, _PERIOD_MS, slot_ms) / exact - 1),
+            "bias_measured_pct": 100 * (float(found.mean()) / exact - 1),
+            "half_width_pct": 100 * _half_width(found) / exact,
+            "camera_s_per_wall_s": repeats * seconds * CAMERAS / (time.perf_counter() - begun),
+        })  # fmt: skip
+    return rows
+
+
+def seeds(most: int, seconds: float, seed: int = 0) -> Rows:
+    """Half width of the 95 % interval of the mean age from 2, 4, 8, ... seeds, and the share of groups of
+    that many whose interval holds the exact age.
+
+    More seeds narrow the interval around what a run of this length gives, and that has a bias of its own: it
+    starts with a delivery, when the age is least. Longer runs remove it, more seeds only lay it bare.
+    """
+    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
+    config = channel_from_mapping({"preset": "ch5"})
+    begun = time.perf_counter()
+    found = np.array([_age(config, CAMERAS, seconds, seed + k) for k in range(most)])
+    each_ms = (time.perf_counter() - begun) / most * 1e3
+    bias_width = _half_width(found)
+    rows = []
+    count = 2
+    while count <= most // 4:  # groups enough to say how often the interval is right
+        groups = found[: most // count * count].reshape(-1, count)
+        widths = np.array([_half_width(group) for group in groups])
+        inside = np.abs(groups.mean(1) - exact) <= widths
+        rows.append({
+            "seeds": count, "seconds": seconds, "groups": len(groups),
+            "half_width_pct": 100 * float(widths.mean()) / exact, "holds_exact": float(inside.mean()),
+            "bias_pct": 100 * (float(found.mean()) / exact - 1),
+            "bias_half_width_pct": 100 * bias_width / exact,
+            "wall_ms": each_ms * count,
+        })  # fmt: skip
+        count *= 2
+    return rows
+
+
+def show(tables: dict[str, Rows]) -> str:
+    """The tables for a person."""
+    lines = ["error of the mean age against seconds simulated (18 cameras, chapter 5)",
+             f"{'seconds':>10} {'rms error %':>12} {'wall ms':>10}"]  # fmt: skip
+    lines += [
+        f"{r['seconds']:10.1f} {r['rms_error_pct']:12.3f} {r['wall_ms']:10.2f}" for r in tables["duration"]
+    ]
+    lines += ["", "bias of a slot grid against its length (slot 0: continuous time)"]
+    lines += [f"{'what':16} {'slot ms':>8} {'exact %':>9} {'measured %':>20} {'camera-s/wall-s':>16}"]
+    lines += [
+        f"{r['what']:16} {r['slot_ms']:8g} {r['bias_exact_pct']:9.3f} "
+        f"{r['bias_measured_pct']:10.3f} +- {r['half_width_pct']:6.3f} {r['camera_s_per_wall_s']:16,.0f}"
+        for r in tables["slots"]
+    ]
+    lines += ["", "95 % interval of the mean age against seeds (18 cameras, chapter 5)",
+              f"{'seeds':>6} {'half width %':>13} {'holds exact':>12} {'wall ms':>10}"]  # fmt: skip
+    lines += [
+        f"{r['seeds']:6d} {r['half_width_pct']:13.3f} {r['holds_exact']:12.2f} {r['wall_ms']:10.2f}"
+        for r in tables["seeds"]
+    ]
+    last = tables["seeds"][-1]
+    lines.append(f"bias of a run of {last['seconds']:g} s, which starts with a delivery: "
+                 f"{last['bias_pct']:.3f} +- {last['bias_half_width_pct']:.3f} %")  # fmt: skip
+    return "\n".join(lines)
+
+
+def write(tables: dict[str, Rows], out: Path) -> list[Path]:
+    """OUT/accuracy-NAME.csv of each table and OUT/accuracy.png. Raises SimulationError without matplotlib."""
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, rows in tables.items():
+        path = out / f"accuracy-{name}.csv"
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+        written.append(path)
+    return [*written, _draw(tables, out / "accuracy.png")]
+
+
+def _draw(tables: dict[str, Rows], path: Path) -> Path:
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise SimulationError("the figure needs matplotlib (pip install 'freshfield[edge]')") from None
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, middle, right = figure.subplots(1, 3)
+    error = [r["rms_error_pct"] for r in tables["duration"]]
+    left.loglog([r["seconds"] for r in tables["duration"]], error, "o-", label="seconds simulated")
+    left.loglog([r["wall_ms"] / 1e3 for r in tables["duration"]], error, "s--", label="seconds of computing")
+    left.set(xlabel="seconds", ylabel="rms error of the mean age (%)", title="18 cameras, chapter 5")
+    left.legend()
+    for what in dict.fromkeys(r["what"] for r in tables["slots"]):
+        rows = [r for r in tables["slots"] if r["what"] == what and r["slot_ms"]]
+        slots = [r["slot_ms"] / r["period_ms"] for r in rows]
+        (line,) = middle.plot(slots, [r["bias_exact_pct"] for r in rows], "-", label=f"{what}, exact")
+        middle.errorbar(
+            slots, [r["bias_measured_pct"] for r in rows], [r["half_width_pct"] for r in rows], fmt="o",
+            color=line.get_color(), label=f"{what}, measured",
+        )  # fmt: skip
+    middle.set(xscale="log", xlabel="slot / period", ylabel="bias of the mean age (%)", title="Slot grids")
+    middle.set_yscale("symlog", linthresh=0.1)
+    middle.legend(fontsize="small")
+    right.loglog([r["seeds"] for r in tables["seeds"]], [r["half_width_pct"] for r in tables["seeds"]], "o-")
+    right.set(xlabel="seeds", ylabel="half width of the 95 % interval (%)", title="60 s a seed")
+    counts = [r["seeds"] for r in tables["seeds"]]
+    right.set_xticks(counts, [str(count) for count in counts])
+    right.minorticks_off()
+    figure.savefig(path, dpi=120)
+    return path
+
+
+def _age(config: ChannelConfig, cameras: int, seconds: float, seed: int) -> float:
+    """Mean age in ms over the cameras that had a delivery."""
+    age = simulate(config, cameras, seconds, seed, engine="kernel").mean_age_ms()
+    if age is None:
+        raise SimulationError(f"nothing was delivered within {seconds:g} s")
+    return age
+
+
+def _half_width(values: np.ndarray) -> float:
+    """Of the 95 % interval of the mean by Student's t."""
+    try:
+        from scipy.stats import t
+    except ImportError:
+        raise SimulationError("intervals need scipy (pip install 'freshfield[edge]')") from None
+    return float(t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5)

@@ -1,0 +1,156 @@
+"""The chain's path over a whole horizon, and work spent along it: ``chain.Chain`` and ``traffic.spend``."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from channel_emu.model.instants import NEVER_NS
+from channel_emu.virtual.kernels.philox import fill
+
+_NEVER = float(NEVER_NS)
+# Numbers drawn ahead: enough to hide the start of a block, little enough to stay in the first cache.
+_BLOCK = 256
+
+
+@njit(cache=True, nogil=True)
+def saturate(span_ns):
+    return NEVER_NS if span_ns >= _NEVER else np.int64(span_ns + 0.5)
+
+
+@njit(cache=True, nogil=True)
+def later(instant_ns, span_ns):
+    return min(instant_ns + span_ns, NEVER_NS)
+
+
+@njit(cache=True, nogil=True)
+def chain_path(pace, jumps, slot_ns, key, initial, horizon_ns):
+    """Sojourns up to the first that ends after the horizon: starts int64 (S + 1,) ending with that end, and
+    states int64 (S,). ``pace`` (M,), ``jumps`` (M, M) and ``slot_ns`` are ``chain.Chain``'s."""
+    starts = np.empty(1024, np.int64)
+    states = np.empty(1024, np.int64)
+    starts[0], states[0] = 0, initial
+    u, v = np.empty(_BLOCK), np.empty(_BLOCK)
+    count = 0
+    while True:
+        state = states[count]
+        k = count % _BLOCK
+        if k == 0:
+            fill(count, u, v, key)
+        end = NEVER_NS
+        if pace[state] != 0.0:
+            if slot_ns == 0:
+                end = later(starts[count], saturate(-math.log(u[k]) / pace[state] * 1e6))
+            else:
+                slots = math.log(u[k]) / pace[state]
+                if slots * slot_ns < _NEVER:
+                    end = later(starts[count], (np.int64(slots) + 1) * slot_ns)
+        count += 1
+        if count + 1 >= len(starts):
+            starts = np.concatenate((starts, np.empty_like(starts)))
+            states = np.concatenate((states, np.empty_like(states)))
+        starts[count] = end
+        if end > horizon_ns:
+            return starts[: count + 1].copy(), states[:count].copy()
+        states[count] = np.searchsorted(jumps[state], v[k], side="right")
+
+
+@njit(cache=True, nogil=True)
+def segment(starts, at_ns, hint):
+    """Index of the sojourn that contains ``at_ns``, searched forwards from ``hint``, backwards if it must."""
+    i = hint
+    if starts[i] > at_ns:
+        return np.searchsorted(starts, at_ns, side="right") - 1
+    while i + 1 < len(starts) and starts[i + 1] <= at_ns:
+        i += 1
+    return i
+
+
+@njit(cache=True, nogil=True)
+def spend(work, rates_per_ns, starts, states, start_ns, hint):
+    """Instant at which ``work`` is used up; NEVER_NS if not before the path's end."""
+    alike = True
+    for k in range(1, len(rates_per_ns)):
+        alike &= rates_per_ns[k] == rates_per_ns[0]
+    if alike:
+        rate = rates_per_ns[0]
+        return later(start_ns, saturate(work / rate)) if rate > 0.0 else NEVER_NS
+    at_ns = start_ns
+    i = segment(starts, at_ns, hint)
+    while i < len(states):
+        until_ns = starts[i + 1]
+        rate = rates_per_ns[states[i]]
+        if rate > 0.0:
+            left = float(until_ns - at_ns)
+            need = work / rate
+            if need <= left:
+                return later(at_ns, saturate(need))
+            work -= rate * left
+        at_ns = until_ns
+        i += 1
+    return NEVER_NS
+
+
+@njit(cache=True, nogil=True)
+def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
+    """Instants of a (Markov-modulated) Poisson process in [0, horizon], int64.
+
+    ``spend`` written out: the same operations in the same order, without a call for each arrival.
+    """
+    found = np.empty(1024, np.int64)
+    u, v = np.empty(_BLOCK), np.empty(_BLOCK)
+    alike = True
+    for k in range(1, len(rates_per_ns)):
+        alike &= rates_per_ns[k] == rates_per_ns[0]
+    count, at_ns, i = 0, np.int64(0), 0
+    while True:
+        k = count % _BLOCK
+        if k == 0:
+            fill(count, u, v, key)
+        work = -math.log(u[k])
+        if alike:
+            at_ns = later(at_ns, saturate(work / rates_per_ns[0])) if rates_per_ns[0] > 0.0 else NEVER_NS
+        else:
+            while True:
+                until_ns = starts[i + 1]
+                rate = rates_per_ns[states[i]]
+                if rate > 0.0:
+                    left = float(until_ns - at_ns)
+                    need = work / rate
+                    if need <= left:
+                        at_ns = later(at_ns, saturate(need))
+                        break
+                    work -= rate * left
+                at_ns = until_ns
+                i += 1
+                if i == len(states):
+                    at_ns = NEVER_NS
+                    break
+        if at_ns > horizon_ns:
+            return found[:count].copy()
+        if not alike:  # an instant rounded to the end of a sojourn belongs to the next one
+            while starts[i + 1] <= at_ns:
+                i += 1
+        if count == len(found):
+            found = np.concatenate((found, np.empty_like(found)))
+        found[count] = at_ns
+        count += 1
+
+
+@njit(cache=True, nogil=True)
+def sample_newest(offered_ns, rates_per_ns, starts, states, key):
+    """For each offered frame the arrival that samples it, or -1 where a newer frame was offered first."""
+    sampled = np.empty(len(offered_ns), np.int64)
+    u, v = np.empty(_BLOCK), np.empty(_BLOCK)
+    hint = 0
+    for n in range(len(offered_ns)):
+        k = n % _BLOCK
+        if k == 0:
+            fill(n, u, v, key)
+        hint = segment(starts, offered_ns[n], hint)
+        at_ns = spend(-math.log(u[k]), rates_per_ns, starts, states, offered_ns[n], hint)
+        skipped = n + 1 < len(offered_ns) and at_ns > offered_ns[n + 1]
+        sampled[n] = -1 if skipped else at_ns
+    return sampled

@@ -1,0 +1,69 @@
+"""The work of a link's frames, drawn ahead for all of them: the shapes of ``service``."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from channel_emu.virtual.kernels.philox import fill, pair
+
+LAW_NONE, LAW_EXPONENTIAL, LAW_DETERMINISTIC, LAW_GAMMA, LAW_LOGNORMAL, LAW_TRACE = 0, 1, 2, 3, 4, 5
+
+
+@njit(cache=True, nogil=True)
+def _normal(u, v):
+    return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
+
+
+@njit(cache=True, nogil=True)
+def exponentials(first, count, key):
+    """Unit-mean exponentials of the numbers first, first + 1, ..., float64 (count,)."""
+    u, v = np.empty(count), np.empty(count)
+    fill(first, u, v, key)
+    for i in range(count):
+        u[i] = -math.log(u[i])
+    return u
+
+
+@njit(cache=True, nogil=True)
+def _gamma(number, shape, key):
+    boosted = shape if shape >= 1.0 else shape + 1.0
+    d = boosted - 1.0 / 3.0
+    c = 1.0 / math.sqrt(9.0 * d)
+    again = 1
+    while True:
+        a, b = pair(number, again, key)
+        x = _normal(a, b)
+        v = (1.0 + c * x) ** 3
+        u = pair(number, again + 1, key)[0]
+        if v > 0.0 and math.log(u) < 0.5 * x * x + d - d * v + d * math.log(v):
+            break
+        again += 2
+    value = d * v
+    if shape < 1.0:
+        value *= pair(number, 0, key)[0] ** (1.0 / shape)
+    return value / shape
+
+
+@njit(cache=True, nogil=True)
+def draw(count, law, parameter, delays_ms, key):
+    """Work of mean one of the frames 0, 1, ..., float64 (count,); of law ``trace`` it is the delay in ms, and
+    of no law nothing."""
+    if law == LAW_EXPONENTIAL:
+        return exponentials(0, count, key)
+    if law == LAW_LOGNORMAL:
+        u, v = np.empty(count), np.empty(count)
+        fill(0, u, v, key)
+        for i in range(count):
+            u[i] = math.exp(parameter * _normal(u[i], v[i]) - parameter * parameter / 2)
+        return u
+    drawn = np.full(count, 1.0 if law == LAW_DETERMINISTIC else 0.0)
+    if law == LAW_TRACE:
+        for i in range(count):
+            drawn[i] = delays_ms[i % len(delays_ms)]
+    elif law == LAW_GAMMA:
+        for i in range(count):
+            drawn[i] = _gamma(i, parameter, key)
+    return drawn

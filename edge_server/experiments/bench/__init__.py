@@ -1,0 +1,1 @@
+"""``edge-server bench``: measurements of this machine, one part a file."""

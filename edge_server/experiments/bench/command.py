@@ -1,0 +1,272 @@
+"""``edge-server bench``: what this machine does a second, with how busy others kept it beside each figure."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from edge_server.experiments.common.machine_load import BenchError
+from edge_server.experiments.common.result_store import Kept
+from edge_server.experiments.fitting.command import FitError, parse_options
+from edge_server.fields.registry import field_names, make_field
+from edge_server.report.machine import machine, versions
+from freshfield.files import write_json, write_text
+
+DESCRIPTION = """\
+Measure this machine. Figures are medians; outside_cores says how many cores others kept busy meanwhile.
+
+  edge-server bench                       # everything but peer, hours
+  edge-server bench field --quick
+  edge-server bench track --scene room --field ngp --update-s 0.5
+  edge-server bench field track options --json docs/results/field.json
+  edge-server bench ingest --json ingest.json
+
+field      steps, rays and samples a second, ms a rendering, compile time, memory, seconds to 22..30 dB
+track      updates after motion: how far behind a fit from scratch
+drift      the same for 300 updates of room: whether a field wears out
+options    what each optional part of a representation costs in time and gains in dB
+limits     what this machine allows (random reads and additions, multiply-adds), and how near each kernel gets
+ingest     a real edge server that trains, and a real client: how long an answer takes, whether memory grows
+fidelity   what scoring one image costs
+decide     what a decision of a learnt policy takes, embeddings aside, with 18 and with 200 cameras
+embed      ms to embed a frame, beside ONNX Runtime alone, by the shipped detectors or --model FILE; needs
+           the extra embed; not part of all
+foreground masks of lego against its alpha: IoU and ms by options, what detectors find (--model FILE: another
+           one), and dB that a field gains; needs FRESHFIELD_DATA; not part of all
+peer       seconds to 20 and 25 dB on lego and kitchen, beside nerfstudio's nerfacto where it is installed and
+           the same field in plain torch; needs FRESHFIELD_DATA; not part of all
+surface    meshes of tile from 0.3 m: error and completeness against fit seconds and voxel size, seconds of
+           each stage; needs the extra surface; not part of all
+
+With --json FILE figures are written scene by scene as they are measured; at the end of a part also FILE
+with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on where it stopped.
+"""
+
+PARTS = ("field", "track", "drift", "options", "limits", "ingest", "fidelity", "decide")
+# Not part of "all": they need an extra, or recorded data and patience.
+MORE = ("embed", "foreground", "peer", "surface")
+# Parts that write each figure as it comes, and can skip what is known.
+_KEEPING = ("field", "track", "drift", "options", "surface")
+_FOLLOWING = ("track", "drift")
+# Flags that mean something to some parts only.
+_ONLY_OF = {
+    "field": _KEEPING, "resume": (*PARTS, *MORE), "only": ("options",), "scene": _FOLLOWING,
+    "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
+    "option": _FOLLOWING, "model": ("embed", "foreground"),
+}  # fmt: skip
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    parser = _parser()
+    args = parser.parse_args(argv)
+    parts = list(dict.fromkeys(p for part in args.part or ["all"] for p in _expanded(part)))
+    if unknown := set(parts) - {*PARTS, *MORE}:
+        parser.error(f"no part is called {', '.join(unknown)}; there are: {', '.join((*PARTS, *MORE))}, all")
+    args.field = [name for words in args.field for name in words.split(",")]
+    if unknown := set(args.field) - set(field_names()):
+        parser.error(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
+    if args.resume and args.json is None:
+        parser.error("--resume needs --json FILE, the file to go on with")
+    for flag, of in _ONLY_OF.items():
+        if getattr(args, flag) and not set(parts) & set(of):
+            parser.error(f"--{flag.replace('_', '-')} is for {', '.join(of)}; asked for: {', '.join(parts)}")
+    try:
+        args.option = parse_options(args.option)
+        for name in args.field or field_names():
+            make_field(name, args.option)
+        figures = _known(args.json, args.quick) if args.resume else {}
+    except (BenchError, FitError, ValueError) as error:
+        parser.error(str(error))
+    figures |= {"machine": machine(), "versions": versions(), "quick": args.quick}
+    figures["runs"] = figures.get("runs", 0) + 1
+    status = 0
+    for part in parts:
+        print(f"== {part}", flush=True)
+        module = importlib.import_module(f"edge_server.experiments.bench.{part}")
+        try:
+            _measure(part, module, args, figures)
+        except BenchError as error:
+            print(f"edge-server bench {part}: {error}", file=sys.stderr)
+            status = 1  # the other parts may go well
+            continue
+        except KeyboardInterrupt:
+            _write(args.json, figures)
+            kept = f"; what was measured is in {args.json}: --resume goes on" if args.json else ""
+            print(f"\nstopped{kept}", flush=True)
+            return 130
+        print(_as_text(part, module, figures[part]), flush=True)
+        _write(args.json, figures)
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server bench", description=DESCRIPTION, formatter_class=raw)
+    add = parser.add_argument
+    add("part", nargs="*", metavar="PART", help=f"{', '.join((*PARTS, *MORE))}, all [all]")
+    add("--json", type=Path, metavar="FILE", help="write figures there; plots and tables beside")
+    add("--resume", action="store_true", help="keep what FILE holds already, measure the rest")
+    add(
+        "--field",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="of field, track, drift, options, surface [all there are]",
+    )
+    add("--quick", action="store_true", help="fewer repetitions, cached kernels only")
+    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    add("--only", action="append", default=[], metavar="NAME", help="of options: 'exposure', ... [all]")
+    add("--model", type=Path, metavar="FILE", help="of embed, foreground: a YOLO ONNX [the shipped ones]")
+    track = parser.add_argument_group("of track and drift")
+    add = track.add_argument
+    scenes = ("room", "kitchen")
+    add("--scene", action="append", default=[], choices=scenes, help="[track: both; drift: room]")
+    add(
+        "--updates",
+        type=_at_least_one,
+        metavar="N",
+        help="consecutive updates [100, drift 300; --quick: 16, drift 32]",
+    )
+    add("--update-s", type=_seconds, metavar="S,...", help="seconds of an update, a run each [1,0.25]")
+    add("--steps", type=_at_least_one, metavar="N", help="steps of an update instead: repeats bit for bit")
+    add("--samples", type=_at_least_one, metavar="N", help="frames with a fresh fit [8; --quick: 3]")
+    add("--option", action="append", default=[], metavar="KEY=VALUE", help="setting of the field")
+    return parser
+
+
+def _expanded(part: str) -> tuple[str, ...]:
+    return PARTS if part == "all" else (part,)
+
+
+def _at_least_one(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number from 1")
+    return int(text)
+
+
+def _seconds(text: str) -> tuple[float, ...]:
+    try:
+        found = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        found = ()
+    if not found or not all(0.0 < s < 3600.0 for s in found):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected seconds with commas between, as 1,0.25")
+    return found
+
+
+def _known(path: Path, quick: bool) -> dict[str, Any]:
+    """The figures of an earlier run. BenchError where they cannot be gone on with."""
+    if not path.is_file():
+        return {}
+    try:
+        known: dict[str, Any] = json.loads(path.read_text())
+        known_quick = known["quick"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BenchError(f"--resume: {path} is not what bench writes: {error}") from None
+    if known_quick != quick:
+        raise BenchError(
+            f"--resume: {path} was measured {'with' if known_quick else 'without'} --quick: go on alike, "
+            "or write another file"
+        )
+    return known
+
+
+def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: dict[str, Any]) -> None:
+    """One part, into ``figures``."""
+    more: dict[str, Any] = {}
+    if part in _KEEPING:
+        save = partial(_write_json, args.json, figures)
+        more = {"fields": args.field, "kept": Kept(figures.setdefault(part, {}), save)}
+    elif args.resume and part in figures:
+        print("  known already", flush=True)
+        return
+    if part in _FOLLOWING:
+        more |= {
+            "scenes": args.scene, "updates": args.updates, "update_s": args.update_s, "steps": args.steps,
+            "samples": args.samples, "options": args.option or None,
+        }  # fmt: skip
+    elif part == "options":
+        more["only"] = args.only
+    elif part in ("embed", "foreground"):
+        more["model"] = args.model
+    with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
+        figures[part] = module.measure(args.quick, Path(folder), args.lpips, **more)
+
+
+def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, figures, indent=1)
+
+
+def _write(path: Path | None, figures: dict[str, Any]) -> None:
+    """The JSON, its tables beside it, and PART.png of every part that draws one."""
+    if path is None:
+        return
+    _write_json(path, figures)
+    text = [
+        f"# Measured by `edge-server bench{' --quick' if figures['quick'] else ''}`",
+        _conditions(figures),
+    ]
+    for part in (*PARTS, *MORE):
+        if not figures.get(part):
+            continue
+        module = importlib.import_module(f"edge_server.experiments.bench.{part}")
+        text.append(f"## {part}")
+        if hasattr(module, "draw"):
+            picture = path.with_name(f"{part}.png")
+            module.draw(figures[part], picture)
+            text += [f"![{part}]({picture.name})"] if picture.is_file() else []
+        if hasattr(module, "table"):
+            text.append(module.table(figures[part]))
+        else:
+            rows = "\n".join(f"| {name} | {value} |" for name, value in flat(figures[part]))
+            text.append(f"| figure | value |\n|---|---|\n{rows}")
+    write_text(path.with_suffix(".md"), "\n\n".join(text) + "\n")
+
+
+def _conditions(figures: dict[str, Any]) -> str:
+    m, v = figures["machine"], figures["versions"]
+    known = ", ".join(f"{name} {version}" for name, version in v.items() if version is not None)
+    runs = "one run" if figures["runs"] == 1 else f"{figures['runs']} runs"
+    return (
+        f"{m['cpu']}, {m['cores']} cores, {m['memory_gb']} GB, {m['system']} {m['kernel']}; {known}. "
+        f"Measured in {runs}; outside cores: what others kept busy meanwhile."
+    )
+
+
+def _as_text(part: str, module: ModuleType, figures: dict[str, Any]) -> str:
+    if hasattr(module, "table"):
+        text: str = module.table(figures)
+        return text
+    return "\n".join(f"  {name:42} {value}" for name, value in flat(figures))
+
+
+def flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Nested figures as pairs of a name, ``a.b.c``, and a value for people; series are left out."""
+    out: list[tuple[str, str]] = []
+    for name, value in figures.items():
+        if isinstance(value, dict):
+            out += flat(value, f"{prefix}{name}.")
+        elif not isinstance(value, list):
+            out.append((prefix + name, _shown(value)))
+    return out
+
+
+def _shown(value: Any) -> str:
+    if not isinstance(value, float):
+        return f"{value}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:,.3g}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,113 @@
+"""How long a learnt decision takes, from the newest frames to the action, and what of it is the network.
+
+Embeddings are not computed here (``bench embed`` measures them): a decision is given them.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.experiments.common.machine_load import Usage
+from edge_server.live.buffer import Buffered
+from edge_server.scheduler import Epoch
+from edge_server.scheduler.learned import networks
+from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.observation import observe
+from edge_server.scheduler.learned.state import PARTS, State, StateLayout
+from freshfield.frame import Frame
+from freshfield.geometry import Pinhole, Pose, look_at
+
+CAMERAS = (18, 200)
+DIM = 64
+OMEGAS_MS = tuple(float(omega) for omega in range(0, 301, 20))
+_LENS = Pinhole.from_fov(64, 64, 60.0)
+
+
+def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
+    """Milliseconds, median and 99th percentile, by what is decided and by how many cameras there are."""
+    del folder, lpips
+    repeats = 200 if quick else 2000
+    usage = Usage("bench")
+    found = {
+        f"{action}, {n} cameras": _of(action, n, repeats) for n in CAMERAS for action in ("select", "wait")
+    }
+    return {"embedding_dim": DIM, **found, "outside_cores": usage.outside(usage.row(0.0))}
+
+
+def _of(action: Any, n: int, repeats: int) -> dict[str, float]:
+    spec = Spec(action, StateLayout(dim=DIM), () if action == "select" else OMEGAS_MS)
+    policy = Bandit(Actor(spec, networks.new_actor(spec, np.random.default_rng(0))), "bandit", _rng())
+    newest, embeddings = _rig(n), _Known(n)
+    names = tuple(newest)
+    generated = {c: item.generated_ns for c, item in newest.items()}
+    at = [0]
+
+    def state(parts: Sequence[str] = PARTS) -> State:
+        return observe(names, newest, at[0], embeddings, parts)
+
+    def decide() -> None:
+        at[0] += 10_000_000
+        epoch = Epoch(at[0], 0, generated, state)
+        plan = policy.plan(epoch)
+        policy.select(epoch, plan)
+
+    whole, features = state(), spec.layout.batch([state()])
+    told = {
+        "decision": decide,
+        "state": lambda: spec.layout.features(state(spec.layout.parts)),
+        "network": lambda: policy.actor.logits(features),
+        "action": lambda: policy.actor.act([whole]),
+    }
+    return {name: value for part, task in told.items() for name, value in _ms(part, task, repeats).items()}
+
+
+def _ms(part: str, task: Callable[[], Any], repeats: int) -> dict[str, float]:
+    """By the clock, and of this thread's processor time, which others' load does not lengthen."""
+    for _ in range(20):  # libraries load and allocate at the first calls
+        task()
+    gc.collect()
+    spent: list[tuple[float, float]] = []
+    for _ in range(repeats):
+        began, cpu_began = time.perf_counter(), time.thread_time()
+        task()
+        spent.append((time.perf_counter() - began, time.thread_time() - cpu_began))
+    wall_ms, cpu_ms = 1e3 * np.array(spent).T
+    return {
+        f"{part}_ms_p50": float(np.median(wall_ms)),
+        f"{part}_ms_p99": float(np.percentile(wall_ms, 99)),
+        f"{part}_cpu_ms_p99": float(np.percentile(cpu_ms, 99)),
+    }
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(1)
+
+
+def _rig(n: int) -> dict[str, Buffered]:
+    """The newest frames of ``n`` cameras in a circle; nobody decodes them."""
+    found = {}
+    for i in range(n):
+        angle = 2.0 * np.pi * i / n
+        pose = Pose.from_matrix(look_at([3.0 * np.cos(angle), 3.0 * np.sin(angle), 1.5], [0.0, 0.0, 0.0]))
+        frame = Frame(f"cam{i:03d}", "bench", 0, i * 1_000_000, pose, _LENS, "jpeg", b"")
+        found[frame.camera] = Buffered(frame, frame.generated_ns, 0)
+    return found
+
+
+class _Known:
+    """Embeddings that are there already."""
+
+    def __init__(self, n: int) -> None:
+        self._rows = _rng().standard_normal((n, DIM)).astype(np.float32)
+
+    def of(self, items: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        return self._rows[: len(items)], np.ones(len(items), bool)

@@ -1,0 +1,127 @@
+"""What embedding a frame costs, beside ONNX Runtime alone on the same part of the same model."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.embed import MODELS, EmbeddingConfig, EmbeddingError, SizeError, make_embedder
+from edge_server.experiments.common.machine_load import BenchError, Usage
+
+SIZES = (128, 320)
+BATCHES = (1, 18)  # one camera, and a whole rig
+# Of a camera whose frames are not of the model's size.
+CAMERA = (480, 640)
+DIM = 32
+_LEFT_OUT = 3  # rounds at first: memory is laid out in them
+
+
+def measure(
+    quick: bool, folder: Path, lpips: Path | None = None, model: Path | None = None, threads: int = 1
+) -> dict[str, Any]:
+    """Median milliseconds a frame by model, size and batch: ``embed_ms`` of frames of the model's size,
+    ``runtime_ms`` of ONNX Runtime on ready-made input in the same parts, run by run in turn, ``camera_ms``
+    from frames of 640 x 480, which are fitted into the model's size first; ``ratio`` and ``camera_ratio``,
+    the medians over rounds of the first and of the last over the second, and ``cpu_ratio`` and
+    ``camera_cpu_ratio`` of their processor time, which others' load does not touch. Raises BenchError where
+    there is no model to measure."""
+    del folder, lpips
+    repeats = 20 if quick else 100
+    files = [model] if model is not None else sorted(MODELS.glob("detector_*.onnx"))
+    found: dict[str, Any] = {"threads": threads, "repeats": repeats}
+    for path in files:
+        of_model = {}
+        for size in SIZES:
+            try:
+                config = EmbeddingConfig(str(path), DIM, size, None, "cpu", threads)
+                rows = {str(n): _of_batch(config, n, repeats) for n in BATCHES}
+            except SizeError:
+                continue  # exported for one size, and measured at that one
+            except EmbeddingError as error:
+                raise BenchError(str(error)) from None
+            of_model[str(size)] = rows
+        if not of_model:
+            raise BenchError(f"{path}: takes images of neither {SIZES[0]} nor {SIZES[1]} pixels a side")
+        found[path.stem] = of_model
+    return found
+
+
+def _of_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
+    embedder = make_embedder(config)
+    backbone = embedder.backbone
+    rng = np.random.default_rng(0)
+    frames = _pictures(rng, n, backbone.height, backbone.width)
+    larger = _pictures(rng, n, *CAMERA)
+    ready = rng.random((n, 3, backbone.height, backbone.width)).astype(backbone.dtype)
+    step = embedder.step
+    parts = [ready[first : first + step] for first in range(0, n, step)]
+    if backbone.batch is not None:
+        parts[-1] = np.resize(parts[-1], (backbone.batch, *ready.shape[1:]))
+
+    def alone() -> None:
+        for part in parts:
+            embedder.run(part)
+
+    usage = Usage("bench")
+    spent = _in_turn(
+        {"embed": lambda: embedder.embed(frames), "runtime": alone, "camera": lambda: embedder.embed(larger)},
+        repeats,
+    )
+    ms = {f"{name}_ms": statistics.median(wall for wall, _ in rows) / n for name, rows in spent.items()}
+    ratios = {}
+    for name, prefix in (("embed", ""), ("camera", "camera_")):
+        rounds = list(zip(spent[name], spent["runtime"]))
+        ratios[f"{prefix}ratio"] = statistics.median(a[0] / b[0] for a, b in rounds)
+        ratios[f"{prefix}cpu_ratio"] = statistics.median(a[1] / b[1] for a, b in rounds)
+    return {
+        **ms,
+        **ratios,
+        "outside_cores": usage.outside(usage.row(0.0)),
+    }
+
+
+def _in_turn(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list[tuple[float, float]]]:
+    """(milliseconds, processor milliseconds) of each run; in turn, so that whatever else happens meets all
+    alike, and each round in another order, because a busy system likes to stop whoever has just run long."""
+    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in work}
+    names = list(work)
+    for k in range(repeats + _LEFT_OUT):
+        for i in range(len(names)):
+            name = names[(i + k) % len(names)]
+            began, cpu = time.perf_counter(), time.process_time()
+            work[name]()
+            if k >= _LEFT_OUT:
+                row = (time.perf_counter() - began, time.process_time() - cpu)
+                spent[name].append((row[0] * 1e3, row[1] * 1e3))
+    return spent
+
+
+def _pictures(rng: np.random.Generator, n: int, height: int, width: int) -> list[NDArray[np.uint8]]:
+    return list(rng.integers(0, 256, (n, height, width, 3), dtype=np.uint8))
+
+
+def table(figures: dict[str, Any]) -> str:
+    """Rows of a model, size and batch."""
+    lines = [
+        f"ms a frame, medians of {figures['repeats']} runs in turn, {figures['threads']} thread(s)",
+        "",
+        "| model | size | batch | embed | ONNX Runtime | ratio | CPU ratio | of 640 x 480 | its ratio | "
+        "its CPU ratio | outside cores |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, sizes in figures.items():
+        for size, batches in sizes.items() if isinstance(sizes, dict) else ():
+            for n, row in batches.items():
+                lines.append(
+                    f"| {name} | {size} | {n} | {row['embed_ms']:.3f} | {row['runtime_ms']:.3f} | "
+                    f"{row['ratio']:.2f} | {row['cpu_ratio']:.2f} | {row['camera_ms']:.3f} | "
+                    f"{row['camera_ratio']:.2f} | {row['camera_cpu_ratio']:.2f} | "
+                    f"{row['outside_cores']} |"
+                )
+    return "\n".join(lines)

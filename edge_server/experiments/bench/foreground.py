@@ -1,0 +1,278 @@
+"""What cutting the background out costs and gains, on pictures whose alpha is the truth (lego).
+
+The pictures have no background of their own, so they are laid over two: white, and a cluttered one that is a
+function of the direction alone, hence the same place seen from every camera and infinitely far. On the
+second a field is fitted as well, for the same steps: to whole pictures, to cut ones, and to the true alpha.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.scenes.recorded import load_recorded
+from edge_server.fidelity.psnr import psnr
+from edge_server.fields import Budget, View
+from edge_server.fields.registry import make_field
+from edge_server.foreground import BOX, DEFAULT, GRABCUT, ForegroundConfig, ForegroundError, Four
+from edge_server.foreground.foreground import Foreground, make_foreground
+from freshfield.geometry import world_rays
+
+SCENE = "lego_synthetic"
+# Half a percent of each side: what a detector that was trained for the object is good for.
+BOX_MARGIN = 0.005
+SIDES, ITERATIONS = (80, 160, 320), (1, 3, 5)
+FIELD = "ngp"
+_SEEN = 0.5  # of alpha: the object
+_WAVES = 24
+_CLUTTER_SEED = 17
+
+Mask = NDArray[np.bool_]
+
+
+def measure(
+    quick: bool, folder: Path, lpips: Path | None = None, model: Path | None = None
+) -> dict[str, Any]:
+    """``masks``: IoU and milliseconds of each way to cut, by background; ``detectors``: what they find of the
+    object; ``field``: PSNR on the object's pixels of held-out views after the same steps.
+
+    Raises BenchError."""
+    del folder, lpips
+    data = os.environ.get("FRESHFIELD_DATA")
+    if not data:
+        raise BenchError(f"set FRESHFIELD_DATA to the folder that holds {SCENE}")
+    # Full size for masks, half for the field.
+    large, small = _views(Path(data), 1.0), _views(Path(data), 2.0)
+    some = large[:: 25 if quick else 10]
+    usage = Usage("bench")
+    figures: dict[str, Any] = {"views": len(some), "size": [*some[0].image.shape[:2]], "masks": {}}
+    for ground, lay in (("white", _white), ("clutter", _clutter)):
+        figures["masks"][ground] = _masks(some, lay)
+        print(f"  masks on {ground}: measured", flush=True)
+    models = [DEFAULT] if model is None else [DEFAULT, str(model)]
+    figures["detectors"] = {Path(m).name: _detections(some, m) for m in models}
+    figures["field"] = _fields(small, steps=100 if quick else 500, seeds=1 if quick else 2)
+    figures["outside_cores"] = usage.outside(usage.row(0.0))
+    return figures
+
+
+def _views(data: Path, scale: float) -> tuple[View, ...]:
+    try:
+        return load_recorded(data / SCENE, holdout="0", scale=scale).training
+    except DatasetError as error:
+        raise BenchError(str(error)) from None
+
+
+def true_mask(view: View) -> Mask:
+    """(H, W): the object, by the picture's own alpha."""
+    return view.image[..., 3] > 255 * _SEEN
+
+
+def _white(view: View) -> NDArray[np.uint8]:
+    return _laid(view, np.full((*view.image.shape[:2], 3), 255.0))
+
+
+def _clutter(view: View) -> NDArray[np.uint8]:
+    """Waves of all directions and some edges, in every colour, as strong as the object's own."""
+    _, rays = world_rays(view.intrinsics, view.camera_to_world)
+    rng = np.random.default_rng(_CLUTTER_SEED)
+    waves = rng.normal(0.0, 9.0, (_WAVES, 3))
+    shades = np.sin(rays @ waves.T + rng.uniform(0.0, 2 * np.pi, _WAVES))
+    edges = np.sign(shades[..., : _WAVES // 3])
+    mixed = np.concatenate([shades, edges], axis=-1) @ rng.normal(0.0, 1.0, (_WAVES + _WAVES // 3, 3))
+    return _laid(view, 127.5 + 100.0 * np.tanh(mixed / 6.0))
+
+
+def _laid(view: View, ground: NDArray[np.float64]) -> NDArray[np.uint8]:
+    alpha = view.image[..., 3:] / 255.0
+    return np.rint(view.image[..., :3] * alpha + ground * (1.0 - alpha)).astype(np.uint8)
+
+
+def true_box(view: View, margin: float = BOX_MARGIN) -> Four:
+    """Left, top, right, bottom around the object, as shares of the picture."""
+    mask = true_mask(view)
+    h, w = mask.shape
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    left, top = max(columns[0] / w - margin, 0.0), max(rows[0] / h - margin, 0.0)
+    return left, top, min((columns[-1] + 1) / w + margin, 1.0), min((rows[-1] + 1) / h + margin, 1.0)
+
+
+def _masks(views: Sequence[View], lay: Callable[[View], NDArray[np.uint8]]) -> dict[str, Any]:
+    """By way to cut: mean and worst IoU with the truth, and median milliseconds a picture."""
+    boxes = {view.camera: true_box(view) for view in views}
+    pictures = [(view.camera, lay(view), true_mask(view)) for view in views]
+    ways = {BOX: ForegroundConfig(boxes=boxes, segment=BOX)}
+    for side in SIDES:
+        for iterations in ITERATIONS:
+            ways[f"{GRABCUT} side {side} x{iterations}"] = ForegroundConfig(
+                boxes=boxes, segment=GRABCUT, side=side, iterations=iterations
+            )
+    found = {}
+    for name, config in ways.items():
+        cut = make_foreground(config)
+        ious, spent_ms = [], []
+        for camera, picture, truth in pictures:
+            begun = time.perf_counter()
+            rgba, _ = cut.apply(camera, picture)
+            spent_ms.append(1e3 * (time.perf_counter() - begun))
+            ious.append(_iou(_kept(rgba), truth))
+        found[name] = {
+            "iou": statistics.fmean(ious),
+            "worst": min(ious),
+            "ms": statistics.median(spent_ms),
+            "whole": len(pictures) - cut.counts.masked,
+        }
+    return found
+
+
+def _kept(image: NDArray[np.uint8]) -> Mask:
+    """What an image still shows; all of one that was passed through whole."""
+    return image[..., 3] > 0 if image.shape[2] == 4 else np.ones(image.shape[:2], np.bool_)
+
+
+def _iou(a: Mask, b: Mask) -> float:
+    return float((a & b).sum() / max(int((a | b).sum()), 1))
+
+
+def _detections(views: Sequence[View], model: str) -> dict[str, Any]:
+    """What a detector finds on white and on clutter: pictures with a detection, IoU of its box with the true
+    one, the kinds it took the object for, and median milliseconds."""
+    try:
+        from edge_server.foreground.detector import Detector
+
+        detector = Detector(model)
+    except (ForegroundError, ModuleNotFoundError) as error:
+        return {"missing": str(error)}
+    found: dict[str, Any] = {}
+    for ground, lay in (("white", _white), ("clutter", _clutter)):
+        ious, kinds, spent_ms = [], [], []
+        for view in views:
+            picture = lay(view)
+            begun = time.perf_counter()
+            detected = detector.detect(picture, 0.25)
+            spent_ms.append(1e3 * (time.perf_counter() - begun))
+            if detected:
+                kinds.append(detected[0].kind)
+                ious.append(_box_iou(detected[0].box, true_box(view, 0.0), picture.shape))
+        found[ground] = {
+            "detected": len(ious),
+            "of": len(views),
+            "iou": statistics.fmean(ious) if ious else None,
+            "kinds": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
+            "ms": statistics.median(spent_ms),
+        }
+    return found
+
+
+def _box_iou(pixels: Four, shares: Four, shape: tuple[int, ...]) -> float:
+    h, w = shape[:2]
+    other = (shares[0] * w, shares[1] * h, shares[2] * w, shares[3] * h)
+    both = max(0.0, min(pixels[2], other[2]) - max(pixels[0], other[0])) * max(
+        0.0, min(pixels[3], other[3]) - max(pixels[1], other[1])
+    )
+    areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (pixels, other)]
+    return both / max(sum(areas) - both, 1e-9)
+
+
+def _fields(views: Sequence[View], steps: int, seeds: int) -> dict[str, Any]:
+    """By what was fitted: PSNR on the object's pixels of the views held out (every eighth), mean and seeds'
+    spread; IoU of the masks it was fitted with; seconds of fitting."""
+    training = [view for k, view in enumerate(views) if k % 8]
+    held_out = views[::8]
+    boxes = {view.camera: true_box(view) for view in training}
+    whole = [dataclasses.replace(view, image=_clutter(view)) for view in training]
+    sets: dict[str, list[View]] = {"whole": whole}
+    for name, segment, doubt in (
+        (BOX, BOX, 1.0), (f"{GRABCUT}, doubt 1", GRABCUT, 1.0), (f"{GRABCUT}, doubt 0.3", GRABCUT, 0.3),
+        (f"{GRABCUT}, doubt 0", GRABCUT, 0.0),
+    ):  # fmt: skip
+        cut = make_foreground(ForegroundConfig(boxes=boxes, segment=segment, doubt=doubt))
+        sets[name] = [_cut(cut, view) for view in whole]
+    sets["true alpha"] = [_with_alpha(seen, view) for seen, view in zip(whole, training)]
+    found: dict[str, Any] = {"steps": steps, "seeds": seeds, "rows": {}}
+    truths = [(view, view.image[..., :3] / 255.0, view.image[..., 3] == 255) for view in held_out]
+    for name, fitted in sets.items():
+        dbs, spent_s = [], []
+        for seed in range(seeds):
+            field = make_field(FIELD, {}, seed=seed)
+            report = field.fit(fitted, Budget(steps=steps))
+            spent_s.append(report.seconds)
+            scores = [
+                psnr(field.render(view.camera_to_world, view.intrinsics).color, truth, mask)
+                for view, truth, mask in truths
+            ]
+            dbs.append(statistics.fmean(score for score in scores if score is not None))
+        found["rows"][name] = {
+            "object_db": statistics.fmean(dbs),
+            "spread_db": max(dbs) - min(dbs),
+            "iou": statistics.fmean(_iou(_kept(v.image), true_mask(o)) for v, o in zip(fitted, training)),
+            "fit_s": statistics.median(spent_s),
+        }
+        print(f"  field on {name}: {found['rows'][name]['object_db']:.2f} dB on the object", flush=True)
+    return found
+
+
+def _cut(cut: Foreground, view: View) -> View:
+    image, weight = cut.apply(view.camera, view.image)
+    return dataclasses.replace(view, image=image, weight=weight)
+
+
+def _with_alpha(seen: View, view: View) -> View:
+    """``seen`` with the true mask: the object's edges carry the background's colour, as with any mask."""
+    mask = true_mask(view)
+    image = np.dstack([np.where(mask[..., None], seen.image, 0), np.where(mask, 255, 0)]).astype(np.uint8)
+    return dataclasses.replace(seen, image=image)
+
+
+def table(figures: dict[str, Any]) -> str:
+    """Three tables: masks, detectors, field."""
+    h, w = figures["size"]
+    lines = [
+        f"lego at {w} x {h}, {figures['views']} views, box known to {100 * BOX_MARGIN:g} % of a side; "
+        f"one thread; outside cores: {figures['outside_cores']}",
+        "",
+        "| segmentation | IoU on white (worst) | ms | IoU on clutter (worst) | ms |",
+        "|---|---|---|---|---|",
+    ]
+    white, clutter = figures["masks"]["white"], figures["masks"]["clutter"]
+    for name in white:
+        cells = [
+            f"{m[name]['iou']:.3f} ({m[name]['worst']:.3f}) | {m[name]['ms']:.1f}" for m in (white, clutter)
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    lines += ["", "| detector | on | detected | box IoU | taken for | ms |", "|---|---|---|---|---|---|"]
+    for name, grounds in figures["detectors"].items():
+        if "missing" in grounds:
+            lines.append(f"| {name} | - | {grounds['missing']} | - | - | - |")
+            continue
+        for ground, row in grounds.items():
+            iou = "-" if row["iou"] is None else f"{row['iou']:.2f}"
+            kinds = ", ".join(f"{kind} {n}" for kind, n in row["kinds"].items()) or "-"
+            share = f"{row['detected']} of {row['of']}"
+            lines.append(f"| {name} | {ground} | {share} | {iou} | {kinds} | {row['ms']:.1f} |")
+    field = figures["field"]
+    lines += [
+        "",
+        f"{FIELD}, {field['steps']} steps on 200 x 200 over clutter, {field['seeds']} seeds; PSNR on the "
+        "object's pixels of 13 held-out views",
+        "",
+        "| fitted to | mask IoU | dB | spread | against whole | fit s |",
+        "|---|---|---|---|---|---|",
+    ]
+    base = field["rows"]["whole"]["object_db"]
+    for name, row in field["rows"].items():
+        lines.append(
+            f"| {name} | {row['iou']:.3f} | {row['object_db']:.2f} | {row['spread_db']:.2f} | "
+            f"{row['object_db'] - base:+.2f} | {row['fit_s']:.1f} |"
+        )
+    return "\n".join(lines)

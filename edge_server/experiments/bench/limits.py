@@ -1,0 +1,315 @@
+"""How far the fields' kernels are from what this machine allows: its limits, then each kernel against them.
+
+The limits are measured, not looked up: random reads and writes of one vertex (two float32, as the hash
+tables hold them) in tables of several sizes, arithmetic on what is in registers, divisions, and copies within
+a core's own cache; multiply-adds of BLAS, on one large and one narrow matrix, are a peer, not a limit: on a
+processor that it was not tuned for it does half of what is possible. A kernel's floor is the time that all
+cores together need at the least for whatever of its reads, writes and arithmetic takes longest, the others
+going on beside it, as they do in these processors; what it takes beyond that goes into addresses, drawing,
+marching, branches and waiting. Of ``ngp`` and ``splat``: the default and the fastest.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.common.machine_load import Usage
+from edge_server.experiments.common.machine_probe import (
+    CHAINS,
+    PER_TASK,
+    ROUNDS,
+    TASKS,
+    copies,
+    divisions,
+    random_adds,
+)
+from edge_server.experiments.common.machine_speed import in_chains, median_s, reads
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.fields import Budget, FitReport, View
+from edge_server.fields.common.kernels.hash_grid import FEATURES
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.training_schedule import active_levels
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.splat.field import SplatField
+from edge_server.fields.splat.kernels.composite import KEPT, STRIP, STRIPS, SUMS
+from edge_server.fields.splat.kernels.project import BASE, HALF_HEIGHT, MY, TILE
+from edge_server.fields.splat.settings import SplatSettings
+
+TABLES_MB = (1, 4, 64)
+CORNERS = 8  # of a cell, each read once a level and sample, and written once by its gradient
+WARM_STEPS = 600
+LEAST_SHARE = 0.01  # of a step: what takes less has no row in the table
+LIMITS = {
+    **{f"reads_{mb}mb_m_per_s": f"million random reads a second from {mb} MB" for mb in TABLES_MB},
+    **{f"adds_{mb}mb_m_per_s": f"million random additions a second to {mb} MB a core" for mb in TABLES_MB},
+    "multiply_adds_g_per_s": "billion multiply-adds a second in registers",
+    "operations_g_per_s": "billion operations a second in registers, a multiply-add as one",
+    "gemm_g_per_s": "of BLAS: billion multiply-adds a second, 2048 x 2048 x 2048",
+    "narrow_gemm_g_per_s": "of BLAS: billion multiply-adds a second, 65536 x 32 x 32",
+    "divisions_g_per_s": "billion divisions a second",
+    "copies_gb_per_s": "GB copied a second within a core's cache",
+}
+
+# Operations of the Gaussians' kernels, counted in their sources: additions, multiplications, comparisons and
+# conversions, a multiplication with the addition that follows it as one. Of a pixel and a Gaussian in one of
+# its strips, forward (a power of 2 is 12 of them) and back (folding the sums of lanes is 11):
+LAYING, LIFTING = 33, 31
+# Of a Gaussian: projected; its pairs' sums led back through the projection, and a step of Adam.
+PROJECTING, UPDATING = 300, 680
+# Of a Gaussian that is sorted: counted and moved, twice. Of a pair: counted, owned, listed.
+SORTING, DEALING = 4, 3
+
+
+class TimedPool(Pool):
+    """A pool that adds up the wall seconds spent in each kernel, by its name."""
+
+    def __init__(self, threads: int | None = None) -> None:
+        super().__init__(threads, nice=0)
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    def run(self, kernel: Callable[..., Any], *args: Any) -> None:
+        """As ``Pool.run``."""
+        began = time.perf_counter()
+        super().run(kernel, *args)
+        self.seconds[kernel.__name__] += time.perf_counter() - began
+
+
+def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
+    """The machine's limits and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each kernel's share of a
+    step, its milliseconds a step and the share of them that its floor explains."""
+    del folder, lpips
+    pool = TimedPool()
+    usage = Usage("bench")
+    limits = Limits(repeats=5 if quick else 15)
+    figures: dict[str, Any] = {}
+    steps = 60 if quick else 300
+    for name in ("tile", "room"):
+        views = synthetic(name, cameras=19, size=128).training
+        figures[f"ngp on {name}"] = _of_ngp(views, pool, limits, steps)
+        figures[f"splat on {name}"] = _of_splat(views, pool, limits, steps)
+    figures["machine"] = limits.highest
+    limits.pool.close()
+    pool.close()
+    figures["outside_cores"] = usage.outside(usage.row(0.0))
+    return figures
+
+
+class Limits:
+    """The machine's limits, measured again after each fit that is held against them: a shared machine gets
+    slower and faster within a minute, and a kernel is not faster than its limits because they were measured
+    in a slow one.
+
+    highest: of each limit, over all measurements."""
+
+    def __init__(self, repeats: int) -> None:
+        self.pool = Pool(nice=0)
+        self._repeats = repeats
+        self._last = machine_limits(self.pool, repeats)
+        self.highest = self._last
+
+    def around(self) -> dict[str, float]:
+        """Of what was done since the measurement before: the higher of that and of a new one."""
+        before, self._last = self._last, machine_limits(self.pool, self._repeats)
+        self.highest = _higher(self.highest, self._last)
+        return _higher(before, self._last)
+
+
+def _higher(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
+    return {name: max(limit, b[name]) for name, limit in a.items()}
+
+
+def machine_limits(pool: Pool, repeats: int) -> dict[str, float]:
+    """Millions of random vertex reads and of random vertex additions a second, all workers together, by
+    table size; billions of float32 multiply-adds a second, of any operations, of BLAS's multiply-adds
+    (2048 x 2048; 65536 x 32 x 32), of divisions, and of bytes copied from 256 kB to 256 kB."""
+    limits: dict[str, float] = {}
+    rng = np.random.default_rng(0)
+    for megabytes in TABLES_MB:
+        vertices = megabytes * 2**20 // (4 * FEATURES)
+        # Reading: from one table, as the hash tables are. Adding: to a table each, since no two workers of
+        # the gradient's kernel share one either.
+        tables = np.zeros((pool.threads, vertices, FEATURES), np.float32)
+        rows = rng.integers(0, vertices, PER_TASK).astype(np.uint32)
+        add_s = median_s(repeats, partial(pool.run, random_adds, tables, rows))
+        limits[f"reads_{megabytes}mb_m_per_s"] = reads(pool, megabytes, repeats)
+        limits[f"adds_{megabytes}mb_m_per_s"] = TASKS * PER_TASK / add_s / 1e6
+    for name, (m, k, n) in {"gemm": (2048, 2048, 2048), "narrow_gemm": (65536, 32, 32)}.items():
+        a, b = rng.random((m, k), np.float32), rng.random((k, n), np.float32)
+        limits[f"{name}_g_per_s"] = m * k * n / median_s(repeats, partial(np.matmul, a, b)) / 1e9
+    limits |= {"multiply_adds_g_per_s": 0.0, "operations_g_per_s": 0.0}
+    for k, (_, multiply_adds, additions) in enumerate(CHAINS):
+        vectors = in_chains(pool, k, repeats)
+        for name, chains in {"multiply_adds": multiply_adds, "operations": multiply_adds + additions}.items():
+            limits[f"{name}_g_per_s"] = max(limits[f"{name}_g_per_s"], chains * vectors)
+    x, y = rng.random((2, 2048), np.float32) + np.float32(1.0)
+    out = np.zeros((pool.threads, x.size), np.float32)
+    memory = np.zeros((pool.threads, 2 * PER_TASK), np.float32)
+    divide_s = median_s(repeats, partial(pool.run, divisions, x, y, out))
+    copy_s = median_s(repeats, partial(pool.run, copies, memory))
+    limits["divisions_g_per_s"] = TASKS * ROUNDS * x.size / divide_s / 1e9
+    limits["copies_gb_per_s"] = TASKS * PER_TASK * 4 / copy_s / 1e9
+    return limits
+
+
+def _of_ngp(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) -> dict[str, Any]:
+    settings = NgpSettings(device="cpu")
+    field = NgpField(settings, pool)
+    field.fit(views, Budget(steps=WARM_STEPS))  # all levels on, most of space known to be empty
+    pool.seconds.clear()
+    report = field.fit(views, Budget(steps=steps))
+    floors = _floors_of_ngp(
+        samples=report.samples / report.steps,
+        levels=active_levels(settings, field.step),
+        widths=[int(w) for w in field._net.widths],
+        table_mb=field.state()["table"].nbytes / settings.levels / 2**20,
+        limits=limits.around(),
+    )
+    return _against(floors, report, pool)
+
+
+def _of_splat(views: Sequence[View], pool: TimedPool, limits: Limits, steps: int) -> dict[str, Any]:
+    field = SplatField(SplatSettings(), pool)
+    field.fit(views, Budget(steps=WARM_STEPS))  # grown to what it holds at most
+    pool.seconds.clear()
+    report = field.fit(views, Budget(steps=steps))
+    spent = dict(pool.seconds)  # how much there is to do is counted without the clock
+    counts = []
+    for _ in range(len(views)):
+        field.fit(views, Budget(steps=1))
+        counts.append(_counted(field))
+    pool.seconds.clear()
+    pool.seconds.update(spent)
+    gaussians, seen, pairs, strips = np.mean(counts, axis=0)
+    return _against(_floors_of_splat(gaussians, seen, pairs, strips, limits.around()), report, pool)
+
+
+def _counted(field: SplatField) -> tuple[int, int, int, int]:
+    """Of a field's last step, of one picture: Gaussians, those in the picture, pairs of one with a tile, and
+    the strips that pairs which changed a pixel reach: the others are hidden. Some of these strips may have
+    been dark already, so that the floor is a little high where much is hidden."""
+    passes, count = field._passes, len(field.cloud)
+    lists, pairs = passes.lists, int(passes.lists.needed[0])
+    used = (passes.sums[0, :pairs] != 0.0).any(axis=-1)
+    rows = passes.projected[0, lists.owner[0, :pairs][used]]
+    row = np.zeros(pairs, np.int64)  # of tiles, of each pair
+    lengths = np.diff(lists.first[0, : int(passes.columns[0] * passes.rows[0]) + 1])
+    row[lists.pair[0, :pairs]] = np.repeat(np.arange(len(lengths)) // passes.columns[0], lengths)
+    middle = rows[:, MY] - TILE * row[used] - 0.5
+    top, bottom = (
+        np.clip(edge, 0, TILE - 1).astype(np.int64) * STRIPS // TILE
+        for edge in (np.ceil(middle - rows[:, HALF_HEIGHT]), middle + rows[:, HALF_HEIGHT])
+    )
+    return count, int((lists.own_count[0, :count] > 0).sum()), pairs, int((bottom - top + 1).sum())
+
+
+def _against(floors: dict[str, dict[str, float]], report: FitReport, pool: TimedPool) -> dict[str, Any]:
+    """What each kernel took in the steps reported, beside its floor's parts in milliseconds a step."""
+    spent_ms = {name: s / report.steps * 1e3 for name, s in sorted(pool.seconds.items(), key=lambda i: -i[1])}
+    kernels: dict[str, Any] = {}
+    for name, ms in spent_ms.items():
+        kernels[name] = {"ms_a_step": ms, "share": ms / (report.seconds / report.steps * 1e3)}
+        if name in floors:
+            kernels[name] |= {
+                "floor_ms": max(floors[name].values()),
+                "floor_share": max(floors[name].values()) / ms,
+                "floor_parts_ms": floors[name],
+            }
+    return {
+        "ms_a_step": report.seconds / report.steps * 1e3,
+        "samples_a_step": report.samples / report.steps,
+        "samples_per_s": report.samples / report.seconds,
+        "outside_kernels_share": 1.0 - sum(pool.seconds.values()) / report.seconds,
+        "kernels": kernels,
+    }
+
+
+def _floors_of_ngp(
+    samples: float, levels: int, widths: list[int], table_mb: float, limits: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """For the two kernels that do nearly everything: milliseconds a step of reads, additions and
+    multiply-adds at the machine's limits. table_mb: of one level, which is what a pass walks through.
+
+    The floor of ``scatter`` counts every sample, the kernel leaves out those without a gradient (behind the
+    first opaque surface): its share can pass 1. What BLAS makes of a product as narrow as the network's is
+    printed as a peer."""
+    size = min(TABLES_MB, key=lambda mb: abs(np.log(mb / table_mb)))
+    vertices = samples * levels * CORNERS
+    multiply_adds = samples * sum(a * b for a, b in pairwise(widths))
+    return {
+        "train_chunks": {
+            "reads": vertices / limits[f"reads_{size}mb_m_per_s"] / 1e3,
+            # Forward once; backward twice: the gradient of the inputs and that of the weights.
+            "multiply_adds": 3.0 * multiply_adds / limits["multiply_adds_g_per_s"] / 1e6,
+        },
+        "scatter": {"adds": vertices / limits[f"adds_{size}mb_m_per_s"] / 1e3},
+    }
+
+
+def _floors_of_splat(
+    gaussians: float, seen: float, pairs: float, strips: float, limits: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
+
+    gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; strips: in which these change a
+    pixel. Operations count as if that were all there is: what ``project`` and ``update`` do is mostly to move
+    numbers so that they lie side by side, and ``deal`` to sort."""
+    operations, divisions_ms = limits["operations_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
+    copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
+    parameters = BASE
+    return {
+        "train_tiles": {
+            "arithmetic": strips * STRIP * (LAYING + LIFTING) / operations,
+            "divisions": strips * STRIP / divisions_ms,
+            "copies": strips * KEPT * 4 / copied,  # written once, read once
+        },
+        "project": {"arithmetic": gaussians * PROJECTING / operations},
+        "deal": {"moves": (seen * SORTING + pairs * DEALING) / added},
+        "update": {
+            "arithmetic": (seen * UPDATING + pairs * SUMS) / operations,
+            "divisions": seen * 2 * parameters / divisions_ms,  # roots take as long
+            "copies": pairs * SUMS * 4 / 2 / copied,
+        },
+    }
+
+
+def table(figures: dict[str, Any]) -> str:
+    """Markdown: the machine's limits, then a row a kernel."""
+    rows = ["| limit of this machine, all cores | |", "|---|---|"]
+    for name, value in figures["machine"].items():
+        rows.append(
+            f"| {LIMITS[name]} | {value:,.0f} |" if value >= 100 else f"| {LIMITS[name]} | {value:.1f} |"
+        )
+    rows += [
+        "",
+        "| field, scene | kernel | ms a step | of the step | explained by limits | by which, ms |",
+        "|---|---|---|---|---|---|",
+    ]
+    for about, found in figures.items():
+        if isinstance(found, dict) and "kernels" in found:
+            rows += _rows(about, found)
+    return "\n".join(rows)
+
+
+def _rows(about: str, found: dict[str, Any]) -> list[str]:
+    rows = []
+    for name, kernel in found["kernels"].items():
+        if kernel["share"] >= LEAST_SHARE:
+            parts = kernel.get("floor_parts_ms", {})
+            told = ", ".join(f"{part.replace('_', '-')} {ms:.2f}" for part, ms in parts.items())
+            explained = f"{kernel['floor_share']:.0%}" if parts else "-"
+            took = f"{kernel['ms_a_step']:.2f} | {kernel['share']:.0%}"
+            rows.append(f"| {about} | {name} | {took} | {explained} | {told} |")
+    outside = found["outside_kernels_share"]
+    return [
+        *rows,
+        f"| {about} | outside kernels | {found['ms_a_step'] * outside:.2f} | {outside:.0%} | - | |",
+    ]

@@ -1,0 +1,185 @@
+"""The optional parts of the representations, and the scenes that call for them or do not.
+
+``CHOICES`` is what ``bench options`` goes through: another option is another line.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments.scenes.multiview_sequence import Film, recorded_film, synthetic_film
+from edge_server.experiments.scenes.multiview_still import Still, open_still, synthetic
+from edge_server.fields import View
+from freshfield.geometry import so3_exp
+
+VIEWS, SIZE = 18, 128
+FEW = 6  # of the training views, spread over them
+GAIN_SPREAD = 0.2  # standard deviation of the logarithm of a camera's gain, a channel
+POSE_M, POSE_DEG = 0.01, 1.0
+LATE_FRAMES = 4  # of 1/15 s: views up to 267 ms old
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One optional part. off, on: settings of a field. scenes: of ``SCENES``."""
+
+    name: str
+    off: Mapping[str, Any]
+    on: Mapping[str, Any]
+    scenes: tuple[str, ...]
+
+
+# Another option is another line here.
+CHOICES: tuple[Choice, ...] = (
+    Choice("view-dependent colour", {"harmonics": 1}, {"harmonics": 4}, ("tile", "room", "lego", "kitchen")),
+    Choice("exposure", {"exposure": False}, {"exposure": True}, ("room, gains", "room")),
+    Choice("contraction", {"contracted": False}, {"contracted": True}, ("room", "tile")),
+    Choice(
+        "pose refinement",
+        {"refine_m": 0.0, "refine_deg": 0.0},
+        {"refine_m": 0.03, "refine_deg": 3.0},
+        ("room, poses", "room"),
+    ),
+    Choice("random background", {"background": "auto"}, {"background": "random"}, ("tile", "lego")),
+    Choice("distortion loss", {"distortion": 0.0}, {"distortion": 0.01}, ("tile", "room")),
+    Choice("no density seen by few", {"min_views": 0}, {"min_views": 2}, ("tile", "room")),
+    Choice("near fade", {"near_fade": 0.0}, {"near_fade": 0.3}, ("tile", "room")),
+    Choice(
+        "changed pixels first", {"changed_share": 0.0}, {"changed_share": 0.25},
+        ("room, moving", "kitchen, moving"),
+    ),
+    Choice(
+        "depth guide", {"depth_guide": 0.0}, {"depth_guide": 0.1},
+        ("tile", "tile, six", "lego", "kitchen, six", "room"),
+    ),
+    Choice("smoothness", {"smooth": 0.0}, {"smooth": 3e-3}, ("tile", "room")),
+    Choice("diffusion", {"diffuse": 0.0}, {"diffuse": 1.0}, ("tile", "room", "kitchen", "lego")),
+    Choice("appearance", {"appearance": 0}, {"appearance": 8}, ("room, gains", "room")),
+    Choice("outlines", {"outline": 0.0}, {"outline": 0.25}, ("tile", "room")),
+    Choice("weighed by age", {"age_tau_ms": 0.0}, {"age_tau_ms": 100.0}, ("room, late", "room, moving")),
+    Choice(
+        "stale pixels masked", {"mask_stale_ms": 0.0}, {"mask_stale_ms": 50.0}, ("room, late", "room, moving")
+    ),
+    Choice("movement followed", {"follow": 0}, {"follow": 8}, ("room, late", "room, moving")),
+    Choice(
+        "wrong views refused", {"refuse_beyond": 0.0}, {"refuse_beyond": 2.5},
+        ("room, moving", "kitchen, moving"),
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a field is fitted to and scored on. still: views, from scratch. film: else, updates after motion;
+    late: its views are up to so many frames old. Scores of a film are means over the updates."""
+
+    still: Still | None = None
+    film: Film | None = None
+    late: int = 0
+
+
+def _ours(name: str) -> Scene:
+    return Scene(synthetic(name, cameras=VIEWS + 1, size=SIZE))
+
+
+def _recorded(path: str, holdout: str, scale: float) -> Scene:
+    return Scene(open_still(str(_data() / path), holdout=holdout, scale=scale))
+
+
+def _few(make: Callable[[], Scene]) -> Scene:
+    """Some of a still scene's views, evenly spread."""
+    scene = make()
+    assert scene.still is not None
+    training = scene.still.training
+    some = [training[k] for k in np.linspace(0, len(training) - 1, FEW).round().astype(int)]
+    return replace(scene, still=replace(scene.still, training=tuple(some)))
+
+
+def _data() -> Path:
+    if not (data := os.environ.get("FRESHFIELD_DATA")):
+        raise DatasetError("set FRESHFIELD_DATA to the folder that holds it")
+    return Path(data)
+
+
+def _gains() -> Scene:
+    still = synthetic("room", cameras=VIEWS + 1, size=SIZE)
+    return Scene(replace(still, name="room, gains", training=with_gains(still.training, GAIN_SPREAD)))
+
+
+def _poses() -> Scene:
+    still = synthetic("room", cameras=VIEWS + 1, size=SIZE)
+    return Scene(replace(still, name="room, poses", training=displaced(still.training, POSE_M, POSE_DEG)))
+
+
+def _moving(late: int = 0) -> Scene:
+    return Scene(film=synthetic_film("room", VIEWS + 1, SIZE, 15.0, speed_m_per_s=1.0), late=late)
+
+
+def _kitchen() -> Scene:
+    return _recorded("blender_kitchen/transforms.json", "cam00", 1.0)
+
+
+def _kitchen_moving() -> Scene:
+    return Scene(film=recorded_film(_data() / "blender_kitchen" / "transforms.json", "cam00"))
+
+
+SCENES: dict[str, tuple[str, Callable[[], Scene]]] = {
+    "tile": ("18 views", partial(_ours, "tile")),
+    "room": ("18 views", partial(_ours, "room")),
+    "room, gains": (f"each camera and channel with a gain of its own, e^N(0, {GAIN_SPREAD:g})", _gains),
+    "room, poses": (f"each camera off by {100 * POSE_M:g} cm and {POSE_DEG:g} degree", _poses),
+    "room, moving": ("a person at 1 m/s, 15 frames a second", _moving),
+    "room, late": ("the same, views 0 to 267 ms old", partial(_moving, LATE_FRAMES)),
+    "lego": ("at 200 x 200, every 8th held out", partial(_recorded, "lego_synthetic", "8", 2.0)),
+    "kitchen": ("the first instant", _kitchen),
+    "tile, six": (f"{FEW} of them", partial(_few, partial(_ours, "tile"))),
+    "kitchen, six": (f"{FEW} of its 18 views", partial(_few, _kitchen)),
+    "kitchen, moving": ("30 frames a second", _kitchen_moving),
+}  # fmt: skip
+MOVING = ("room, moving", "room, late", "kitchen, moving")
+
+
+def with_gains(views: Sequence[View], spread: float, seed: int = 3) -> tuple[View, ...]:
+    """The views, each with a gain a channel of its own, log-normal, 1 on average (geometric)."""
+    gains = np.exp(np.random.default_rng(seed).normal(0.0, spread, (len(views), 3)))
+    gains /= np.exp(np.log(gains).mean(axis=0))
+    images = [np.clip(v.image[..., :3] * g + 0.5, 0.0, 255.0).astype(np.uint8) for v, g in zip(views, gains)]
+    return tuple(replace(v, image=image) for v, image in zip(views, images))
+
+
+def displaced(views: Sequence[View], size_m: float, deg: float, seed: int = 5) -> tuple[View, ...]:
+    """The views, each pose off by ``size_m`` and ``deg`` on average, in any direction; the mean of all errors
+    is none, since no picture could tell it from a scene that stands elsewhere."""
+    both = np.random.default_rng(seed).normal(size=(2, len(views), 3))
+    both -= both.mean(axis=1, keepdims=True)
+    turns, shifts = both / np.linalg.norm(both, axis=2).mean(axis=1)[:, None, None]
+    out = []
+    for view, turn, shift in zip(views, turns * np.deg2rad(deg), shifts * size_m):
+        pose = np.array(view.camera_to_world)
+        pose[:3, :3] = so3_exp(turn) @ pose[:3, :3]
+        pose[:3, 3] += shift
+        out.append(replace(view, camera_to_world=pose))
+    return tuple(out)
+
+
+def missing(scenes: Iterable[str]) -> set[str]:
+    """Those scenes that cannot be had; says why."""
+    out = set()
+    for scene in sorted(scenes):
+        if scene == "lego" or scene.startswith("kitchen"):
+            folder = "lego_synthetic" if scene == "lego" else "blender_kitchen"
+            try:
+                if not (_data() / folder).is_dir():
+                    raise DatasetError(f"{_data()} has no folder {folder}")
+            except DatasetError as error:
+                print(f"  {scene} left out: {error}", flush=True)
+                out.add(scene)
+    return out

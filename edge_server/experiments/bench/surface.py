@@ -1,0 +1,219 @@
+"""Mesh error and completeness against fit seconds and voxel size, with the seconds of every stage.
+
+A field is fitted to a scan of ``tile`` from 0.3 m (``offline.scan``); after each of some seconds its depth is
+compared with the exact one, and meshes are made of it: from the depth as it is, from depth sharpened by the
+pictures, from voxels carved anew and then sharpened (``surface.carve``), with truncated signed distances at
+several voxel sizes and with a fitted distance function. Row
+``exact`` fuses the exact depth instead: what pictures of this size and these cameras allow at best.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.common.progress import Progress
+from edge_server.experiments.common.result_store import Kept, settled
+from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, exact_depth, scan, truth_of
+from edge_server.fields import Budget
+from edge_server.fields.registry import make_field
+from edge_server.surface import SurfaceError
+from edge_server.surface.depth import DepthMap, depth_map
+from edge_server.surface.metrics import (
+    SEEN_BY,
+    TARGET_CHAMFER_MM,
+    TARGET_COMPLETE,
+    WITHIN_M,
+    Truth,
+    compare,
+    depth_error_mm,
+)
+from edge_server.surface.reconstruct import MeshSettings, maps_of, mesh_of_maps
+
+# What is fitted, by name: representation and options.
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "splat": ("splat", {}),
+    "splat, planar": ("splat", {"flatten": 0.02, "align": 0.3}),
+    "ngp": ("ngp", {}),
+    "voxel": ("voxel", {}),
+}
+# Depth that meshes are made from, and what makes it.
+DEPTHS = {
+    "of the field": MeshSettings(sharpen=False),
+    "sharpened": MeshSettings(carve=False),
+    "carved": MeshSettings(),
+}
+TARGET = (
+    f"chamfer at most {TARGET_CHAMFER_MM:g} mm, completeness at least {100 * TARGET_COMPLETE:g} % at "
+    f"{1e3 * WITHIN_M:g} mm"
+)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """size: of the pictures. fit_s: seconds of fitting after which meshes are made. voxels_mm: of the
+    sharpened meshes; the others are made at the middle one. cases: of ``CASES``."""
+
+    size: int
+    fit_s: tuple[float, ...]
+    voxels_mm: tuple[float, ...]
+    cases: tuple[str, ...]
+
+
+FULL = Effort(192, (5.0, 20.0, 60.0), (4.0, 2.0, 1.0), tuple(CASES))
+QUICK = Effort(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"))
+
+
+def measure(
+    quick: bool,
+    folder: Path,
+    lpips: Path | None = None,
+    fields: Sequence[str] = (),
+    kept: Kept | None = None,
+) -> dict[str, Any]:
+    """{scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}. BenchError: scikit-image is missing."""
+    del folder, lpips
+    try:
+        import skimage  # noqa: F401 -- told before minutes of fitting, not after
+    except ImportError:
+        raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
+    effort, kept = QUICK if quick else FULL, kept or Kept()
+    names = [n for n in (effort.cases if not fields else CASES) if not fields or CASES[n][0] in fields]
+    settings = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(effort).items()}
+    settings.pop("cases")
+    settings["depths"] = list(DEPTHS)  # figures of other stages are measured anew
+    close = scan(effort.size)
+    truth = truth_of(close)
+    kept.put("scan", {
+        "views": len(close.views), "size": effort.size, "distance_m": DISTANCE_M,
+        "truth_points": len(truth.points), "seen_by_two": float((truth.cameras >= SEEN_BY).mean()),
+    })  # fmt: skip
+    exact = [exact_depth(close.scene, view) for view in close.views]
+    kept.get("exact", measure=lambda: _of_exact(effort, close, exact, truth), settings=settings)
+    progress = Progress(len(names) * effort.fit_s[-1])
+    for name in names:
+        case = partial(_of_case, name, effort, close, exact, truth, progress)
+        made_with = {**settings, "defaults": settled(*CASES[name])}
+        kept.get("cases", name, settings=made_with, measure=case)
+    return kept.figures
+
+
+def _of_exact(
+    effort: Effort, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth
+) -> dict[str, Any]:
+    maps = [
+        depth_map(d.astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
+        for d, v in zip(exact, close.views)
+    ]
+    return {"meshes": [_mesh(maps, "tsdf", "exact", mm, truth) for mm in effort.voxels_mm]}
+
+
+def _of_case(
+    name: str,
+    effort: Effort,
+    close: Scan,
+    exact: Sequence[NDArray[np.float64]],
+    truth: Truth,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Fits of one case, each the last one gone on with."""
+    representation, options = CASES[name]
+    field = make_field(representation, {**close.options, **options})
+    field.warm_up()
+    usage, fits, spent, steps = Usage("bench"), [], 0.0, 0
+    for until in effort.fit_s:
+        report = field.fit(close.views, Budget(seconds=until - spent))
+        spent, steps = until, steps + report.steps
+        fit: dict[str, Any] = {"fit_s": until, "steps": steps, "meshes": []}
+        snapshot = field.snapshot()
+        middle = effort.voxels_mm[len(effort.voxels_mm) // 2]
+        every = [("tsdf", mm) for mm in effort.voxels_mm]
+        for depth, wanted in (
+            ("of the field", [("tsdf", middle)]),
+            ("sharpened", [*every, ("sdf", middle)]),
+            ("carved", every),
+        ):
+            seconds: dict[str, float] = {}
+            began = time.perf_counter()
+
+            def say(what: str, share: float, seconds=seconds, began=began) -> None:
+                seconds[what] = time.perf_counter() - began - sum(v for k, v in seconds.items() if k != what)
+
+            maps = maps_of(snapshot, close.views, DEPTHS[depth], say)
+            fit[depth] = {**_depth_error(maps, exact), **{f"{k}_s": v for k, v in seconds.items()}}
+            fit["meshes"] += [_mesh(maps, method, depth, mm, truth) for method, mm in wanted]
+        fits.append(fit)
+        progress.did(until - (fits[-2]["fit_s"] if len(fits) > 1 else 0.0))
+        best = min((m["chamfer_mm"] for m in fit["meshes"] if "chamfer_mm" in m), default=float("nan"))
+        progress.say(name, f"{until:g} s", f"{steps} steps, best chamfer {best:.2f} mm")
+    return {"fits": fits, "outside_cores": usage.outside(usage.row(0.0))}
+
+
+def _depth_error(maps: Sequence[DepthMap], exact: Sequence[NDArray[np.float64]]) -> dict[str, float]:
+    """Means over the maps, and the share of surface pixels that have a depth."""
+    rows = [depth_error_mm(np.where(m.seen, m.depth, 0), e) for m, e in zip(maps, exact)]
+    out = {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]}
+    covered = [float(m.seen[np.isfinite(e)].mean()) for m, e in zip(maps, exact)]
+    return {**out, "covered": float(np.mean(covered))}
+
+
+def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, truth: Truth) -> dict[str, Any]:
+    """One mesh, measured. seconds: of all after the depth maps."""
+    row: dict[str, Any] = {"method": method, "depth": depth, "voxel_mm": voxel_mm}
+    began = time.perf_counter()
+    try:
+        mesh = mesh_of_maps(maps, MeshSettings(method=method, voxel_m=1e-3 * voxel_mm))
+    except SurfaceError as error:
+        return {**row, "failed": str(error)}
+    row |= {"seconds": time.perf_counter() - began, "triangles": len(mesh.faces)}
+    return {**row, **dataclasses.asdict(compare(mesh, truth))}
+
+
+def table(figures: dict[str, Any]) -> str:
+    """Two Markdown tables: depth, and meshes."""
+    facts = figures["scan"]
+    lines = [
+        f"{facts['views']} pictures of {facts['size']} x {facts['size']} of `tile` from "
+        f"{facts['distance_m']:g} m. Target: {TARGET}.",
+        "",
+        "| field | fit s | steps | depth | covered | bias mm | median mm | p90 mm | seconds |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, case in figures.get("cases", {}).items():
+        for fit in case["fits"]:
+            for depth in DEPTHS:
+                d = fit[depth]
+                seconds = ", ".join(f"{k[:-2]} {v:.1f}" for k, v in d.items() if k.endswith("_s"))
+                lines.append(
+                    f"| {name} | {fit['fit_s']:g} | {fit['steps']} | {depth} | {100 * d['covered']:.0f} % | "
+                    f"{d['bias_mm']:+.2f} | {d['median_mm']:.2f} | {d['p90_mm']:.2f} | {seconds} |"
+                )
+    lines += [
+        "",
+        "| field | fit s | depth | method | voxel mm | chamfer mm | accuracy mm (median) | "
+        "completeness mm | within 3 mm: surface, mesh | triangles | seconds |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    rows = [("exact", "", m) for m in figures.get("exact", {}).get("meshes", [])]
+    for name, case in figures.get("cases", {}).items():
+        rows += [(name, f"{fit['fit_s']:g}", m) for fit in case["fits"] for m in fit["meshes"]]
+    for name, fit_s, m in rows:
+        head = f"| {name} | {fit_s} | {m['depth']} | {m['method']} | {m['voxel_mm']:g} |"
+        if "failed" in m:
+            lines.append(f"{head} {m['failed']} | | | | | |")
+            continue
+        lines.append(
+            f"{head} {m['chamfer_mm']:.2f} | {m['accuracy_mm']:.2f} ({m['accuracy_median_mm']:.2f}) | "
+            f"{m['completeness_mm']:.2f} | {100 * m['complete']:.1f} %, {100 * m['precise']:.1f} % | "
+            f"{m['triangles']} | {m['seconds']:.1f} |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,359 @@
+"""Updates after motion: how far a field that follows a moving scene stays behind one fitted afresh.
+
+A field that has settled on the first frame is given all training views of the next one and a short update,
+then those of the frame after that, and so on; each update is scored on the held-out camera at that frame.
+At some of the frames a new field of the same representation is fitted for fifteen seconds (or times the
+steps of an update) to the same views: that is what the follower could know. Between those frames its score is
+interpolated.
+
+Updates are of some seconds, or of a number of steps (``--steps``), which repeats bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.common.progress import Progress
+from edge_server.experiments.common.result_store import Interrupted, Kept, settled
+from edge_server.experiments.scenes.multiview_sequence import Film, recorded_film, synthetic_film
+from edge_server.fidelity.baselines import baseline
+from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fields import Budget, Field
+from edge_server.fields.registry import field_names, make_field
+
+NEAR_DB = 0.5
+FRESH_TIMES = 15  # a fresh fit takes so many times an update of one second, or of ``--steps``
+_METRICS = {"whole": "psnr_db", "moving": "psnr_moving_db"}
+# Under FRESHFIELD_DATA: file, held out, by what images are divided.
+_RECORDED = {"kitchen": ("blender_kitchen/transforms.json", "cam00", 1.0)}
+SCENES = ("room", *_RECORDED)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """update_s: seconds of an update, each tried in a run of its own; steps: their number instead. samples:
+    frames at which a fresh field is fitted, the first one (where the follower comes from) among them."""
+
+    updates: int = 100
+    update_s: tuple[float, ...] = (1.0, 0.25)
+    steps: int | None = None
+    samples: int = 8
+    cameras: int = 19
+    size: int = 128
+    speed_m_per_s: float = 1.0
+    fps: float = 15.0
+    options: Mapping[str, Any] | None = None
+
+    def budgets(self) -> dict[str, Budget]:
+        """The budget of an update in each run, by the run's name."""
+        if self.steps is not None:
+            return {f"{self.steps}_steps": Budget(steps=self.steps)}
+        return {f"{s:g}_s": Budget(seconds=s) for s in self.update_s}
+
+    def fresh(self) -> Budget:
+        """The budget of a fresh fit."""
+        if self.steps is not None:
+            return Budget(steps=FRESH_TIMES * self.steps)
+        return Budget(seconds=float(FRESH_TIMES))
+
+    def sampled(self) -> list[int]:
+        """The frames of the fresh fits, evenly spread from the first to the last."""
+        return sorted({round(f) for f in np.linspace(0, self.updates, max(2, self.samples))})
+
+    def amount(self) -> float:
+        """Seconds, or steps, of all fits of one representation on one scene."""
+        updates = sum(map(_amount, self.budgets().values())) * self.updates
+        return updates + _amount(self.fresh()) * len(self.sampled())
+
+
+FULL = Plan()
+QUICK = Plan(updates=16, samples=3)
+
+
+def measure(
+    quick: bool,
+    folder: Path,
+    lpips: Path | None = None,
+    fields: Sequence[str] = (),
+    kept: Kept | None = None,
+    scenes: Sequence[str] = (),
+    **changed: Any,
+) -> dict[str, Any]:
+    """{SCENE: {scene, baseline, FIELD: {fresh, RUN: {series, gaps, ...}}}} of ``fields`` (default: all).
+
+    scenes: of ``SCENES``; recorded ones need FRESHFIELD_DATA. changed: other values for the plan.
+    BenchError: a scene that was asked for cannot be had.
+    """
+    del folder, lpips
+    given = {name: value for name, value in changed.items() if value is not None}
+    plan, kept = replace(QUICK if quick else FULL, **given), kept or Kept()
+    names = tuple(fields) or field_names()
+    films = dict(_films(plan, scenes))
+    todo = [(s, n) for s in films for n in names if not kept.has(s, n, settings=_as_json(plan, n))]
+    progress = Progress(plan.amount() * len(todo))
+    for scene, film in films.items():
+        kept.get(scene, "baseline", measure=lambda film=film: _baseline(film))  # type: ignore[misc]
+        kept.figures[scene] |= {"scene": film.describe(), "frame_ms": film.period_ms}
+        for name in names:
+            kept.get(
+                scene,
+                name,
+                settings=_as_json(plan, name),
+                measure=lambda name=name, film=film: _follow(name, film, plan, progress),  # type: ignore[misc]
+            )
+    return kept.figures
+
+
+def _films(plan: Plan, scenes: Sequence[str]) -> Iterable[tuple[str, Film]]:
+    data = os.environ.get("FRESHFIELD_DATA")
+    for scene in scenes or SCENES:
+        if scene == "room":
+            film = synthetic_film(scene, plan.cameras, plan.size, plan.fps, speed_m_per_s=plan.speed_m_per_s)
+            yield scene, film
+            continue
+        path, holdout, scale = _RECORDED[scene]
+        try:
+            if not data:
+                raise DatasetError("set FRESHFIELD_DATA to the folder that holds it")
+            yield scene, replace(recorded_film(Path(data) / path, holdout, scale), name=scene)
+        except DatasetError as error:
+            if scenes:
+                raise BenchError(f"{scene}: {error}") from None
+            print(f"  {scene} left out: {error}", flush=True)
+
+
+def _follow(name: str, film: Film, plan: Plan, progress: Progress) -> dict[str, Any]:
+    """One representation on one scene. Raises Interrupted with what there is by then."""
+    usage, scorer = Usage("bench"), Scorer()
+    figures: dict[str, Any] = {"fresh": {}}
+    make_field(name, plan.options).warm_up()
+    start: Field | None = None
+    known: dict[int, dict[str, Any]] = {}  # of a film that repeats no frame is fitted twice
+    try:
+        for frame in plan.sampled():
+            key = film.key(frame)
+            if key not in known:
+                field = make_field(name, plan.options)
+                report = field.fit(film.training(frame), plan.fresh())
+                start = start or field  # the first frame comes first
+                score = _row(film.score(field, frame, scorer))
+                known[key] = {"fitted_s": report.seconds, "steps": report.steps, **score}
+            # Beside each: what is seen of this frame by a field that stayed with the first one.
+            assert start is not None
+            stayed = _row(film.score(start, frame, scorer))
+            stale = {f"not_updated_{metric}": stayed[metric] for metric in _METRICS.values()}
+            figures["fresh"][str(frame)] = {**known[key], **stale}
+            progress.did(_amount(plan.fresh()))
+            progress.say(f"{name} {film.name}", f"fresh at frame {frame}", _told(known[key]))
+        assert start is not None
+        warm = start.state()
+        for run, budget in plan.budgets().items():
+            start.load_state(warm)
+            figures[run] = _run(
+                start, film, plan, budget, figures["fresh"], scorer, progress, f"{name} {run}"
+            )
+    except Interrupted as stopped:
+        figures[run] = stopped.figures
+        raise Interrupted({**figures, "outside_cores": usage.outside(usage.row(0.0))}) from None
+    except KeyboardInterrupt:
+        raise Interrupted({**figures, "outside_cores": usage.outside(usage.row(0.0))}) from None
+    return {**figures, "outside_cores": usage.outside(usage.row(0.0))}
+
+
+def _run(
+    field: Field, film: Film, plan: Plan, budget: Budget, fresh: Mapping[str, Mapping[str, Any]],
+    scorer: Scorer, progress: Progress, label: str,
+) -> dict[str, Any]:  # fmt: skip
+    """Updates of one length, one frame after the other."""
+    rows: list[dict[str, Any]] = []
+    stopped = True
+    with suppress(KeyboardInterrupt):
+        for frame in range(1, plan.updates + 1):
+            report = field.fit(film.training(frame), budget)
+            score = _row(film.score(field, frame, scorer))
+            rows.append({"frame": frame, "fitted_s": report.seconds, "steps": report.steps, **score})
+            progress.did(_amount(budget))
+            if frame % max(1, plan.updates // 10) == 0:
+                progress.say(f"{label} {film.name}", f"update {frame} of {plan.updates}", _told(score))
+        stopped = False
+    figures = summary(rows, fresh)
+    if stopped:
+        raise Interrupted(figures)
+    return figures
+
+
+def summary(rows: Sequence[Mapping[str, Any]], fresh: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures of one run: the series, and per metric what lies between it and the fresh fits.
+
+    rows: one an update. fresh: by frame (as text) the scores of the fresh fits.
+    """
+    series = {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
+    frames = [row["frame"] for row in rows]
+    found: dict[str, Any] = {"updates": len(rows)}
+    for key in ("fitted_s", "steps"):
+        found[key] = statistics.median(series[key]) if rows else None
+    for kind, metric in _METRICS.items():
+        known = {int(f): row[metric] for f, row in fresh.items() if row[metric] is not None}
+        tracked = [row[metric] for row in rows]
+        scored = [v for v in tracked if v is not None]
+        found[kind] = {"mean_db": statistics.fmean(scored) if scored else None}
+        found[kind] |= gaps(frames, tracked, known)
+    return {**found, "series": series}
+
+
+def gaps(
+    frames: Sequence[int], tracked: Sequence[float | None], fresh: Mapping[int, float]
+) -> dict[str, Any]:
+    """What a follower lacks, fresh minus tracked in dB; every value None where nothing is known.
+
+    frames, tracked: a score an update. fresh: scores of some frames, linearly interpolated over the others
+    (beyond the first and the last: as those). share_near: of the updates within NEAR_DB. first_tenth_db,
+    last_tenth_db: means; drift_db: the latter minus the former.
+    """
+    names = ("fresh_mean_db", "share_near", "median_db", "first_tenth_db", "last_tenth_db", "drift_db")
+    known = [(f, v) for f, v in zip(frames, tracked) if v is not None]
+    if not known or not fresh:
+        return dict.fromkeys(names)
+    at = sorted(fresh)
+    reference = np.interp([f for f, _ in known], at, [fresh[f] for f in at])
+    gap = reference - np.array([v for _, v in known])
+    tenth = -(-len(gap) // 10)
+    first, last = float(gap[:tenth].mean()), float(gap[-tenth:].mean())
+    values = (reference.mean(), (gap <= NEAR_DB).mean(), np.median(gap), first, last, last - first)
+    return dict(zip(names, map(float, values)))
+
+
+def _told(score: Mapping[str, Any]) -> str:
+    return f"PSNR {_db(score['psnr_db'])} dB, moving {_db(score['psnr_moving_db'])} dB"
+
+
+def _amount(budget: Budget) -> float:
+    return float(budget.steps or budget.seconds or 0.0)
+
+
+def _row(score: Score) -> dict[str, Any]:
+    return {"psnr_db": score.psnr_db, "psnr_moving_db": score.psnr_moving_db}
+
+
+def _as_json(plan: Plan, name: str) -> dict[str, Any]:
+    """The settings that a representation's row is kept with."""
+    values = {**asdict(plan), "update_s": list(plan.update_s), "options": dict(plan.options or {})}
+    return {**values, "defaults": settled(name, plan.options)}
+
+
+def _baseline(film: Film) -> dict[str, Any]:
+    """Of the first frame; means over the held-out cameras."""
+    training = film.training(0)
+    found = [baseline(training, v.image, v.camera_to_world) for v in film.truth(0)]
+    names = ("mean_colour_db", "nearest_view_db")
+    return {name: statistics.fmean(getattr(b, name) for b in found) for name in names}
+
+
+def _runs(figures: Mapping[str, Any]) -> Iterable[tuple[str, str, str, dict[str, Any], dict[str, Any]]]:
+    """(scene, representation, run's name, run, all of the representation) of everything measured."""
+    for scene, part in figures.items():
+        if not isinstance(part, dict):
+            continue
+        for name, rows in part.items():
+            if isinstance(rows, dict) and "fresh" in rows:
+                for run, found in rows.items():
+                    if isinstance(found, dict) and "series" in found:
+                        yield scene, name, run, found, rows
+
+
+def draw(figures: dict[str, Any], path: Path) -> None:
+    """PSNR over the updates with the fresh fits as markers, a row a scene, whole image and moving pixels, to
+    ``path`` (PNG). No file where there is nothing to draw."""
+    from edge_server.report.style import figure, label_lines
+
+    found = list(_runs(figures))
+    scenes = list(dict.fromkeys(scene for scene, *_ in found))
+    if not scenes:
+        return
+    with figure(path, len(scenes), 2, height_inch=2.6) as (_, axes):
+        for row, scene in zip(axes, scenes):
+            below = "update" if scene == scenes[-1] else None
+            of_scene = [rest for other, *rest in found if other == scene]
+            for ax, metric in zip(row, _METRICS.values()):
+                _panel(ax, metric, of_scene)
+            label_lines(row[1], "PSNR (dB)", below, "pixels that move")
+            row[0].set(title=figures[scene]["scene"], ylabel="PSNR (dB)", xlabel=below or "")
+
+
+def _panel(ax: Any, metric: str, of_scene: Sequence[Sequence[Any]]) -> None:
+    """The lines of all runs and the markers of the fresh fits. of_scene: see ``_runs``, without the scene."""
+    from edge_server.report.style import CYCLE, GREY
+
+    names = list(dict.fromkeys(name for name, *_ in of_scene))
+    runs = list(dict.fromkeys(run for _, run, *_ in of_scene))
+    for name, run, one, rows in of_scene:
+        colour, line = CYCLE[names.index(name) % len(CYCLE)], ("-", ":", "--", "-.")[runs.index(run) % 4]
+        shown = [float("nan") if v is None else v for v in one["series"].get(metric, [])]
+        label = f"{name}, {run.replace('_', ' ')}"
+        ax.plot(one["series"].get("frame", []), shown, line, color=colour, label=label)
+        if run == runs[0]:
+            ax.plot(*_fresh(rows, metric), "o", color=colour, markersize=4.5, label=f"{name}, fresh")
+    name, _, _, rows = of_scene[0]
+    still = _fresh(rows, f"not_updated_{metric}")
+    ax.plot(*still, "x", color=GREY, markersize=4.5, label=f"{name}, never updated")
+
+
+def _fresh(rows: Mapping[str, Any], key: str) -> tuple[list[int], list[float]]:
+    """Frames and values of what is known at the frames of the fresh fits."""
+    known = [(int(frame), row[key]) for frame, row in rows["fresh"].items() if row[key] is not None]
+    return [frame for frame, _ in known], [value for _, value in known]
+
+
+def table(figures: dict[str, Any]) -> str:
+    """Every run as a row of one Markdown table; whole image, and moving pixels in parentheses."""
+    lines = [
+        "| scene | representation | update | updates | PSNR dB (moving) | fresh fit dB | never updated dB "
+        f"| within {NEAR_DB} dB of fresh | median gap dB | gap of the first, last tenth dB "
+        "| mean colour, nearest view dB | outside cores |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for scene, name, run, found, rows in _runs(figures):
+        whole, moving = found["whole"], found["moving"]
+        # Of the first frame a field that is never updated knows as much as any: it tells nothing.
+        later = {**rows, "fresh": {f: row for f, row in rows["fresh"].items() if f != "0"}}
+        values = [_fresh(later, f"not_updated_{metric}")[1] for metric in _METRICS.values()]
+        stayed = [statistics.fmean(v) if v else None for v in values]
+        bases = figures[scene]["baseline"]
+        cells = [
+            scene, name, _length(run, found), str(found["updates"]), _both(whole, moving, "mean_db"),
+            _both(whole, moving, "fresh_mean_db"), f"{_db(stayed[0])} ({_db(stayed[1])})",
+            f"{_percent(whole['share_near'])} ({_percent(moving['share_near'])})",
+            _both(whole, moving, "median_db"),
+            f"{_both(whole, moving, 'first_tenth_db')}, {_both(whole, moving, 'last_tenth_db')}",
+            ", ".join(_db(bases[key]) for key in ("mean_colour_db", "nearest_view_db")),
+            _db(rows.get("outside_cores")),
+        ]  # fmt: skip
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _length(run: str, found: Mapping[str, Any]) -> str:
+    steps = "" if run.endswith("steps") or found["steps"] is None else f" ({found['steps']:.0f} steps)"
+    return run.replace("_", " ") + steps
+
+
+def _both(whole: Mapping[str, Any], moving: Mapping[str, Any], key: str) -> str:
+    return f"{_db(whole[key])} ({_db(moving[key])})"
+
+
+def _db(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %"

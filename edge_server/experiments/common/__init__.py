@@ -1,0 +1,1 @@
+"""What benches, studies and trainings share: stored results, progress, machine load."""

@@ -1,0 +1,1 @@
+"""``edge-server fit``: fields fitted to recorded data without a network."""

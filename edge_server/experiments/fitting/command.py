@@ -1,0 +1,359 @@
+"""``edge-server fit``: a recorded data set without a network, fidelity over seconds of fitting."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from camera_node.sources.datasets.formats import FORMATS
+from camera_node.sources.datasets.records import DatasetError
+from camera_node.synthetic import SCENES
+from camera_node.synthetic.source import WORLD_FPS
+from edge_server.experiments.common.machine_load import Usage
+from edge_server.experiments.fitting.evaluate import Scored, evaluate, fit_in_slices, marks_s
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.recorded import Recorded, load_recorded
+from edge_server.fidelity.baselines import Baseline, baseline
+from edge_server.fidelity.images import Colour, to_unit
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.fields import Field, View, checkpoint
+from edge_server.fields.registry import field_names, option_help
+from edge_server.live.scoring_thread import to_bytes
+from freshfield.files import write_json
+
+DESCRIPTION = """\
+Fit a recorded data set as fast as this machine can, and measure fidelity on views it never saw.
+
+  edge-server fit ~/data/lego --seconds 60 --holdout 8 --scale 2 --out runs/lego
+  edge-server fit ~/data/kitchen --field splat --holdout cam00 --frame 12
+  edge-server fit tower --field splat --seconds 10
+  edge-server fit --field splat --list-options
+  edge-server fit ~/data/people/calibration.json --holdout cam01 --scale 4 --option samples=256
+  edge-server fit ~/data/apartment --format eyeful --holdout split
+
+DATA is the folder of a data set, or one of our own scenes: room, tile, tower. Its files say what it is:
+transforms JSON (nerfstudio, instant-ngp, NeRF-synthetic), videos with a calibration JSON, DyNeRF (videos
+with poses_bounds.npy), ZJU-MoCap (annots.npy), Eyeful Tower (cameras.json or .xml), a COLMAP model (text or
+binary). Name the describing file itself, or give --format, where several lie there. What moves is fitted at
+one instant (--frame, 15 a second in a scene). Time spent on evaluation is not counted as fitting. Ctrl-C
+ends it early; report, pictures and checkpoint are written all the same, and --resume goes on from there.
+"""
+
+BACKGROUNDS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+_SCENE_SIZE = 128  # pixels a side of a scene of ours, before --scale
+# Enough to tell how far a field is from the views it was trained on, where nothing is held out.
+_SCORED_OF_TRAINING = 8
+
+
+class FitError(ValueError):
+    """An option that cannot work; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One fit as asked for. options: of the field, as in a scenario."""
+
+    data: Path
+    field: str = "ngp"
+    seconds: float = 60.0
+    holdout: str = "8"
+    scale: float = 1.0
+    frame: int = 0
+    background: str = "white"
+    seed: int = 0
+    format: str | None = None
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    parser = argparse.ArgumentParser(
+        prog="edge-server fit", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
+    parser.add_argument("--format", choices=list(FORMATS), help="of the data set [what its files say]")
+    parser.add_argument(
+        "--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]"
+    )
+    parser.add_argument("--list-options", action="store_true", help="say what the field's options mean")
+    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
+    parser.add_argument(
+        "--holdout", default="8", metavar="K|NAME,...",
+        help="every K-th view, or these images or cameras; split: what the data set keeps for testing; "
+        "0: none [%(default)s]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]"
+    )
+    parser.add_argument(
+        "--frame", type=int, default=0, metavar="N", help="instant of a moving set [%(default)s]"
+    )
+    parser.add_argument(
+        "--background", choices=sorted(BACKGROUNDS), default="white",
+        help="what transparent images are laid on [%(default)s]",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
+    parser.add_argument(
+        "--option", action="append", default=[], metavar="KEY=VALUE",
+        help="setting of the field, e.g. levels=12; again for more",
+    )  # fmt: skip
+    parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
+    parser.add_argument("--resume", action="store_true", help="go on from OUT until --seconds in all")
+    args = parser.parse_args(argv)
+    if args.list_options:
+        try:
+            known = option_help(args.field)
+        except ValueError as error:
+            parser.error(str(error))
+        print("\n".join(f"{name:18} {text}" for name, text in known.items()))
+        return 0
+    if args.data is None:
+        parser.error("name a data set: a folder, or the file that describes it")
+    job = Job(args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background,
+              args.seed, args.format)  # fmt: skip
+    out = args.out or Path("runs") / f"fit-{_called(args.data)}"
+    try:
+        job.options.update(parse_options(args.option))
+        run(job, out, args.lpips, args.resume)
+    except (DatasetError, FitError) as error:
+        print(f"edge-server fit: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parse_options(words: Sequence[str]) -> dict[str, Any]:
+    """``key=value`` words as settings; values are YAML (8, 0.5, true, [0, 0, 1], white)."""
+    options: dict[str, Any] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not key or not equals:
+            raise FitError(f"--option {word}: expected KEY=VALUE")
+        try:
+            options[key] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise FitError(f"--option {word}: {value!r} is not a value") from None
+    return options
+
+
+def run(job: Job, out: Path, lpips_folder: Path | None = None, resume: bool = False) -> dict[str, Any]:
+    """Fit, measure and leave everything in ``out``; returns the contents of report.json.
+
+    Raises DatasetError or FitError for input that cannot be used.
+    """
+    from edge_server.fields.registry import make_field  # numba loads only once the options are read
+
+    if not 0.0 < job.seconds <= 1e6:
+        raise FitError(f"--seconds {job.seconds:g}: expected more than 0")
+    data = _open(job)
+    transparent = any(v.image.shape[2] == 4 for v in data.training)
+    options = {"background": job.background, **job.options} if transparent else job.options
+    try:
+        model = make_field(job.field, options, seed=job.seed)
+    except (ValueError, TypeError) as error:
+        raise FitError(f"--field {job.field}: {error}") from None
+    out.mkdir(parents=True, exist_ok=True)
+    run_ = _Run(job, options, data, model, out, lpips_folder)
+    if resume:
+        run_.load()
+    print(run_.headline(), flush=True)
+    print(f"kernels ready after {model.warm_up():.1f} s", flush=True)
+    return run_.go()
+
+
+def _is_scene(data: Path) -> bool:
+    return str(data) in SCENES and not data.exists()
+
+
+def _called(data: Path) -> str:
+    """What a scene or data set is called in names of folders and reports."""
+    return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
+
+
+def _open(job: Job) -> Recorded:
+    if not _is_scene(job.data):
+        return load_recorded(job.data, job.holdout, job.scale, job.frame, job.format)
+    t_s = job.frame / WORLD_FPS
+    still = synthetic(str(job.data), size=max(8, round(_SCENE_SIZE / job.scale)), t_s=t_s)
+    return Recorded(job.data, still.training, still.held_out, f"at {t_s:g} s")
+
+
+class _Run:
+    """One fit in progress: the files of ``out`` and the lines on the terminal."""
+
+    def __init__(
+        self, job: Job, options: dict[str, Any], data: Recorded, model: Field, out: Path, lpips: Path | None
+    ) -> None:
+        self.job, self.options, self.data, self.model, self.out = job, options, data, model, out
+        metric, self.lpips_missing = open_lpips(lpips)
+        self.background = BACKGROUNDS[job.background]
+        self.scorer = Scorer(metric, background=self.background)
+        self.views = data.held_out or data.training[:_SCORED_OF_TRAINING]
+        self.rendered: NDArray[np.float32] | None = None
+        self.rows: list[dict[str, Any]] = []
+        self.processes: list[dict[str, Any]] = []
+        self.spent_s, self.spent_steps = 0.0, 0
+        self.usage = Usage("fit")
+
+    def headline(self) -> str:
+        d, image = self.data, self.data.training[0].image
+        held_out = f"{len(d.held_out)} held out" if d.held_out else "none held out: scored on training views"
+        instant = f", {d.instant}" if d.instant else ""
+        missing = f" ({d.missing} entries have no image)" if d.missing else ""
+        sizes = f"{image.shape[1]} x {image.shape[0]}"
+        return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
+
+    def load(self) -> None:
+        """Take up what ``save`` left. Raises FitError where that is not possible."""
+        try:
+            state, about = checkpoint.load(self.out / "field")
+            self.model.load_state(state)
+            self.spent_s, self.spent_steps = float(about["seconds"]), int(about["steps"])
+            self.rows = [json.loads(line) for line in (self.out / "series.jsonl").read_text().splitlines()]
+            self.processes = [
+                json.loads(line) for line in (self.out / "processes.jsonl").read_text().splitlines()
+            ]
+        except (OSError, ValueError, KeyError) as error:
+            raise FitError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
+        if self.spent_s >= self.job.seconds - 0.05:
+            raise FitError(
+                f"--resume: {self.out} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
+            )
+
+    def go(self) -> dict[str, Any]:
+        marks = marks_s(self.job.seconds)
+        try:
+            done = fit_in_slices(
+                self.model,
+                self.data.training,
+                self._score,
+                marks,
+                self._scored,
+                self.spent_s,
+                self.spent_steps,
+            )
+        except KeyboardInterrupt:  # during an evaluation: the last one scored stands
+            done = False
+        if not done:
+            print("stopped early", flush=True)
+        return self.finish()
+
+    def _score(self) -> Score:
+        self.processes.append(self.usage.row(0.0))
+        score, self.rendered = evaluate(self.model, self.views, self.scorer)
+        return score
+
+    def _scored(self, at: Scored) -> None:
+        score = at.score
+        self.spent_s = at.seconds
+        self.spent_steps = at.steps if at.steps is not None else self.spent_steps
+        self.processes[-1]["t_s"] = round(at.seconds, 3)
+        outside = self.usage.outside(self.processes[-1])
+        self.usage.row(0.0)  # what evaluation used is nobody's load
+        self.rows.append(
+            {
+                "number": len(self.rows),
+                "t_s": at.seconds,
+                "psnr_db": score.psnr_db,
+                "psnr_moving_db": None,
+                "ssim": score.ssim,
+                "lpips": score.lpips,
+                "aaoi_ms": None,
+                "selected": len(self.data.training),
+                "update_ms": at.slice_s * 1e3,
+                "truth_gap_ms": None,
+                "steps": at.steps,
+                "loss": at.loss,
+                "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else "selected",
+            }
+        )
+        print(progress(at, outside), flush=True)
+
+    def finish(self) -> dict[str, Any]:
+        """Write checkpoint, pictures and report."""
+        from edge_server.report import build_report  # draws with matplotlib
+
+        about = {
+            "field": self.job.field,
+            "options": self.options,
+            "scenario": self._name(),
+            "seed": self.job.seed,
+            "seconds": self.spent_s,
+            "steps": self.spent_steps,
+        }
+        checkpoint.save(self.out / "field", self.model.state(), about)
+        _write_lines(self.out / "series.jsonl", self.rows)
+        _write_lines(self.out / "processes.jsonl", self.processes)
+        write_json(self.out / "edge.json", self._status())
+        if self.rendered is not None:
+            truth = to_unit(self.views[0].image, "held-out view", self.background)
+            _write_png(self.out / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
+            _write_png(self.out / "rendered.png", to_bytes(self.rendered))
+        report = build_report(self.out)
+        print(self.out / "report.html", flush=True)
+        return report
+
+    def _status(self) -> dict[str, Any]:
+        found = [self._baseline(view) for view in self.data.held_out]
+        return {
+            "kind": "fit",
+            "scenario": self._name(),
+            "seed": self.job.seed,
+            "field": self.job.field,
+            "options": self.options,
+            "data": {
+                "file": self.data.file.name,
+                "instant": self.data.instant,
+                "training": len(self.data.training),
+                "held_out": [v.camera for v in self.data.held_out],
+                "missing": self.data.missing,
+            },
+            "seconds": self.spent_s,
+            "baseline": {
+                name: float(np.mean([getattr(b, name) for b in found])) if found else None
+                for name in ("mean_colour_db", "nearest_view_db")
+            },
+            "lpips_missing": self.lpips_missing,
+            "lpips_network": None if self.lpips_missing else "alex",
+        }
+
+    def _baseline(self, view: View) -> Baseline:
+        return baseline(self.data.training, view.image, view.camera_to_world, self.background)
+
+    def _name(self) -> str:
+        return f"fit {_called(self.job.data)}"
+
+
+def progress(at: Scored, outside: float | None) -> str:
+    """One line for people: time, steps, scores and how many cores others kept busy."""
+    score = at.score
+    words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
+    words.append(f"PSNR {score.psnr_db:5.2f} dB")
+    words += [f"SSIM {score.ssim:.3f}"] if score.ssim is not None else []
+    words += [f"LPIPS {score.lpips:.3f}"] if score.lpips is not None else []
+    words += [f"(others used {outside:.1f} cores)"] if outside is not None else []
+    return "  ".join(words)
+
+
+def _write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    path.write_text("".join(json.dumps(row, allow_nan=False) + "\n" for row in rows))
+
+
+def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""``edge-server frontier``: what accuracy costs in time."""

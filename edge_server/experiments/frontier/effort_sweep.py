@@ -1,0 +1,136 @@
+"""What accuracy costs in time, from scratch: effort levels of a field against seconds, Pareto front."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from edge_server.experiments.common.machine_load import Usage
+from edge_server.experiments.fitting.evaluate import evaluate
+from edge_server.experiments.scenes.multiview_still import Still
+from edge_server.fidelity.scorer import PerceptualMetric, Scorer
+from edge_server.fields import Budget, View
+from edge_server.fields.registry import efforts_of, make_field
+
+# What one knob alone buys, against the level "medium" (only in the full sweep).
+_KNOBS: dict[str, dict[str, dict[str, Any]]] = {
+    "ngp": {
+        "fewer samples": {"samples": 96},
+        "more samples": {"samples": 288},
+        "fewer rays": {"batch_samples": 32768, "rays": 4096},
+        "more rays": {"batch_samples": 131072, "rays": 16384},
+        "coarse grid": {"finest_resolution": 128},
+        "fine grid": {"finest_resolution": 512},
+        "more levels": {"levels": 12},
+        "wide network": {"hidden": 64},
+    }
+}
+
+
+@dataclass(frozen=True)
+class Effort:
+    """A named way to spend time. field: the representation. options: its settings. divided: training images
+    are divided by this; the score is always of the full ones. live: tried on the moving scene, too."""
+
+    field: str
+    name: str
+    options: dict[str, Any]
+    divided: float = 1.0
+    live: bool = True
+
+    @property
+    def label(self) -> str:
+        return f"{self.field} {self.name}"
+
+
+def efforts(field: str, options: dict[str, Any], knobs: bool) -> list[Effort]:
+    """The field's effort levels, cheapest first; with ``knobs`` also images of half the size, and each knob
+    turned alone. ``options`` apply to all of them."""
+    levels = [Effort(field, level, {"effort": level, **options}) for level in efforts_of(field)]
+    if knobs:
+        levels += [replace(e, name=f"{e.name}, half size", divided=2.0, live=False) for e in levels]
+        levels += [
+            Effort(field, n, {**turned, **options}, live=False) for n, turned in _KNOBS.get(field, {}).items()
+        ]
+    return levels
+
+
+def shrunk(views: Sequence[View], divided: float) -> tuple[View, ...]:
+    """The same views with images and lenses divided by ``divided``; alpha weighs what it covers."""
+    if divided == 1.0:
+        return tuple(views)
+    small = []
+    for view in views:
+        lens = view.intrinsics.scaled(1.0 / divided)
+        image = view.image.astype(np.float32)
+        if image.shape[2] == 4:
+            image[..., :3] *= image[..., 3:] / 255.0
+        size = (lens.width, lens.height)
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        if image.shape[2] == 4:
+            image[..., :3] *= 255.0 / np.maximum(image[..., 3:], 1e-3)
+        pixels = np.clip(image + 0.5, 0.0, 255.0).astype(np.uint8)
+        small.append(replace(view, image=pixels, intrinsics=lens))
+    return tuple(small)
+
+
+def fit_from_scratch(
+    effort: Effort, still: Still, seconds: float, seed: int, lpips: PerceptualMetric | None
+) -> dict[str, Any]:
+    """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost."""
+    model = make_field(effort.field, effort.options, seed=seed)
+    still = replace(still, training=shrunk(still.training, effort.divided))
+    model.warm_up()
+    usage = Usage("fit")
+    report = model.fit(still.training, Budget(seconds=seconds))
+    row = usage.row(seconds)
+    score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
+    ms_per_step = 1e3 * report.seconds / max(report.steps, 1)
+    return {
+        "effort": effort.label,
+        "seconds": report.seconds,
+        "steps": report.steps,
+        "ms_per_step": ms_per_step,
+        "rays_per_s": report.rays / max(report.seconds, 1e-9),
+        "samples_per_s": report.samples / max(report.seconds, 1e-9),
+        "psnr_db": score.psnr_db,
+        "ssim": score.ssim,
+        "lpips": score.lpips,
+        "outside_cores": usage.outside(row),
+    }
+
+
+def medians(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Points of the same effort and planned seconds (``planned_s``) over seeds, as their medians."""
+    groups: dict[tuple[str, float], list[dict[str, Any]]] = {}
+    for point in points:
+        groups.setdefault((point["effort"], point["planned_s"]), []).append(point)
+    names = ("seconds", "steps", "ms_per_step", "rays_per_s", "samples_per_s", "psnr_db",
+             "ssim", "lpips", "outside_cores")  # fmt: skip
+    rows = []
+    for (effort, planned_s), group in groups.items():
+        row: dict[str, Any] = {"effort": effort, "planned_s": planned_s, "seeds": len(group)}
+        for name in names:
+            known = [p[name] for p in group if p[name] is not None]
+            row[name] = statistics.median(known) if known else None
+        rows.append(row)
+    return rows
+
+
+def mark_front(rows: Sequence[dict[str, Any]]) -> None:
+    """Set ``on_front`` of each row: no other row that was given as little time is as accurate (PSNR)."""
+    best = float("-inf")
+    for row in sorted(rows, key=lambda r: (r["planned_s"], -r["psnr_db"])):
+        row["on_front"] = row["psnr_db"] > best
+        best = max(best, row["psnr_db"])
+
+
+def costs(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Milliseconds of a step from scratch by effort: medians over all points of the effort."""
+    names = dict.fromkeys(row["effort"] for row in rows)
+    return {name: statistics.median(r["ms_per_step"] for r in rows if r["effort"] == name) for name in names}

@@ -1,0 +1,174 @@
+"""Writes what the frontier found: two CSV files, two figures, a table and a conclusion for people."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from edge_server.experiments.frontier.update_time import best
+from edge_server.report.style import CYCLE, INK, figure
+
+Row = dict[str, Any]
+_LINES = {"low": "--", "high": "-."}
+_METRICS = (("psnr_db", "PSNR (dB)"), ("ssim", "SSIM"), ("lpips", "LPIPS"))
+
+
+def write_output(out: Path, data: Row) -> str:
+    """frontier.csv, frontier.png and, where something moved, updates.csv and updates.png; returns the text
+    for the terminal."""
+    rows, updates = data["from_scratch"], data["updates"]
+    _write_csv(out / "frontier.csv", rows)
+    draw_frontier(out / "frontier.png", rows, data)
+    text = [table(rows)]
+    if updates:
+        _write_csv(out / "updates.csv", updates)
+        draw_updates(out / "updates.png", updates, data)
+        text += [updates_table(updates), conclusion(updates)]
+    return "\n\n".join(["", *text])
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Effort levels by seconds: PSNR, SSIM, LPIPS; a star marks the Pareto front."""
+    lines = [f"{'effort':22} {'seconds':>8} {'steps':>6} {'ms/step':>8} {'PSNR':>7} {'SSIM':>6} {'LPIPS':>6}"]
+    for row in rows:
+        lines.append(
+            f"{row['effort']:22} {row['seconds']:8.2f} {row['steps']:6.0f} {row['ms_per_step']:8.2f} "
+            f"{row['psnr_db']:7.2f} {_n(row['ssim'])} {_n(row['lpips'])} {'*' if row['on_front'] else ''}"
+        )
+    return "\n".join([*lines, "* on the Pareto front: nothing measured is both faster and more accurate"])
+
+
+def updates_table(rows: Sequence[Row]) -> str:
+    """Fidelity at the present by speed and seconds an update takes."""
+    names = ("PSNR", "moving", "seen", "moving")
+    lines = [
+        f"{'field, effort':16} {'speed':>8} {'update':>8} {'steps':>6} {'aAoI':>9} "
+        + " ".join(f"{n:>7}" for n in names)
+    ]
+    for row in rows:
+        numbers = [row[k] for k in ("psnr_db", "psnr_moving_db", "seen_psnr_db", "seen_psnr_moving_db")]
+        lines.append(
+            f"{_who(row):16} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
+            f"{row['aaoi_ms']:6.0f} ms " + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
+        )
+    return "\n".join([*lines, "seen: what a viewer sees on average, between publications too"])
+
+
+def conclusion(rows: Sequence[Row]) -> str:
+    """One line: the best update time at each speed, and what the longest one costs."""
+    parts = []
+    for speed in dict.fromkeys(row["speed_m_per_s"] for row in rows):
+        group = [row for row in rows if row["speed_m_per_s"] == speed]
+        whole, moving = best(group, "psnr_db"), best(group, "psnr_moving_db")
+        if whole is None or moving is None:
+            continue
+        longest = max((r for r in group if _who(r) == _who(moving)), key=lambda row: row["update_s"])
+        lost = moving["psnr_moving_db"] - (longest["psnr_moving_db"] or moving["psnr_moving_db"])
+        parts.append(
+            f"at {speed:g} m/s {whole['update_s']:.2f} s ({_who(whole)}) for the whole image and "
+            f"{moving['update_s']:.2f} s ({_who(moving)}) where it moves "
+            f"({longest['update_s']:.1f} s costs {lost:.1f} dB there)"
+        )
+    return "Best time to spend on an update: " + "; ".join(parts) + "."
+
+
+def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
+    """PSNR, SSIM and LPIPS of every effort level against seconds from scratch; the front in PSNR marked."""
+    shown = [(key, label) for key, label in _METRICS if any(row[key] is not None for row in rows)]
+    efforts = list(dict.fromkeys(row["effort"] for row in rows))
+    looks = _looks([tuple(effort.split(" ", 1)) for effort in efforts])
+    front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["seconds"])
+    with figure(path, len(shown), height_inch=2.7, sharex=True) as (fig, axes):
+        for ax, (key, label) in zip(axes[:, 0], shown):
+            for effort, look in zip(efforts, looks):
+                group = sorted((r for r in rows if r["effort"] == effort), key=lambda r: r["seconds"])
+                ax.plot(
+                    [r["seconds"] for r in group], [r[key] for r in group], marker=".", **look,
+                    label=f"{effort} ({data['ms_per_step'][effort]:.1f} ms a step)",
+                )  # fmt: skip
+            if key == "psnr_db":
+                ax.plot(
+                    [r["seconds"] for r in front], [r[key] for r in front], "o", markersize=9, mfc="none",
+                    color=INK, label="Pareto front",
+                )  # fmt: skip
+            name = f"LPIPS-{data['lpips_network']}" if key == "lpips" else label
+            ax.set_ylabel(f"{name}, {'lower' if key == 'lpips' else 'higher'} is better")
+        axes[0, 0].set_title(f"What accuracy costs in time: {data['scene']}")
+        axes[-1, 0].set_xlabel("seconds from scratch")
+        fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper")
+        _seconds_axis(axes[-1, 0], [row["planned_s"] for row in rows])
+
+
+def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
+    """Fidelity at the present against seconds an update takes: a column for each speed, a colour for each
+    representation, a line for each effort, the best of all encircled. What is seen between updates is shown
+    of one of them."""
+    speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
+    efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
+    main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
+    panels = (("psnr_db", "PSNR, whole image (dB)"), ("psnr_moving_db", "PSNR where it moves (dB)"))
+    with figure(path, len(panels), len(speeds), height_inch=3.0, sharex=True, sharey="row") as (fig, axes):
+        for row, (key, label) in enumerate(panels):
+            axes[row, 0].set_ylabel(label)
+            for ax, speed in zip(axes[row], speeds):
+                here = [r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None]
+                for who, look in zip(efforts, _looks(efforts)):
+                    group = sorted((r for r in here if (r["field"], r["effort"]) == who),
+                                   key=lambda r: r["update_s"])  # fmt: skip
+                    x = [r["update_s"] for r in group]
+                    ax.plot(
+                        x, [r[key] for r in group], marker=".", linewidth=1.2, label=" ".join(who), **look
+                    )
+                    if who == main:
+                        ax.plot(x, [r[f"seen_{key}"] for r in group], ":", color=look["color"], linewidth=1.0,
+                                label=f"{' '.join(main)}, seen on\naverage, between updates too")  # fmt: skip
+                top = best(here, key)
+                if top is not None:
+                    ax.plot(
+                        [top["update_s"]], [top[key]], "o", markersize=10, mfc="none", color=INK, label="best"
+                    )
+        for ax, speed in zip(axes[0], speeds):
+            ax.set_title(f"{speed:g} m/s")
+        for ax in axes[-1]:
+            ax.set_xlabel("seconds an update takes")
+            _seconds_axis(ax, [row["planned_update_s"] for row in rows])
+            ax.tick_params(axis="x", labelrotation=90)
+        fig.suptitle("More is not always better: the world moves while the field is fitted")
+        fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
+
+
+def _looks(efforts: Sequence[tuple[str, ...]]) -> list[Row]:
+    """How to draw (representation, effort): a colour and a line."""
+    fields = list(dict.fromkeys(who[0] for who in efforts))
+    return [
+        {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")}
+        for who in efforts
+    ]
+
+
+def _seconds_axis(axes: Axes, seconds: Sequence[float]) -> None:
+    """A logarithmic axis, shared by all panels, with a tick at every value that was planned."""
+    axes.set_xscale("log")
+    ticks = sorted(set(seconds))
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    flat = [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(flat[0]))
+        writer.writeheader()
+        writer.writerows(flat)
+
+
+def _who(row: Row) -> str:
+    return f"{row['field']} {row['effort']}"
+
+
+def _n(value: float | None) -> str:
+    return "     -" if value is None else f"{value:6.3f}"

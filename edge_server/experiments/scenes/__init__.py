@@ -1,0 +1,1 @@
+"""Input of experiments: multi-view stills and sequences, synthetic or recorded, with their truth."""

@@ -1,0 +1,115 @@
+"""A scan of ``tile`` from close by, and the exact surface it shows: what meshes are measured on.
+
+Cameras stand ``DISTANCE_M`` from a raster of points of the tile, as an arm would hold one: straight above
+each point, and leaning to four sides. They see neither the tile's lower side nor its carrier's walls head-on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic import make_scene
+from camera_node.synthetic.camera_rig import on_sphere
+from camera_node.synthetic.render import Placed, cast, place_still, surfaces
+from camera_node.synthetic.scene import Scene
+from edge_server.fields import View
+from edge_server.surface.metrics import STEEPEST_DEG, Truth, thinned
+from freshfield.geometry import Pinhole, world_rays
+
+DISTANCE_M = 0.3
+FOV_DEG = 50.0
+# Points of the tile's upper side, and (azimuth, elevation) of the cameras around each.
+RASTER_M = tuple((x, y, 0.03) for y in (-0.13, 0.0, 0.13) for x in (-0.19, -0.065, 0.065, 0.19))
+ANGLES_DEG = ((0.0, 88.0), (0.0, 45.0), (90.0, 45.0), (180.0, 45.0), (270.0, 45.0))
+SPACING_M = 0.0005  # between points of the truth
+_FINE = 3  # rays a pixel side for the truth: closer than its spacing
+_SAME = 2e-3  # of the distance, within which a ray has met the point it was sent to
+
+
+@dataclass(frozen=True)
+class Scan:
+    """scene: with the close cameras. views: what they took, supersampled."""
+
+    scene: Scene
+    views: tuple[View, ...]
+
+    @property
+    def options(self) -> dict[str, object]:
+        """What a cell knows about its scene and a field is told: where it is and what is behind it."""
+        low, high = self.scene.bounds
+        behind = "#" + "".join(f"{round(255 * c):02x}" for c in self.scene.background)
+        return {
+            "centre_m": [float(c) for c in 0.5 * (low + high)],
+            "radius_m": float(0.5 * (high - low).max()) + 0.01,
+            "near_m": 0.3 * DISTANCE_M,
+            "contracted": False,
+            "background": behind,
+        }
+
+
+def scan(size: int = 256, raster: tuple[tuple[float, float, float], ...] = RASTER_M) -> Scan:
+    """``size`` pixels a side; five cameras a point of ``raster``."""
+    scene = make_scene("tile", {"count": 1, "width": size, "height": size})
+    lens = Pinhole.from_fov(size, size, FOV_DEG)
+    poses = [on_sphere(point, DISTANCE_M, a, e) for point in raster for a, e in ANGLES_DEG]
+    cameras = {f"scan{k:02d}": (lens, pose) for k, pose in enumerate(poses)}
+    scene = scene.with_cameras(cameras)
+    views = tuple(
+        View(name, scene.view(lens, pose).image(0.0), pose, lens) for name, (lens, pose) in cameras.items()
+    )
+    return Scan(scene, views)
+
+
+def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
+    """Distance (H, W) along the ray through every pixel's centre, inf where it meets nothing."""
+    renderer = replace(scene, params=replace(scene.params, supersample=1)).view(
+        view.intrinsics, view.camera_to_world
+    )
+    return renderer.distance()
+
+
+def truth_of(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
+    """The surface that the scan's cameras see, see ``surface.metrics``."""
+    placed = place_still(scan.scene.world.statics)
+    points, normals = [], []
+    for view in scan.views:
+        fine = view.intrinsics.scaled(_FINE)
+        origin, rays = world_rays(fine, view.camera_to_world)
+        rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
+        t, which = cast(origin, rays, placed, np.full(rays.shape[1], np.inf))
+        hit = np.flatnonzero(which >= 0)
+        met = origin[:, None] + t[hit] * rays[:, hit]
+        _, facing = surfaces(placed, which[hit], met, rays[:, hit])
+        seen = -(facing * rays[:, hit]).sum(axis=0) >= np.cos(np.deg2rad(STEEPEST_DEG))
+        first = thinned(met.T[seen], spacing_m)
+        points.append(met.T[seen][first])
+        normals.append(facing.T[seen][first])
+    every, all_normals = np.concatenate(points), np.concatenate(normals)
+    first = thinned(every, spacing_m)
+    every, all_normals = every[first], all_normals[first]
+    count = np.zeros(len(every), np.int64)
+    for view in scan.views:
+        count += _sees(view, placed, every, all_normals)
+    return Truth(every, count)
+
+
+def _sees(
+    view: View, placed: Placed, points: NDArray[np.float64], normals: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether a camera sees surface points (N, 3) with ``normals`` (N, 3)."""
+    pose, lens = view.camera_to_world, view.intrinsics
+    with np.errstate(invalid="ignore"):
+        at = lens.project((points - pose[:3, 3]) @ pose[:3, :3])
+        inside = ((at >= 0) & (at < (lens.width, lens.height))).all(axis=1)
+    ray = points - pose[:3, 3]
+    distance = np.linalg.norm(ray, axis=1)
+    ray /= distance[:, None]
+    turned = -(ray * normals).sum(axis=1) >= np.cos(np.deg2rad(STEEPEST_DEG))
+    asked = np.flatnonzero(inside & turned)
+    t, _ = cast(pose[:3, 3], np.ascontiguousarray(ray[asked].T), placed, np.full(len(asked), np.inf))
+    out = np.zeros(len(points), np.bool_)
+    out[asked] = np.abs(t - distance[asked]) <= _SAME * distance[asked]
+    return out

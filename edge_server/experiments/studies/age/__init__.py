@@ -1,0 +1,1 @@
+"""Studies of age and fidelity (thesis chapters 5 and 6)."""

@@ -1,0 +1,111 @@
+"""Equation 5.8: what the weight of timeliness does to the best threshold and the best wait."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from edge_server.experiments.studies.age.max_age import GAMMAS, QUICK_GAMMAS, RECORDED, trial_of
+from edge_server.experiments.studies.statistics import Interval, move_of_optimum, optimum
+from edge_server.experiments.studies.study import (
+    Ask,
+    Curve,
+    Point,
+    Row,
+    Table,
+    Verdict,
+    by_bool,
+    to_win,
+    with_data,
+)
+from edge_server.report.style import CYCLE, figure, label_lines
+
+# Weight of one second of age against a mean squared error of 0.01 (20 dB).
+LAMBDAS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+WAITS = (15.0, 30.0, 45.0, 60.0, 90.0, 120.0, 200.0, 300.0)
+QUICK_WAITS = (15.0, 45.0, 90.0, 150.0, 300.0)
+# Whose ages count: as (5.8) is printed, those of all cameras at the edge; or of the used views, as (6.35).
+SUMS = {"all cameras (5.8)": "age_sum_ms", "used views (6.35)": "used_age_sum_ms"}
+CLAIM = "a larger lambda buys freshness: the best omega falls (5.8)."
+
+
+class Weighing:
+    name = "lambda"
+    title = "The weight of timeliness in the objective (equation 5.8)"
+
+    def points(self, ask: Ask) -> list[Point]:
+        found = []
+        for scene in with_data(ask, ("room",), RECORDED.get):
+            for seed in ask.repeats(10, 40):
+                # The thresholds are the very trials of ``mat``: where that has been run, they are known.
+                base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5", "discipline": "drop-new"})
+                found.append(Point({"scene": scene, "policy": "all"}, base))
+                ideal = trial_of(ask, scene, seed=seed, channel={"preset": "ideal"})
+                found.append(Point({"scene": scene, "policy": "no delay"}, ideal))
+                for policy, values in (
+                    ("threshold", QUICK_GAMMAS if ask.quick else GAMMAS),
+                    ("wait", QUICK_WAITS if ask.quick else WAITS),
+                ):
+                    for omega in values:
+                        trial = dataclasses.replace(base, policy=policy, value=omega)
+                        found.append(Point({"scene": scene, "policy": policy, "omega_ms": omega}, trial))
+        return found
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        for row in table.rows:
+            row["used_age_sum_ms"] = row["aaoi_ms"] * row["views"]
+        verdicts = []
+        for scene in table.distinct("scene"):
+            best: dict[tuple[str, str], list[float]] = {}
+            for metric, where in (("psnr_moving_db", "where it moves"), ("psnr_db", "whole image")):
+                for policy in ("threshold", "wait"):
+                    for label, column in SUMS.items():
+                        curves = {w: _curve(table, scene, policy, metric, column, w) for w in LAMBDAS}
+                        if not all(curves.values()):
+                            continue
+                        found = [optimum(curve, True).x for curve in curves.values()]
+                        best[f"{policy}, {where}", label] = found
+                        _, move = move_of_optimum(curves, lower_is_better=True)
+                        told = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
+                        verdicts.append(
+                            Verdict(
+                                f"{scene}, {policy}, {where}, ages of {label}",
+                                CLAIM,
+                                f"best omega in ms by lambda {told}; it moves by {move} ms; "
+                                f"{to_win(table, metric, scene=scene)}.",
+                                by_bool(_falls(move)),
+                            )
+                        )
+            with figure(ask.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
+                at = axes[0, 0]
+                for k, ((policy, label), xs) in enumerate(best.items()):
+                    at.plot(
+                        range(len(LAMBDAS)), xs, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
+                        linestyle="-" if k < len(CYCLE) else "--", label=f"{policy}, {label}",
+                    )  # fmt: skip
+                at.set_xticks(range(len(LAMBDAS)), [f"{w:g}" for w in LAMBDAS])
+                label_lines(
+                    at, "best omega (ms)", "lambda (per 0.01 of squared error and second of age)", scene
+                )
+        return verdicts
+
+
+def _falls(move: Interval) -> bool | None:
+    """Whether the best omega falls: yes, no (it stays or rises), or the seeds do not tell."""
+    if move.high < 0.0:
+        return True
+    return False if move.low >= 0.0 else None
+
+
+def loss(row: Row, metric: str, column: str, weight: float) -> float:
+    """(5.8) for one update: squared error in units of 0.01, plus the weighted sum of ages in seconds."""
+    return float(10.0 ** (-row[metric] / 10.0) / 0.01 + weight * row[column] / 1e3)
+
+
+def _curve(table: Table, scene: str, policy: str, metric: str, column: str, weight: float) -> Curve:
+    found: Curve = {}
+    for row in table.where(scene=scene, policy=policy):
+        if row[metric] is not None and np.isfinite(row[metric]):
+            found.setdefault(float(row["omega_ms"]), {})[row["seed"]] = loss(row, metric, column, weight)
+    return found

@@ -1,0 +1,83 @@
+"""Figures 6.5 and 6.6: LPIPS and age against the number of images, cameras looking in and out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
+from edge_server.experiments.studies.drawing import draw_metrics
+from edge_server.experiments.studies.statistics import interval, negated, paired
+from edge_server.experiments.studies.study import (
+    METRICS,
+    Ask,
+    Point,
+    Table,
+    Verdict,
+    by_bool,
+    tell,
+    to_win,
+    with_data,
+)
+
+COUNTS = (2, 3, 4, 6, 8, 10, 12, 14, 16, 18)
+QUICK_COUNTS = (3, 6, 10, 14, 18)
+# Scene, the thesis's representation for it, and what it found from few to many images.
+SCENES = {
+    "room": ("nerfacto", "looking in (6.5)", "LPIPS .323 to .101, mean age 16 to 82 ms"),
+    "tower": ("splat", "looking out (6.6)", "LPIPS .472 to .214, mean age 37 to 146 ms"),
+}
+_METRICS = ("lpips", "psnr_db", "psnr_moving_db", "ssim", "aaoi_ms")
+
+
+class Images:
+    name = "images"
+    title = "Perceptual distance and age against the number of images (figures 6.5, 6.6)"
+
+    def points(self, ask: Ask) -> list[Point]:
+        found = []
+        for scene in with_data(ask, tuple(SCENES), RECORDED.get):
+            field = SCENES[scene][0] if scene in SCENES and not ask.quick else "splat"
+            for seed in ask.repeats(6, 40):
+                base = trial_of(ask, scene, seed=seed, channel={"preset": "ch5"}, field=field)
+                cameras = len(base.scenario().training)
+                found.append(Point({"scene": scene, "field": field, "policy": "all"}, base))
+                ideal = dataclasses.replace(base, channel={"preset": "ideal"})
+                found.append(Point({"scene": scene, "field": field, "policy": "no delay"}, ideal))
+                for count in [c for c in (QUICK_COUNTS if ask.quick else COUNTS) if c <= cameras]:
+                    trial = dataclasses.replace(base, policy="freshest-k", value=float(count))
+                    found.append(Point({"scene": scene, "field": field, "images": count}, trial))
+        return found
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        verdicts = []
+        for scene in table.distinct("scene"):
+            field = table.where(scene=scene)[0]["field"]
+            _, way, thesis = SCENES.get(scene, ("", "", "the same"))
+            draw_metrics(
+                ask.out / f"images-{scene}.png", table, "images", "images, the freshest", _METRICS,
+                [(field, {"scene": scene})], f"{scene}, cameras {way}",
+            )  # fmt: skip
+            for metric, rises in (
+                ("lpips", False),
+                ("psnr_db", True),
+                ("psnr_moving_db", True),
+                ("aaoi_ms", True),
+            ):
+                curve = table.curve("images", metric, scene=scene)
+                if not curve:
+                    continue
+                name, _, digits = METRICS[metric]
+                xs = list(curve)
+                change = paired(curve[xs[-1]], curve[xs[0]])
+                first, last = (interval(list(curve[x].values())).mean for x in (xs[0], xs[-1]))
+                verdicts.append(
+                    Verdict(
+                        f"{scene}, {name}",
+                        f"more images: {'higher' if rises else 'lower'} (thesis: {thesis}).",
+                        f"from {xs[0]:g} to {xs[-1]:g} images {tell(first, digits)} to {tell(last, digits)}, "
+                        f"change {tell(change.mean, digits)} [{tell(change.low, digits)}, "
+                        f"{tell(change.high, digits)}]; {to_win(table, metric, scene=scene)}.",
+                        by_bool(change.above(0.0) if rises else negated(change.above(0.0))),
+                    )
+                )
+        return verdicts

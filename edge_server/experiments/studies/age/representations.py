@@ -1,0 +1,90 @@
+"""Figure 6.7: is the trade the same whatever the representation?"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from edge_server.experiments.studies.age.max_age import trial_of
+from edge_server.experiments.studies.drawing import draw_metrics
+from edge_server.experiments.studies.statistics import optimum
+from edge_server.experiments.studies.study import (
+    LEAST,
+    METRICS,
+    Ask,
+    Point,
+    Table,
+    Verdict,
+    by_bool,
+    tell,
+    to_win,
+)
+
+OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
+QUICK_OMEGAS = (30.0, 75.0, 120.0, 240.0)
+# Steps of one update: about as long as one of splat, on two cores.
+FIELDS = {"splat": 400, "ngp": 250, "nerfacto": 150, "voxel": 60, "tensorf": 150}
+QUICK_FIELDS = {"splat": 150, "ngp": 80, "voxel": 40}
+POLICIES = ("threshold", "wait")
+_METRICS = ("psnr_db", "psnr_moving_db", "lpips", "f_w")
+
+
+class Representations:
+    name = "representations"
+    title = "Threshold and wait, by representation (figure 6.7)"
+
+    def points(self, ask: Ask) -> list[Point]:
+        found = []
+        for scene in ask.scenes or ("room",):
+            for field, steps in (QUICK_FIELDS if ask.quick else FIELDS).items():
+                for seed in ask.repeats(4, 20):
+                    base = trial_of(ask, scene, seed=seed, channel={"preset": "ch6-high"}, every_ms=2400.0)
+                    base = dataclasses.replace(base, field=field, steps=steps)
+                    ideal = dataclasses.replace(base, channel={"preset": "ideal"})
+                    labels = {"scene": scene, "field": field}
+                    found.append(Point({**labels, "policy": "all"}, base))
+                    found.append(Point({**labels, "policy": "no delay"}, ideal))
+                    for policy in POLICIES:
+                        for omega in QUICK_OMEGAS if ask.quick else OMEGAS:
+                            trial = dataclasses.replace(base, policy=policy, value=omega)
+                            found.append(Point({**labels, "policy": policy, "omega_ms": omega}, trial))
+        return found
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        verdicts = []
+        for scene in table.distinct("scene"):
+            fields = table.distinct("field")
+            for policy in POLICIES:
+                draw_metrics(
+                    ask.out / f"representations-{scene}-{policy}.png", table, "omega_ms", "omega (ms)",
+                    _METRICS,
+                    [(f, {"scene": scene, "field": f, "policy": policy}) for f in fields],
+                    f"{scene}, {policy}: from scratch",
+                )  # fmt: skip
+                for metric in _METRICS:
+                    verdicts += self._judge(table, scene, policy, metric)
+        return verdicts
+
+    def _judge(self, table: Table, scene: str, policy: str, metric: str) -> list[Verdict]:
+        name, lower, _ = METRICS[metric]
+        answers, told = [], []
+        for field in table.distinct("field"):
+            curve = table.curve("omega_ms", metric, scene=scene, field=field, policy=policy)
+            if curve:
+                best = optimum(curve, lower)
+                answers.append(best.interior(LEAST[metric]))
+                told.append(
+                    f"{field} {tell(best.x, 0)} ms{best.spread} ("
+                    f"{to_win(table, metric, scene=scene, field=field)})"
+                )
+        if not told:
+            return []
+        same = all(answers) if None not in answers else False if False in answers else None
+        return [
+            Verdict(
+                f"{scene}, {policy}, {name}",
+                "the trade shows with every representation (6.5.2).",
+                f"best omega: {', '.join(told)}; an optimum inside for "
+                f"{sum(a is True for a in answers)} of {len(answers)}.",
+                by_bool(same),
+            )
+        ]

@@ -1,0 +1,231 @@
+"""Where is there a trade at all? A map over speed, delay, memory of the field and cost of computing.
+
+The thesis does not have it. Beside every policy stands the limit, no delay at all: where it is close to
+using everything, there is nothing to win, whatever a scheduler does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.studies.age.max_age import RECORDED, trial_of
+from edge_server.experiments.studies.statistics import Interval, at_its_best, optimum, paired, share_closed
+from edge_server.experiments.studies.study import (
+    DOES_NOT_HOLD,
+    HOLDS,
+    LEAST_DB,
+    UNDECIDED,
+    Ask,
+    Point,
+    Table,
+    Verdict,
+    tell,
+    with_data,
+)
+from edge_server.report.style import figure
+
+# What a step and an update of 18 new views cost: splat at 64 x 64, warm, two cores (medians of two runs: 2.8
+# and 4.0, 66 and 93).
+CHARGED = {"ms_per_step": 3.0, "ms_per_update": 70.0}
+# What treating a view of 64 x 64 takes there.
+COST_MS = {"mask": 0.5, "freshen": 4.0}
+PERIOD_MS = 30.0
+METRIC = "psnr_moving_db"
+# Thresholds and waits tried, in mean delays after one period.
+THRESHOLDS, QUICK_THRESHOLDS = (0.5, 1.0, 2.0, 4.0), (0.75, 1.5, 3.0)
+WAITS, QUICK_WAITS = (0.5, 1.0, 2.0, 4.0), (1.0, 2.5)
+OWN = ("mask", "freshen")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A place on the map."""
+
+    scene: str
+    speed: float | None
+    delay_ms: float
+    memory: str
+    compute: str
+
+    @property
+    def labels(self) -> dict[str, Any]:
+        return {
+            "scene": self.scene, "speed_m_per_s": self.speed, "delay_ms": self.delay_ms,
+            "memory": self.memory, "compute": self.compute,
+        }  # fmt: skip
+
+    @property
+    def told(self) -> str:
+        speed = "" if self.speed is None else f" at {self.speed:g} m/s"
+        return f"{self.scene}{speed}, mean delay {self.delay_ms:g} ms, {self.memory}, compute {self.compute}"
+
+
+class Phase:
+    name = "phase"
+    title = "Where the trade between age and fidelity exists"
+
+    def points(self, ask: Ask) -> list[Point]:
+        found = []
+        for cell in self._cells(ask):
+            ours = cell.scene not in RECORDED
+            for seed in ask.repeats(4 if ours else 3, 12):
+                base = self._trial(ask, cell, seed)
+                for policy, value in self._policies(ask, cell.delay_ms):
+                    labels = {**cell.labels, "policy": policy, "omega_ms": value}
+                    trial = dataclasses.replace(base, policy=policy, value=value)
+                    if cell.compute == "charged" and policy in COST_MS:
+                        charge = {**CHARGED, "ms_per_treated_view": COST_MS[policy]}
+                        trial = dataclasses.replace(trial, compute=charge)
+                    found.append(Point(labels, trial))
+                ideal = dataclasses.replace(base, channel={"preset": "ideal"})
+                found.append(Point({**cell.labels, "policy": "no delay", "omega_ms": None}, ideal))
+        return found
+
+    def _cells(self, ask: Ask) -> Iterator[Cell]:
+        quick = ask.quick
+        for scene in with_data(ask, ("room", "kitchen", "people"), RECORDED.get):
+            ours = scene not in RECORDED
+            speeds: tuple[float | None, ...] = (None,)
+            if ours:
+                speeds = (0.5, 2.0) if quick else (0.3, 1.0, 2.0, 4.0)
+            delays: tuple[float, ...] = (60.0, 150.0) if quick else (30.0, 60.0, 120.0, 240.0)
+            if quick and not ours:
+                delays = (60.0,)
+            for speed in speeds:
+                for delay in delays:
+                    usual = delay == 60.0  # the thesis's mean; a quick pass looks at the others once
+                    if usual or not quick:
+                        yield Cell(scene, speed, delay, "scratch", "zero")
+                    yield Cell(scene, speed, delay, "warm", "zero")
+                    if not quick or (ours and usual):
+                        yield Cell(scene, speed, delay, "warm", "charged")
+                    if not quick:
+                        yield Cell(scene, speed, delay, "scratch", "charged")
+
+    def _trial(self, ask: Ask, cell: Cell, seed: int) -> Any:
+        channel = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": cell.delay_ms}}
+        more: dict[str, Any] = {"every_ms": 1500.0}
+        if cell.scene not in RECORDED:
+            more["speed_m_per_s"] = cell.speed
+        base = trial_of(ask, cell.scene, seed=seed, channel=channel, lpips=False, **more)
+        if cell.memory == "warm":
+            update: dict[str, Any] = {
+                "first_steps": 2 * base.steps,
+                "steps": base.steps // 3,
+                "settle": 2,
+                "decisions": 3,
+            }
+            base = dataclasses.replace(base, scratch=False, **update)
+        if cell.compute == "charged":
+            base = dataclasses.replace(base, compute=CHARGED)
+        return base
+
+    def _policies(self, ask: Ask, delay_ms: float) -> Iterator[tuple[str, float | None]]:
+        yield "all", None
+        for share in QUICK_THRESHOLDS if ask.quick else THRESHOLDS:
+            yield "threshold", PERIOD_MS + share * delay_ms
+        for share in QUICK_WAITS if ask.quick else WAITS:
+            yield "wait", PERIOD_MS + share * delay_ms
+        for name in OWN:
+            yield name, None
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        cells = [Cell(*key) for key in dict.fromkeys(
+            (r["scene"], r["speed_m_per_s"], r["delay_ms"], r["memory"], r["compute"]) for r in table.rows
+        )]  # fmt: skip
+        verdicts = []
+        for cell in cells:
+            for metric, name in (("psnr_moving_db", "moving pixels"), ("psnr_db", "whole image")):
+                verdicts += self._judge(table, cell, metric, name)
+        self._draw(ask, table, cells)
+        return verdicts
+
+    def _judge(self, table: Table, cell: Cell, metric: str, name: str) -> list[Verdict]:
+        best = {p: _best(table, cell, metric, p) for p in ("threshold", "wait")}
+        use_all = table.values(metric, policy="all", **cell.labels)
+        limit = table.values(metric, policy="no delay", **cell.labels)
+        gap = paired(limit, use_all)
+        if not gap.count:
+            return []
+        nothing = " (nothing to win)" if gap.above(LEAST_DB) is False else ""
+        told = [f"no delay is {gap} dB above use-all{nothing}"]
+        answers = []
+        for policy, (omega, values) in best.items():
+            gain = paired(values, use_all)
+            answers.append(gain.above(LEAST_DB))
+            told.append(f"best {policy} ({omega:g} ms) {gain}")
+        verdict = HOLDS if True in answers else DOES_NOT_HOLD if set(answers) == {False} else UNDECIDED
+        about = f"{cell.told}; {name}"
+        found = [
+            Verdict(about, "giving up stale views (threshold, wait) beats using everything.",
+                    "; ".join(told) + " dB.", verdict)
+        ]  # fmt: skip
+        for policy in OWN:
+            treated = table.values(metric, policy=policy, **cell.labels)
+            share = share_closed(treated, use_all, limit) if gap.above(0.0) else None
+            over = [paired(treated, others) for _, others in best.values()]
+            beats = [o.above(0.0) for o in over]
+            found.append(
+                Verdict(
+                    about,
+                    f"{policy} beats the best threshold and the best wait.",
+                    f"{policy} is {paired(treated, use_all)} dB above use-all, {_percent(share)}; "
+                    f"{over[0]} above the best threshold, {over[1]} above the best wait "
+                    f"(each at the best omega of the other seeds); {COST_MS[policy]:g} ms a view.",
+                    HOLDS if all(beats) else DOES_NOT_HOLD if False in beats else UNDECIDED,
+                )
+            )
+        return found
+
+    def _draw(self, ask: Ask, table: Table, cells: list[Cell]) -> None:
+        """A map a scene: speed up, delay across; colour: gain of the best policy over use-all."""
+        for scene in table.distinct("scene"):
+            mine = [c for c in cells if c.scene == scene]
+            kinds = list(dict.fromkeys((c.memory, c.compute) for c in mine))
+            with figure(ask.out / f"phase-{scene}.png", len(kinds), 1, height_inch=2.2) as (_, axes):
+                for at, kind in zip(axes[:, 0], kinds):
+                    shown = [c for c in mine if (c.memory, c.compute) == kind]
+                    self._draw_map(at, table, shown, f"{scene}, {kind[0]}, compute {kind[1]}: moving pixels")
+
+    def _draw_map(self, at: Any, table: Table, cells: list[Cell], title: str) -> None:
+        speeds = sorted({c.speed or 0.0 for c in cells})
+        delays = sorted({c.delay_ms for c in cells})
+        gains = np.full((len(speeds), len(delays)), np.nan)
+        for cell in cells:
+            i, j = speeds.index(cell.speed or 0.0), delays.index(cell.delay_ms)
+            use_all = table.values(METRIC, policy="all", **cell.labels)
+            options = {p: _best(table, cell, METRIC, p) for p in ("threshold", "wait")}
+            scored = {f"{p} {o:g} ms": paired(v, use_all).mean for p, (o, v) in options.items()}
+            scored |= {p: paired(table.values(METRIC, policy=p, **cell.labels), use_all).mean for p in OWN}
+            name = max(scored, key=lambda p: np.nan_to_num(scored[p], nan=-np.inf))
+            gains[i, j] = scored[name]
+            limit = paired(table.values(METRIC, policy="no delay", **cell.labels), use_all).mean
+            words = f"{name if scored[name] > 0 else 'use all'}\n{scored[name]:+.1f} of {limit:+.1f} dB"
+            at.text(j, i, words, ha="center", va="center", fontsize=8)
+        at.imshow(gains, cmap="PuOr", vmin=-3, vmax=3, aspect="auto", origin="lower")
+        at.grid(False)
+        at.set_xticks(range(len(delays)), [f"{d:g}" for d in delays])
+        at.set_yticks(range(len(speeds)), [f"{s:g}" if s else "own" for s in speeds])
+        at.set_xlabel("mean delay (ms)")
+        at.set_ylabel("speed (m/s)")
+        at.set_title(title)
+
+
+def _best(table: Table, cell: Cell, metric: str, policy: str) -> tuple[float, dict[int, float]]:
+    """The policy's best omega over the seeds, and its values at its best as other seeds chose it."""
+    curve = table.curve("omega_ms", metric, policy=policy, **cell.labels)
+    if not curve:
+        return float("nan"), {}
+    return optimum(curve).x, at_its_best(curve)
+
+
+def _percent(share: Interval | None) -> str:
+    if share is None or not np.isfinite(share.mean):
+        return "and no gap to close is shown"
+    low, high = tell(100 * share.low, 0), tell(100 * share.high, 0)
+    return f"{100 * share.mean:.0f} % [{low}, {high}] of the gap closed"

@@ -1,0 +1,238 @@
+"""Runs trials: one after the other, in processes of this machine, or on a Ray cluster; what is known is not
+run again.
+
+A trial's result depends on the trial and on nothing else, so who runs it and in which order makes no
+difference; a test compares the three. Results are kept in FOLDER by content: the trial, the program's own
+source and the data set. After Ctrl-C the same command goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import camera_node
+import channel_emu
+import edge_server
+import freshfield
+from edge_server.experiments.common.worker import begin
+from edge_server.experiments.studies.trial import Folders, Row, Trial, run_trial
+from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE
+from edge_server.report.machine import versions
+from freshfield.files import write_json
+
+# Trials of one task: enough to share pictures, few enough that little is lost by Ctrl-C.
+_TRIALS_A_TASK = 6
+# These do not decide a trial's result.
+_BESIDE = ("edge_server/page", "edge_server/report", "edge_server/experiments/studies")
+_DECIDES = "edge_server/experiments/studies/trial.py"
+
+
+class StudyError(RuntimeError):
+    """A study that cannot be run as asked; the message says what to change."""
+
+
+Task = list[dict[str, Any]]
+"""Trials of the same pictures, as mappings: what travels to a process or machine."""
+
+
+def run_task(task: Task, folders: Folders) -> list[Row]:
+    """The results of a task's trials, in order. This very function runs wherever trials are run."""
+    if folders.lpips is not None:
+        import torch
+
+        # How many threads share a convolution decides its last bits.
+        torch.set_num_threads(1)
+    return [run_trial(Trial(**mapping), folders) for mapping in task]
+
+
+@dataclass
+class Engine:
+    """jobs: processes; 1 runs everything in this one. ray: address of a cluster (``auto``, ``local`` or
+    host:port), instead of processes. known: results by content. say: called with each line of progress."""
+
+    folder: Path
+    folders: Folders = field(default_factory=Folders)
+    jobs: int = 1
+    ray: str | None = None
+    say: Callable[[str], None] = print
+    known: dict[str, Row] = field(default_factory=dict)
+
+    def run(self, trials: Sequence[Trial], name: str = "study") -> list[Row]:
+        """The result of each trial, in the order given. Raises StudyError; KeyboardInterrupt leaves what is
+        finished in the folder."""
+        keys = [content_key(trial, self.folders) for trial in trials]
+        wanted: dict[str, Trial] = {}
+        for key, trial in zip(keys, trials):
+            if key not in self.known and not self._load(key):
+                wanted[key] = trial
+        total, done, began = len(wanted), 0, time.monotonic()
+        if total:
+            self.say(f"{name}: {total} trials to run, {len(set(keys)) - total} known")
+        for task, results in self._results(wanted):
+            for key, result in zip(task, results):
+                self.known[key] = result
+                self._path(key).parent.mkdir(parents=True, exist_ok=True)
+                write_json(self._path(key), {"trial": wanted[key].mapping(), "result": result})
+            done += len(task)
+            spent = time.monotonic() - began
+            left = spent / done * (total - done)
+            self.say(f"{name}: {done}/{total} trials, {spent:.0f} s, {left:.0f} s left")
+        return [self.known[key] for key in keys]
+
+    def _results(self, wanted: dict[str, Trial]) -> Iterator[tuple[list[str], list[Row]]]:
+        """Each task's keys and results, as they come."""
+        tasks = _tasks(wanted)
+        sent: list[Task] = [[wanted[key].mapping() for key in task] for task in tasks]
+        if self.ray is not None and tasks:
+            yield from self._on_ray(tasks, sent)
+        elif self.jobs > 1 and len(tasks) > 1:
+            yield from self._in_processes(tasks, sent)
+        else:
+            for task, mappings in zip(tasks, sent):
+                yield task, run_task(mappings, self.folders)
+
+    def _in_processes(
+        self, tasks: list[list[str]], sent: list[Task]
+    ) -> Iterator[tuple[list[str], list[Row]]]:
+        # Fresh processes: forking one that has threads of kernels in it would hang.
+        jobs = min(self.jobs, len(tasks))
+        pool = ProcessPoolExecutor(jobs, get_context("spawn"), begin, (_threads_each(jobs),))
+        try:
+            running: dict[Future[list[Row]], list[str]] = {
+                pool.submit(run_task, mappings, self.folders): task for task, mappings in zip(tasks, sent)
+            }
+            while running:
+                finished, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    yield running.pop(future), future.result()
+        except BaseException:
+            _end_at_once(pool)
+            raise
+        pool.shutdown()
+
+    def _on_ray(self, tasks: list[list[str]], sent: list[Task]) -> Iterator[tuple[list[str], list[Row]]]:
+        try:
+            import ray
+        except ImportError:
+            raise StudyError("--ray needs Ray: pip install 'freshfield[cluster]'") from None
+        assert self.ray is not None
+        if not ray.is_initialized():
+            address = None if self.ray == "local" else self.ray
+            try:
+                ray.init(address=address, log_to_driver=False, include_dashboard=False)
+            except (ConnectionError, ValueError, RuntimeError) as error:
+                raise StudyError(f"--ray {self.ray}: no cluster can be reached: {error}") from None
+        remote = ray.remote(num_cpus=1, runtime_env={"env_vars": {THREADS_VARIABLE: "1"}})(run_task)
+        running = {remote.remote(mappings, self.folders): task for task, mappings in zip(tasks, sent)}
+        try:
+            while running:
+                finished, _ = ray.wait(list(running), num_returns=1)
+                for reference in finished:
+                    yield running.pop(reference), ray.get(reference)
+        except BaseException:
+            for reference in running:
+                ray.cancel(reference, force=True)
+            raise
+
+    def _path(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key}.json"
+
+    def _load(self, key: str) -> bool:
+        """Take a kept result; a torn or foreign file counts as none."""
+        try:
+            found = json.loads(self._path(key).read_text())["result"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+        self.known[key] = found
+        return True
+
+
+def content_key(trial: Trial, folders: Folders) -> str:
+    """What a result is kept under: the trial, the source that computes it, the data it reads."""
+    scenario = trial.scenario()
+    parts = {
+        "trial": trial.mapping(),
+        "scenario": [scenario.source, scenario.channel, scenario.edge, scenario.cameras, scenario.held_out],
+        "source": source_digest(),
+        "versions": _versions(),
+        "data": _data_digest(folders.data, scenario.source.get("data")),
+        "lpips": _weights_digest(folders.lpips) if trial.lpips else None,
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:40]
+
+
+@cache
+def source_digest() -> str:
+    """Of every Python file that can decide a trial's result."""
+    digest = hashlib.sha256()
+    for package in (freshfield, camera_node, channel_emu, edge_server):
+        root = Path(str(package.__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            name = f"{root.name}/{path.relative_to(root).as_posix()}"
+            if name == _DECIDES or not name.startswith(_BESIDE):
+                digest.update(name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def _data_digest(folder: Path | None, name: str | None) -> str | None:
+    """Of a recorded data set: names and sizes of its files, and what its small ones say."""
+    if name is None:
+        return None
+    path = Path(name) if folder is None else folder / name
+    home = path if path.is_dir() else path.parent
+    digest = hashlib.sha256()
+    for file in sorted(home.rglob("*")) if home.is_dir() else []:
+        if file.is_file():
+            size = file.stat().st_size
+            digest.update(f"{file.relative_to(home)} {size}".encode())
+            if file.suffix in (".json", ".txt") and size < 10_000_000:
+                digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+_versions = cache(versions)
+
+
+@cache
+def _weights_digest(folder: Path | None) -> str | None:
+    if folder is None or not folder.is_dir():
+        return None
+    digest = hashlib.sha256()
+    for file in sorted(folder.glob("*.npz")):
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _tasks(wanted: dict[str, Trial]) -> list[list[str]]:
+    """Keys in groups that share pictures and moments; the longest first would need a guess, so as given."""
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    for key, trial in wanted.items():
+        kind = (trial.field, json.dumps(trial.field_options, sort_keys=True))
+        groups.setdefault((*trial.stage, *kind, trial.seed), []).append(key)
+    return [
+        group[i : i + _TRIALS_A_TASK]
+        for group in groups.values()
+        for i in range(0, len(group), _TRIALS_A_TASK)
+    ]
+
+
+def _threads_each(jobs: int) -> int:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores // jobs)
+
+
+def _end_at_once(pool: ProcessPoolExecutor) -> None:
+    for process in list((pool._processes or {}).values()):
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)

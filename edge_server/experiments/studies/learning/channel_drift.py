@@ -1,0 +1,212 @@
+"""The channel changes during use: how a fixed policy, a learnt one and one that is still learning take it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.studies.learning.setup import RUNS, Lesson, School, Taught, better, room
+from edge_server.experiments.studies.study import Ask, Table, Verdict
+from edge_server.experiments.training.scheduler.choices import choose, named
+from edge_server.experiments.training.scheduler.command import OMEGAS_MS
+from edge_server.experiments.training.scheduler.episode import Moment
+from edge_server.experiments.training.scheduler.evaluation import PerSeed, rivals, write_rows
+from edge_server.experiments.training.scheduler.report import smoothed
+from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.report.style import CYCLE, figure, label_lines
+from edge_server.scheduler import Policy
+from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.state import StateLayout
+from edge_server.scheduler.online.online_policy import Apprentice, Leash
+
+EPISODES = {True: 40, False: 600}
+# Of one run, before and after the change.
+BEFORE, AFTER = 10, 60
+# Episodes whose rewards come back together: live, they come some seconds after the decisions.
+_TOGETHER = 5
+AGE = -0.003
+PRICE = 0.003
+# The nearest to the camera that rewards.
+DYING = "cam01"
+NOTHING_LOST, NOT_WITHIN = "nothing was lost", "not within the run"
+POLICIES = ("fixed", "learnt", "still learning", "learnt afterwards")
+
+Rewards = dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class Change:
+    """The channel before and after, and a camera that is gone afterwards. price: what a view takes off the
+    reward; above 0, what is learnt selects views one by one instead of choosing a threshold of age: there,
+    which cameras there are is what a decision depends on."""
+
+    before: dict[str, Any]
+    after: dict[str, Any]
+    gone: str | None = None
+    price: float = 0.0
+
+    def settings(self) -> tuple[Setting, Setting]:
+        """What decisions are made in, before and after."""
+        return room(self.before), room(self.after, silent=(self.gone,) if self.gone else ())
+
+    def course(self, school: School, episodes: int, training: int) -> Course:
+        """What is learnt of either."""
+        parts = StateLayout(("age", "pose"))
+        if self.price:
+            reward = dataclasses.replace(school.reward("set"), views=-self.price)
+            return Course(Spec("select", parts), reward, episodes, seed=training)
+        reward = dataclasses.replace(school.reward("corrected"), age=AGE)
+        return Course(
+            Spec("threshold", parts, OMEGAS_MS["threshold"]), reward, episodes, tries=3, seed=training
+        )
+
+
+def changes() -> dict[str, Change]:
+    """By name."""
+    usual = {"preset": "ch5"}
+    slow = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 200.0}}
+    return {
+        "delays three times as long": Change(usual, slow),
+        "bursts": Change(usual, {"preset": "swing"}),
+        "one camera dies": Change(usual, usual, DYING),
+        "half of the frames lost": Change(usual, {"preset": "ch5", "faults": {"loss": {"probability": 0.5}}}),
+        "the best camera dies where views cost": Change(usual, usual, DYING, PRICE),
+    }
+
+
+class Drift(Taught):
+    name = "drift"
+    title = "The channel changes during use: fixed, learnt, and still learning"
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        del table
+        found: list[Verdict] = []
+        written: list[dict[str, Any]] = []
+        with School(ask) as school:
+            known = changes()
+            for name in ask.chosen(list(known), list(known)[:1]):
+                trainings = RUNS[ask.quick]
+                each = max(1, len(ask.repeats(3, 9)) // trainings)
+                runs = [
+                    [_one_run(school, name, known[name], training, training * each + k) for k in range(each)]
+                    for training in range(trainings)
+                ]  # fmt: skip
+                found += judge(f"room, {name}", runs)
+                together = [run for of in runs for run in of]
+                _draw(ask, name, together)
+                written += [
+                    {"drift": name, "run": r, "policy": policy, "decision": k, "reward": value}
+                    for r, run in enumerate(together) for policy, values in run.items()
+                    for k, value in enumerate(values)
+                ]  # fmt: skip
+        write_rows(ask.out / f"{self.name}.csv", written)
+        return found
+
+
+def _one_run(school: School, name: str, change: Change, training: int, run: int) -> Rewards:
+    """Rewards of every decision as the reporting cameras have them, by policy: the same decisions for all."""
+    before, after = change.settings()
+    course = change.course(school, school.ask.taught(EPISODES), training)
+    reward, priced = course.reward, "priced-" * bool(change.price)
+    home = school.teach(Lesson(f"drift-before-{priced}{training}", before, course))
+    there = school.teach(Lesson(f"drift-{name.replace(' ', '-')}-{training}", after, course))
+    thresholds = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random",))
+    chosen = school.contest(before, thresholds, reward, 6, seed=7)
+    fixed = named(chosen.best_fixed("threshold")[1])
+    rng = np.random.default_rng([run, 7])
+    policies: dict[str, Policy] = {
+        "fixed": fixed(rng),
+        "learnt": Bandit(home.actor, "learnt", rng),
+        "still learning": Apprentice(
+            Learner.load(home.folder / "policy.npz"),
+            fixed(rng),
+            "still learning",
+            rng,
+            Leash(settle=0),  # as it is shipped, but for its first look at a deployment
+        ),
+        "learnt afterwards": Bandit(there.actor, "learnt afterwards", rng),
+    }
+    rewards: Rewards = {policy: [] for policy in POLICIES}
+    number = 0
+    for setting, count, first in ((before, BEFORE, 0), (after, AFTER, BEFORE)):
+        numbers = seeds(run + 1, "test", count, first)
+        for start in range(0, count, _TOGETHER):
+            part = numbers[start : start + _TOGETHER]
+            moments = [m for episode in school.crew.draw(setting, part) for m in episode]
+            for policy in POLICIES:
+                rewards[policy] += _decide(school, setting, policies[policy], moments, reward, number)
+            number += len(moments)
+    return rewards
+
+
+def _decide(
+    school: School, setting: Setting, policy: Policy, moments: list[Moment], reward: Reward, first: int
+) -> list[float]:
+    """Rewards of decisions that are numbered from ``first`` on, as the reporting cameras have them; one that
+    learns learns from those of the rewarding ones."""
+    asked = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
+
+    def totals(of: Setting) -> list[float | None]:
+        found = [reward.of(outcome) for outcome in school.crew.evaluate(of, asked)]
+        return [r.total if r.complete else None for r in found]
+
+    if isinstance(policy, Apprentice):
+        for k, total in enumerate(totals(setting)):
+            if policy.scored(first + k, total):
+                policy.learn()
+    return [np.nan if total is None else total for total in totals(setting.judged)]
+
+
+def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
+    """Over the second half of what follows the change, when there has been time to learn. runs: of each
+    training."""
+
+    def late(policy: str) -> list[PerSeed]:
+        return [{r: float(np.nanmean(_after(run[policy])[len(_after(run[policy])) // 2 :]))
+                 for r, run in enumerate(of)} for of in runs]  # fmt: skip
+
+    recovered = [recovery(run) for of in runs for run in of]
+    told = ", ".join(r if isinstance(r, str) else f"{r} decisions" for r in recovered)
+    return [
+        better(about, "one that goes on learning is better than what was learnt before the change.",
+               late("still learning"), late("learnt"),
+               f"half of what the change cost is made up after: {told} (a run each); "),
+        better(about, "and better than the fixed policy that was best before.", late("still learning"),
+               late("fixed")),
+        better(about, "what is learnt on the new channel is better than what was learnt on the old.",
+               late("learnt afterwards"), late("learnt")),
+    ]  # fmt: skip
+
+
+def recovery(run: Rewards) -> int | str:
+    """Decisions after the change until the one that learns has made up half of what the change cost the
+    learnt one, beside one learnt on the new channel; or, in words, that it cost nothing or is not made up
+    within the run."""
+    mine, old, new = (smoothed(_after(run[p]), 40) for p in ("still learning", "learnt", "learnt afterwards"))
+    lost = float(np.nanmean(new - old))
+    if not lost > 0.0:
+        return NOTHING_LOST
+    there = np.flatnonzero((mine - old >= 0.5 * lost) & (np.arange(len(mine)) >= 20))
+    return int(there[0]) if len(there) else NOT_WITHIN
+
+
+def _after(values: list[float]) -> np.ndarray:
+    return np.array(values[len(values) * BEFORE // (BEFORE + AFTER) :])
+
+
+def _draw(ask: Ask, name: str, runs: list[Rewards]) -> None:
+    with figure(ask.out / f"drift-{name.replace(' ', '-')}.png", 1, height_inch=3.2) as (_, axes):
+        at = axes[0, 0]
+        for k, policy in enumerate(POLICIES):
+            mean = np.nanmean([run[policy] for run in runs], axis=0)
+            at.plot(smoothed(mean, 40), color=CYCLE[k], label=policy)
+        at.axvline(len(mean) * BEFORE // (BEFORE + AFTER), color="#999999", linestyle=":")
+        label_lines(at, "reward, mean of 40 decisions", "decision", f"The channel changes: {name}")

@@ -1,0 +1,63 @@
+"""How much of what is best at a decision can be foreseen from the ages that are known there.
+
+That the best omega differs between decisions is no promise: hindsight knows what was still to come. A rule
+fitted to the rewards of all values, decision by decision, says what going by the ages could win; where it
+wins nothing, no learner can be blamed for finding the best fixed value and no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.experiments.studies.statistics import Interval, interval
+from edge_server.experiments.training.scheduler.episode import Moment
+from edge_server.experiments.training.scheduler.evaluation import Contest
+
+# Of the cameras' ages, as a state has them: what a rule sees.
+_QUANTILES = (0, 10, 25, 50, 75, 90, 100)
+_SCALE_MS = 100.0
+_RIDGE = 30.0
+
+
+def by_ages(contest: Contest, kind: str, moments: Sequence[Moment]) -> Interval:
+    """Reward of a rule that chooses the value of ``kind`` (wait, threshold) by the ages, minus that of the
+    best fixed value, paired over seeds. Rule and fixed value are fitted to all seeds but the one that they
+    are measured on, to all rewards at every decision: many more than a learner is ever told of."""
+    names = [name for name in contest.outcomes if name.startswith(f"{kind}:")]
+    values = {name: contest.decisions(name) for name in names}
+    known = [
+        m for m in moments
+        if m.state.reported.any() and all(values[n].get((m.seed, m.number)) is not None for n in names)
+    ]  # fmt: skip
+    if not known:
+        return interval([])
+    rewards = np.array([[values[n][m.seed, m.number] for n in names] for m in known], float)
+    features, seeds = _features(known), np.array([m.seed for m in known])
+    found: list[float | None] = []
+    for seed in np.unique(seeds) if len(np.unique(seeds)) > 1 else ():
+        here = seeds == seed
+        chosen = _rule(features[~here], rewards[~here], features[here])
+        fixed = int(rewards[~here].mean(axis=0).argmax())
+        mine = rewards[here]
+        found.append(float((mine[np.arange(len(mine)), chosen] - mine[:, fixed]).mean()))
+    return interval(found)
+
+
+def _features(moments: Sequence[Moment]) -> NDArray[np.float64]:
+    """(n, features): quantiles of the logarithms of a decision's ages, standardised, and their squares."""
+    ages = [np.maximum(m.state.ages_ms[m.state.reported], 0.0) for m in moments]
+    x = np.array([np.percentile(np.log1p(a / _SCALE_MS), _QUANTILES) for a in ages])
+    x = (x - x.mean(axis=0)) / np.maximum(x.std(axis=0), 1e-6)
+    return np.hstack([x, x**2, np.ones((len(x), 1))])
+
+
+def _rule(x: NDArray[np.float64], rewards: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The number of the value that promises most at each row of ``at``, by ridge regression of how much
+    better each value does than their mean."""
+    better = rewards - rewards.mean(axis=1, keepdims=True)
+    usual = better.mean(axis=0)
+    weights = np.linalg.solve(x.T @ x + _RIDGE * np.eye(x.shape[1]), x.T @ (better - usual))
+    return np.asarray((at @ weights + usual).argmax(axis=1), np.int64)

@@ -1,0 +1,144 @@
+"""Does it help to look at the pictures where something important moves in one part of the view, and does it
+cost nothing where nothing does?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from edge_server.experiments.studies.engine import StudyError
+from edge_server.experiments.studies.learning.setup import (
+    School,
+    Taught,
+    better,
+    embeddings_missing,
+    mean_of,
+    named_runs,
+    no_worse,
+    runs_of,
+)
+from edge_server.experiments.studies.learning.visibility import Sees, Sight, telling
+from edge_server.experiments.studies.learning.workshop import PARTS, priced, workshop
+from edge_server.experiments.studies.statistics import interval
+from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
+from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
+from edge_server.experiments.training.scheduler.evaluation import RIVALS, Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.report import span
+from edge_server.experiments.training.scheduler.setting import seeds
+from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.report.style import CYCLE, figure, label_lines
+from edge_server.scheduler.learned.learner_spec import Spec
+
+EPISODES = {True: 300, False: 1200}
+# scene -> (speed, PSNR of what). A person walks on one of four sides of the workshop, or stands there.
+SCENES = {"somebody moves": (1.0, "moving"), "nothing moves": (0.0, "whole")}
+# So many cameras are used by those that know which of them see what moves.
+KNOWING = (1, 2, 3, 4)
+
+# In the figure: name of a family of policies -> how their names begin.
+LEARNT = ("with-", "without-")
+FAMILIES = {
+    "learnt with semantics": LEARNT[0], "learnt without": LEARNT[1], "knows who sees it": "sees:",
+    "thresholds": "threshold:", "freshest k": "freshest-k:", "random": "random",
+}  # fmt: skip
+
+
+class Semantics(Taught):
+    name = "semantics"
+    title = "Where semantics help, and whether they cost anything where they do not (6.31-6.33)"
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        del table
+        if missing := embeddings_missing():
+            raise StudyError(f"{self.name}: {missing}")
+        found: list[Verdict] = []
+        written: list[dict[str, Any]] = []
+        with School(ask) as school:
+            for scene in ask.chosen(list(SCENES), list(SCENES)):
+                speed, on = SCENES[scene]
+                setting = workshop(speed)
+                reward = priced(school, on)
+                mine: dict[str, Any] = {}
+                for name, layout in (
+                    ("with", layout_of(setting, PARTS)),
+                    ("without", layout_of(setting, PARTS[1:])),
+                ):
+                    course = Course(Spec("select", layout), reward, ask.taught(EPISODES))
+                    lesson = f"{self.name}-{scene.replace(' ', '-')}-{name}"
+                    mine |= named_runs(name, school.teach_all(lesson, setting, course))
+                everybody: dict[str, Any] = {
+                    **rivals(OMEGAS_MS["threshold"], ["threshold"], RIVALS), **mine
+                }  # fmt: skip
+                count = len(ask.repeats(10, 100))
+                sight = Sight(setting)
+                if speed:
+                    everybody |= {f"sees:{k}": Sees(sight, k) for k in KNOWING}
+                contest = school.contest(setting, everybody, reward, count)
+                written += rows(contest, scene=scene)
+                found += judge(scene, contest, on == "moving")
+                if speed:
+                    moments = [m for e in school.crew.draw(setting, seeds(0, "test", count)) for m in e]
+                    found += why(scene, contest, telling(sight, moments))
+        write_rows(ask.out / f"{self.name}.csv", written)
+        draw(ask.out / f"{self.name}.png", written)
+        return found
+
+
+def judge(scene: str, contest: Contest, moves: bool) -> list[Verdict]:
+    """Whether who looks at the pictures does better than who does not; or, where nothing moves, no worse.
+    And whether either is better than the best of what does not learn."""
+    about, seeing, blind = f"tower, ch5, {scene}", runs_of(contest, "with"), runs_of(contest, "without")
+    told = ""
+    for name, runs in (("with", seeing), ("without", blind)):
+        views, won = contest.term(f"{name}-0", "views").mean, contest.share(mean_of(runs))
+        told += f"{name}: {views:.1f} views, {span(won, 2)} of the way from random to hindsight; "
+    if moves:
+        claim = "semantics help where something important moves."
+        found = [better(about, claim, seeing, blind, told)]
+    else:
+        claim = "semantics cost no more than 1 % where nothing moves."
+        found = [no_worse(about, claim, seeing, blind, contest)]
+    fixed = [n for n in contest.outcomes if not n.startswith(("with", "random", "sees"))]
+    best = max(fixed, key=lambda n: interval(list(contest.rewards(n).values())).mean)
+    return found + [
+        better(f"{about}, {name} semantics", "better than the best of all that does not learn.", runs,
+               contest.rewards(best), f"{best}, known from the very seeds; ")
+        for name, runs in (("with", seeing), ("without", blind))
+    ]  # fmt: skip
+
+
+def why(scene: str, contest: Contest, told: tuple[float, float]) -> list[Verdict]:
+    """Whether the embedding tells what is to be known, and whether who knows it could use it. told: as
+    ``telling`` has it."""
+    about, (embedding, camera) = f"tower, ch5, {scene}", told
+    knowing = [n for n in contest.outcomes if n.startswith("sees")]
+    best = max(knowing, key=lambda n: interval(list(contest.rewards(n).values())).mean)
+    return [
+        Verdict(about, "the embedding tells which cameras see what moves (better than which camera it is).",
+                f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "
+                f"to; {camera:.2f} from which camera it is.", by_bool(embedding > camera)),
+        better(about, "who knows which cameras see what moves does better than what is learnt blindly.",
+               contest.rewards(best), runs_of(contest, "without"),
+               f"{best}, the best number of them known from the very seeds; "),
+    ]  # fmt: skip
+
+
+def draw(path: Path, written: Sequence[Mapping[str, Any]]) -> None:
+    """Mean reward against views used, a panel a scene: families of policies as lines, what was learnt as
+    diamonds. No intervals: what counts are paired differences, which the verdicts have. written: rows of the
+    contests, as the table has them."""
+    scenes = list(dict.fromkeys(row["scene"] for row in written))
+    with figure(path, 1, len(scenes), height_inch=3.4) as (_, axes):
+        for at, scene in zip(axes[0], scenes):
+            known = [row for row in written if row["scene"] == scene and row.get("views")]
+            for k, (label, prefix) in enumerate(FAMILIES.items()):
+                some = sorted(
+                    (float(row["views"]), float(row["reward"]))
+                    for row in known if row["policy"].startswith(prefix)
+                )  # fmt: skip
+                style = "D" if prefix in LEARNT else ".-"
+                at.plot([v for v, _ in some], [r for _, r in some], style, color=CYCLE[k], label=label)
+            label_lines(at, "reward", "views used", scene)
+        for at in axes[0][:-1]:
+            at.get_legend().remove()

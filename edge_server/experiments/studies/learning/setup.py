@@ -1,0 +1,303 @@
+"""What studies of schedulers that learn share: settings of the room, trainings that are kept, contests.
+
+A training is a chain, not a heap of trials, so it does not go through the engine: it is kept with its
+checkpoints below OUT/training, evaluations in OUT/training/evaluations.jsonl by content, and the same command
+goes on with either.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from camera_node.config import WorldConfig, source_config
+from edge_server.experiments.studies.engine import source_digest
+from edge_server.experiments.studies.statistics import Interval, crossed, interval
+from edge_server.experiments.studies.study import Ask, Point, Verdict, by_bool
+from edge_server.experiments.studies.trial import Trial
+from edge_server.experiments.training.scheduler.command import reward_of
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Contest, PerSeed, Rival, hold
+from edge_server.experiments.training.scheduler.report import draw_curve, span
+from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.trainer import Course, Row, read_log, train
+from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.virtual.from_scenario import exact_scene
+from edge_server.scheduler import Epoch, Plan
+from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.rewards import Reward
+from freshfield.files import write_json
+
+FIELD = "splat"
+FIELD_OPTIONS = {"effort": "low"}
+SIZE = 64
+FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
+# From here what was learnt is judged; no reward has come from here and no update has seen it.
+REPORT = ("cam05", "cam08")
+# Trainings of one lesson: how differently the same lesson may be learnt is part of an interval.
+RUNS = {True: 1, False: 3}
+
+Runs = Sequence[PerSeed]
+"""Rewards by seed of each of several trainings of the same lesson."""
+
+
+class Taught:
+    """A study that trains: what it does is no heap of trials."""
+
+    def points(self, ask: Ask) -> list[Point]:
+        """None."""
+        return []
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """One training of a study. name: of its folder and in its tables."""
+
+    name: str
+    setting: Setting
+    course: Course
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """actor: what was learnt. rows: of its log. seconds: of training, wall clock, when it was trained, by
+    ``jobs`` processes. folder: with its policy.npz."""
+
+    lesson: Lesson
+    actor: Actor
+    rows: list[Row]
+    seconds: float
+    jobs: int
+    folder: Path
+
+
+def room(
+    channel: Mapping[str, Any] | str = "ch5",
+    *,
+    scene: str = "room",
+    speed_m_per_s: float = 1.0,
+    held_out: tuple[str, ...] = ("cam00",),
+    report: tuple[str, ...] = REPORT,
+    embedding: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> Setting:
+    """The usual setting: a world at 64 x 64, nineteen cameras, of which ``held_out`` reward and ``report``
+    report, and a splat field that is warm. more: of ``Setting``; ``scratch`` is the thesis's. channel: a
+    preset or a section. embedding: the section ``edge.embedding``."""
+    section = {"preset": channel} if isinstance(channel, str) else dict(channel)
+    trial = Trial(
+        scene, 0, section, size=SIZE, field=FIELD, field_options=FIELD_OPTIONS, speed_m_per_s=speed_m_per_s
+    )
+    scenario = trial.scenario()
+    apart = tuple(c for c in scenario.cameras if c in {*held_out, *report})
+    scenario = dataclasses.replace(scenario, held_out=apart)
+    if embedding is not None:
+        scenario = dataclasses.replace(scenario, edge={**scenario.edge, "embedding": dict(embedding)})
+    return Setting(scenario, report=report, **{"steps": 50 if more.get("scratch") else 20, **more})
+
+
+class Nearest:
+    """The k cameras that stand nearest to those that reward, whatever their age: what can be won by knowing
+    from where the reward comes, without looking at the state."""
+
+    name = "nearest"
+    parameter = "k"
+
+    def __init__(self, setting: Setting, k: int) -> None:
+        self.value: float | None = float(k)
+        source = cast(WorldConfig, source_config(setting.scenario))
+        scene, _ = exact_scene(setting.scenario, source)
+        stand = {camera: pose[:3, 3] for camera, (_, pose) in scene.cameras.items()}
+        watched = [stand[camera] for camera in setting.rewarding]
+        far = {
+            c: min(float(np.linalg.norm(stand[c] - w)) for w in watched) for c in setting.scenario.training
+        }
+        self._order = sorted(far, key=lambda c: far[c])
+        self._k = k
+
+    def plan(self, epoch: Epoch) -> Plan:
+        return Plan(epoch.now_ns)
+
+    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
+        near = set([c for c in self._order if c in epoch.generated_ns][: self._k])
+        return tuple(c for c in epoch.generated_ns if c in near)
+
+
+@dataclass
+class School:
+    """Trains and compares for one study; use as a context."""
+
+    ask: Ask
+    crew: Crew = field(init=False)
+    _told: bool = False
+
+    def __post_init__(self) -> None:
+        self.folder = self.ask.out / "training"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.crew = Crew(self.ask.folders, self.ask.jobs, self.folder / "evaluations.jsonl")
+
+    def __enter__(self) -> School:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.crew.__exit__(*error)
+
+    def reward(self, name: str, on: str = "whole") -> Reward:
+        """A reward of the presets; said once where its LPIPS term has to be left out."""
+        reward, missing = reward_of(name, on, self.ask.folders.lpips)
+        if missing and not self._told:
+            print(f"  {missing}")
+            self._told = True
+        return reward
+
+    def teach(self, lesson: Lesson) -> Learnt:
+        """The lesson's learner, trained now or kept; its curve is drawn to OUT/LESSON.png."""
+        folder = self.folder / f"{lesson.name}-{_digest(lesson)}"
+        by = folder / "jobs.json"
+        learner = train(
+            lesson.setting, lesson.course, self.crew, folder,
+            lambda line: print(f"  {lesson.name}: {line}", flush=True),
+        )  # fmt: skip
+        rows = read_log(folder)
+        draw_curve(self.ask.out / f"{lesson.name}.png", rows)
+        if not by.exists():
+            write_json(by, self.ask.jobs)
+        seconds = sum(row["seconds"] for row in rows)
+        return Learnt(lesson, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
+
+    def teach_all(self, name: str, setting: Setting, course: Course) -> list[Learnt]:
+        """The lesson, taught as many times as is asked for: each time other episodes, another beginning."""
+        runs = range(RUNS[self.ask.quick])
+        return [
+            self.teach(Lesson(f"{name}-{run}", setting, dataclasses.replace(course, seed=run)))
+            for run in runs
+        ]  # fmt: skip
+
+    def contest(
+        self,
+        setting: Setting,
+        everybody: Mapping[str, Rival],
+        reward: Reward,
+        count: int,
+        seed: int = 0,
+    ) -> Contest:
+        """All of ``everybody`` on ``count`` seeds that nobody trained on, judged by the cameras that report:
+        none of what they are asked is what was rewarded."""
+        return self.contest_as_rewarded(setting.judged, everybody, reward, count, seed)
+
+    def contest_as_rewarded(
+        self,
+        setting: Setting,
+        everybody: Mapping[str, Rival],
+        reward: Reward,
+        count: int,
+        seed: int = 0,
+    ) -> Contest:
+        """The same judged by the cameras that rewarded, too: beside the other, never instead of it."""
+        return hold(
+            setting, self.crew, seeds(seed, "test", count), everybody, reward,
+            lambda line: print(f"  contest: {line}", flush=True),
+        )  # fmt: skip
+
+
+def embeddings_missing() -> str | None:
+    """Why no policy can look at pictures here, in one line; None: it can."""
+    from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+
+    try:
+        make_embedder(EmbeddingConfig())
+    except EmbeddingError as error:
+        return str(error)
+    return None
+
+
+def fixed_of(contest: Contest, kind: str) -> str:
+    """The best fixed policy of a kind, in words."""
+    values, name = contest.best_fixed(kind)
+    return f"{name} {span(interval(list(values.values())))}"
+
+
+def mean_of(runs: Runs) -> PerSeed:
+    """Mean reward over several trainings of the same lesson, by seed of testing; for what is told, never for
+    an interval, which would not know how differently the same lesson is learnt."""
+    found: PerSeed = {}
+    for s in runs[0]:
+        values = [v for run in runs if (v := run[s]) is not None]
+        found[s] = sum(values) / len(runs) if len(values) == len(runs) else None
+    return found
+
+
+def named_runs(name: str, learnt: Sequence[Learnt | Actor]) -> dict[str, Actor]:
+    """The actors of several trainings of one lesson as a contest takes them."""
+    return {f"{name}-{run}": one.actor if isinstance(one, Learnt) else one for run, one in enumerate(learnt)}
+
+
+def runs_of(contest: Contest, name: str) -> Runs:
+    """Rewards of each of the trainings that ``named_runs`` called ``name``."""
+    of = [n for n in contest.outcomes if n.startswith(f"{name}-") and n[len(name) + 1 :].isdigit()]
+    return [contest.rewards(n) for n in of]
+
+
+def over(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
+    """Paired difference, over seeds and, where they are of several trainings, over those: run r of the one
+    with run r of the other, which saw the same episodes."""
+    ours, theirs = _runs(mine), _runs(other)
+    if len(theirs) == 1:
+        theirs = list(theirs) * len(ours)
+    if len(ours) == 1:
+        ours = list(ours) * len(theirs)
+    differences: list[PerSeed] = [
+        {s: None if (x := a[s]) is None or (y := b.get(s)) is None else x - y for s in a}
+        for a, b in zip(ours, theirs, strict=True)
+    ]
+    return crossed(differences)
+
+
+def _runs(values: PerSeed | Runs) -> Runs:
+    return [values] if isinstance(values, dict) else values
+
+
+def _told_of(found: Interval, runs: int) -> str:
+    """The difference for people, and what its interval is over."""
+    trainings = f"{runs} trainings and " if runs > 1 else ""
+    alone = "" if runs > 1 else " of a single training"
+    return f"difference {span(found)} over {trainings}{found.count} seeds{alone}"
+
+
+def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, found: str = "") -> Verdict:
+    """Whether ``mine`` is better than ``other``: the paired interval says."""
+    difference = over(mine, other)
+    told = _told_of(difference, len(_runs(mine)))
+    if difference.low == difference.high == 0.0:
+        return Verdict(about, claim, f"{found}{told}: it does the very same.", by_bool(False))
+    return Verdict(about, claim, f"{found}{told}.", by_bool(difference.above(0.0)))
+
+
+def no_worse(
+    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, contest: Contest, share: float = 0.01
+) -> Verdict:
+    """Whether ``mine`` loses no more than ``share`` of the size of ``other``'s mean reward, and what part
+    that is of all that could be won in the contest: a reward's zero is arbitrary, its differences are not.
+    No answer where the reward is too near its zero for a percentage."""
+    difference, base = over(mine, other), crossed(_runs(other))
+    told = f"{_told_of(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
+    if base.low <= 0.0 <= base.high:
+        return Verdict(about, claim, f"{told}no percentage: too near zero.", by_bool(None))
+    told += f"{100 * difference.mean / abs(base.mean):+.2f} %"
+    limit = over(contest.rewards(HINDSIGHT), contest.rewards("random"))
+    if limit.above(0.0):
+        told += f", and {100 * difference.mean / limit.mean:+.0f} % of the way from random to hindsight"
+    return Verdict(about, claim, f"{told}.", by_bool(difference.above(-share * abs(base.mean))))
+
+
+def _digest(lesson: Lesson) -> str:
+    """Lessons of one name and other settings stand beside each other, and so do those of other code: what
+    an earlier learner learnt must not pass for what this one does."""
+    text = source_digest() + lesson.setting.key + repr(dataclasses.asdict(lesson.course))
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

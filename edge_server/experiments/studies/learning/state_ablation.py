@@ -1,0 +1,75 @@
+"""What each part of the state is worth (6.33): age; + pose; + semantics; all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from edge_server.experiments.studies.learning.setup import (
+    FOUR_VIEWPOINTS,
+    School,
+    Taught,
+    better,
+    embeddings_missing,
+    fixed_of,
+    named_runs,
+    room,
+    runs_of,
+)
+from edge_server.experiments.studies.study import Ask, Table, Verdict
+from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
+from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.scheduler.learned.learner_spec import Spec
+
+EPISODES = {True: 100, False: 600}
+# name -> parts of the state
+VARIANTS = {
+    "age": ("age",), "age+pose": ("age", "pose"), "age+semantics": ("semantics", "age"),
+    "all": ("semantics", "age", "pose"),
+}  # fmt: skip
+
+
+class Ablation(Taught):
+    name = "ablation"
+    title = "What each part of the state is worth: age, pose, semantics (6.33)"
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        del table
+        variants = dict(VARIANTS)
+        if missing := embeddings_missing():
+            print(f"  semantics are left out: {missing}")
+            variants = {name: parts for name, parts in variants.items() if "semantics" not in parts}
+        # All see the same decisions, drawn with all that any of them looks at.
+        parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
+        setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
+        with School(ask) as school:
+            reward = school.reward("set", "moving")
+            mine: dict[str, Any] = {}
+            for name, used in variants.items():
+                spec = Spec("select", layout_of(setting, used))
+                course = Course(spec, reward, ask.taught(EPISODES))
+                learnt = school.teach_all(f"{self.name}-{name}", setting, course)
+                mine |= named_runs(f"learnt {name}", learnt)
+            everybody: dict[str, Any] = {
+                **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
+            }  # fmt: skip
+            contest = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
+        write_rows(ask.out / f"{self.name}.csv", rows(contest))
+        return judge(contest, list(variants))
+
+
+def judge(contest: Contest, variants: Sequence[str]) -> list[Verdict]:
+    """What each variant of the state is worth, by the contest of what was learnt with them."""
+    about, learnt = (
+        "room, ch5, moving, four viewpoints",
+        {n: runs_of(contest, f"learnt {n}") for n in variants},
+    )
+    best, told = contest.best_fixed("threshold")[0], fixed_of(contest, "threshold")
+    found = [better(f"{about}, {name}", "better than the best fixed threshold.", runs, best,
+                    f"against {told}; ") for name, runs in learnt.items()]  # fmt: skip
+    found += [better(f"{about}, {name}", "better than age alone.", runs, learnt["age"])
+              for name, runs in learnt.items() if name != "age"]  # fmt: skip
+    if "all" in learnt:
+        found.append(better(about, "semantics add to age and pose.", learnt["all"], learnt["age+pose"]))
+    return found

@@ -1,0 +1,79 @@
+"""Trained on one scene and channel, used on another."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from edge_server.experiments.studies.learning.setup import (
+    School,
+    Taught,
+    better,
+    fixed_of,
+    named_runs,
+    no_worse,
+    room,
+    runs_of,
+)
+from edge_server.experiments.studies.study import Ask, Table, Verdict
+from edge_server.experiments.training.scheduler.command import OMEGAS_MS
+from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.setting import Setting
+from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.state import StateLayout
+
+EPISODES = {True: 40, False: 600}
+HOME = "room, swing"
+AGE = -0.003
+
+
+def settings(quick: bool) -> dict[str, Setting]:
+    """Where policies are used; they are trained in each, and that of ``HOME`` is used in all."""
+    found = {HOME: room("swing"), "tower, swing": room("swing", scene="tower")}
+    more = {"room at 3 m/s, swing": room("swing", speed_m_per_s=3.0), "room, ch6-slow": room("ch6-slow")}
+    return found if quick else found | more
+
+
+class Transfer(Taught):
+    name = "transfer"
+    title = "Trained on one scene and channel, used on another"
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        del table
+        found: list[Verdict] = []
+        written: list[dict[str, Any]] = []
+        spec = Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
+        with School(ask) as school:
+            reward = dataclasses.replace(school.reward("corrected"), age=AGE)
+            places = settings(ask.quick)
+            course = Course(spec, reward, ask.taught(EPISODES), tries=3)
+            learnt = {
+                place: school.teach_all(
+                    f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",
+                    setting, course,
+                )
+                for place, setting in places.items()
+            }  # fmt: skip
+            for place, setting in places.items():
+                everybody: dict[str, Any] = {
+                    **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
+                    **named_runs("learnt at home", learnt[HOME]), **named_runs("learnt here", learnt[place]),
+                }  # fmt: skip
+                contest = school.contest(setting, everybody, reward, len(ask.repeats(8, 100)))
+                written += rows(contest, place=place)
+                found += judge(place, contest)
+        write_rows(ask.out / f"{self.name}.csv", written)
+        return found
+
+
+def judge(place: str, contest: Contest) -> list[Verdict]:
+    """How what was learnt at home does at a place, beside what was learnt there."""
+    home, here = runs_of(contest, "learnt at home"), runs_of(contest, "learnt here")
+    best, told = contest.best_fixed("wait")[0], fixed_of(contest, "wait")
+    found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best,
+                    f"against {told}; ")]  # fmt: skip
+    if place != HOME:
+        claim = f"learnt in {HOME}, it loses no more than 5 % to what is learnt here."
+        found.append(no_worse(place, claim, home, here, contest, 0.05))
+    return found

@@ -1,0 +1,37 @@
+"""Where it can matter to look at the pictures: a workshop in which a person walks on one of four sides, on
+which nobody knows without looking, and where a view costs something."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from edge_server.experiments.studies.learning.setup import School, room
+from edge_server.experiments.training.scheduler.setting import Setting
+from edge_server.scheduler.learned.rewards import Reward
+
+PARTS = ("semantics", "age", "pose")
+# Cameras look outward: one for each side, of those that reward and of those that judge.
+REWARDING, JUDGING = ("cam00", "cam08", "cam15", "cam16"), ("cam14", "cam11", "cam06", "cam07")
+# Of the reward, a view: with views for nothing there is nothing to choose, since no view ever harms.
+PRICE = 0.002
+# An update a second: what has moved since the last one is worth a view.
+STEPS, REFRESH_MS = 40, 900.0
+
+
+def priced(school: School, on: str) -> Reward:
+    """Of ``moving`` pixels, PSNR alone: SSIM and the distance are of the whole image, which hardly shows who
+    walks in a corner of it, so that with them whatever serves the rest of the scene is rewarded."""
+    reward = dataclasses.replace(school.reward("set", on), views=-PRICE)
+    return dataclasses.replace(reward, ssim=0.0, distance=0.0) if on == "moving" else reward
+
+
+def workshop(speed_m_per_s: float) -> Setting:
+    """The scene and how it is updated."""
+    setting = room(
+        "ch5", scene="tower", speed_m_per_s=speed_m_per_s, held_out=REWARDING, report=JUDGING, parts=PARTS,
+        steps=STEPS, refresh_ms=REFRESH_MS,
+    )  # fmt: skip
+    scenario = setting.scenario
+    params = {**scenario.source.get("params", {}), "movers": "person"}
+    source = {**scenario.source, "params": params}
+    return dataclasses.replace(setting, scenario=dataclasses.replace(scenario, source=source))

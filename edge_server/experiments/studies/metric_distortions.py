@@ -1,0 +1,125 @@
+"""Figure 3.6: what PSNR, SSIM and LPIPS say of a brightness shift, a blur and a ghost."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic import make_scene
+from edge_server.experiments.studies.drawing import draw_pictures
+from edge_server.experiments.studies.statistics import interval, negated, paired
+from edge_server.experiments.studies.study import Ask, Point, Table, Verdict, by_bool, tell
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.psnr import psnr
+from edge_server.fidelity.ssim import ssim
+
+# The thesis's table.
+THESIS = {
+    "brightness shift": (18.45, 0.8046, 0.0276),
+    "Gaussian blur": (24.99, 0.8214, 0.3234),
+    "local ghosting": (23.95, 0.9329, 0.0660),
+}
+Unit = NDArray[np.float32]
+
+
+def distortions(reference: Unit) -> dict[str, Unit]:
+    """Figure 3.6's three distortions of an image (H, W, 3) in [0, 1], each as strong as there: of its PSNR.
+
+    What SSIM and LPIPS then say can be compared; the PSNRs are alike by construction, as near as they go.
+    """
+    return {case: _as_strong(reference, case, THESIS[case][0]) for case in THESIS}
+
+
+def distorted(reference: Unit, case: str, strength: float) -> Unit:
+    """One distortion: shift of all values, blur's sigma in widths, or weight of a shifted copy."""
+    height, width = reference.shape[:2]
+    if case == "brightness shift":
+        return np.clip(reference + strength, 0.0, 1.0).astype(np.float32)
+    if case == "Gaussian blur":
+        return np.asarray(cv2.GaussianBlur(reference, (0, 0), max(strength * width, 1e-3)), np.float32)
+    rows, columns = slice(height // 4, 3 * height // 4), slice(width // 4, 3 * width // 4)
+    ghost = reference.copy()
+    copy = np.roll(reference, round(0.06 * width), axis=1)
+    ghost[rows, columns] = (1.0 - strength) * reference[rows, columns] + strength * copy[rows, columns]
+    return ghost
+
+
+# The strongest that is tried of each.
+_STRONGEST = {"brightness shift": 0.5, "Gaussian blur": 0.1, "local ghosting": 1.0}
+
+
+def _as_strong(reference: Unit, case: str, wanted_db: float) -> Unit:
+    """By bisection: PSNR falls as the strength grows."""
+    low, high = 0.0, _STRONGEST[case]
+    for _ in range(24):
+        middle = (low + high) / 2
+        reached_db = psnr(distorted(reference, case, middle), reference)
+        weak = reached_db is None or reached_db > wanted_db
+        low, high = (middle, high) if weak else (low, middle)
+    return distorted(reference, case, high)
+
+
+class Metrics:
+    name = "metrics"
+    title = "What the three metrics say of three artefacts (figure 3.6)"
+
+    def points(self, ask: Ask) -> list[Point]:
+        return []
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        lpips, missing = open_lpips(ask.folders.lpips)
+        scores: dict[str, dict[str, list[float | None]]] = {}
+        pictures: list[tuple[str, Unit]] = []
+        scene = make_scene("room", {"count": 19, "width": 192, "height": 192})
+        cameras = list(scene.cameras)
+        for seed in ask.repeats(8, 19):
+            name = cameras[seed % len(cameras)]
+            reference = scene.render(name, 0.3 * seed).astype(np.float32) / 255.0
+            for case, image in distortions(reference).items():
+                into = scores.setdefault(case, {"psnr": [], "ssim": [], "lpips": []})
+                into["psnr"].append(psnr(image, reference))
+                into["ssim"].append(ssim(image, reference))
+                if lpips is not None:
+                    into["lpips"].append(lpips(image, reference))
+            if not pictures:
+                pictures = [("reference", reference), *distortions(reference).items()]
+        shown = [(label, (image * 255).astype(np.uint8)) for label, image in pictures]
+        draw_pictures(ask.out / "metrics.png", [("room", shown)])
+        lines = ["case,psnr_db,ssim,lpips,seeds"]
+        for case, found in scores.items():
+            means = [tell(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips")]
+            lines.append(f"{case},{','.join(means)},{len(found['psnr'])}")
+        (ask.out / "metrics.csv").write_text("\n".join(lines) + "\n")
+        verdicts = [
+            self._ordering(scores, "ssim", "lowest for the brightness shift", "brightness shift", True),
+            self._ordering(scores, "ssim", "highest for ghosting, against the prose",
+                           "local ghosting", False),
+        ]  # fmt: skip
+        if missing:
+            print(f"  LPIPS is left out: {missing}")
+            return verdicts
+        order = [scores[c]["lpips"] for c in ("brightness shift", "local ghosting", "Gaussian blur")]
+        steps = [paired(dict(enumerate(b)), dict(enumerate(a))).above(0.0) for a, b in pairwise(order)]
+        rising = False if False in steps else None if None in steps else True
+        told = ", ".join(f"{interval(values).mean:.3f}" for values in order)
+        verdicts.append(
+            Verdict(
+                "LPIPS",
+                "brightness shift < ghosting < blur (figure 3.6's table).",
+                told + ".",
+                by_bool(rising),
+            )
+        )
+        return verdicts
+
+    def _ordering(self, scores: dict, metric: str, claim: str, case: str, lowest: bool) -> Verdict:
+        mine = scores[case][metric]
+        others = [v[metric] for c, v in scores.items() if c != case]
+        gaps = [paired(dict(enumerate(other)), dict(enumerate(mine))) for other in others]
+        answers = [g.above(0.0) if lowest else negated(g.above(0.0)) for g in gaps]
+        answer = False if False in answers else None if None in answers else True
+        told = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
+        return Verdict(metric.upper(), f"{claim} (figure 3.6's table).", told + ".", by_bool(answer))

@@ -1,0 +1,218 @@
+"""What every study is made of: points (labels and a trial), their results as a table, and verdicts."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from edge_server.experiments.studies.engine import Engine, StudyError
+from edge_server.experiments.studies.statistics import Interval, interval, paired
+from edge_server.experiments.studies.trial import Folders, Row, Trial
+from freshfield.files import write_text
+
+HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
+# metric -> (label of an axis, lower is better, digits)
+METRICS: dict[str, tuple[str, bool, int]] = {
+    "psnr_db": ("PSNR (dB)", False, 2),
+    "psnr_moving_db": ("PSNR, moving pixels (dB)", False, 2),
+    "ssim": ("SSIM", False, 3),
+    "lpips": ("LPIPS", True, 3),
+    "aaoi_ms": ("mean age of used views (ms)", True, 1),
+    "f_w": ("F_w (6.37)", True, 3),
+}
+# Differences in PSNR below this are not worth a claim; nor are these of the other metrics.
+LEAST_DB = 0.1
+LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips": 0.002, "f_w": 0.01}
+
+Curve = dict[float, dict[int, float | None]]
+
+
+@dataclass(frozen=True)
+class Ask:
+    """What was asked for; None, or no case, takes the study's own. seeds: repetitions of every point. scenes:
+    of those whose data are here. Of studies that train, jobs: processes; cases: words in the names of those
+    that are wanted; episodes: of one training."""
+
+    quick: bool
+    out: Path
+    folders: Folders
+    seeds: int | None = None
+    scenes: tuple[str, ...] | None = None
+    jobs: int = 1
+    cases: tuple[str, ...] = ()
+    episodes: int | None = None
+
+    def chosen(self, cases: Sequence[str], quick: Sequence[str]) -> list[str]:
+        """Of a study's ``cases``, those that were asked for; of a quick pass that asked for none, ``quick``.
+        StudyError for one that there is not."""
+        if not self.cases:
+            return list(quick if self.quick else cases)
+        if unknown := [word for word in self.cases if not any(word in case for case in cases)]:
+            raise StudyError(
+                f"--case: none has {', '.join(map(repr, unknown))} in its name; there are: {'; '.join(cases)}"
+            )
+        return [case for case in cases if any(word in case for word in self.cases)]
+
+    def taught(self, episodes: Mapping[bool, int]) -> int:
+        """Episodes of one training. episodes: the study's own, by whether it is a quick pass."""
+        return self.episodes or episodes[self.quick]
+
+    def repeats(self, quick: int, full: int) -> range:
+        return range(self.seeds or (quick if self.quick else full))
+
+    def pictured(self) -> dict[str, Any]:
+        """Size of pictures and steps of a fit."""
+        return {"size": 64, "steps": 150} if self.quick else {"size": 128, "steps": 400}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The thesis's claim, what was found here, and whether it holds. about: scene and setting, short."""
+
+    about: str
+    claim: str
+    found: str
+    verdict: str
+
+    def line(self) -> str:
+        return f"[{self.verdict}] {self.about}: {self.claim} Found: {self.found}"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A trial and what a table calls it."""
+
+    labels: Row
+    trial: Trial
+
+
+@dataclass
+class Table:
+    """Points with their results, in the order of the points."""
+
+    points: list[Point]
+    results: list[Row]
+    rows: list[Row] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.rows = [
+            {**p.labels, "seed": p.trial.seed, **r, "f_w": objective(r)}
+            for p, r in zip(self.points, self.results)
+        ]
+
+    def where(self, **labels: Any) -> list[Row]:
+        """Rows that carry all the given labels."""
+        return [row for row in self.rows if all(row.get(k) == v for k, v in labels.items())]
+
+    def values(self, metric: str, **labels: Any) -> dict[int, float | None]:
+        """seed -> value of the one point that the labels leave."""
+        return {row["seed"]: row[metric] for row in self.where(**labels)}
+
+    def curve(self, x: str, metric: str, **labels: Any) -> Curve:
+        """x -> seed -> value, for the points that have an x and, somewhere, a value."""
+        found: Curve = {}
+        for row in self.where(**labels):
+            if row.get(x) is not None:
+                found.setdefault(float(row[x]), {})[row["seed"]] = row[metric]
+        return {k: v for k, v in sorted(found.items()) if any(y is not None for y in v.values())}
+
+    def distinct(self, label: str) -> list[Any]:
+        """The label's values in order of appearance."""
+        return list(dict.fromkeys(row[label] for row in self.rows if row.get(label) is not None))
+
+    def write_csv(self, path: Path) -> None:
+        names = list(dict.fromkeys(name for row in self.rows for name in row))
+        with path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, names, restval="")
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+
+class Study(Protocol):
+    """One study. name: of the command. title: one line for people."""
+
+    name: str
+    title: str
+
+    def points(self, ask: Ask) -> list[Point]: ...
+
+    def report(self, ask: Ask, table: Table) -> list[Verdict]:
+        """Draw the figures into ``ask.out`` and judge the claims."""
+        ...
+
+
+def run_study(study: Study, ask: Ask, engine: Engine) -> list[Verdict]:
+    """Run what is missing, write OUT/NAME.csv, figures and OUT/NAME.md, return the verdicts."""
+    ask.out.mkdir(parents=True, exist_ok=True)
+    points = study.points(ask)
+    table = Table(points, engine.run([p.trial for p in points], study.name))
+    if table.rows:
+        table.write_csv(ask.out / f"{study.name}.csv")
+    verdicts = study.report(ask, table)
+    text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
+    write_text(ask.out / f"{study.name}.md", text)
+    return verdicts
+
+
+def objective(
+    row: Row, w_p: float = -0.02, w_s: float = 0.2, w_l: float = 0.3, w_t: float = 0.015
+) -> float | None:
+    """F_w of (6.36) and (6.37), smaller is better; ages in slots of 1 ms. None where a metric is missing.
+
+    The weights are the thesis's (6.5): its w_s = +0.2 counts a better SSIM as worse; -0.2 is what the text
+    means.
+    """
+    needed = (row.get("psnr_db"), row.get("ssim"), row.get("lpips"), row.get("aaoi_ms"))
+    if any(v is None for v in needed):
+        return None
+    psnr, ssim, lpips, age = (float(v) for v in needed)  # type: ignore[arg-type]
+    return w_p * psnr + w_s * ssim + w_l * lpips + w_t * age
+
+
+def to_win(table: Table, metric: str, **labels: Any) -> str:
+    """How much better no delay at all is than using everything, in words: what any scheduler could win."""
+    kept = {k: v for k, v in labels.items() if k in ("scene", "field")}
+    use_all = table.values(metric, policy="all", **labels)
+    limit = table.values(metric, policy="no delay", **kept)
+    _, lower, digits = METRICS[metric]
+    gap = paired(use_all, limit) if lower else paired(limit, use_all)
+    if metric == "aaoi_ms":
+        return f"with no delay it is {tell(interval(list(limit.values())).mean, digits)}"
+    nothing = " (nothing to win)" if gap.above(LEAST[metric]) is False else ""
+    return (
+        f"no delay at all is {tell(gap.mean, digits)} [{tell(gap.low, digits)}, {tell(gap.high, digits)}] "
+        f"better than use-all{nothing}"
+    )
+
+
+def mean_curve(curve: Curve) -> tuple[list[float], list[Interval]]:
+    """Points and intervals of a curve, as a plot takes them."""
+    return list(curve), [interval(list(values.values())) for values in curve.values()]
+
+
+def tell(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def by_bool(answer: bool | None) -> str:
+    """A verdict from yes, no, cannot be told."""
+    return UNDECIDED if answer is None else HOLDS if answer else DOES_NOT_HOLD
+
+
+def with_data(ask: Ask, scenes: Sequence[str], needs: Callable[[str], str | None]) -> list[str]:
+    """Of ``scenes``, those asked for and there. needs: the file below the data folder, None: none."""
+    wanted = [s for s in (ask.scenes or scenes)]
+    found = []
+    for scene in wanted:
+        file = needs(scene)
+        if file is None or (ask.folders.data is not None and (ask.folders.data / file).exists()):
+            found.append(scene)
+        else:
+            print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
+    if not found:
+        raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
+    return found

@@ -1,0 +1,259 @@
+"""One trial of a study: a deployment in virtual time under one policy, channel and seed.
+
+A trial is plain values, so that it can be hashed, sent to another process or machine, and repeated bit for
+bit: the seed is in it, and nothing else decides. Trials that differ in their policy only decide at the same
+instants on the same deliveries, so their differences are paired.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.capture import Camera
+from camera_node.config import source_config
+from edge_server.config import read_config
+from edge_server.experiments.virtual.from_scenario import deploy, training_cameras, truth_of
+from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, Truth, VirtualDeployment
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import Score, Scorer
+from edge_server.live.state import Publication
+from freshfield.scenario import Scenario, ScenarioError, load, parse
+
+# Scenes of ours are captured at the thesis's period of 30 ms.
+WORLD_FPS = 100 / 3
+SCENARIOS = {"room": "room19", "tile": "tile", "tower": "tower", "kitchen": "kitchen", "people": "people"}
+# Decision instants of one seed come this much after those of the one before: not whole frames, so that seeds
+# meet the captures at every phase.
+_STAGGER_MS = 217.0
+_TRUTHS_KEPT = 4096
+_MOMENT_S = 1e-6
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """scene: a key of ``SCENARIOS``. size: width and height of a world's pictures; recordings are divided by
+    ``scale``. channel: the section of a scenario. steps: of the optimiser for one update. scratch: every
+    update begins with nothing (the thesis); else the field is warm: it keeps what it knows, and the first
+    update has ``first_steps``. compute: ms_per_step and ms_per_update charged; none as in the thesis.
+    decisions: how many are scored, every ``every_ms``; of a warm field the first ``settle`` are not."""
+
+    scene: str
+    seed: int
+    channel: dict[str, Any]
+    policy: str = "all"
+    value: float | None = None
+    size: int = 64
+    scale: float = 1.0
+    cameras: int = 19
+    speed_m_per_s: float | None = 1.0
+    field: str = "splat"
+    field_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    steps: int = 200
+    scratch: bool = True
+    first_steps: int = 0
+    compute: dict[str, float] = dataclasses.field(default_factory=dict)
+    decisions: int = 1
+    settle: int = 0
+    every_ms: float = 900.0
+    lpips: bool = True
+
+    @property
+    def stage(self) -> tuple[Any, ...]:
+        """What decides the pictures: trials of one stage share what was rendered and decoded."""
+        return (self.scene, self.size, self.scale, self.cameras, self.speed_m_per_s)
+
+    @property
+    def first_ms(self) -> float:
+        """Instant of the first decision."""
+        return 900.0 + _STAGGER_MS * (self.seed % 64)
+
+    def mapping(self) -> Row:
+        return dataclasses.asdict(self)
+
+    def scenario(self) -> Scenario:
+        """The deployment as a scenario. Raises ScenarioError."""
+        shipped = load(SCENARIOS.get(self.scene, self.scene), self.seed)
+        source, edge = dict(shipped.source), dict(shipped.edge)
+        cameras: Row = {"ids": list(shipped.cameras), "held_out": list(shipped.held_out)}
+        if source.get("kind") == "world":
+            source |= {"width": self.size, "height": self.size, "fps": WORLD_FPS}
+            if self.speed_m_per_s is not None:
+                source["speed_m_per_s"] = self.speed_m_per_s
+            cameras = {"count": self.cameras, "held_out": ["cam00"]}
+        elif self.scale != 1.0:
+            source["scale"] = self.scale * source.get("scale", 1.0)
+        edge = {
+            "field": self.field, "field_options": self.field_options,
+            "policy": {"name": self.policy, "value": self.value},
+            "noisy_truth": edge.get("noisy_truth", False), "lpips": edge.get("lpips", "alex"),
+        }  # fmt: skip
+        data = {
+            "name": self.scene, "seed": self.seed, "cameras": cameras, "source": source,
+            "channel": self.channel, "edge": edge,
+        }  # fmt: skip
+        return parse(data, Path(f"study {self.scene}"))
+
+    def terms(self) -> Terms:
+        first_ms = self.first_ms
+        return Terms(
+            steps=self.steps,
+            first_steps=self.first_steps,
+            compute=Compute(**self.compute),
+            epoch_ms=self.every_ms,
+            grace_ms=0.0,
+            first_ms=first_ms,
+            scratch=self.scratch,
+        )
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where a machine has what is not in the repository. data: recorded data sets. lpips: weights."""
+
+    data: Path | None = None
+    lpips: Path | None = None
+
+
+@dataclass
+class Stage:
+    """What trials of the same pictures share."""
+
+    cameras: list[Camera]
+    truth: Truth | None
+
+
+class KnownTruth:
+    """A truth whose picture at an instant is scored against again and again."""
+
+    def __init__(self, truth: Any) -> None:
+        self._truth = truth
+        if hasattr(truth, "image"):  # exact: an analytic scene is rendered for every instant
+            self._truth = dataclasses.replace(truth, image=lru_cache(_TRUTHS_KEPT)(truth.image))
+
+    def view(self, camera: str, present_ns: int) -> tuple[Any, Any, Any]:
+        found: tuple[Any, Any, Any] = self._truth.view(camera, present_ns)
+        return found
+
+    def score(self, field: Any, present_ns: int) -> Score | None:
+        found: Score | None = self._truth.score(field, present_ns)
+        return found
+
+
+def run_trial(trial: Trial, folders: Folders) -> Row:
+    """Means over the trial's decisions: psnr_db, psnr_moving_db, ssim, lpips (None where there are none),
+    views, aaoi_ms (6.35: of the selected views at the present), age_sum_ms (5.8: of all cameras), wait_ms
+    (from decision to publication) and decisions. Raises ScenarioError or DatasetError."""
+    rows: list[Row] = []
+    deployment: VirtualDeployment = _deploy(trial, folders, lambda p: rows.append(_row(p, deployment)))
+    _finish(deployment, trial)
+    kept = rows[trial.settle : trial.settle + trial.decisions]
+    if not kept:
+        raise ScenarioError(f"study {trial.scene}: no update was published; does a frame ever arrive?")
+    names = [n for n in kept[0] if n != "decisions"]
+    return {**{n: _mean([row[n] for row in kept]) for n in names}, "decisions": len(kept)}
+
+
+def picture(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Row]:
+    """(truth, rendering, figures) of the trial's last decision on the held-out camera, uint8 (H, W, 3)."""
+    found: list[tuple[NDArray[np.uint8], NDArray[np.uint8], Row]] = []
+
+    def look(publication: Publication) -> None:
+        truth, shown = _shown(trial, deployment, publication.published_ns)
+        found.append((truth, shown, _row(publication, deployment)))
+
+    deployment = _deploy(trial, folders, look)
+    _finish(deployment, trial)
+    return found[-1]
+
+
+def _deploy(trial: Trial, folders: Folders, on_published: Any) -> VirtualDeployment:
+    scenario = trial.scenario()
+    stage = _stage(json.dumps(trial.stage), trial, folders)
+    deployment = deploy(
+        scenario, trial.terms(), field=_field(trial), cameras=stage.cameras, data=folders.data,
+        on_published=on_published, truth=stage.truth,
+    )  # fmt: skip
+    return deployment
+
+
+def _finish(deployment: VirtualDeployment, trial: Trial) -> None:
+    """Run until the last decision has been published, however long its policy waits."""
+    wanted = trial.settle + trial.decisions
+    # Up to just before the decision after the first, or an update would be made that nobody looks at.
+    deployment.run((trial.first_ms + trial.every_ms) / 1e3 - _MOMENT_S)
+    for _ in range(4 * wanted + 16):
+        if len(deployment.publications) >= wanted:
+            return
+        deployment.run(trial.every_ms / 1e3)
+
+
+def _row(publication: Publication, deployment: VirtualDeployment) -> Row:
+    ages = deployment.updates.buffer.ages_ms(publication.published_ns)
+    return {
+        "psnr_db": publication.psnr_db,
+        "psnr_moving_db": publication.psnr_moving_db,
+        "ssim": publication.ssim,
+        "lpips": publication.lpips,
+        "views": float(len(publication.selected)),
+        "aaoi_ms": publication.aaoi_ms,
+        "age_sum_ms": float(sum(a for a in ages.values() if a is not None)),
+        "wait_ms": (publication.published_ns - deployment.decided_ns) / 1e6,
+        "decisions": 1,
+    }
+
+
+# A process keeps a few stages: trials come grouped by their pictures.
+_STAGES: dict[tuple[str, Folders, bool], Stage] = {}
+_FIELDS: dict[str, Any] = {}
+
+
+def _stage(key: str, trial: Trial, folders: Folders) -> Stage:
+    at = (key, folders, trial.lpips)
+    if at not in _STAGES:
+        while len(_STAGES) >= 4:
+            _STAGES.pop(next(iter(_STAGES)))
+        scenario = trial.scenario()
+        lpips = open_lpips(folders.lpips)[0] if trial.lpips else None
+        edge = read_config(scenario)
+        truth = truth_of(scenario, source_config(scenario), edge, Scorer(lpips), folders.data)
+        _STAGES[at] = Stage(training_cameras(scenario, folders.data), truth and KnownTruth(truth))
+    return _STAGES[at]
+
+
+def _field(trial: Trial) -> Any:
+    """A field as new, of the trial's settings and seed: made once a process, for its kernels and memory."""
+    from edge_server.fields.registry import make_field
+
+    key = json.dumps([trial.field, trial.field_options], sort_keys=True)
+    if key not in _FIELDS:
+        _FIELDS.clear()
+        _FIELDS[key] = make_field(trial.field, trial.field_options, seed=0)
+    made = _FIELDS[key]
+    made.reset()
+    return made
+
+
+def _shown(
+    trial: Trial, deployment: VirtualDeployment, present_ns: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """The held-out camera's truth and what the field shows of it."""
+    if deployment.truth is None:
+        raise ScenarioError(f"study {trial.scene}: no camera is held out, so there is nothing to show")
+    image, lens, pose = deployment.truth.view(trial.scenario().held_out[0], present_ns)
+    color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
+    return image, np.clip(color * 255.0 + 0.5, 0, 255).astype(np.uint8)
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,1 @@
+"""Training of schedulers and of the detector."""

@@ -1,0 +1,112 @@
+"""Renders the detector's pictures once, in shards that are kept, so that an interrupted run goes on."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic.scene import make_scene
+from edge_server.experiments.common.progress import Progress
+from edge_server.experiments.training.detector.scenes import Boxes, own_rig, scene_of, variation
+
+SHARD_SHOTS = 20
+INSTANTS = 8
+# Of the shipped scenes, whose cameras are never trained on: every third camera at four instants.
+RIG_CAMERAS = tuple(f"cam{k:02d}" for k in range(0, 19, 3))
+RIG_INSTANTS_S = (0.0, 0.7, 1.6, 2.5)
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """images (n, side, side, 3) uint8; boxes: of each image (m, 5), see scenes.Boxes."""
+
+    images: NDArray[np.uint8]
+    boxes: list[Boxes]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers: int) -> Pictures:
+    """``INSTANTS`` pictures of each of ``shots`` variations, from ``folder`` where they are there already."""
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = [
+        (
+            purpose,
+            seed,
+            first,
+            min(SHARD_SHOTS, shots - first),
+            side,
+            _shard(folder, purpose, seed, first, side),
+        )
+        for first in range(0, shots, SHARD_SHOTS)
+    ]
+    missing = [job for job in jobs if _load(job[-1]) is None]
+    if missing:
+        progress = Progress(len(missing))
+        # Spawned, because torch's threads do not survive a fork.
+        import multiprocessing
+
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+            for job, _ in zip(missing, pool.map(_render_shard, missing)):
+                progress.did(1)
+                progress.say(f"{purpose} pictures", f"{job[2] + job[3]} of {shots} worlds", "rendered")
+    found = [_load(job[-1]) for job in jobs]
+    return joined([part for part in found if part is not None])
+
+
+def scenes_of(purpose: str, shots: int, seed: int) -> list[str]:
+    """The shipped scene that each picture of ``render`` is a variation of."""
+    return [scene_of(_seed(seed, k), purpose) for k in range(shots) for _ in range(INSTANTS)]
+
+
+def of_own_rigs(side: int) -> dict[str, Pictures]:
+    """The shipped scenes through some of their own cameras."""
+    return {
+        name: joined([Pictures(*own_rig(name, c, side).take(instants)) for c in RIG_CAMERAS])
+        for name in ("room", "tower", "tile")
+        for instants in [RIG_INSTANTS_S if make_scene(name, {"count": 1}).moving else RIG_INSTANTS_S[:1]]
+    }
+
+
+def joined(parts: list[Pictures]) -> Pictures:
+    """Several sets as one."""
+    return Pictures(np.concatenate([p.images for p in parts]), [b for p in parts for b in p.boxes])
+
+
+def _shard(folder: Path, purpose: str, seed: int, first: int, side: int) -> Path:
+    return folder / f"{purpose}-{side}-{seed}-{first:04d}.npz"
+
+
+def _render_shard(job: tuple[str, int, int, int, int, Path]) -> None:
+    purpose, seed, first, shots, side, path = job
+    parts = []
+    for k in range(first, first + shots):
+        shot, rng = variation(_seed(seed, k), purpose, side)
+        parts.append(Pictures(*shot.take(list(rng.uniform(0.0, 12.0, INSTANTS)))))
+    whole = joined(parts)
+    counts = [len(b) for b in whole.boxes]
+    part = path.with_suffix(f".{os.getpid()}.part")
+    with part.open("wb") as file:
+        np.savez(file, images=whole.images, counts=counts, boxes=np.concatenate(whole.boxes))
+    part.replace(path)  # whole or not there: Ctrl-C leaves no half shard
+
+
+def _seed(seed: int, number: int) -> int:
+    """Of a set's variation of this number."""
+    return seed * 1_000_003 + number
+
+
+def _load(path: Path) -> Pictures | None:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            ends = np.cumsum(archive["counts"])[:-1]
+            return Pictures(archive["images"], list(np.split(archive["boxes"], ends)))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

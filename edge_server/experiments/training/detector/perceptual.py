@@ -1,0 +1,251 @@
+"""``edge-server train-perceptual``: fits the stand-in for LPIPS to real LPIPS; says how well it follows."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.embed import MODELS, EmbeddingError
+from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
+from edge_server.fidelity.perceptual import COEFFICIENTS, DETECTOR, Layers, Perceptual, save_coefficients
+
+Array = NDArray[np.float64]
+
+DESCRIPTION = """\
+Fit the perceptual distance of the shipped detector's backbone (thesis 3.34, 3.35) to real LPIPS.
+
+  edge-server train-perceptual --lpips ~/data/lpips --out runs/perceptual
+
+Renderings of our own scenes are distorted in ten ways (blur, noise, JPEG, exposure, stale, ghost, coarse,
+displaced, floaters, warped) at random strength; weights that are not negative and a power are fitted to what
+LPIPS says of them, and the rank correlation with LPIPS is measured on variations that were not fitted to,
+and on what a field of ours renders of the shipped scenes while it learns. All of these are room, tower or
+tile; for a scene of another kind look at what is found with one scene left out of the fit altogether. Needs
+the weights of LPIPS; whoever uses the distance does not. In OUT: perceptual.npz and perceptual.json.
+"""
+# The power's range, and where its search starts.
+POWERS, _START = (0.3, 2.0), 0.7
+# Added to distances within the fit, whose logarithm is taken: a thousandth of the smallest that matter.
+_NEAR = 1e-6
+TRIES = 5  # distortions of each picture
+UNSEEN = "unseen variations"
+_PART = 32
+_TOLD_EVERY = 20  # parts
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    try:
+        told = run(args)
+    except (EmbeddingError, FitFailed) as error:
+        print(f"edge-server train-perceptual: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        print(
+            f"edge-server train-perceptual needs {error.name}: pip install 'freshfield[edge,embed]'",
+            file=sys.stderr,
+        )
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nstopped; the same command goes on with the pictures in {args.out}", flush=True)
+        return 130
+    print(json.dumps(told) if args.json else show(told))
+    return 0
+
+
+class FitFailed(ValueError):
+    """Nothing to fit to; the message says what is missing."""
+
+
+def run(args: argparse.Namespace) -> dict[str, Any]:
+    """Render, distort, fit, measure, write; returns what perceptual.json holds."""
+    from edge_server.experiments.common.progress import Progress
+    from edge_server.experiments.training.detector.dataset import Pictures, of_own_rigs, render, scenes_of
+    from edge_server.experiments.training.detector.network import LAYERS
+    from edge_server.experiments.training.detector.renderings import field_renderings
+    from freshfield.files import write_json
+
+    lpips, missing = open_lpips(weights_folder(args.lpips), "alex")
+    if lpips is None:
+        raise FitFailed(f"real LPIPS is what is fitted to: {missing}")
+    args.out.mkdir(parents=True, exist_ok=True)
+    layers = Layers(args.detector, tuple(f"model.{k}" for k in LAYERS))
+    worlds, held = (8, 3) if args.quick else (args.worlds, 20)
+
+    def distort(pictures: Pictures, purpose: str) -> tuple[NDArray[np.uint8], list[str]]:
+        return pairs_of(pictures.images, np.random.default_rng([args.seed, *purpose.encode()]))
+
+    def compare(pairs: NDArray[np.uint8], name: str) -> tuple[Array, Array]:
+        """Differences (n, D) and LPIPS (n,)."""
+        progress = Progress(len(pairs))
+        x, y = [], []
+        for first in range(0, len(pairs), _PART):
+            shown, truth = (p[first : first + _PART] / 255.0 for p in (pairs[:, 0], pairs[:, 1]))
+            x.append(layers.differences(shown, truth))
+            y.append(lpips.batch(shown, truth))
+            progress.did(len(shown))
+            if first // _PART % _TOLD_EVERY == _TOLD_EVERY - 1:
+                progress.say(name, f"{first + len(shown)} of {len(pairs)} pairs", "compared")
+        return np.concatenate(x), np.concatenate(y)
+
+    folder = args.out / "pictures"
+    known = render("perceptual", worlds, args.side, args.seed, folder, args.workers)
+    x, y = compare(distort(known, "perceptual")[0], "fit")
+    weights, power = fit(x, y)
+    unseen = render("perceptual-held-out", held, args.side, args.seed, folder, args.workers)
+    tests = {UNSEEN: distort(unseen, "unseen worlds")}
+    for name, pictures in of_own_rigs(args.side).items():
+        tests[f"own rig of {name}"] = distort(pictures, name)
+    tests["field renderings"] = field_renderings(args.side, args.seed)
+    rank, by_scene = {}, [Compared(x, y, scenes_of("perceptual", worlds, args.seed))]
+    for name, (pairs, names) in tests.items():
+        xt, yt = compare(pairs, name)
+        rank[name] = correlation((xt @ weights) ** power, yt, names)
+        if name == UNSEEN:
+            by_scene.append(Compared(xt, yt, scenes_of("perceptual-held-out", held, args.seed)))
+    split = np.split(weights, np.cumsum(layers.widths())[:-1])
+    taps = tuple(layers.taps)
+    Perceptual(layers, split, power)  # what is written can be read
+    save_coefficients(args.out / COEFFICIENTS, taps, split, power)
+    told = {
+        "fitted_to": f"LPIPS-{lpips.network}", "pairs": len(y), "power": power, "seed": args.seed,
+        "share_by_layer": {
+            tap: round(float((x[:, part] @ weights[part]).sum() / (x @ weights).sum()), 3)
+            for tap, part in zip(taps, _slices(layers.widths()))
+        },
+        "channels_used": int((weights > 0).sum()), "channels": len(weights), "unseen": rank,
+        "scene_left_out_of_the_fit": left_out(by_scene),
+    }  # fmt: skip
+    write_json(args.out / "perceptual.json", told, indent=1)
+    return told
+
+
+def pairs_of(images: NDArray[np.uint8], rng: np.random.Generator) -> tuple[NDArray[np.uint8], list[str]]:
+    """(n, 2, H, W, 3): what is shown and what is true, and how each was distorted. Neighbours in ``images``
+    are other instants of the same view."""
+    from edge_server.experiments.training.detector.distortions import distorted
+
+    pairs, names = [], []
+    for k, image in enumerate(images):
+        other = images[k ^ 1] if k ^ 1 < len(images) else images[k]
+        for _ in range(TRIES):
+            shown, name = distorted(image, other, rng)
+            pairs.append((shown, image))
+            names.append(name)
+    return np.array(pairs), names
+
+
+def fit(x: Array, y: Array) -> tuple[Array, float]:
+    """Weights (D,), not negative, and the power for which (x @ weights)^power is nearest to y (n,): least
+    squares of the roots, so that small distances are told apart as well as large ones."""
+    from scipy.optimize import minimize
+
+    scale = x.mean(axis=0) + 1e-9
+    root = np.sqrt(y)
+
+    def error(z: Array) -> tuple[float, Array]:
+        """Mean squared error and its gradient at weights * scale and the power."""
+        distance = x @ (z[:-1] / scale) + _NEAR
+        found = distance ** (0.5 * z[-1])
+        off = found - root
+        slope = off * found / len(y)  # of half the error, times the distance over half the power
+        by_weight = x.T @ (slope * z[-1] / distance) / scale
+        return float((off * off).mean()), np.append(by_weight, (slope * np.log(distance)).sum())
+
+    start = np.append(np.full(x.shape[1], float(np.mean(y ** (1.0 / _START))) / x.shape[1]), _START)
+    bounds = [(0.0, None)] * x.shape[1] + [POWERS]
+    best = minimize(error, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 3000})
+    return np.asarray(best.x[:-1] / scale), float(best.x[-1])
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Differences (n, D), LPIPS (n,), and the scene of each picture, of which there are ``TRIES`` pairs."""
+
+    x: Array
+    y: Array
+    scenes: list[str]
+
+    def of(self, scene: str, others: bool = False) -> tuple[Array, Array]:
+        """The pairs of a scene, or those of all others."""
+        chosen = (np.repeat(self.scenes, TRIES) == scene) != others
+        return self.x[chosen], self.y[chosen]
+
+
+def left_out(known: Sequence[Compared]) -> dict[str, Any]:
+    """``correlation`` on all pairs of each scene, with weights and power fitted to the others' of the first
+    set: what to expect of a scene that is no variation of those fitted to. (The backbone has seen variations
+    of all of them.)"""
+    found = {}
+    for scene in sorted(set(known[0].scenes)):
+        x, y = known[0].of(scene, others=True)
+        if not len(y):
+            continue
+        weights, power = fit(x, y)
+        xs, ys = (np.concatenate(part) for part in zip(*(some.of(scene) for some in known)))
+        found[scene] = correlation((xs @ weights) ** power, ys, [scene] * len(ys))
+        del found[scene]["spearman_by_distortion"]
+    return found
+
+
+def correlation(found: Array, true: Array, names: Sequence[str]) -> dict[str, Any]:
+    """Spearman's and Pearson's correlation, the mean error, and Spearman's for each single distortion."""
+    from scipy.stats import pearsonr, spearmanr
+
+    by_name = {}
+    for name in sorted(set(names)):
+        chosen = np.array([n == name for n in names])
+        if "+" not in name and chosen.sum() >= 20 and np.ptp(true[chosen]) > 0:
+            by_name[name] = round(float(spearmanr(found[chosen], true[chosen]).statistic), 3)
+    return {
+        "pairs": len(true),
+        "spearman": round(float(spearmanr(found, true).statistic), 4),
+        "pearson": round(float(pearsonr(found, true).statistic), 4),
+        "mean_absolute_error": round(float(np.abs(found - true).mean()), 4),
+        "spearman_by_distortion": by_name,
+    }
+
+
+def show(told: dict[str, Any]) -> str:
+    """The outcome for people."""
+    lines = [f"fitted to {told['fitted_to']} on {told['pairs']} pairs, power {told['power']:.2f}"]
+    left = {f"{name} not fitted to": row for name, row in told["scene_left_out_of_the_fit"].items()}
+    for name, found in (told["unseen"] | left).items():
+        lines.append(
+            f"  {name:20} Spearman {found['spearman']:.3f}  Pearson {found['pearson']:.3f}  "
+            f"mean error {found['mean_absolute_error']:.3f}  ({found['pairs']} pairs)"
+        )
+    return "\n".join(lines)
+
+
+def _slices(widths: Sequence[int]) -> list[slice]:
+    ends = np.cumsum([0, *widths])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        "edge-server train-perceptual", description=DESCRIPTION, formatter_class=raw
+    )
+    add = parser.add_argument
+    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    add("--detector", type=Path, default=MODELS / DETECTOR, metavar="FILE", help="[the shipped one]")
+    add("--out", type=Path, default=Path("runs/perceptual"), metavar="DIR", help="[%(default)s]")
+    add("--seed", type=int, default=0, help="[%(default)s]")
+    add("--worlds", type=int, default=80, metavar="N", help="to fit on, 8 pictures each [%(default)s]")
+    add("--side", type=int, default=128, metavar="PX", help="of the pictures [%(default)s]")
+    add("--workers", type=int, default=2, metavar="N", help="processes that render [%(default)s]")
+    add("--quick", action="store_true", help="8 worlds: to try it out")
+    add("--json", action="store_true", help="print perceptual.json instead of a summary")
+    return parser

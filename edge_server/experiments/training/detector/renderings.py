@@ -1,0 +1,39 @@
+"""What fields of ours really show, half-fitted and well-fitted: the pictures that a distance is for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic.scene import SCENES
+from edge_server.experiments.common.progress import Progress
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.fields import Budget, View
+from edge_server.fields.registry import make_field
+
+FIELD = "voxel"
+# Optimiser steps between pictures: from fog to as good as it gets.
+STEPS = (15, 25, 60, 150, 250)
+INSTANT_S = 0.4
+
+
+def field_renderings(side: int, seed: int) -> tuple[NDArray[np.uint8], list[str]]:
+    """(pairs (n, 2, side, side, 3) of rendering and truth, scene and steps of each): every third camera of
+    the shipped scenes is left out of the fit and rendered after each of ``STEPS``."""
+    pairs, names = [], []
+    progress = Progress(len(SCENES) * sum(STEPS))
+    for scene in SCENES:
+        still = synthetic(scene, size=side, t_s=INSTANT_S)
+        views: list[View] = [*still.held_out, *still.training]
+        known = [view for k, view in enumerate(views) if k % 3]
+        field, steps = make_field(FIELD, {}, seed=seed), 0
+        for more in STEPS:
+            field.fit(known, Budget(steps=more))
+            steps += more
+            for view in views[::3]:
+                shown = field.render(view.camera_to_world, view.intrinsics).color
+                pairs.append((np.clip(np.rint(shown * 255.0), 0, 255).astype(np.uint8), view.image))
+                names.append(f"{scene} {steps} steps")
+            progress.did(more)
+        progress.say("field renderings", scene, f"{len(pairs)} pairs")
+    return np.array(pairs), names

@@ -1,0 +1,189 @@
+"""Trains the detector; an epoch is the unit that is kept, and that Ctrl-C and a resumed run agree on."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edge_server.experiments.common.progress import Progress
+from edge_server.experiments.training.detector.dataset import Pictures
+from edge_server.experiments.training.detector.loss import detection_loss
+from edge_server.experiments.training.detector.network import Detector
+from edge_server.experiments.training.detector.scenes import KINDS, MIN_SIDE_PX, Boxes
+
+BATCH = 32
+WARMUP_STEPS = 100
+# Weights averaged over about this many steps are what is exported.
+AVERAGED_STEPS = 300
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that does not belong to this run; the message says which setting differs."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the weights, bit for bit, threads included: they split sums."""
+
+    seed: int = 0
+    side: int = 128
+    worlds: int = 400
+    epochs: int = 18
+    rate: float = 2e-3
+    threads: int = 1
+
+
+def train(pictures: Pictures, settings: Settings, checkpoint: Path) -> tuple[Detector, list[dict[str, Any]]]:
+    """(the averaged detector in eval mode, a row an epoch). Goes on from ``checkpoint`` if it is there."""
+    torch.set_num_threads(settings.threads)
+    torch.use_deterministic_algorithms(True)
+    torch.manual_seed(settings.seed)
+    # Channels last: a quarter less processor time a step.
+    model = Detector(len(KINDS))
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's own types
+    averaged = Detector(len(KINDS)).eval()
+    averaged.load_state_dict(model.state_dict())
+    optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=0.02)
+    log = _resume(checkpoint, settings, model, averaged, optimizer)
+    per_epoch = len(pictures) // BATCH
+    progress = Progress(settings.epochs - len(log))
+    for epoch in range(len(log), settings.epochs):
+        began, sums = time.perf_counter(), np.zeros(2)
+        model.train()
+        for k, (images, truths) in enumerate(_batches(pictures, settings, epoch)):
+            step = epoch * per_epoch + k
+            for group in optimizer.param_groups:
+                group["lr"] = settings.rate * _schedule(step, settings.epochs * per_epoch)
+            scored, boxed = detection_loss(model.raw(images), truths)
+            optimizer.zero_grad(set_to_none=True)
+            (scored + boxed).backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+            optimizer.step()
+            _average(averaged, model, step)
+            sums += (float(scored.detach()), float(boxed.detach()))
+        score_loss, box_loss = (round(float(v), 5) for v in sums / per_epoch)
+        if not math.isfinite(score_loss + box_loss):
+            raise FloatingPointError(f"the loss of epoch {epoch + 1} is not finite; lower the rate")
+        seconds = round(time.perf_counter() - began, 1)
+        log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
+        _save(checkpoint, settings, model, averaged, optimizer, log)
+        progress.did(1)
+        told = f"loss {score_loss:.3f} + {box_loss:.3f}"
+        progress.say("training", f"epoch {epoch + 1} of {settings.epochs}", told)
+    return averaged, log
+
+
+def _schedule(step: int, steps: int) -> float:
+    """Share of the rate: a short warm-up, then half a cosine down to a hundredth."""
+    warm = min(1.0, (step + 1) / WARMUP_STEPS)
+    return warm * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * step / max(1, steps))))
+
+
+def _average(averaged: Detector, model: Detector, step: int) -> None:
+    keep = min(1.0 - 1.0 / AVERAGED_STEPS, (1.0 + step) / (10.0 + step))
+    with torch.no_grad():
+        for a, b in zip(averaged.state_dict().values(), model.state_dict().values()):
+            if a.dtype.is_floating_point:
+                a.mul_(keep).add_(b, alpha=1.0 - keep)
+            else:
+                a.copy_(b)
+
+
+def _resume(
+    checkpoint: Path,
+    settings: Settings,
+    model: Detector,
+    averaged: Detector,
+    optimizer: torch.optim.Optimizer,
+) -> list[dict[str, Any]]:
+    if not checkpoint.is_file():
+        return []
+    try:
+        kept = torch.load(checkpoint, weights_only=True)
+        known = kept["settings"]
+    except Exception as error:  # torch's reader raises whatever its archive's layers raise
+        raise CheckpointError(f"{checkpoint}: cannot be read ({error}); delete it to start afresh") from None
+    for key, value in asdict(settings).items():
+        if known.get(key) != value:
+            raise CheckpointError(
+                f"{checkpoint}: was trained with {key} {known.get(key)}, not {value}: go on alike, delete "
+                "it, or name another --out"
+            )
+    model.load_state_dict(kept["model"])
+    averaged.load_state_dict(kept["averaged"])
+    optimizer.load_state_dict(kept["optimizer"])
+    log: list[dict[str, Any]] = kept["log"]
+    return log
+
+
+def _save(
+    checkpoint: Path,
+    settings: Settings,
+    model: Detector,
+    averaged: Detector,
+    optimizer: torch.optim.Optimizer,
+    log: list[dict[str, Any]],
+) -> None:
+    part = checkpoint.with_suffix(".part")
+    state = {"model": model.state_dict(), "averaged": averaged.state_dict(), "log": log}
+    torch.save({"settings": asdict(settings), "optimizer": optimizer.state_dict(), **state}, part)
+    part.replace(checkpoint)
+
+
+def _batches(pictures: Pictures, settings: Settings, epoch: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
+    """Augmented batches of one epoch, a function of seed and epoch alone."""
+    order = np.random.default_rng([settings.seed, epoch]).permutation(len(pictures))
+    for first in range(0, len(pictures) - BATCH + 1, BATCH):
+        images, truths = [], []
+        for i in order[first : first + BATCH]:
+            rng = np.random.default_rng([settings.seed, epoch, int(i)])
+            image, boxes = augmented(pictures.images[i], pictures.boxes[i], rng)
+            images.append(image)
+            truths.append(torch.from_numpy(boxes))
+        yield torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2), truths
+
+
+def augmented(
+    image: NDArray[np.uint8], boxes: Boxes, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], Boxes]:
+    """A picture (side, side, 3) as another camera might have taken it, in [0, 1], and its boxes: mirrored,
+    scaled, shifted, with another exposure and tint, now and then blurred or noisy."""
+    side = image.shape[0]
+    boxes = boxes.copy()
+    if rng.random() < 0.5:
+        image = image[:, ::-1]
+        boxes[:, [0, 2]] = side - boxes[:, [2, 0]]
+    if rng.random() < 0.7:
+        scale = rng.uniform(0.7, 1.4)
+        shift = (1.0 - scale) * side / 2 + rng.uniform(-0.15, 0.15, 2) * side
+        warp = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
+        image = np.asarray(cv2.warpAffine(np.ascontiguousarray(image), warp, (side, side),
+                                          borderValue=(114, 114, 114)), np.uint8)  # fmt: skip
+        before = np.maximum(boxes[:, 2:4] - boxes[:, :2], 1.0).prod(axis=1)
+        boxes[:, :4] = boxes[:, :4] * scale + np.tile(shift, 2)
+        boxes[:, :4] = boxes[:, :4].clip(0, side)
+        size = boxes[:, 2:4] - boxes[:, :2]
+        # What is cut down to a sliver cannot be told any more.
+        kept = (size.min(axis=1, initial=float(side)) >= MIN_SIDE_PX) & (
+            size.prod(axis=1) > 0.25 * before * scale**2
+        )
+        boxes = boxes[kept]
+    out = image.astype(np.float32) / 255.0
+    out = out * rng.uniform(0.6, 1.4) * rng.uniform(0.85, 1.15, 3).astype(np.float32) + rng.uniform(
+        -0.08, 0.08
+    )
+    if rng.random() < 0.2:
+        out = np.asarray(cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.2)))
+    if rng.random() < 0.3:
+        out = out + rng.normal(0.0, rng.uniform(0.005, 0.04), out.shape)
+    return np.clip(out, 0.0, 1.0).astype(np.float32), boxes.astype(np.float32)

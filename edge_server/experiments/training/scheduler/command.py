@@ -1,0 +1,319 @@
+"""``edge-server train-scheduler``: a scheduler learns in virtual time, with real field fits as reward."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.config import open_embedder, read_config
+from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.training.scheduler.choices import Maker
+from edge_server.experiments.training.scheduler.evaluation import Contest, hold, rivals, write_rows
+from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
+from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
+from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.trainer import REPORTS, Course, TrainingError, read_log, train
+from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
+from edge_server.fields.registry import field_names
+from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
+from edge_server.scheduler.learned.rewards import REWARDS, Reward, available, make_reward
+from edge_server.scheduler.learned.state import PARTS, StateLayout
+from freshfield.files import write_json
+from freshfield.scenario import Scenario, ScenarioError, load
+
+DESCRIPTION = """\
+Learns when and of which views to update the field: decisions are drawn from the scenario in virtual time,
+each action is carried out by a real field fit and rewarded on a held-out camera at the instant of
+publication. Another camera, which is not trained on either, reports how well it learnt.
+
+  edge-server train-scheduler room19 --out runs/select
+  edge-server train-scheduler room19 --kind wait --reward corrected --episodes 200 --out runs/wait
+  edge-server run room --policy bandit:runs/select/policy.npz
+
+  --kind select      a set of cameras, Bernoulli each (thesis 5.4, algorithm 1)
+  --kind threshold   how old a view may be (6.3)
+  --kind wait        how long to wait for younger ones (6.3, algorithm 2)
+
+  --on whole | moving   whose PSNR it is. Of the whole image of a scene that hardly moves it teaches to ignore
+                        how old views are; where nothing moves there are no moving pixels
+
+  --reward set        0.02 PSNR + 0.5 SSIM - LPIPS (5.19); usual for select
+  --reward corrected  -F_w (6.36-6.38), a better SSIM rewarded; usual for threshold and wait
+  --reward thesis     -F_w as printed, which rewards a worse SSIM
+
+An episode is --decisions decisions at random instants. Of each, --tries actions are carried out from a copy
+of the same field, so that they can be compared: one that knows the scene, or nothing (--scratch, the thesis).
+In a world each episode has a motion of its own, so that it is tested on motions it never saw. Pictures are
+small (--size) and the field is quick (--field), so that there are many decisions.
+
+OUT/policy.npz is the learnt policy, OUT/training.csv and .png its course with every term of the reward
+apart, OUT/contest.csv and summary.json how it does on seeds it was never trained on. After Ctrl-C the same
+command goes on, bit for bit; so it does whatever --jobs is.
+"""
+OMEGAS_MS = {
+    "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
+    "wait": (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0),
+}
+LEARNT = "learnt"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
+    folders = Folders(base, weights_folder(args.lpips, base))
+    try:
+        setting = setting_of(args, load(args.scenario))
+        course = _course(args, setting, folders)
+        _check(args, course)
+    except (ScenarioError, DatasetError, ValueError) as error:
+        print(f"edge-server train-scheduler: {error}", file=sys.stderr)
+        return 2
+    try:
+        with Crew(folders, args.jobs, _made(args.out) / "evaluations.jsonl") as crew:
+            _go(args, setting, course, crew)
+    except (ScenarioError, DatasetError, TrainingError) as error:
+        print(f"edge-server train-scheduler: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\nstopped; what is finished is in {args.out}: the same command goes on", flush=True)
+        return 130
+    return 0
+
+
+def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) -> None:
+    print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judged.scoring)}")
+    if course.reward.fidelity == "whole" and not course.reward.age:
+        print("  the reward is of the whole image and has no term of age: where little moves it teaches to "
+              "ignore how old views are (--on moving)")  # fmt: skip
+    if not setting.draws_motions:
+        print("  every episode has the same motion: it is tested on unseen channels and instants alone")
+    learner = train(setting, course, crew, args.out, lambda line: print(f"  {line}", flush=True))
+    # They are about an earlier call; one that was refused has left them alone.
+    for name in REPORTS:
+        (args.out / name).unlink(missing_ok=True)
+    rows = read_log(args.out)
+    spent = sum(row["seconds"] for row in rows)
+    write_rows(args.out / "training.csv", rows)
+    print(f"  {course.episodes} episodes; trained for {spent:.0f} s in all", flush=True)
+    if not args.test:
+        draw_curve(args.out / "training.png", rows)
+        return
+    kinds = ["threshold"] if course.spec.action == "select" else [course.spec.action]
+    omegas = course.spec.omegas_ms or OMEGAS_MS["threshold"]
+    everybody: dict[str, Maker | Actor] = {**rivals(omegas, kinds), LEARNT: learner.actor}
+    contest = hold(
+        setting.judged, crew, seeds(course.seed, "test", args.test), everybody, course.reward,
+        lambda line: print(f"  on unseen seeds: {line}", flush=True),
+    )  # fmt: skip
+    about = {
+        "reward_name": course.reward.name, "on": course.reward.fidelity, "seconds": round(spent, 1),
+        "rewarded_from": setting.rewarding, "judged_from": setting.judged.scoring,
+        "motions": setting.draws_motions,
+    }  # fmt: skip
+    _report(args.out, contest, kinds[0], rows, about)
+
+
+def _report(
+    out: Path, contest: Contest, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]
+) -> None:
+    write_rows(out / "contest.csv", rows_of(contest))
+    found = summary(contest, LEARNT, fixed)
+    names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
+    levels = {label: found["rewards"][name][0] for label, name in names.items()}
+    # From another camera a reward has another zero, which the course of the training does not share.
+    told = {} if about["rewarded_from"] != about["judged_from"] else levels
+    draw_curve(out / "training.png", rows, {k: v for k, v in told.items() if v is not None})
+    write_json(out / "summary.json", {**found, **about}, indent=1)
+    for line in lines(contest, LEARNT, fixed):
+        print(f"  {line}")
+    print(f"  {out / 'policy.npz'}: edge-server run SCENARIO --policy bandit:{out / 'policy.npz'}")
+
+
+def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
+    """Where decisions come from: the scenario with small pictures and a quick field."""
+    source, edge = dict(scenario.source), dict(scenario.edge)
+    if source.get("kind") == "world" and args.size:
+        source |= {"width": args.size, "height": args.size}
+    if args.field:
+        if args.field not in field_names():
+            raise ValueError(f"--field: expected one of {', '.join(field_names())}, got {args.field!r}")
+        edge["field"] = args.field
+        edge["field_options"] = {"effort": "low"} if args.field in ("splat", "voxel", "ngp") else {}
+    if args.distance == "perceptual":
+        edge["metrics"] = sorted({*edge.get("metrics", ()), "perceptual"})
+    edge["policy"] = {"name": "all"}
+    report = _reporting(args, scenario)
+    held_out = tuple(c for c in scenario.cameras if c in {*scenario.held_out, *report})
+    given = dataclasses.replace(scenario, source=source, edge=edge, held_out=held_out)
+    return Setting(
+        given,
+        report=report,
+        motions=not args.same_motion,
+        steps=(50 if args.scratch else 20) if args.fit_steps is None else args.fit_steps,
+        scratch=args.scratch,
+        decisions=args.decisions,
+        compute=read_config(given).compute,
+        parts=_parts(args.parts),
+    )
+
+
+def _reporting(args: argparse.Namespace, scenario: Scenario) -> tuple[str, ...]:
+    """Cameras that report. By themselves: the last of several that are held out, else one in the middle of
+    those that are trained on, which then is not."""
+    if args.report == "none" or not scenario.held_out:
+        return ()
+    if args.report:
+        asked = tuple(args.report.split(","))
+        if unknown := [c for c in asked if c not in scenario.cameras]:
+            raise ValueError(f"--report: {', '.join(unknown)} is not one of the scenario's cameras")
+        if set(scenario.held_out) <= set(asked):
+            raise ValueError("--report: a held-out camera must be left to reward")
+        return asked
+    if len(scenario.held_out) > 1:
+        return scenario.held_out[-1:]
+    if len(scenario.training) < 3 or args.network == "flat":
+        raise ValueError(
+            "--report: no camera can be spared to report ("
+            + ("--network flat learns for as many as there are" if args.network == "flat" else "too few")
+            + "): hold two out in the scenario, or --report none judges from the one that rewards"
+        )
+    return (scenario.training[len(scenario.training) // 2],)
+
+
+def reward_of(
+    name: str, on: str, lpips_folder: Path | None, network: str = "alex", distance: str = "lpips"
+) -> tuple[Reward, str | None]:
+    """The reward of a name, on the whole image or its moving pixels. network: the scenario's edge.lpips.
+    distance: lpips, perceptual (its stand-in) or none. Where LPIPS is asked for and cannot be had its term
+    is left out, and the second value says so."""
+    reward = make_reward(name, fidelity=on)  # type: ignore[arg-type]
+    if distance == "none":
+        return dataclasses.replace(reward, distance=0.0), None
+    if distance == "perceptual":
+        return dataclasses.replace(reward, distance_is="perceptual"), None
+    missing: str | None = "the scenario's edge.lpips is none"
+    if network != "none":
+        _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]
+    found = available(reward, missing)
+    return found, None if found == reward else f"the reward has no term of distance: {missing}"
+
+
+def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
+    """What a network sees of the state: ``parts``, embedded as the setting's scenario says. ValueError where
+    nothing can embed here."""
+    if "semantics" not in parts:
+        return StateLayout(parts)
+    from edge_server.embed import EmbeddingConfig
+
+    embedder = open_embedder(read_config(setting.scenario).embedding or EmbeddingConfig())
+    assert embedder is not None
+    return StateLayout(parts, embedder.dim, embedding=embedder.name)
+
+
+def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Course:
+    name = args.reward or ("set" if args.kind == "select" else "corrected")
+    network = read_config(setting.scenario).lpips
+    reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
+    if missing:
+        print(f"  {missing}")
+    if not 0.0 <= args.price < math.inf:
+        raise TrainingError(f"--price: expected 0 or more, got {args.price:g}")
+    if args.price:
+        reward = dataclasses.replace(reward, views=-args.price)
+    given = _omegas(args)
+    spec = Spec(
+        args.kind,
+        layout_of(setting, setting.parts),
+        () if args.kind == "select" else given or OMEGAS_MS[args.kind],
+        network=args.network,
+        cameras=len(setting.scenario.training) if args.network == "flat" else None,
+    )
+    return Course(spec, reward, args.episodes, args.batch, args.tries, args.seed)
+
+
+def _omegas(args: argparse.Namespace) -> tuple[float, ...] | None:
+    if args.omegas is None:
+        return None
+    if args.kind == "select":
+        raise ValueError("--omegas: --kind select chooses cameras, not an omega")
+    try:
+        return tuple(float(v) for v in args.omegas.split(","))
+    except ValueError:
+        raise ValueError(f"--omegas: expected milliseconds such as 20,60,120, got {args.omegas!r}") from None
+
+
+def _parts(text: str) -> tuple[str, ...]:
+    asked = set(text.split(","))
+    if unknown := asked - set(PARTS):
+        raise ValueError(f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(PARTS)}")
+    return tuple(part for part in PARTS if part in asked)
+
+
+def _check(args: argparse.Namespace, course: Course) -> None:
+    if args.jobs < 1:
+        raise TrainingError(f"--jobs: expected at least 1, got {args.jobs}")
+    if not 0 <= args.test <= 10_000:
+        raise TrainingError(f"--test: expected 0 to 10000 seeds, got {args.test}")
+    seeds(course.seed, "train", course.episodes)
+
+
+def _made(out: Path) -> Path:
+    out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+    return out
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        "edge-server train-scheduler", description=DESCRIPTION, formatter_class=raw
+    )
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    add = parser.add_argument
+    add("scenario", help="scenario file, or the name of a shipped one; it must hold a camera out")
+    add("--kind", choices=ACTIONS, default="select", help="what is decided [%(default)s]")
+    add("--episodes", type=int, default=600, metavar="N", help="[%(default)s]")
+    add("--decisions", type=int, default=4, metavar="N", help="of an episode [%(default)s]")
+    add("--batch", type=int, default=10, metavar="N", help="episodes of one update [%(default)s]")
+    add("--tries", type=int, default=2, metavar="N", help="actions tried at a decision [%(default)s]")
+    add("--reward", choices=tuple(REWARDS), help="[set for select, else corrected]")
+    add("--on", choices=("whole", "moving"), default="whole", help="pixels of the PSNR [%(default)s]")
+    add(
+        "--distance",
+        choices=("lpips", "perceptual", "none"),
+        default="lpips",
+        help="the reward's distance; perceptual is the stand-in where LPIPS has no weights [%(default)s]",
+    )
+    add("--price", type=float, default=0.0, metavar="R",
+        help="what a view used takes off the reward; free ones hardly ever harm [0]")  # fmt: skip
+    add("--report", metavar="CAM,...",
+        help="cameras that only report; none: the one that rewards [the last of several that are held out, "
+        "else one of the training cameras]")  # fmt: skip
+    add("--same-motion", action="store_true", help="the scene's own motion in every episode")
+    add(
+        "--parts", default="age,pose", metavar="P,...", help=f"of the state: {', '.join(PARTS)} [%(default)s]"
+    )
+    add("--omegas", metavar="MS,...", help="what threshold and wait choose from")
+    add("--network", choices=("pooled", "flat"), default="pooled",
+        help="pooled takes any number of cameras, flat is the thesis's [%(default)s]")  # fmt: skip
+    add("--scratch", action="store_true", help="updates begin with nothing, as in the thesis")
+    add("--fit-steps", type=int, metavar="N", help="of an update [20; 50 with --scratch]")
+    add("--size", type=int, default=64, metavar="PX", help="of a world's pictures, 0: its own [%(default)s]")
+    add("--field", default="splat", metavar="NAME", help="representation, '': the scenario's [%(default)s]")
+    add("--seed", type=int, default=0, metavar="K", help="[%(default)s]")
+    add("--test", type=int, default=20, metavar="N", help="unseen seeds at the end [%(default)s]")
+    add("--jobs", type=int, default=cores, metavar="J", help="processes [%(default)s]")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add("--lpips", type=Path, metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
+    add("--out", type=Path, required=True, metavar="DIR", help="where everything is written")
+    return parser

@@ -1,0 +1,367 @@
+"""Episodes: a virtual deployment is watched, decisions are drawn from it, and what was chosen is carried out.
+
+The channel does not depend on what the edge decides, so that one run of it serves every action at every
+decision: the deliveries are recorded, and the buffer at any instant follows from the record. Each choice is
+then rewarded by a field fit of its own, from nothing or from a copy of the same warm field, so that actions
+of one decision are comparable (thesis 5.4, algorithm 1; 6.3, algorithm 2).
+"""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.capture import Camera
+from camera_node.config import WorldConfig, source_config
+from camera_node.synthetic.effects import NO_EFFECTS
+from edge_server.config import read_config
+from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.training.scheduler.setting import GRID_MS, Setting
+from edge_server.experiments.virtual.from_scenario import deploy, exact_scene, training_cameras, truth_of
+from edge_server.experiments.virtual.truth import ExactTruth
+from edge_server.experiments.virtual.virtual_deployment import Terms, Truth, VirtualDeployment
+from edge_server.fidelity.lpips_weights import open_lpips
+from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fields import Budget, Field, View
+from edge_server.fields.registry import make_field
+from edge_server.live.buffer import Buffered, FrameBuffer
+from edge_server.live.view_decoder import Decoder
+from edge_server.scheduler import make_policy, treatment_of
+from edge_server.scheduler.learned.observation import Embeddings, observe
+from edge_server.scheduler.learned.state import State
+from freshfield.frame import Frame
+from freshfield.scenario import Scenario, ScenarioError
+
+if TYPE_CHECKING:
+    from edge_server.embed import Embedder
+
+Image = Callable[[str, float], NDArray[np.uint8]]
+# Episodes whose pictures and warm fields a process keeps.
+_EPISODES_KEPT = 32
+_TRUTHS_KEPT = 8192
+# The deployment's own edge never decides here.
+_NEVER_MS = 1e11
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A frame that reached the buffer. generated_ns: on the edge's clock."""
+
+    camera: str
+    sequence: int
+    generated_ns: int
+    received_ns: int
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a policy chose: these cameras' newest frames as of ``at_ns``, treated or not. omega_ms: as people
+    call it, no part of what is chosen."""
+
+    cameras: tuple[str, ...]
+    at_ns: int
+    treatment: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an update came to: fidelity on the scoring cameras (None where there is none), aaoi_ms (6.35: of
+    the used views at publication; None of none), views used, and wait_ms from the decision to publication."""
+
+    psnr_db: float | None
+    psnr_moving_db: float | None
+    ssim: float | None
+    lpips: float | None
+    perceptual: float | None
+    aaoi_ms: float | None
+    views: float
+    wait_ms: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A decision: everything that a policy may look at, and what arrives while it waits, in plain values.
+
+    state: at ``now_ns`` (6.33). arrivals: in order of reception; of those before ``now_ns`` each camera's two
+    youngest. until_ns: end of what is known of the channel.
+    """
+
+    seed: int
+    number: int
+    now_ns: int
+    until_ns: int
+    cameras: tuple[str, ...]
+    arrivals: tuple[Arrival, ...]
+    state: State
+
+    def newest(self, at_ns: int) -> dict[str, Arrival]:
+        """Omega(t) of (5.6) as the buffer holds it at ``at_ns``, in the cameras' order."""
+        return _newest(self.arrivals, at_ns, self.cameras)
+
+    def earlier(self, at_ns: int) -> dict[str, Arrival]:
+        """Of each camera, the youngest arrival that is older than its newest."""
+        newest = self.newest(at_ns)
+        found: dict[str, Arrival] = {}
+        for a in self.arrivals:
+            if a.received_ns <= at_ns and a.generated_ns < newest[a.camera].generated_ns:
+                known = found.get(a.camera)
+                if known is None or a.generated_ns > known.generated_ns:
+                    found[a.camera] = a
+        return found
+
+    def next_arrival_ns(self, after_ns: int) -> int | None:
+        """Instant of the first arrival after an instant; None: nothing more is known to come."""
+        return next((a.received_ns for a in self.arrivals if a.received_ns > after_ns), None)
+
+
+def _newest(arrivals: Iterable[Arrival], at_ns: int, cameras: Sequence[str]) -> dict[str, Arrival]:
+    """Of each camera that has one, the youngest of what was received by ``at_ns``; in the cameras' order.
+    arrivals: in order of reception."""
+    found: dict[str, Arrival] = {}
+    for arrival in arrivals:
+        if arrival.received_ns > at_ns:
+            break
+        known = found.get(arrival.camera)
+        if known is None or arrival.generated_ns > known.generated_ns:
+            found[arrival.camera] = arrival
+    return {c: found[c] for c in cameras if c in found}
+
+
+class _Recorder(FrameBuffer):
+    """A buffer that remembers all that was put into it."""
+
+    def __init__(self, cameras: Sequence[str]) -> None:
+        super().__init__(cameras)
+        self.record: list[Buffered] = []
+
+    def put(self, frame: Frame, received_ns: int) -> None:
+        super().put(frame, received_ns)
+        self.record.append(Buffered(frame, frame.generated_edge_ns, received_ns))
+
+
+def _remembered(image: Image, period_ns: int | None) -> Image:
+    """``image``, rendered once for every instant of a round."""
+    known = lru_cache(_TRUTHS_KEPT)(lambda camera, at_ns: image(camera, at_ns / 1e9))
+    return lambda camera, t_s: known(camera, round(t_s * 1e9) % period_ns if period_ns else round(t_s * 1e9))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is seen of one motion."""
+
+    truth: Truth
+    cameras: list[Camera]
+
+
+class Ground:
+    """What the episodes of a setting share in one process: a scorer, a field, an embedder, and the pictures
+    where all have the same motion."""
+
+    def __init__(self, setting: Setting, folders: Folders) -> None:
+        scenario = setting.scenario
+        self._edge = edge = read_config(scenario)
+        source = source_config(scenario)
+        self._moving, self._period_ns = False, None
+        if isinstance(source, WorldConfig):
+            scene, effects = exact_scene(scenario, source)
+            self._moving = scene.moving and setting.motions and hasattr(scene.params, "motion_seed")
+            if scene.moving and effects is NO_EFFECTS and not self._moving:
+                self._period_ns = round(scene.period_s * 1e9)
+        lpips = None if edge.lpips == "none" else open_lpips(folders.lpips, edge.lpips)[0]  # type: ignore[arg-type]
+        self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=listed_metric(edge.metrics))
+        self.setting, self.folders = setting, folders
+        self._shared = None if self._moving else self._stage(scenario)
+        self._field: tuple[int, Field] | None = None
+        self._embedder: Embedder | None = None
+        if "semantics" in setting.parts:
+            # Nothing of it is loaded where no policy looks at pictures.
+            from edge_server.embed import EmbeddingConfig, make_embedder
+
+            self._embedder = make_embedder(edge.embedding or EmbeddingConfig())
+        self._episodes: OrderedDict[int, Episode] = OrderedDict()
+
+    def scenario(self, seed: int) -> Scenario:
+        """The deployment of an episode."""
+        return self.setting.seeded(seed, self._moving)
+
+    def stage(self, seed: int) -> Stage:
+        """The pictures of an episode."""
+        return self._shared or self._stage(self.scenario(seed))
+
+    def embeddings(self) -> Embeddings | None:
+        """Of one episode: frames of the same number are other pictures in the next."""
+        if self._embedder is None:
+            return None
+        from edge_server.embed.cache import EmbeddingCache
+
+        return EmbeddingCache(self._embedder, Decoder())
+
+    def field(self, seed: int) -> Field:
+        """The field of an episode, in any state: whoever takes it resets or loads it."""
+        seed = self.setting.field_seed(seed)
+        if self._field is None or self._field[0] != seed:
+            options = {**self._edge.field_options, "threads": 1}
+            try:
+                self._field = seed, make_field(self._edge.field, options, seed=seed)
+            except ValueError as error:
+                raise ScenarioError(f"{self.setting.scenario.path}: edge: {error}") from None
+        return self._field[1]
+
+    def _stage(self, scenario: Scenario) -> Stage:
+        # The truth is of who scores; none of the others that are held out is rendered.
+        scoring = replace(scenario, held_out=self.setting.scoring)
+        truth = truth_of(scoring, source_config(scenario), self._edge, self._scorer, self.folders.data)
+        assert truth is not None  # a setting has a camera held out
+        if isinstance(truth, ExactTruth):
+            truth = replace(truth, image=_remembered(truth.image, self._period_ns))
+        return Stage(truth, training_cameras(scenario, self.folders.data))
+
+    def episode(self, seed: int) -> Episode:
+        """The episode of a seed: the same whether it is new or kept."""
+        found = self._episodes.get(seed)
+        if found is None:
+            found = self._episodes[seed] = Episode(self, seed)
+            while len(self._episodes) > _EPISODES_KEPT:
+                self._episodes.popitem(last=False)
+        self._episodes.move_to_end(seed)
+        return found
+
+
+class Episode:
+    """One seed's deployment: its decisions, and the field fits of what is chosen there."""
+
+    def __init__(self, ground: Ground, seed: int) -> None:
+        began_s = time.process_time()
+        self._ground, setting = ground, ground.setting
+        scenario = replace(ground.scenario(seed), edge={**setting.scenario.edge, "policy": {"name": "all"}})
+        stage = ground.stage(seed)
+        self._truth = stage.truth
+        heard = tuple(c for c in scenario.cameras if c not in setting.silent)
+        self._deployment: VirtualDeployment = deploy(
+            replace(scenario, cameras=heard),
+            Terms(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
+            field=ground.field(seed),
+            cameras=[camera for camera in stage.cameras if camera.name in heard],
+            data=ground.folders.data,
+            truth=stage.truth,
+        )
+        recorder = _Recorder([c for c in scenario.training if c in heard])
+        self._deployment.updates.buffer = recorder
+        rng = scenario.rng("decisions")
+        lead, span = setting.lead_ms / GRID_MS, setting.span_ms / GRID_MS
+        at = np.sort(rng.integers(round(lead), round(lead + span), setting.decisions))
+        self.instants_ns = [int(tick) * GRID_MS * 10**6 for tick in at]
+        self._until_ns = self.instants_ns[-1] + round(setting.horizon_ms * 1e6)
+        self._deployment.run(self._until_ns / 1e9)
+        self._record = [
+            Arrival(b.frame.camera, b.frame.sequence, b.generated_ns, b.received_ns) for b in recorder.record
+        ]
+        self._frames = {(b.frame.camera, b.frame.sequence): b for b in recorder.record}
+        self._views: dict[tuple[str, int], View | None] = {}
+        self._warm: list[dict[str, NDArray[Any]]] = []
+        self.seed = seed
+        self._embeddings = ground.embeddings()
+        self.moments = tuple(self._moment(number) for number in range(setting.decisions))
+        self.spent_s = 0.0
+        """Processor time of all that was evaluated so far; the first one bears that of the episode itself."""
+        self._owed_s = time.process_time() - began_s
+
+    def evaluate(self, number: int, choice: Choice) -> Outcome:
+        """Fit what was chosen at a decision and score it at the instant of publication on the setting's
+        scoring cameras. Where nothing was chosen, or nothing of it can be decoded, there are no scores."""
+        began_s = time.process_time() - self._owed_s
+        self._owed_s = 0.0
+        found = self._carried_out(number, choice)
+        self.spent_s += time.process_time() - began_s
+        return found
+
+    def _carried_out(self, number: int, choice: Choice) -> Outcome:
+        setting, moment = self._ground.setting, self.moments[number]
+        newest = moment.newest(choice.at_ns)
+        chosen = [newest[c] for c in choice.cameras]
+        views = self._decoded(chosen)
+        if not views:
+            waited_ms = (choice.at_ns - moment.now_ns) / 1e6
+            return Outcome(None, None, None, None, None, None, 0.0, waited_ms)
+        treated = len(views) if choice.treatment else 0
+        published_ns = choice.at_ns + setting.compute.charge_ns(setting.steps, treated)
+        shown = views
+        if choice.treatment:
+            before = moment.earlier(choice.at_ns)
+            earlier = self._decoded([before[c] for c in choice.cameras if c in before])
+            by_camera = {view.camera: view for view in earlier}
+            treatment = treatment_of(make_policy(choice.treatment, None, np.random.default_rng(0)))
+            assert treatment is not None
+            shown = treatment.treat(views, by_camera, published_ns)
+        field = self._ground.field(self.seed)
+        warm = None if setting.scratch else self._warm_state(number)
+        if warm is None:
+            field.reset()
+        else:
+            field.load_state(warm)
+        field.fit(shown, Budget(steps=setting.steps))
+        score = self._truth.score(field.snapshot(published_ns), published_ns)
+        ages_ms = [(published_ns - view.generated_ns) / 1e6 for view in views]
+        views_used, wait_ms = float(len(views)), (published_ns - moment.now_ns) / 1e6
+        aaoi_ms = float(np.mean(ages_ms))
+        if score is None:
+            return Outcome(None, None, None, None, None, aaoi_ms, views_used, wait_ms)
+        return Outcome(
+            score.psnr_db, score.psnr_moving_db, score.ssim, score.lpips, score.perceptual, aaoi_ms,
+            views_used, wait_ms,
+        )  # fmt: skip
+
+    def _moment(self, number: int) -> Moment:
+        now_ns = self.instants_ns[number]
+        before: dict[str, list[Arrival]] = {}
+        after: list[Arrival] = []
+        for arrival in self._record:
+            if arrival.received_ns > now_ns:
+                after.append(arrival)
+                continue
+            kept = [a for a in before.get(arrival.camera, ()) if a.generated_ns != arrival.generated_ns]
+            before[arrival.camera] = sorted([*kept, arrival], key=lambda a: a.generated_ns)[-2:]
+        known = sorted((a for kept in before.values() for a in kept), key=lambda a: a.received_ns)
+        reported = [max(kept, key=lambda a: a.generated_ns) for kept in before.values()]
+        newest = {item.frame.camera: item for item in self._exposed(reported)}
+        setting = self._ground.setting
+        cameras = setting.scenario.training
+        state = observe(cameras, newest, now_ns, self._embeddings, setting.parts)
+        return Moment(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)
+
+    def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[Buffered, ...]:
+        return self._deployment.exposed([self._frames[a.camera, a.sequence] for a in arrivals])
+
+    def _decoded(self, arrivals: Sequence[Arrival]) -> list[View]:
+        """Views in the order given, each decoded once, without those that cannot be."""
+        missing = [a for a in arrivals if (a.camera, a.sequence) not in self._views]
+        for item in self._exposed(missing):
+            views = Decoder().views([item])
+            self._views[item.frame.camera, item.frame.sequence] = views[0] if views else None
+        found = [self._views.get((a.camera, a.sequence)) for a in arrivals]
+        return [view for view in found if view is not None]
+
+    def _warm_state(self, number: int) -> dict[str, NDArray[Any]]:
+        """The field before a decision; nothing that is chosen at any decision changes it."""
+        setting, field = self._ground.setting, self._ground.field(self.seed)
+        while len(self._warm) <= number:
+            moment = self.moments[len(self._warm)]
+            # What was delivered by then is all in the record of the deployment, not of the moment.
+            then_ns = moment.now_ns - round(setting.refresh_ms * 1e6)
+            if self._warm:
+                field.load_state(self._warm[-1])
+            else:
+                field.reset()
+            steps = setting.steps if self._warm else setting.warm_steps
+            views = self._decoded(list(_newest(self._record, then_ns, moment.cameras).values()))
+            if views:
+                field.fit(views, Budget(steps=steps))
+            self._warm.append(field.state())
+        return self._warm[number]

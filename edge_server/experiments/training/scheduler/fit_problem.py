@@ -1,0 +1,69 @@
+"""Decisions with real field fits as a ``Problem``, for learners that are not ours.
+
+with Crew(folders) as crew:
+    problem = FitProblem(setting, Spec("select"), make_reward("set"), crew)
+    environment = ...                      # scheduler.learned.environment, with gymnasium's interface
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from edge_server.experiments.training.scheduler.choices import of_action
+from edge_server.experiments.training.scheduler.episode import Moment
+from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE, Setting, seeds
+from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.state import State
+
+KEPT = 16  # episodes whose frames stay in memory, of those drawn last
+
+
+@dataclass(frozen=True)
+class FitProblem:
+    """``scheduler.learned.problem.Problem``: seed s is decision s mod D of episode s div D of training, D
+    being the setting's decisions in an episode; whatever the seed, no episode is one that others are tested
+    on. spec: what an action means. run: whose episodes of training."""
+
+    setting: Setting
+    spec: Spec
+    reward: Reward
+    crew: Crew
+    run: int = 0
+    _drawn: deque[int] = field(
+        default_factory=lambda: deque(maxlen=KEPT), init=False, repr=False, compare=False
+    )
+
+    def draw(self, seed: int) -> FitDecision:
+        episode, number = divmod(seed, self.setting.decisions)
+        (of,) = seeds(self.run, "train", 1, episode % SEEDS_A_PURPOSE)
+        if of not in self._drawn:
+            if len(self._drawn) == KEPT:
+                self.crew.forget(self.setting, [self._drawn[0]])
+            self._drawn.append(of)
+        return FitDecision(self, self.crew.draw(self.setting, [of])[0][number])
+
+
+@dataclass(frozen=True)
+class FitDecision:
+    """``scheduler.learned.problem.Decision``."""
+
+    problem: FitProblem
+    moment: Moment
+
+    @property
+    def state(self) -> State:
+        return self.moment.state
+
+    def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
+        """The reward of a real fit, NaN where a term of it is missing, and its terms."""
+        of, moment = self.problem, self.moment
+        choice = of_action(of.spec, action, moment)
+        (outcome,) = of.crew.evaluate(of.setting, [(moment.seed, moment.number, choice)])
+        found = of.reward.of(outcome)
+        total = found.total if found.complete else None
+        return (math.nan if total is None else total), found.terms

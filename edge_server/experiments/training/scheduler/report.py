@@ -1,0 +1,112 @@
+"""What a training came to: its curve, and in words how it did against everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge_server.experiments.studies.statistics import Interval, interval, paired
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Contest, PerSeed
+from edge_server.report.style import CYCLE, GREY, figure, label_lines
+
+# Batches that a point of the smoothed curve is the mean of.
+_SMOOTH = 9
+
+
+def draw_curve(path: Path, rows: Sequence[dict[str, Any]], levels: dict[str, float] | None = None) -> None:
+    """The learning curve (figures 5.9, 6.8), every term of the reward beside it. levels: label -> reward of
+    policies that do not learn, on seeds of testing."""
+    terms = [name for name in rows[0] if name.startswith("term_")]
+    episodes = [row["episodes"] for row in rows]
+    with figure(path, 2, height_inch=2.6, sharex=True) as (_, axes):
+        top, bottom = axes[:, 0]
+        rewards = _numbers(rows, "reward")
+        top.plot(episodes, rewards, color=CYCLE[0], alpha=0.3, linewidth=0.9)
+        top.plot(episodes, smoothed(rewards), color=CYCLE[0], label="reward in training")
+        for k, (label, level) in enumerate((levels or {}).items()):
+            top.axhline(level, color=GREY, linestyle=(":", "--", "-.")[k % 3], linewidth=1.1, label=label)
+        label_lines(top, "reward", None, "Learning, explored actions included")
+        for k, term in enumerate(terms):
+            values = smoothed(_numbers(rows, term))
+            # What terms are worth has an arbitrary zero: their change is what can be compared.
+            bottom.plot(episodes, values - values[:1], color=CYCLE[k], label=term.removeprefix("term_"))
+        label_lines(bottom, "terms of the reward,\nchange since the start", "episodes")
+
+
+def smoothed(values: np.ndarray, count: int = _SMOOTH) -> np.ndarray:
+    """Mean of the last ``count`` values at each (fewer at the beginning); NaN counts for nothing."""
+    parts = [values[max(0, i + 1 - count) : i + 1] for i in range(len(values))]
+    return np.array([np.nan if np.isnan(p).all() else np.nanmean(p) for p in parts])
+
+
+def summary(contest: Contest, learnt: str, fixed: str) -> dict[str, Any]:
+    """Figures of a contest as JSON takes them: rewards, paired differences and shares, each with its 95 %
+    interval over seeds. fixed: the kind whose best value is the one to beat, threshold or wait."""
+    mine = contest.rewards(learnt)
+    best, name = contest.best_fixed(fixed)
+    varies = contest.varies(fixed)
+    return {
+        "seeds": contest.seeds(learnt)[1],
+        "seeds_without_value": contest.seeds(learnt)[0] - contest.seeds(learnt)[1],
+        "reward": _told(interval(list(mine.values()))),
+        "rewards": {n: _told(interval(list(contest.rewards(n).values())))
+                    for n in (*contest.outcomes, HINDSIGHT)},
+        "over_random": _told(paired(mine, contest.rewards("random"))),
+        "over_best_fixed": _told(paired(mine, best)),
+        "best_fixed": name,
+        "share": _told(contest.share(mine)),
+        "best_fixed_share": _told(contest.share(best)),
+        "best_value_by_decision": varies["quartiles"],
+        "knowing_it_is_worth": _told(varies["gain"]),
+    }  # fmt: skip
+
+
+def lines(contest: Contest, learnt: str, fixed: str) -> list[str]:
+    """The same for people."""
+    mine, random = contest.rewards(learnt), contest.rewards("random")
+    best, name = contest.best_fixed(fixed)
+    varies = contest.varies(fixed)
+    drawn, known = contest.seeds(learnt)
+    lacking = "" if known == drawn else f"; {drawn - known} more have a decision without a reward"
+    return [
+        f"reward {span(interval(list(mine.values())))} on {known} unseen seeds{lacking}",
+        f"over random {span(paired(mine, random))}, over the best fixed {fixed} ({name}) "
+        f"{span(paired(mine, best))}",
+        f"share of what could be won: {span(contest.share(mine), 2)}; the best fixed {fixed} has "
+        f"{span(contest.share(best), 2)}",
+        f"the best {fixed} of a decision is {quartiles(varies)}; to know it would be worth "
+        f"{span(varies['gain'])} over the best fixed one",
+    ]
+
+
+def quartiles(varies: dict[str, Any]) -> str:
+    """``contest.varies`` for people."""
+    low, middle, high = varies["quartiles"]
+    return "not known" if middle is None else f"{middle:g} ms (quartiles {low:g} to {high:g})"
+
+
+def percent(values: PerSeed, base: PerSeed) -> str:
+    """Gain in mean reward over ``base``, in per cent of its size, as the thesis tells it. Where the reward's
+    zero, which is arbitrary, lies near ``base`` or between the two, there is no such figure."""
+    a, b = interval(list(values.values())), interval(list(base.values()))
+    if not (b.mean * a.mean > 0.0 and (b.low > 0.0 or b.high < 0.0)):
+        return f"no percentage ({a.mean:.4f} against {b.mean:.4f}, near zero or of other signs)"
+    return f"{100.0 * (a.mean - b.mean) / abs(b.mean):+.1f} %"
+
+
+def span(i: Interval, digits: int = 4) -> str:
+    """``mean [low, high]``."""
+    if i.count < 2 or np.isnan(i.low):
+        return f"{i.mean:.{digits}f}"
+    return f"{i.mean:.{digits}f} [{i.low:.{digits}f}, {i.high:.{digits}f}]"
+
+
+def _told(i: Interval) -> list[float | None]:
+    return [None if np.isnan(v) else round(v, 6) for v in (i.mean, i.low, i.high)]
+
+
+def _numbers(rows: Sequence[dict[str, Any]], name: str) -> np.ndarray:
+    return np.array([np.nan if row.get(name) is None else row[name] for row in rows], float)

@@ -1,0 +1,261 @@
+"""A learner learns from decisions that are drawn, acted on, carried out and rewarded, batch by batch.
+
+Everything follows from the seed: episodes from their numbers, actions from the learner's own stream, rewards
+from the field fits, whoever makes them. Between two batches the learner is all there is, so that a run that
+was stopped goes on bit for bit from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.experiments.training.scheduler.choices import of_action
+from edge_server.experiments.training.scheduler.episode import Moment, Outcome
+from edge_server.experiments.training.scheduler.setting import Setting, seeds
+from edge_server.experiments.training.scheduler.workers import Crew, Progress
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.rewards import Reward, Rewarded
+from freshfield.files import write_json, write_text
+
+if TYPE_CHECKING:
+    from edge_server.scheduler.learned.ppo import Learner
+
+Row = dict[str, Any]
+_TELL_EVERY_S = 5.0
+# What train-scheduler tells of a finished training, beside it.
+REPORTS = ("summary.json", "contest.csv")
+
+
+class TrainingError(ValueError):
+    """A training that cannot be run as asked; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a learner is taught. episodes: in all; batch: of one update of the weights. tries: actions drawn
+    and carried out at every decision. Of more than one, each is rewarded by how much better it did than the
+    others of the same decision: their mean is an estimate of V(s) (5.24) that knows this very scene and
+    channel, which no function of the state does. seed: of episodes and of the learner. checkpoint_every:
+    batches. stages: numbers of batches after which what has been learnt until then is kept, too.
+    """
+
+    spec: Spec
+    reward: Reward
+    episodes: int = 600
+    batch: int = 10
+    tries: int = 2
+    seed: int = 0
+    checkpoint_every: int = 5
+    stages: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if min(self.episodes, self.batch, self.tries, self.checkpoint_every) < 1:
+            raise TrainingError("episodes, batch, tries and checkpoint_every: expected at least 1")
+        if not all(1 <= stage <= self.batches for stage in self.stages):
+            raise TrainingError(f"stages: expected numbers of batches from 1 to {self.batches}")
+
+    @property
+    def batches(self) -> int:
+        return -(-self.episodes // self.batch)
+
+    def seeds(self, number: int) -> range:
+        """Of the episodes of a batch."""
+        first = number * self.batch
+        return seeds(self.seed, "train", min(self.batch, self.episodes - first), first)
+
+
+def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable[[str], None]) -> Learner:
+    """Teach until the course is over; what is in ``out`` of the same course is gone on with. Writes
+    OUT/training.jsonl (a line a batch), OUT/training.json, ``stage_file`` of each of the course's stages and,
+    at its end, OUT/policy.npz. TrainingError where ``out`` holds another course, or where no reward can be
+    had; KeyboardInterrupt leaves the last checkpoint there."""
+    out.mkdir(parents=True, exist_ok=True)
+    kept = _Kept(out, _key(setting, course))
+    learner, rows = kept.load()
+    began, first = time.monotonic(), len(rows)
+    if first and first < course.batches:
+        say(f"going on after {first} of {course.batches} batches")
+    if learner is None:
+        # What an earlier course left must not pass for what this one teaches.
+        for name in ("policy.npz", *REPORTS):
+            (out / name).unlink(missing_ok=True)
+        learner = _new_learner(setting, course, crew)
+    learner.taught_by = dataclasses.asdict(course.reward)
+    for number in range(first, course.batches):
+        at = time.monotonic()
+        row = _one_batch(setting, course, crew, learner, number, say)
+        rows.append({**row, "seconds": round(time.monotonic() - at, 3)})
+        if (number + 1) % course.checkpoint_every == 0 or number + 1 == course.batches:
+            kept.save(learner, rows)
+        if number + 1 in course.stages:
+            learner.save(stage_file(out, number + 1))
+        spent = time.monotonic() - began
+        left = spent / (number + 1 - first) * (course.batches - number - 1)
+        say(f"{_told(course, row)}; {left:.0f} s left")
+    learner.save(out / "policy.npz")
+    return learner
+
+
+def stage_file(out: Path, batches: int) -> Path:
+    """Where a training in ``out`` keeps what had been learnt after so many batches."""
+    return out / f"after-{batches:05d}.npz"
+
+
+def read_log(out: Path) -> list[Row]:
+    """The lines of a training so far, one a batch."""
+    return [json.loads(line) for line in (out / "training.jsonl").read_text().splitlines()]
+
+
+def _one_batch(
+    setting: Setting, course: Course, crew: Crew, learner: Learner, number: int, say: Callable[[str], None]
+) -> Row:
+    """Draw, act, carry out, learn. TrainingError where the first batch has not a single reward."""
+    chosen = course.seeds(number)
+    moments = [m for episode in crew.draw(setting, chosen) for m in episode]
+    crew.forget(setting, chosen)
+    # The tries of one decision stand together.
+    each = [m for m in moments for _ in range(course.tries)]
+    states = [m.state for m in each]
+    actions, logps = learner.act(states)
+    asked = [(m.seed, m.number, of_action(course.spec, a, m)) for m, a in zip(each, actions)]
+    before = crew.evaluated
+    outcomes = crew.evaluate(setting, asked, told_now_and_then(say, f"fits of batch {number + 1}"))
+    found = [course.reward.of(outcome) for outcome in outcomes]
+    # A reward that lacks a term is not comparable with one that does not.
+    rewards = np.array([r.total if r.complete and r.total is not None else np.nan for r in found])
+    if number == 0 and not np.isfinite(rewards).any():
+        raise TrainingError(_why_not(outcomes, found))
+    told = learner.update(learner.batch(states, actions, logps, compared(rewards, course.tries)))
+    row: Row = {
+        "batch": number, "episodes": chosen[-1] + 1 - course.seeds(0)[0], "reward": _mean(rewards),
+        "decisions": len(moments), "fits": len(each), "carried_out": crew.evaluated - before,
+        "processor_seconds": crew.cost_s(setting, asked),
+    }  # fmt: skip
+    row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
+    row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
+    if course.spec.action != "select":
+        row["omega_ms"] = _mean([course.spec.omegas_ms[int(a)] for a in actions])
+    return row | {k: v for k, v in dataclasses.asdict(told).items() if k != "reward"}
+
+
+def told_now_and_then(say: Callable[[str], None], what: str) -> Progress:
+    """Progress for people, where it takes long."""
+    last_s = time.monotonic()
+
+    def told(done: int, count: int) -> None:
+        nonlocal last_s
+        if time.monotonic() - last_s >= _TELL_EVERY_S:
+            last_s = time.monotonic()
+            say(f"{done}/{count} {what}")
+
+    return told
+
+
+def _why_not(outcomes: list[Outcome], found: list[Rewarded]) -> str:
+    """Why not one of these has a reward, and what to do."""
+    if not any(outcome.views for outcome in outcomes):
+        return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
+    missing = list(dict.fromkeys(name for r in found for name in r.missing))
+    hints = {
+        "lpips": "lpips: see edge.lpips and --lpips, or leave it out with --distance none",
+        "perceptual": "perceptual: see edge.metrics, or leave it out with --distance none",
+        "psnr_moving": "psnr_moving: nothing moves where the held-out cameras look; --on whole",
+    }
+    return "no decision of the first batch has a reward, it lacks " + "; ".join(
+        hints.get(name, name) for name in missing
+    )
+
+
+def compared(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
+    """Rewards (B,) as they are learnt from, ``tries`` of every decision together: each less the mean of the
+    others of its decision, so that it does not count itself; of a single try, as it is. NaN where it, or
+    all others, are NaN."""
+    if tries == 1:
+        return rewards
+    table = rewards.reshape(-1, tries)
+    known = np.isfinite(table)
+    filled = np.where(known, table, 0.0)
+    count = known.sum(axis=1, keepdims=True) - known
+    with np.errstate(divide="ignore", invalid="ignore"):
+        others = (filled.sum(axis=1, keepdims=True) - filled) / count
+    return np.where(known, table - others, np.nan).reshape(-1)
+
+
+def _new_learner(setting: Setting, course: Course, crew: Crew) -> Learner:
+    from edge_server.scheduler.learned.ppo import Learner
+
+    spec = course.spec
+    if "semantics" in spec.layout.parts and not spec.layout.centre:
+        first: list[Moment] = [m for e in crew.draw(setting, course.seeds(0)) for m in e]
+        spec = dataclasses.replace(spec, layout=spec.layout.standardised([m.state for m in first]))
+    return Learner(spec, course.seed)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A course's checkpoint: weights under a name of their own, then the file that names them, so that
+    what stands there is whole whenever it is stopped."""
+
+    out: Path
+    key: str
+
+    def load(self) -> tuple[Learner | None, list[Row]]:
+        """The learner and the rows of its log, if a course was begun here."""
+        from edge_server.scheduler.learned.ppo import Learner
+
+        path = self.out / "training.json"
+        if not path.exists():
+            return None, []
+        try:
+            found = json.loads(path.read_text())
+            key, name, done = found["key"], str(found["weights"]), int(found["batches"])
+        except (ValueError, KeyError, TypeError):
+            raise TrainingError(f"{path}: damaged: choose another --out, or delete it") from None
+        if key != self.key:
+            raise TrainingError(
+                f"{self.out} holds a training with other settings: choose another --out, or delete it"
+            )
+        try:
+            lines = (self.out / "training.jsonl").read_text().splitlines()[:done]
+            return Learner.load(self.out / name), [json.loads(line) for line in lines]
+        except (OSError, ValueError) as error:
+            raise TrainingError(
+                f"{self.out}: cannot go on: {error}: choose another --out, or delete it"
+            ) from None
+
+    def save(self, learner: Learner, rows: list[Row]) -> None:
+        name = f"weights-{len(rows):05d}.npz"
+        learner.save(self.out / name)
+        write_text(self.out / "training.jsonl", "".join(json.dumps(row) + "\n" for row in rows))
+        write_json(self.out / "training.json", {"key": self.key, "batches": len(rows), "weights": name})
+        for old in self.out.glob("weights-*.npz"):
+            if old.name != name:
+                old.unlink(missing_ok=True)
+
+
+def _key(setting: Setting, course: Course) -> str:
+    taught = dataclasses.asdict(course)
+    taught.pop("checkpoint_every")  # decides when the disk is written, not what is learnt
+    text = json.dumps([setting.key, taught], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _told(course: Course, row: Row) -> str:
+    omega = f", omega {row['omega_ms']:.0f} ms" if row.get("omega_ms") is not None else ""
+    reward = "-" if row["reward"] is None else f"{row['reward']:.4f}"
+    return f"{row['episodes']}/{course.episodes} episodes: reward {reward}, {row['views']:.1f} views{omega}"
+
+
+def _mean(values: Any) -> float | None:
+    known = [float(v) for v in values if v is not None and np.isfinite(v)]
+    return float(np.mean(known)) if known else None

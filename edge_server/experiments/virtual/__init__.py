@@ -1,0 +1,1 @@
+"""A whole deployment in virtual time."""

@@ -1,0 +1,121 @@
+"""A scenario file as a deployment in virtual time: the same cameras, channel, policy and field as live."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from camera_node.build import build_cameras, load
+from camera_node.capture import Camera
+from camera_node.config import LiveConfig, SourceConfig, WorldConfig, source_config
+from camera_node.synthetic import Scene, make_scene
+from camera_node.synthetic.effects import NO_EFFECTS, Effects
+from channel_emu.model.config import channel_from_mapping
+from edge_server.config import EdgeConfig, embedding_for, open_embedder, read_config
+from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
+from edge_server.experiments.virtual.virtual_deployment import Terms, Truth, VirtualDeployment
+from edge_server.fidelity.scorer import Scorer
+from edge_server.fields import Field
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.loop import Updates, open_foreground, open_keyframes
+from edge_server.live.state import Publication
+from edge_server.scheduler import make_policy
+from freshfield.scenario import Scenario, ScenarioError
+
+# Encoded frames kept in memory: in virtual time a minute of nineteen cameras passes in seconds.
+_CACHE_BYTES = 512 * 2**20
+
+
+def deploy(
+    scenario: Scenario,
+    terms: Terms,
+    *,
+    field: Field | None = None,
+    scorer: Scorer | None = None,
+    cameras: list[Camera] | None = None,
+    data: Path | None = None,
+    on_published: Callable[[Publication], None] | None = None,
+    truth: Truth | None = None,
+) -> VirtualDeployment:
+    """``scenario`` in virtual time, from its seed.
+
+    field: one to go on with; None makes the scenario's. scorer: None scores without LPIPS. cameras: of
+    ``training_cameras``, when several runs share what was rendered. data: folder of recorded data sets.
+    truth: of ``truth_of``, when several runs share it.
+    Raises ScenarioError or DatasetError.
+    """
+    edge = read_config(scenario)
+    source = source_config(scenario)
+    channel = channel_from_mapping(scenario.channel, f"{scenario.path}: channel")
+    try:
+        policy = make_policy(edge.policy.name, edge.policy.value, scenario.rng("policy", edge.policy.name))
+        field = field or _field(edge, scenario.seed)
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: edge: {error}") from None
+    try:
+        embedder = open_embedder(embedding_for(edge, policy))
+        keyframes = open_keyframes(edge.keyframes)
+        foreground = open_foreground(edge.foreground, scenario)
+        updates = Updates(FrameBuffer(scenario.training), policy, field, 0, embedder, keyframes, foreground)
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: edge: {error}") from None
+    return VirtualDeployment(
+        cameras or training_cameras(scenario, data),
+        channel,
+        updates,
+        terms,
+        scenario.seed,
+        truth or truth_of(scenario, source, edge, scorer or Scorer(), data),
+        on_published,
+    )
+
+
+def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camera]:
+    """The training cameras as a node would host them. Raises ScenarioError for real cameras, and for ones
+    that an arm carries: those keep real time."""
+    source = source_config(scenario)
+    if isinstance(source, LiveConfig) or getattr(source, "arm", None) is not None:
+        raise ScenarioError(
+            f"{scenario.path}: source: its cameras or its arm keep real time and cannot be run in virtual "
+            "time: use deploy/up.py, or camera-node and edge-server run"
+        )
+    return build_cameras(scenario, source, scenario.training, data, _CACHE_BYTES)
+
+
+def truth_of(
+    scenario: Scenario, source: SourceConfig, edge: EdgeConfig, scorer: Scorer, data: Path | None = None
+) -> Truth | None:
+    """The exact scene where the world is synthetic, else the held-out captures; None where nothing is."""
+    if not scenario.held_out:
+        return None
+    if isinstance(source, WorldConfig):
+        scene, effects = exact_scene(scenario, source)
+        names = dict(zip(scenario.cameras, scene.cameras))
+        if all(camera in scene.cameras for camera in scenario.cameras):
+            names = {camera: camera for camera in scenario.cameras}
+        lenses = {camera: scene.cameras[names[camera]] for camera in scenario.held_out}
+        return ExactTruth(
+            scorer,
+            {camera: (effects.claimed_lens(lens), pose) for camera, (lens, pose) in lenses.items()},
+            lambda camera, t_s: effects.exposed(scene.renderer(names[camera])).image(t_s),
+        )
+    cameras = build_cameras(scenario, source, scenario.held_out, data, _CACHE_BYTES)
+    return CapturedTruth(scorer, cameras, edge.noisy_truth)
+
+
+def exact_scene(scenario: Scenario, source: WorldConfig) -> tuple[Scene, Effects]:
+    """The world as the held-out cameras see it, and the effects that are listed to be in the truth: those of
+    the kinds lens and exposure are the caller's to apply. Noise and wrong poses belong to captured frames, of
+    which an exact truth has none."""
+    try:
+        scene = make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: source: {error}") from None
+    effects = load(scenario, source, (scenario.held_out or scenario.cameras)[0])
+    return (scene, NO_EFFECTS) if effects is None else (effects.extend(scene), effects)
+
+
+def _field(edge: EdgeConfig, seed: int) -> Field:
+    from edge_server.fields.registry import make_field
+
+    return make_field(edge.field, edge.field_options, seed=seed)

@@ -1,0 +1,243 @@
+"""``edge-server simulate``: a scenario's whole deployment in virtual time, repeatable bit for bit."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_config
+from edge_server.experiments.virtual.from_scenario import deploy
+from edge_server.experiments.virtual.virtual_deployment import Terms, VirtualDeployment
+from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
+from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.live.decision_log import Decisions
+from edge_server.live.state import Publication
+from edge_server.report.machine import versions
+from edge_server.scheduler import read_policy
+from freshfield.files import write_json, write_text
+from freshfield.scenario import Scenario, ScenarioError, load
+
+DESCRIPTION = """\
+Cameras, emulated network, buffer, policy and field of a scenario in virtual time: no ports, no waiting.
+
+  edge-server simulate room --seconds 10
+  edge-server simulate room19 --policy threshold:120 --seed 3 --json
+  edge-server simulate room --compute 4:30 --steps 60 --out runs/virtual
+
+The parts are the live ones, faults included; only the clock differs. An update spends a number of optimiser
+steps, and virtual time is charged for them: zero, as the thesis does, or ms a step and ms an update
+(edge.compute of the scenario, or --compute; edge-server frontier measures what a machine takes). One seed,
+one result: the digest that is printed is of every publication and of the field's parameters.
+"""
+_METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
+# Seconds of virtual time between two lines of progress.
+_TOLD_EVERY_S = 1.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    args = _parser().parse_args(argv)
+    base = args.data or (Path(d) if (d := os.environ.get("FRESHFIELD_DATA")) else None)
+    lpips = weights_folder(args.lpips, base)
+    try:
+        scenario = _scenario(args)
+        config = read_config(scenario)
+        terms = Terms(
+            steps=config.steps if args.steps is None else args.steps,
+            first_steps=args.first_steps,
+            compute=config.compute,
+            epoch_ms=args.epoch_ms,
+            grace_ms=config.grace_ms,
+            score_every_ms=args.score_every_ms,
+        )
+        metric, missing = None, None
+        if config.lpips != "none":
+            metric, missing = open_lpips(lpips, cast(Network, config.lpips))
+        scorer = Scorer(metric, config.noisy_truth, perceptual=listed_metric(config.metrics))
+        decisions: Decisions | None = None
+
+        def published(publication: Publication) -> None:
+            if decisions is not None:
+                decisions.keep(deployment.updates.policy, publication.number)
+
+        deployment = deploy(scenario, terms, scorer=scorer, data=base, on_published=published)
+        if args.out is not None:
+            decisions = Decisions(args.out, embedding_for(config, deployment.updates.policy))
+        if config.deadline_ms is not None:
+            print(
+                f"  edge.deadline_ms: virtual time counts steps; an update is {terms.steps} of them, with "
+                "the field's options as they stand",
+                file=sys.stderr,
+            )
+        if config.learn is not None:
+            print("  edge.learn: in virtual time nobody learns, the policy stays as it is", file=sys.stderr)
+        _run(deployment, args.seconds, quiet=args.json)
+    except (ScenarioError, DatasetError, ValueError) as error:
+        print(f"edge-server simulate: {error}", file=sys.stderr)
+        return 2
+    found = summary(scenario, terms, deployment, args.seconds)
+    if missing:
+        found["lpips_missing"] = missing
+    if args.out is not None:
+        write_output(args.out, found, deployment.publications)
+    print(json.dumps(found) if args.json else show(found))
+    return 0
+
+
+def summary(
+    scenario: Scenario, terms: Terms, deployment: VirtualDeployment, seconds: float
+) -> dict[str, Any]:
+    """What a run came to: books, means over its last fifth, and the digest that tells runs apart."""
+    publications = deployment.publications
+    late = [p for p in publications if p.t_s >= 0.8 * seconds]
+    return {
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "seconds": seconds,
+        "policy": deployment.updates.policy.name,
+        "value": deployment.updates.policy.value,
+        "steps": terms.steps,
+        "compute": dataclasses.asdict(terms.compute),
+        "updates": len(publications),
+        "frames": deployment.frames(),
+        "last_fifth": {name: _mean([getattr(p, name) for p in late]) for name in _METRICS},
+        "views": _mean([float(len(p.selected)) for p in publications]),
+        "update_ms": _mean([p.update_ms for p in publications]),
+        "treated_ms_per_view": deployment.updates.treatment_cost.ms_per_view,
+        "digest": digest(deployment),
+        "versions": versions(),
+    }
+
+
+def digest(deployment: VirtualDeployment) -> str:
+    """SHA-256 of all publications and of the field's state, in hexadecimal."""
+    found = hashlib.sha256()
+    for publication in deployment.publications:
+        found.update(json.dumps(dataclasses.asdict(publication), sort_keys=True).encode())
+    for name, array in sorted(deployment.updates.field.state().items()):
+        found.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
+def write_output(out: Path, found: dict[str, Any], publications: Sequence[Publication]) -> None:
+    """OUT/simulation.json, and OUT/series.jsonl with a line for each publication, as a live run has it."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "simulation.json", found)
+    lines = [json.dumps(dataclasses.asdict(p)) for p in publications]
+    write_text(out / "series.jsonl", "".join(line + "\n" for line in lines))
+
+
+def show(found: dict[str, Any]) -> str:
+    """The summary for a terminal."""
+    value = "" if found["value"] is None else f" {found['value']:g}"
+    cost = found["compute"]
+    charged = f"{cost['ms_per_step']:g} ms a step, {cost['ms_per_update']:g} ms an update"
+    told = charged if any(cost.values()) else "free of charge"
+    lines = [
+        f"{found['scenario']}, seed {found['seed']}, {found['seconds']:g} s of virtual time, "
+        f"{found['policy']}{value}",
+        f"  updates     {found['updates']} of {found['steps']} steps, {told}",
+        f"  views       {_n(found['views'], 1)} an update",
+        "  last fifth  "
+        + ", ".join(
+            f"{k} {_n(v, 3)}" for k, v in found["last_fifth"].items() if k != "perceptual" or v is not None
+        ),
+        "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
+        f"  digest      {found['digest'][:32]}",
+    ]
+    return "\n".join(lines)
+
+
+def _run(deployment: VirtualDeployment, seconds: float, quiet: bool) -> None:
+    began, done_s = time.monotonic(), 0.0
+    while done_s < seconds:
+        step_s = min(_TOLD_EVERY_S, seconds - done_s)
+        deployment.run(step_s)
+        done_s += step_s
+        if not quiet:
+            spent = time.monotonic() - began
+            left = spent / done_s * (seconds - done_s)
+            found = deployment.publications
+            told = f", PSNR {_n(found[-1].psnr_db, 2)}" if found else ""
+            print(f"  {done_s:g} of {seconds:g} s: {len(found)} updates{told}; {left:.0f} s left", flush=True)
+
+
+def _scenario(args: argparse.Namespace) -> Scenario:
+    scenario = load(args.scenario, args.seed)
+    edge = dict(scenario.edge)
+    if args.policy:
+        try:
+            edge["policy"] = dataclasses.asdict(PolicyConfig(*read_policy(args.policy)))
+        except ValueError as error:
+            raise ScenarioError(f"--policy {error}") from None
+    if args.compute:
+        edge["compute"] = dataclasses.asdict(_compute(args.compute))
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+    if not 0.0 < args.seconds <= 1e6:
+        raise ScenarioError(f"--seconds: expected more than 0 and at most 1e6, got {args.seconds:g}")
+    return dataclasses.replace(scenario, edge=edge)
+
+
+def _compute(text: str) -> ComputeConfig:
+    if text == "zero":
+        return ComputeConfig()
+    step, _, update = text.partition(":")
+    try:
+        return ComputeConfig(float(step), float(update or 0.0))
+    except ValueError:
+        raise ScenarioError(
+            f"--compute {text}: expected zero, or ms a step and ms an update such as 4:30"
+        ) from None
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server simulate", description=DESCRIPTION, formatter_class=raw)
+    add = parser.add_argument
+    add("scenario", help="scenario file, or the name of a shipped one")
+    add("--seconds", type=float, default=10.0, metavar="S", help="of virtual time [%(default)g]")
+    add("--seed", type=int, metavar="K", help="instead of the scenario's")
+    add("--policy", metavar="NAME[:VALUE]", help="instead of the scenario's, e.g. threshold:120")
+    add("--steps", type=int, metavar="N", help="of an update [edge.steps of the scenario, else 100]")
+    add("--first-steps", type=int, default=0, metavar="N", help="of the first update [as the others]")
+    add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
+    add(
+        "--epoch-ms",
+        type=float,
+        default=250.0,
+        metavar="MS",
+        help="between two decisions [%(default)g]",
+    )
+    add("--score-every-ms", type=float, default=250.0, metavar="MS", help="[%(default)g]")
+    add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
+    add(
+        "--lpips",
+        type=Path,
+        metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]",
+    )
+    add("--out", type=Path, metavar="DIR",
+        help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
+    add("--json", action="store_true", help="everything, as one JSON object")
+    return parser
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _n(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

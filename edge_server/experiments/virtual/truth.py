@@ -1,0 +1,105 @@
+"""What a field is scored against in virtual time: the exact scene, or the nearest capture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.capture import Camera, Encoded
+from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
+from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from freshfield import payload
+from freshfield.geometry import Pinhole
+
+_NOISE_FRAMES = 8
+# Image uint8 (H, W, 3), intrinsics, camera-to-world (4, 4).
+Seen = tuple[NDArray[np.uint8], Pinhole, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class ExactTruth:
+    """A synthetic scene rendered at the very instant: no truth is older or younger than the present.
+
+    cameras: held-out ones, (intrinsics, camera-to-world). image: (camera, seconds) -> uint8 (H, W, 3).
+    """
+
+    scorer: Scorer
+    cameras: dict[str, tuple[Pinhole, NDArray[np.float64]]]
+    image: Callable[[str, float], NDArray[np.uint8]]
+
+    def view(self, camera: str, present_ns: int) -> Seen:
+        """What a held-out camera sees at an instant, its lens and its camera-to-world pose."""
+        return self.image(camera, present_ns / 1e9), *self.cameras[camera]
+
+    def score(self, field: Any, present_ns: int) -> Score:
+        """Mean score over the held-out cameras; moving pixels by what the scene looked like before, which
+        an analytic scene tells of the time before it was looked at, too."""
+        lags_ns = [round(lag * 1e6) for lag in LAGS_MS]
+        scores = []
+        for camera, (intrinsics, pose) in self.cameras.items():
+            truth = self.image(camera, present_ns / 1e9)
+            earlier = [self.image(camera, (present_ns - lag) / 1e9) for lag in lags_ns]
+            shown = field.render(pose, intrinsics).color
+            scores.append(self.scorer.score(camera, shown, present_ns, truth, present_ns, earlier))
+        return mean_score(scores)
+
+
+class CapturedTruth:
+    """Held-out cameras whose captures are the truth: the one nearest to the present, at most half a period
+    away. noisy: real video, so that the bound of moving pixels follows its noise."""
+
+    def __init__(self, scorer: Scorer, cameras: Sequence[Camera], noisy: bool = False) -> None:
+        self._scorer = scorer
+        self._cameras = tuple(cameras)
+        self._bounds = {c.name: _noise_bound(c) if noisy else BOUND for c in cameras}
+
+    def view(self, camera: str, present_ns: int) -> Seen:
+        """What a held-out camera captured nearest to an instant, its lens and its camera-to-world pose."""
+        source = next(c for c in self._cameras if c.name == camera)
+        shot = source.capture(_nearest(source, present_ns))
+        return _image(source, shot), shot.intrinsics, shot.pose.matrix()
+
+    def score(self, field: Any, present_ns: int) -> Score:
+        """Mean score over the held-out cameras."""
+        scores = []
+        for camera in self._cameras:
+            tick = _nearest(camera, present_ns)
+            shot = camera.capture(tick)
+            ticks = range(max(0, tick - round(1.5 * LAGS_MS[-1] * float(camera.fps) / 1e3)), tick + 1)
+            times = [_instant_ns(camera, k) for k in ticks]
+            lags = [ticks[i] for i in frames_at_lags(times, times[-1])]
+            before = [camera.capture(k) for k in lags]
+            earlier = [_image(camera, b) for b in before if b.pose == shot.pose]
+            shown = field.render(shot.pose.matrix(), shot.intrinsics).color
+            scores.append(
+                self._scorer.score(
+                    camera.name, shown, present_ns, _image(camera, shot), times[-1], earlier,
+                    self._bounds[camera.name],
+                )
+            )  # fmt: skip
+        return mean_score(scores)
+
+
+def _nearest(camera: Camera, at_ns: int) -> int:
+    return round(at_ns * camera.fps.numerator / (camera.fps.denominator * 1e9))
+
+
+def _instant_ns(camera: Camera, tick: int) -> int:
+    return tick * 10**9 * camera.fps.denominator // camera.fps.numerator
+
+
+def _image(camera: Camera, shot: Encoded) -> NDArray[np.uint8]:
+    return payload.decode(shot.payload, camera.codec, shot.intrinsics.width, shot.intrinsics.height)
+
+
+def _noise_bound(camera: Camera) -> float:
+    estimate = NoiseEstimate()
+    images = [_image(camera, camera.capture(k)) for k in range(_NOISE_FRAMES)]
+    for a, b in pairwise(images):
+        estimate.add(a, b)
+    return estimate.bound

@@ -1,0 +1,350 @@
+"""A whole deployment in virtual time: cameras -> links -> gate -> buffer -> updates -> publications.
+
+The parts are the live ones; only their clock differs. One seed decides everything, so a run is repeatable
+bit for bit, faults included. What an update costs is charged as ``Compute`` says: the present is the instant
+at which the charge is over.
+
+Pay late holds here too: a frame is captured, encoded and checksummed only when an update uses it or a fault
+damages it. Nobody can tell the difference, because until then nobody looks inside.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from camera_node.capture import Camera
+from channel_emu.model.channel import Channel
+from channel_emu.model.config import ChannelConfig
+from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.link import Event, Kind, Link
+from edge_server.config import ComputeConfig
+from edge_server.fidelity.scorer import Score
+from edge_server.fields import Budget
+from edge_server.live.buffer import Buffered
+from edge_server.live.ingest import Gate
+from edge_server.live.loop import Selection, Updates
+from edge_server.live.state import Publication
+from edge_server.scheduler import treatment_of
+from freshfield.clock import VirtualClock
+from freshfield.frame import Frame, FrameRejected, from_request, to_request
+from freshfield.geometry import Pose
+
+SESSION = "virtual"
+# Where a camera looks is part of what a capture tells; nobody asks before the frame is used.
+_NO_POSE = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+# What an update costs in virtual time.
+Compute = ComputeConfig
+_FREE = Compute()
+
+
+class Wake(NamedTuple):
+    """When the edge goes on: at an instant, or at the next arrival where it waits for one."""
+
+    at_ns: int = NEVER_NS
+    on_arrival: bool = False
+
+
+_AT_ARRIVAL = Wake(on_arrival=True)
+
+
+class Truth(Protocol):
+    """Scores what the field shows at the present. See ``experiments.virtual.truth``."""
+
+    def score(self, field: Any, present_ns: int) -> Score | None: ...
+
+    def view(self, camera: str, present_ns: int) -> tuple[Any, Any, Any]:
+        """Image, intrinsics and pose of a held-out camera at an instant."""
+        ...
+
+
+@dataclass(frozen=True)
+class Terms:
+    """How a deployment runs. steps: the optimiser's, of one update. first_steps: of the first update (0: as
+    the others). epoch_ms: least time between two decisions. grace_ms: how long the first update waits for
+    cameras that have not reported. score_every_ms: publications nearer than this to the last scored one are
+    not scored; None scores nothing. first_ms: no decision before this instant of the run, and from it on only
+    at whole numbers of epochs after it, so that policies that take different times decide at the same
+    instants. scratch: every update begins with a field that knows nothing, as in the thesis."""
+
+    steps: int
+    first_steps: int = 0
+    compute: Compute = _FREE
+    epoch_ms: float = 0.0
+    grace_ms: float = 3000.0
+    score_every_ms: float | None = 0.0
+    first_ms: float | None = None
+    scratch: bool = False
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.first_steps < 0:
+            raise ValueError("steps: expected at least 1, of the first update at least 0")
+        waits = (self.epoch_ms, self.grace_ms, self.score_every_ms or 0.0)
+        if not all(0.0 <= ms < 1e12 for ms in waits):
+            raise ValueError("epoch_ms, grace_ms and score_every_ms: expected finite numbers of at least 0")
+        if self.first_ms is not None and not (self.first_ms >= 0.0 and self.epoch_ms > 0.0):
+            raise ValueError("first_ms: expected zero or more, and an epoch_ms of decisions")
+
+    def next_ns(self, decided_ns: int, done_ns: int, origin_ns: int) -> int:
+        """Instant of the decision after one that was taken at ``decided_ns`` and whose update is done."""
+        epoch_ns = round(self.epoch_ms * 1e6)
+        if self.first_ms is None:
+            return decided_ns + epoch_ns
+        first_ns = origin_ns + round(self.first_ms * 1e6)
+        # One epoch on at least, and none that has passed meanwhile.
+        passed = max(decided_ns + 1, done_ns) - first_ns
+        return first_ns + -(-passed // epoch_ns) * epoch_ns
+
+
+class VirtualDeployment:
+    """Runs ``updates`` on what ``cameras`` send over the channel. ``run`` may be called again to go on.
+
+    cameras: the training cameras, as a node would host them; their names are the buffer's. seed: of the
+    channel. truth: what publications are scored against. on_published: called with each publication.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        channel: ChannelConfig,
+        updates: Updates,
+        terms: Terms,
+        seed: int,
+        truth: Truth | None = None,
+        on_published: Callable[[Publication], None] | None = None,
+    ) -> None:
+        self.clock = VirtualClock(updates.start_ns)
+        self.updates = updates
+        updates.expose = self.exposed
+        self.terms = terms
+        self.truth = truth
+        self.publications: list[Publication] = []
+        self.captured: Counter[str] = Counter()
+        self.delivered: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
+        self.failed: Counter[str] = Counter()
+        """Captures that a source could not give, by camera; noticed when a decision wanted them."""
+        self._on_published = on_published
+        self._origin_ns = updates.start_ns  # of the channel and of the cameras' ticks
+        self._cameras = {camera.name: camera for camera in cameras}
+        if tuple(self._cameras) != updates.buffer.cameras:
+            raise ValueError("the cameras and the buffer's are not the same, or in another order")
+        self._channel = Channel(channel, seed)
+        self._links: dict[str, Link] = {name: self._channel.link(name) for name in self._cameras}
+        # Only a fault that limits bandwidth asks how large a frame is.
+        self._weigh = "bandwidth" in channel.faults
+        self._gate = Gate(updates.buffer.cameras, ())
+        self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
+        self._tick = dict.fromkeys(self._cameras, 0)
+        self._used: dict[str, tuple[Frame, ...]] = {}
+        """The last two frames of each camera that were made: one that is used again is the same object."""
+        self._scored_ns: int | None = None
+        self.decided_ns = updates.start_ns
+        """Instant of the decision that is being carried out, or was last."""
+        self._edge = self._run_edge()
+        self._wake = next(self._edge)
+
+    def run(self, seconds: float) -> list[Publication]:
+        """Go on for ``seconds`` of virtual time; returns the publications of that time."""
+        end_ns = self.clock.now_ns() + round(seconds * 1e9)
+        known = len(self.publications)
+        while True:
+            due_ns = self._origin_ns + min(link.next_event_ns for link in self._links.values())
+            capture_ns = min(self._due_ns(name) for name in self._cameras)
+            now_ns = min(due_ns, capture_ns, self._wake.at_ns)
+            if now_ns > end_ns:
+                break
+            self.clock.advance_to(now_ns)
+            # What completes on a boundary makes room for what is offered there, and a decision sees both.
+            if due_ns == now_ns:
+                for link in self._links.values():
+                    self._take(link.advance(now_ns - self._origin_ns))
+            elif capture_ns == now_ns:
+                for name in self._cameras:
+                    if self._due_ns(name) == now_ns:
+                        self._capture(name, now_ns)
+            else:
+                self._wake = next(self._edge)
+        self.clock.advance_to(end_ns)
+        return self.publications[known:]
+
+    def exposed(self, items: Sequence[Buffered]) -> tuple[Buffered, ...]:
+        """Frames of the buffer with their images and poses, made now; without those that a source cannot
+        give. For who decides in the place of this deployment's own edge."""
+        return self._exposed_once(items)
+
+    def frames(self) -> dict[str, Any]:
+        """The books, with the terms of report.json; every captured frame is offered at once here."""
+        sent = sum(self.captured.values())
+        ends = {
+            kind.value: sum(link.counts[kind] for link in self._links.values())
+            for kind in (Kind.SKIPPED, Kind.DROPPED_BUSY, Kind.SUPERSEDED, Kind.LOST, Kind.BROKEN)
+        }
+        return {
+            "captured": sent, "replaced": 0, "waiting": 0, "sent": sent, **ends,
+            "duplicated": sum(link.counts[Kind.DUPLICATED] for link in self._links.values()),
+            "delivered": sum(self.delivered.values()),
+            "rejected": dict(self.rejected),
+            "in_flight": sum(link.in_flight for link in self._links.values()),
+        }  # fmt: skip
+
+    # --- cameras and channel --------------------------------------------------------------------------
+
+    def _due_ns(self, name: str) -> int:
+        """Instant of a camera's next capture: tick / fps, to the nanosecond."""
+        fps = self._cameras[name].fps
+        tick_ns = self._tick[name] * 10**9 * fps.denominator // fps.numerator
+        return self._origin_ns + tick_ns
+
+    def _capture(self, name: str, now_ns: int) -> None:
+        camera, tick = self._cameras[name], self._tick[name]
+        self._tick[name] = tick + 1
+        stamped_ns = self._node_clocks[name].stamp_ns(now_ns)
+        frame = Frame(
+            camera=name,
+            session=SESSION,
+            sequence=tick,
+            generated_ns=stamped_ns,
+            pose=_NO_POSE,
+            intrinsics=camera.source.intrinsics,
+            codec=camera.codec,
+            payload=b"",
+            # A clock exchange that takes no time knows the offset exactly.
+            clock_offset_ns=now_ns - stamped_ns,
+        )
+        size = len(self._exposed(frame).payload) if self._weigh else 0
+        self.captured[name] += 1
+        self._take(self._links[name].offer(now_ns - self._origin_ns, frame, size)[1])
+
+    def _take(self, events: Sequence[Event]) -> None:
+        for event in events:
+            if event.kind in (Kind.DELIVERED, Kind.DUPLICATED):
+                self._deliver(event.transit.item, event.transit.flips)
+
+    def _flush(self, now_ns: int) -> None:
+        """Break off what is on its way (thesis 6.5: none of it is considered to be in transit)."""
+        for link in self._links.values():
+            self._take(link.flush(now_ns - self._origin_ns))
+
+    def _deliver(self, frame: Frame, flips: tuple[tuple[float, int], ...]) -> None:
+        now_ns = self.clock.now_ns()
+        try:
+            if flips:
+                from channel_emu.model.faults.corruption import (
+                    damage,  # loaded only where a scenario lists it
+                )
+
+                request = to_request(self._exposed(frame))
+                request.payload = damage(request.payload, flips)
+                frame = from_request(request)
+            self._gate.admit(frame, now_ns)
+        except FrameRejected as error:
+            self.rejected[error.reason] += 1
+            return
+        self.delivered[frame.camera] += 1
+        self.updates.buffer.put(frame, now_ns)
+        if self._wake.on_arrival:
+            self._wake = Wake(now_ns)
+
+    def _exposed(self, frame: Frame) -> Frame:
+        """The frame with its image and pose, made now."""
+        shot = self._cameras[frame.camera].capture(frame.sequence)
+        return dataclasses.replace(
+            frame,
+            pose=shot.pose,
+            intrinsics=shot.intrinsics,
+            payload=shot.payload,
+            pose_gap_ns=shot.pose_gap_ns,
+        )
+
+    # --- the edge -------------------------------------------------------------------------------------
+
+    def _run_edge(self) -> Iterator[Wake]:
+        """The edge's loop, which says after each step when it wants to go on."""
+        updates, terms = self.updates, self.terms
+        steps = terms.first_steps or terms.steps
+        if terms.first_ms is None:
+            yield from self._await_cameras()
+        else:  # whoever has reported by then: the instants are given
+            yield Wake(self._origin_ns + round(terms.first_ms * 1e6))
+        while True:
+            decided_ns = self.decided_ns = self.clock.now_ns()
+            plan = updates.plan(decided_ns)
+            if plan.flush:
+                self._flush(decided_ns)
+            while (selection := updates.select(plan, self.clock.now_ns())) is None:
+                waits = plan.wait_until_ns > self.clock.now_ns()
+                yield Wake(plan.wait_until_ns) if waits else _AT_ARRIVAL
+            if terms.scratch:
+                updates.field.reset()
+            treated = len(selection.items) if treatment_of(updates.policy) is not None else 0
+            publishes_ns = self.clock.now_ns() + terms.compute.charge_ns(steps, treated)
+            fitted = updates.fit(self._exposed_all(selection), Budget(steps=steps), publishes_ns)
+            if fitted is None:
+                yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
+                continue
+            views, report = fitted
+            steps = terms.steps
+            yield Wake(self.clock.now_ns() + terms.compute.charge_ns(report.steps, treated))
+            published_ns = self.clock.now_ns()
+            self._publish(updates.publication(selection, views, report, published_ns))
+            next_ns = terms.next_ns(decided_ns, published_ns, self._origin_ns)
+            if next_ns > published_ns:
+                yield Wake(next_ns)
+            elif published_ns == decided_ns:
+                yield _AT_ARRIVAL  # free updates without epochs: once for every arrival, not for ever
+
+    def _await_cameras(self) -> Iterator[Wake]:
+        """As the live loop: give every camera a chance to report."""
+        buffer = self.updates.buffer
+        while not buffer.newest():
+            yield _AT_ARRIVAL
+        until_ns = self.clock.now_ns() + round(self.terms.grace_ms * 1e6)
+        while len(buffer.newest()) < len(self._cameras) and self.clock.now_ns() < until_ns:
+            yield Wake(until_ns, on_arrival=True)
+
+    def _exposed_all(self, selection: Selection) -> Selection:
+        """The selection with images."""
+        earlier = self._exposed_once(selection.earlier)  # first: what a camera made last is kept longest
+        return dataclasses.replace(selection, items=self._exposed_once(selection.items), earlier=earlier)
+
+    def _exposed_once(self, items: Sequence[Buffered]) -> tuple[Buffered, ...]:
+        """With images, those that a source could give. A frame used again stays the same object: it is
+        decoded once."""
+        made = []
+        for item in items:
+            camera, sequence = item.frame.camera, item.frame.sequence
+            known = self._used.get(camera, ())
+            used = next((frame for frame in known if frame.sequence == sequence), None)
+            if used is None:
+                try:
+                    used = self._exposed(item.frame)
+                except ValueError:
+                    self.failed[camera] += 1
+                    continue
+                self._used[camera] = (used, *known)[:2]
+            made.append(Buffered(used, item.generated_ns, item.received_ns))
+        return tuple(made)
+
+    def _publish(self, publication: Publication) -> None:
+        publication = self._with_score(publication)
+        self.publications.append(publication)
+        if self._on_published is not None:
+            self._on_published(publication)
+
+    def _with_score(self, publication: Publication) -> Publication:
+        every_ms, present_ns = self.terms.score_every_ms, publication.published_ns
+        if self.truth is None or every_ms is None:
+            return publication
+        if self._scored_ns is not None and present_ns - self._scored_ns < every_ms * 1e6:
+            return publication
+        score = self.truth.score(self.updates.field.snapshot(present_ns), present_ns)
+        if score is None:
+            return publication
+        self._scored_ns = present_ns
+        return publication.scored(score)

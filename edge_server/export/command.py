@@ -1,0 +1,267 @@
+"""``edge-server export``: what a run or a fit has made, as files for other programs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+from edge_server.export import ExportError, file_names
+from edge_server.surface import SurfaceError
+from freshfield.files import write_json
+
+DESCRIPTION = """\
+Write what a run or a fit has made as files for other programs. RUN is its folder, or a checkpoint in it.
+
+  edge-server export runs/demo --mesh tile.ply
+  edge-server export runs/cell --mesh tile.ply --measure cell      how far it is from the true surface
+  edge-server export runs/fit-tile --mesh tile.glb --voxel 1 --watertight
+  edge-server export runs/demo/snapshot-000120.npz --splats tile.ply
+  edge-server export runs/demo --colmap out/colmap --transforms out/nerf --trajectory out/path.tum
+
+--mesh         triangles with colours: .ply or .glb (scikit-image: pip install 'freshfield[surface]')
+--splats       the Gaussians of a splat field, in the layout that splat viewers open (.ply)
+--points       surface points with colours (.ply)
+--colmap       DIR/images and a model in DIR/sparse/0, as text, or --binary
+--transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
+--trajectory   poses as the TUM benchmark has them; a file for each camera that moved
+
+Several can be asked for at once. Lengths in the files are metres, our z points up (in GLB: y). A mesh comes
+from depth as the cameras see it, fused on a grid; what no camera saw stays open, or is closed: --watertight.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns its exit status."""
+    parser = _parser()
+    args = parser.parse_args(argv)
+    wanted = ("mesh", "splats", "points", "colmap", "transforms", "trajectory")
+    if all(getattr(args, name) is None for name in wanted):
+        parser.error(f"say what to write: {', '.join(f'--{name}' for name in wanted)}")
+    try:
+        Export(args).run()
+    except (ExportError, SurfaceError) as error:
+        print(f"edge-server export: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server export", description=DESCRIPTION, formatter_class=raw)
+    add = parser.add_argument
+    add("run", type=Path, metavar="RUN", help="folder of a run or fit, or a checkpoint")
+    add("--mesh", type=Path, metavar="FILE", help=".ply or .glb")
+    add("--splats", type=Path, metavar="FILE", help=".ply")
+    add("--points", type=Path, metavar="FILE", help=".ply")
+    add("--colmap", type=Path, metavar="DIR")
+    add("--binary", action="store_true", help="of --colmap: binary instead of text")
+    add("--transforms", type=Path, metavar="DIR")
+    add("--trajectory", type=Path, metavar="FILE")
+    add("--count", type=int, default=20000, metavar="N", help="points of --points and others [%(default)s]")
+    mesh = parser.add_argument_group("of --mesh").add_argument
+    mesh("--voxel", type=float, metavar="MM", help="[what a pixel spans at the surface]")
+    mesh("--truncation", type=float, default=4.0, metavar="VOXELS", help="[%(default)g]")
+    mesh(
+        "--bounds", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="metres [what the cameras see]",
+    )  # fmt: skip
+    mesh("--watertight", action="store_true", help="close it where nobody looked")
+    mesh("--method", default="tsdf", help="tsdf, or sdf: a distance function with the eikonal term [tsdf]")
+    mesh("--no-sharpen", action="store_true", help="take the field's depth as it is, without moving it to "
+         "where the cameras' pictures agree: faster, for what moves, less exact")  # fmt: skip
+    mesh("--no-carve", action="store_true", help="start from the field's depth instead of voxels fitted anew "
+         "for it, if 30 pictures show a scene that ends at its box: faster, less complete")  # fmt: skip
+    mesh("--min-weight", type=float, default=0.2, metavar="W", help="evidence a voxel needs [%(default)g]")
+    mesh("--solid", type=float, default=0.8, metavar="A", help="opacity of a surface, 0 to 1 [%(default)g]")
+    mesh("--keep", type=float, default=0.02, metavar="SHARE", help="of the largest piece's area, that others "
+         "need to stay [%(default)g]")  # fmt: skip
+    mesh("--pieces", type=int, metavar="N", help="at most [all of them]")
+    mesh("--measure", metavar="SCENARIO", help="of the run: where its scene is synthetic and still, say how "
+         "far the mesh is from the true surface")  # fmt: skip
+    mesh("--json", type=Path, metavar="FILE", help="size, seconds of each stage and, of --measure, distances")
+    mesh("--memory", type=float, default=2048.0, metavar="MB", help="for voxels [%(default)g]")
+    return parser
+
+
+class Export:
+    """One call of the command. What several outputs need is made once, and only if one needs it."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args = args
+        self._said = ("", 0.0)
+        self._began = time.perf_counter()
+        self._stages: dict[str, tuple[float, float]] = {}  # when each began and when it was last heard of
+
+    @cached_property
+    def source(self):
+        """The field and its cameras."""
+        from edge_server.export.run_source import open_source
+
+        source = open_source(self.args.run)
+        print(f"{source.file}: {source.name}, {len(source.views)} cameras", flush=True)
+        return source
+
+    @cached_property
+    def maps(self):
+        """What the cameras see of the field."""
+        from edge_server.surface.reconstruct import maps_of
+
+        return maps_of(self.source.field.snapshot(), self.source.views, self._settings(), self._progress)
+
+    @cached_property
+    def cloud(self):
+        """Surface points and who sees them."""
+        from edge_server.export.point_cloud import cloud_of
+
+        return cloud_of(self.maps, self.args.count)
+
+    def run(self) -> None:
+        """Check everything that can be checked at once, then write. ExportError, SurfaceError."""
+        args = self.args
+        self._check()
+        for name in ("trajectory", "splats", "transforms", "colmap", "points", "mesh"):
+            if getattr(args, name) is not None:
+                getattr(self, f"_{name}")(getattr(args, name))
+
+    def _check(self) -> None:
+        args = self.args
+        for name, endings in (("mesh", (".ply", ".glb")), ("splats", (".ply",)), ("points", (".ply",))):
+            path = getattr(args, name)
+            if path is not None and path.suffix.lower() not in endings:
+                raise ExportError(f"--{name} {path}: expected a file that ends in {' or '.join(endings)}")
+        if args.count < 1:
+            raise ExportError(f"--count {args.count}: expected 1 or more")
+        if args.binary and args.colmap is None:
+            raise ExportError("--binary is for --colmap DIR")
+        if args.mesh is None and (args.measure is not None or args.json is not None):
+            raise ExportError("--measure and --json are for --mesh FILE")
+        self._settings()
+
+    def _settings(self):
+        from edge_server.surface.reconstruct import MeshSettings
+
+        a = self.args
+        if a.voxel is not None and not a.voxel > 0:
+            raise ExportError(f"--voxel {a.voxel:g}: expected more than 0 mm")
+        box = None if a.bounds is None else (tuple(a.bounds[:3]), tuple(a.bounds[3:]))
+        return MeshSettings(
+            method=a.method,
+            sharpen=not a.no_sharpen,
+            carve=a.mesh is not None and not a.no_carve,  # points need no more than the field has
+            voxel_m=None if a.voxel is None else 1e-3 * a.voxel,
+            truncation=a.truncation,
+            bounds=box,
+            watertight=a.watertight,
+            min_weight=a.min_weight,
+            solid=a.solid,
+            keep_share=a.keep,
+            most=a.pieces,
+            memory_mb=a.memory,
+        )
+
+    def _mesh(self, path: Path) -> None:
+        from edge_server.surface.reconstruct import mesh_of_maps
+
+        begin = time.perf_counter()
+        mesh = mesh_of_maps(self.maps, self._settings(), self._progress)
+        if path.suffix.lower() == ".glb":
+            from edge_server.export.glb import write_mesh
+        else:
+            from edge_server.export.ply import write_mesh
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_mesh(path, mesh.vertices, mesh.faces, mesh.color)
+        spent_s = time.perf_counter() - begin
+        closed = ", watertight" if mesh.watertight else ""
+        print(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices{closed}", flush=True)
+        found = None if self.args.measure is None else self._measured(mesh)
+        if self.args.json is None:
+            return
+        about = {
+            "file": path.name,
+            "triangles": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "watertight": mesh.watertight,
+            "cameras": len(self.source.views),
+            "seconds": round(spent_s, 3),
+            "stages_s": {name: round(end - start, 3) for name, (start, end) in self._stages.items()},
+            "measured": found,
+        }
+        write_json(self.args.json, about, indent=1)
+
+    def _measured(self, mesh):
+        from edge_server.experiments.scenes.mesh_truth import in_words, measured
+
+        found = measured(mesh, self.args.measure, self.source.views)
+        unknown = "not measured: the true surface is known of synthetic scenes that stand still"
+        print(f"  {in_words(found) if found else unknown}", flush=True)
+        return found
+
+    def _points(self, path: Path) -> None:
+        from edge_server.export.ply import write_points
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_points(path, self.cloud.points.astype("float32"), self.cloud.color)
+        print(f"{path}: {len(self.cloud.points)} points", flush=True)
+
+    def _splats(self, path: Path) -> None:
+        from edge_server.export.splats import write_splats
+
+        snapshot = self.source.field.snapshot()
+        if not hasattr(snapshot, "gaussians"):
+            raise ExportError(
+                f"--splats: {self.source.name} has no Gaussians: use a run or fit of field splat"
+            )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        print(f"{path}: {write_splats(path, snapshot.gaussians, snapshot.box)} Gaussians", flush=True)
+
+    def _colmap(self, folder: Path) -> None:
+        from edge_server.export.colmap import write_model
+        from edge_server.export.run_source import write_images
+
+        write_model(folder / "sparse" / "0", self.source.shots, self.cloud, self.args.binary)
+        write_images(folder / "images", self.source.shots)
+        print(f"{folder}: {len(self.source.shots)} images, {len(self.cloud.points)} points", flush=True)
+
+    def _transforms(self, folder: Path) -> None:
+        from edge_server.export.run_source import write_images
+        from edge_server.export.transforms import write_transforms
+
+        write_images(folder / "images", self.source.shots)
+        self._points(folder / "points.ply")
+        path = write_transforms(folder, self.source.shots, "points.ply")
+        print(f"{path}: {len(self.source.shots)} frames", flush=True)
+
+    def _trajectory(self, path: Path) -> None:
+        from edge_server.export.run_source import poses_of
+        from edge_server.export.trajectory import write_tum
+
+        found = poses_of(self.source)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        moved = [camera for camera, rows in found.items() if any(pose != rows[0][1] for _, pose in rows)]
+        if len(moved) <= 1:
+            camera = moved[0] if moved else None
+            rows = found[camera] if camera else [row for rows in found.values() for row in rows]
+            print(f"{path}: {write_tum(path, rows)} poses{f' of {camera}' if camera else ''}", flush=True)
+            return
+        for camera, name in zip(moved, file_names(moved)):
+            file = path.with_name(f"{path.stem}-{name}{path.suffix}")
+            print(f"{file}: {write_tum(file, found[camera])} poses", flush=True)
+
+    def _progress(self, what: str, share: float) -> None:
+        """A line a second, and one when a stage is done."""
+        name, at = self._said
+        now = time.perf_counter()
+        # A stage has begun when the one before it was last heard of.
+        begin = max((end for _, end in self._stages.values()), default=self._began)
+        self._stages[what] = (self._stages.get(what, (begin, now))[0], now)
+        if share >= 1.0 or what != name or now - at >= 1.0:
+            self._said = (what, now)
+            print(f"  {what:10} {100 * share:3.0f} %", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

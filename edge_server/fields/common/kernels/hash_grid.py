@@ -1,0 +1,240 @@
+"""Multiresolution hash encoding (thesis 3.23; Mueller et al. 2022): features of points and their gradient.
+
+A point is given in the unit cube. Level l is a grid of ``resolution[l]`` cells a side; where its vertices
+fit into its table they are stored densely, else hashed. Two features a vertex, interpolated trilinearly.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.mlp import backward, forward
+from edge_server.fields.common.kernels.radiance_model import is_a, query_back, query_color, query_density
+from edge_server.fields.common.kernels.simd import add_pair, fetch_add, weighted_pairs
+
+FEATURES = 2  # a vertex; one 64-bit load
+SEGMENT = 16  # vertices a dirty flag stands for
+
+_PRIME_Y, _PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
+
+
+class Grid(NamedTuple):
+    """The levels of one encoding.
+
+    resolution: int32 (L,), cells a side. first: int64 (L + 1,), first vertex of each level in ``table``;
+    a multiple of SEGMENT. dense: bool (L,). table: float32 (vertices, 2).
+    """
+
+    resolution: NDArray[np.int32]
+    first: NDArray[np.int64]
+    dense: NDArray[np.bool_]
+    table: NDArray[np.float32]
+
+
+@part
+def _corner(x, res):
+    """Lower vertex (uint32) and fraction of coordinate x in [0, 1] on a grid of res cells."""
+    scaled = x * np.float32(res)
+    i = min(max(np.int32(scaled), np.int32(0)), np.int32(res - 1))
+    return np.uint32(i), scaled - np.float32(i)
+
+
+@part
+def _corners(level_dense, res, mask, ix, iy, iz):
+    """The eight vertices' places in the level's table, x fastest, as uint32."""
+    one = np.uint32(1)
+    if level_dense:
+        sy = np.uint32(res + 1)
+        sz = np.uint32(sy * sy)
+        a = np.uint32(ix + np.uint32(iy * sy) + np.uint32(iz * sz))
+        b, c = np.uint32(a + sy), np.uint32(a + sz)
+        d = np.uint32(b + sz)
+        return a, np.uint32(a + one), b, np.uint32(b + one), c, np.uint32(c + one), d, np.uint32(d + one)
+    x1 = np.uint32(ix + one)
+    y0 = np.uint32(iy * _PRIME_Y)
+    y1 = np.uint32(y0 + _PRIME_Y)
+    z0 = np.uint32(iz * _PRIME_Z)
+    z1 = np.uint32(z0 + _PRIME_Z)
+    return (
+        np.uint32((ix ^ y0 ^ z0) & mask),
+        np.uint32((x1 ^ y0 ^ z0) & mask),
+        np.uint32((ix ^ y1 ^ z0) & mask),
+        np.uint32((x1 ^ y1 ^ z0) & mask),
+        np.uint32((ix ^ y0 ^ z1) & mask),
+        np.uint32((x1 ^ y0 ^ z1) & mask),
+        np.uint32((ix ^ y1 ^ z1) & mask),
+        np.uint32((x1 ^ y1 ^ z1) & mask),
+    )
+
+
+@part
+def _weights(fx, fy, fz):
+    one = np.float32(1.0)
+    gx, gy, gz = one - fx, one - fy, one - fz
+    a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
+    return gx * a, fx * a, gx * b, fx * b, gx * c, fx * c, gx * d, fx * d
+
+
+@part
+def _encode_level(dense, res, mask, x, y, z, table, out0, out1):
+    for s in range(out0.size):
+        ix, fx = _corner(x[s], res)
+        iy, fy = _corner(y[s], res)
+        iz, fz = _corner(z[s], res)
+        rows = _corners(dense, res, mask, ix, iy, iz)
+        out0[s], out1[s] = weighted_pairs(table, rows, _weights(fx, fy, fz))
+
+
+@part
+def encode(grid, levels, x, a, b, features):
+    """Features of points a to b: x float32 (3, N) in the unit cube -> features float32 (>= 2 L, N).
+
+    Levels from ``levels`` on are switched off (coarse to fine): their features are 0.
+    """
+    for l in range(grid.resolution.size):
+        out0, out1 = features[2 * l, a:b], features[2 * l + 1, a:b]
+        if l >= levels:
+            out0[:] = np.float32(0.0)
+            out1[:] = np.float32(0.0)
+            continue
+        res = grid.resolution[l]
+        table = grid.table[grid.first[l] : grid.first[l + 1]]
+        mask = np.uint32(table.shape[0] - 1)
+        if grid.dense[l]:
+            _encode_level(True, res, mask, x[0, a:b], x[1, a:b], x[2, a:b], table, out0, out1)
+        else:
+            _encode_level(False, res, mask, x[0, a:b], x[1, a:b], x[2, a:b], table, out0, out1)
+
+
+@part
+def _mark(dirty, i, j):
+    """Flag the segments of two vertices that are neighbours along x, and so mostly share one."""
+    a, b = i >> np.uint32(4), j >> np.uint32(4)
+    dirty[a] = True
+    if b != a:
+        dirty[b] = True
+
+
+@part
+def _scatter_level(dense, res, mask, x, d0, d1, gradient, dirty):
+    zero = np.float32(0.0)
+    for s in range(d0.size):
+        g0, g1 = d0[s], d1[s]
+        if g0 == zero and g1 == zero:  # samples behind the first opaque surface
+            continue
+        ix, fx = _corner(x[0, s], res)
+        iy, fy = _corner(x[1, s], res)
+        iz, fz = _corner(x[2, s], res)
+        i0, i1, i2, i3, i4, i5, i6, i7 = _corners(dense, res, mask, ix, iy, iz)
+        w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
+        add_pair(gradient, i0, w0, g0, g1)
+        add_pair(gradient, i1, w1, g0, g1)
+        add_pair(gradient, i2, w2, g0, g1)
+        add_pair(gradient, i3, w3, g0, g1)
+        add_pair(gradient, i4, w4, g0, g1)
+        add_pair(gradient, i5, w5, g0, g1)
+        add_pair(gradient, i6, w6, g0, g1)
+        add_pair(gradient, i7, w7, g0, g1)
+        _mark(dirty, i0, i1)
+        _mark(dirty, i2, i3)
+        _mark(dirty, i4, i5)
+        _mark(dirty, i6, i7)
+
+
+@kernel
+def scatter(counter, worker, grid, levels, x, d_features, counts, gradient, dirty):
+    """Add the table's gradient of all samples to ``gradient``; a task is a level, so nothing races.
+
+    x: float32 (chunks, 3, N), unit cube. d_features: float32 (chunks, >= 2 L, N), dLoss / dfeatures.
+    counts: int64 (chunks,), columns in use. gradient: float32 like ``grid.table``. dirty: bool
+    (vertices / SEGMENT,), set where a segment received anything.
+    """
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= levels:
+            return
+        l = levels - 1 - task  # the fine levels take longest: they go first
+        a, b = grid.first[l], grid.first[l + 1]
+        res, mask = grid.resolution[l], np.uint32(b - a - 1)
+        level_gradient, level_dirty = gradient[a:b], dirty[a // SEGMENT : b // SEGMENT]
+        for c in range(counts.size):
+            n = counts[c]
+            d0, d1 = d_features[c, 2 * l, :n], d_features[c, 2 * l + 1, :n]
+            if grid.dense[l]:
+                _scatter_level(True, res, mask, x[c], d0, d1, level_gradient, level_dirty)
+            else:
+                _scatter_level(False, res, mask, x[c], d0, d1, level_gradient, level_dirty)
+
+
+@kernel
+def smooth_grid(counter, worker, grid, levels, smooth, gradient, dirty):
+    """Add the gradient of half the squared differences between neighbouring vertices, times ``smooth``
+    (float32), to what is about to be updated; a task is a level.
+
+    Only levels that are stored densely: in a hashed one, neighbours in the table are not neighbours in space.
+    Only segments that are dirty already: what no ray reaches stays as it is.
+    """
+    while True:
+        level = fetch_add(counter, 1)
+        if level >= levels:
+            return
+        if not grid.dense[level]:
+            continue
+        side, first = np.int64(grid.resolution[level]) + 1, grid.first[level]
+        plane = side * side
+        for row in range(side * plane):
+            if not dirty[(first + row) // SEGMENT]:
+                continue
+            i, j, k = row % side, (row // side) % side, row // plane
+            at = first + row
+            x0, x1 = at - 1 if i > 0 else at, at + 1 if i < side - 1 else at
+            y0, y1 = at - side if j > 0 else at, at + side if j < side - 1 else at
+            z0, z1 = at - plane if k > 0 else at, at + plane if k < side - 1 else at
+            for c in range(FEATURES):
+                p = grid.table[at, c]
+                apart = (p - grid.table[x0, c]) + (p - grid.table[x1, c])
+                apart += (p - grid.table[y0, c]) + (p - grid.table[y1, c])
+                apart += (p - grid.table[z0, c]) + (p - grid.table[z1, c])
+                gradient[at, c] += smooth * apart
+
+
+@overload(query_density)
+def _query_density(encoding, levels, net, x, start, end, acts):
+    if not is_a(encoding, Grid):
+        return None
+
+    def run(encoding, levels, net, x, start, end, acts):
+        encode(encoding, levels, x, start, end, acts)
+        for k in range(2 * encoding.resolution.size, net.widths[0]):  # loops: slices compile for seconds
+            padding = acts[k, start:end]
+            for s in range(padding.size):
+                padding[s] = np.float32(0.0)
+        forward(net, acts, start, end)
+
+    return run
+
+
+@overload(query_color)
+def _query_color(encoding, levels, net, x, start, end, acts):
+    """The network has said it already."""
+    return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, Grid) else None
+
+
+@overload(query_back)
+def _query_back(encoding, net, acts, d_acts, n, d_params, d_features):
+    if not is_a(encoding, Grid):
+        return None
+
+    def run(encoding, net, acts, d_acts, n, d_params, d_features):
+        backward(net, acts, d_acts, n, d_params)
+        for k in range(net.widths[0]):
+            to, d = d_features[k], d_acts[k]
+            for s in range(n):
+                to[s] = d[s]
+
+    return run

@@ -1,0 +1,139 @@
+"""A small multilayer perceptron over columns of samples: forward, backward, all widths multiples of 4.
+
+Arrays are (units, samples), so that one unit's values lie side by side and every inner loop is a vector
+loop. Blocks of BLOCK samples pass through all layers while their activations stay in the first-level cache.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.simd import AT_ONCE, add_products
+
+BLOCK = 256
+
+
+class Net(NamedTuple):
+    """widths: int64 (layers + 1,), multiples of 4. params: float32; per layer the matrix (out, in), row
+    after row, then the bias (out,). ReLU after every layer but the last."""
+
+    widths: NDArray[np.int64]
+    params: NDArray[np.float32]
+
+
+def param_count(widths: NDArray[np.int64]) -> int:
+    """Length of ``Net.params`` for these widths."""
+    return int(sum(o * i + o for i, o in pairwise(widths)))
+
+
+@part
+def _combine(w, first, out_stride, in_stride, n_out, n_in, x, x_row, y, y_row, a, b):
+    """y[y_row + o] += sum_i w[first + o out_stride + i in_stride] x[x_row + i], samples a to b."""
+    whole = a + (b - a) // AT_ONCE * AT_ONCE
+    for o in range(0, n_out, 4):
+        base = first + o * out_stride
+        add_products(w, base, out_stride, in_stride, n_in, x, x_row, y, y_row + o, a, whole)
+    for o in range(n_out):
+        for i in range(n_in):
+            weight = w[first + o * out_stride + i * in_stride]
+            for s in range(whole, b):
+                y[y_row + o, s] += weight * x[x_row + i, s]
+
+
+@part
+def _weight_gradient(d_w, first, n_out, n_in, d_y, y_row, x, x_row, a, b):
+    """d_w[o, i] += sum_s d_y[o, s] x[i, s], four by two dot products at a time."""
+    zero = np.float32(0.0)
+    for o in range(0, n_out, 4):
+        y0, y1 = d_y[y_row + o, a:b], d_y[y_row + o + 1, a:b]
+        y2, y3 = d_y[y_row + o + 2, a:b], d_y[y_row + o + 3, a:b]
+        base = first + o * n_in
+        for i in range(0, n_in, 2):
+            x0, x1 = x[x_row + i, a:b], x[x_row + i + 1, a:b]
+            a0 = a1 = b0 = b1 = c0 = c1 = d0 = d1 = zero
+            for s in range(x0.size):
+                u, v = x0[s], x1[s]
+                a0 += y0[s] * u
+                a1 += y0[s] * v
+                b0 += y1[s] * u
+                b1 += y1[s] * v
+                c0 += y2[s] * u
+                c1 += y2[s] * v
+                d0 += y3[s] * u
+                d1 += y3[s] * v
+            d_w[base + i] += a0
+            d_w[base + i + 1] += a1
+            d_w[base + n_in + i] += b0
+            d_w[base + n_in + i + 1] += b1
+            d_w[base + 2 * n_in + i] += c0
+            d_w[base + 2 * n_in + i + 1] += c1
+            d_w[base + 3 * n_in + i] += d0
+            d_w[base + 3 * n_in + i + 1] += d1
+
+
+@part
+def forward(net, acts, start, end):
+    """Run samples start to end through the net.
+
+    acts: float32 (sum of widths, N). Rows 0 .. widths[0] hold the input; each layer's output follows
+    its input's rows, so the result stands in the last widths[-1] rows.
+    """
+    widths, params = net.widths, net.params
+    zero = np.float32(0.0)
+    for a in range(start, end, BLOCK):
+        b = min(a + BLOCK, end)
+        first, row = 0, 0
+        for layer in range(widths.size - 1):
+            n_in, n_out = widths[layer], widths[layer + 1]
+            y_row = row + n_in
+            for o in range(n_out):
+                acts[y_row + o, a:b] = params[first + n_out * n_in + o]
+            _combine(params, first, n_in, 1, n_out, n_in, acts, row, acts, y_row, a, b)
+            if layer < widths.size - 2:
+                for o in range(n_out):
+                    h = acts[y_row + o, a:b]
+                    for s in range(h.size):
+                        h[s] = max(h[s], zero)
+            first += n_out * n_in + n_out
+            row = y_row
+
+
+@part
+def backward(net, acts, d_acts, n, d_params):
+    """Gradients of n samples after ``forward``.
+
+    d_acts: float32 like ``acts``; its last widths[-1] rows hold dLoss / doutput, the other rows are filled
+    here, so that the first widths[0] rows end as dLoss / dinput. d_params: float32 like ``net.params``,
+    added to.
+    """
+    widths, params = net.widths, net.params
+    zero = np.float32(0.0)
+    layers = widths.size - 1
+    for a in range(0, n, BLOCK):
+        b = min(a + BLOCK, n)
+        first, row = params.size, acts.shape[0] - widths[layers]
+        for layer in range(layers - 1, -1, -1):
+            n_in, n_out = widths[layer], widths[layer + 1]
+            first -= n_out * n_in + n_out
+            x_row = row - n_in
+            _weight_gradient(d_params, first, n_out, n_in, d_acts, row, acts, x_row, a, b)
+            for o in range(n_out):
+                total = zero
+                d = d_acts[row + o, a:b]
+                for s in range(d.size):
+                    total += d[s]
+                d_params[first + n_out * n_in + o] += total
+            for i in range(n_in):
+                d_acts[x_row + i, a:b] = zero
+            _combine(params, first, 1, n_in, n_in, n_out, d_acts, row, d_acts, x_row, a, b)
+            if layer > 0:
+                for i in range(n_in):
+                    h, d = acts[x_row + i, a:b], d_acts[x_row + i, a:b]
+                    for s in range(h.size):
+                        d[s] = d[s] if h[s] > zero else zero
+            row = x_row

@@ -1,0 +1,189 @@
+"""Where surfaces are likely, before anything is known: cells whose colour the cameras agree on, and for each
+pixel the best of the cells its ray passes (plane sweep by votes, after Seitz and Dyer's voxel colouring)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.rays import HORIZON, pixel_direction
+from edge_server.fields.common.kernels.simd import fetch_add
+from edge_server.fields.splat.kernels.project import LENS, NEAR, ORIGIN, bent, held
+
+MOST_VIEWS = 32  # that vote
+NOT_SEEN = -2.0
+# What a pixel says of a cell. Added up over all views, the first stays below the second.
+SEES, UNMARKED = 1, 256
+_NO_COLOR = 1e3  # times a number of its own: no colour, and near no other
+_BYTE = np.float32(1.0 / 255.0)
+_EMPTY_VIEWS = 2  # that see plain background through a cell suffice to empty it
+
+_F0, _F1 = np.float32(0.0), np.float32(1.0)
+
+
+@part
+def _spread(u):
+    """A coordinate of contracted space [-2, 2] whose largest is m -> factor to scene units."""
+    return _F1 / ((np.float32(2.0) - u) * u) if u > _F1 else _F1
+
+
+@part
+def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
+    """Where camera ``held`` sees each cell of a row (its places: float32 (3, cells)): the pixel's number,
+    ``nowhere`` if it is not in the picture, to pixels: int32 (cells,)."""
+    for k in range(pixels.size):
+        x, y, z = row[0, k] - cam[ORIGIN], row[1, k] - cam[ORIGIN + 1], row[2, k] - cam[ORIGIN + 2]
+        depth = cam[6] * x + cam[7] * y + cam[8] * z
+        over = _F1 / (depth if depth > cam[NEAR] else _F1)
+        a, b = (cam[0] * x + cam[1] * y + cam[2] * z) * over, (cam[3] * x + cam[4] * y + cam[5] * z) * over
+        sees = (depth > cam[NEAR]) & (abs(a) < np.float32(4.0)) & (abs(b) < np.float32(4.0))
+        through = bent(cam, a, b)
+        px, py = cam[LENS] * through[0] + cam[LENS + 2], cam[LENS + 1] * through[1] + cam[LENS + 3]
+        sees = sees & (px >= _F0) & (py >= _F0) & (px < width) & (py < height)
+        column, line = np.int32(px if sees else _F0), np.int32(py if sees else _F0)
+        pixels[k] = first + line * width + column if sees else nowhere
+
+
+@part
+def _hidden_cells(cams, size, first, says, nowhere, row, pixels, told, hidden):
+    """Where each camera sees each cell of a row, to pixels: int32 (MOST_VIEWS, cells), and which of them most
+    cameras that see them see unmarked, to hidden: bool (cells,); returns whether all are, and the rest of
+    ``pixels`` is not needed. Side by side, since nearly all are: few of hundred thousands need a closer look.
+
+    says: int32 (P + 1,), what a pixel says: ``SEES``, ``SEES + UNMARKED``, or nothing, as number P does,
+    which is ``nowhere``; or (0,): nothing is hidden."""
+    total, cells = cams.shape[0], hidden.size
+    for k in range(cells):
+        told[k] = 0
+    for v in range(total):
+        width, height, seen = np.int32(size[v, 0]), np.int32(size[v, 1]), pixels[v]
+        _pixels_of_row(held(cams, v), np.int32(first[v]), width, height, np.int32(nowhere), row, seen)
+        if says.size == 0:
+            continue
+        few = 0
+        for k in range(cells):
+            told[k] += says[np.int64(seen[k])]
+        if 2 * v < total:
+            continue
+        for k in range(cells):
+            few += np.int32(2 * (told[k] // UNMARKED) <= total)
+        if few == 0:
+            return True
+    for k in range(cells):
+        hidden[k] = 2 * (told[k] // UNMARKED) > told[k] % UNMARKED
+    return False
+
+
+@kernel
+def score_cells(counter, worker, cams, views, blurred, says, plain, plain_color, tolerance, contracted,
+                cells, min_views, scores):  # fmt: skip
+    """scores: float32 (cells^3,), x fastest: how well the cameras agree on a colour there, up to 1; NOT_SEEN
+    where fewer than min_views look or background shows. Tasks are layers along z.
+
+    views: ``rays.Views`` of at most MOST_VIEWS cameras, rows of ``cams``; blurred: uint8 (pixels, 3 or 4),
+    their pictures at the cells' sharpness; pixels of weight 0 have no say. says: see ``_hidden_cells``:
+    only cells that most cameras see marked are looked at, the others are NOT_SEEN; or (0,): all are. plain:
+    whether plain_color (3,) is an empty background; tolerance: of a colour, summed over channels, in [0, 3].
+    """
+    total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
+    red, green, blue = np.empty(MOST_VIEWS, np.float32), np.empty(MOST_VIEWS, np.float32), (
+        np.empty(MOST_VIEWS, np.float32))  # fmt: skip
+    places, pixels = np.empty((3, cells), np.float32), np.empty((MOST_VIEWS, cells), np.int32)
+    told, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
+    sizes, firsts, weight, nowhere = views.size, views.first, views.weight, blurred.shape[0]
+    size = np.float32(2.0) * half / np.float32(cells)
+    while True:
+        layer = fetch_add(counter, 1)
+        if layer >= cells:
+            return
+        for iy in range(cells):
+            for ix in range(cells):
+                x = (np.float32(ix) + np.float32(0.5)) * size - half
+                y = (np.float32(iy) + np.float32(0.5)) * size - half
+                z = (np.float32(layer) + np.float32(0.5)) * size - half
+                s = _spread(max(abs(x), max(abs(y), abs(z)))) if contracted else _F1
+                places[0, ix], places[1, ix], places[2, ix] = x * s, y * s, z * s
+            nothing = _hidden_cells(cams, sizes, firsts, says, nowhere, places, pixels, told, hidden)
+            for ix in range(cells):
+                at = ix + cells * (iy + cells * layer)
+                scores[at] = np.float32(NOT_SEEN)
+                if nothing or hidden[ix]:
+                    continue
+                for k in range(MOST_VIEWS):
+                    red[k] = green[k] = blue[k] = np.float32(_NO_COLOR * (k + 1))
+                n, empty = 0, 0
+                for v in range(total):
+                    pixel = np.int64(pixels[v, ix])
+                    if pixel == nowhere or (weight.size > 0 and weight[pixel] <= _F0):
+                        continue
+                    r, g, b = (
+                        np.float32(blurred[pixel, 0]) * _BYTE, np.float32(blurred[pixel, 1]) * _BYTE,
+                        np.float32(blurred[pixel, 2]) * _BYTE,
+                    )  # fmt: skip
+                    red[n], green[n], blue[n] = r, g, b
+                    away = abs(r - plain_color[0]) + abs(g - plain_color[1]) + abs(b - plain_color[2])
+                    if blurred.shape[1] == 4:
+                        empty += 1 if blurred[pixel, 3] < 16 else 0
+                    elif plain and away < np.float32(0.06):
+                        empty += 1
+                    n += 1
+                    if empty >= _EMPTY_VIEWS:
+                        break
+                if n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
+                    continue
+                best = 0
+                for j in range(n):
+                    agree = 0
+                    r, g, b = red[j], green[j], blue[j]
+                    for k in range(MOST_VIEWS):
+                        agree += np.int32(abs(r - red[k]) + abs(g - green[k]) + abs(b - blue[k]) < tolerance)
+                    best = max(best, agree)
+                scores[at] = np.float32(best - 1) / np.float32(n + 1)
+
+
+@kernel
+def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted, cells, least, scores,
+               distance):  # fmt: skip
+    """For ray n, through pixel ``pixels[n]`` (int64, within the view) of view ``view_of[n]`` (int64), the
+    distance in scene units of the best cell on it; 0 where none is better than ``least``, float32. Tasks are
+    runs of 256 rays.
+
+    middle: the distance that is taken where nothing speaks for another one."""
+    half = np.float32(2.0) if contracted else _F1
+    size = np.float32(2.0) * half / np.float32(cells)
+    horizon = np.float32(HORIZON) if contracted else _F1
+    scale = np.float32(cells) / (np.float32(2.0) * half)
+    while True:
+        base = fetch_add(counter, 1) * 256
+        if base >= pixels.size:
+            return
+        for n in range(base, min(base + 256, pixels.size)):
+            v = view_of[n]
+            width = views.size[v, 0]
+            dx, dy, dz = pixel_direction(
+                views.lens[v], views.rotation[v],
+                np.float64(pixels[n] % width) + 0.5, np.float64(pixels[n] // width) + 0.5,
+            )  # fmt: skip
+            ox, oy, oz = (
+                np.float32(views.origin[v, 0]), np.float32(views.origin[v, 1]), np.float32(views.origin[v, 2])
+            )  # fmt: skip
+            best, at, t = least, _F0, max(near, size)
+            while t < np.float32(2.0) * horizon + middle:
+                x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+                m = max(abs(x), max(abs(y), abs(z)))
+                step = np.float32(0.5) * size
+                if m < horizon:
+                    s = _F1
+                    if contracted and m > _F1:
+                        s = (np.float32(2.0) - _F1 / m) / m
+                        step *= m * m
+                    ix = min(np.int64((x * s + half) * scale), cells - 1)
+                    iy = min(np.int64((y * s + half) * scale), cells - 1)
+                    iz = min(np.int64((z * s + half) * scale), cells - 1)
+                    score = scores[ix + cells * (iy + cells * iz)]
+                    if score > best:  # only then: what is subtracted is never negative
+                        score -= np.float32(0.03) * abs(np.log(t / middle))
+                        if score > best:
+                            best, at = score, t
+                t += step
+            distance[n] = at

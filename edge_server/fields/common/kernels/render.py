@@ -1,0 +1,100 @@
+"""Render rays of a camera, front to back, a few samples at a time, until each ray is opaque or through."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_server.fields.common.kernels.jit import kernel
+from edge_server.fields.common.kernels.radiance_model import query_color, query_density
+from edge_server.fields.common.kernels.rays import NEVER, interval, march, pixel_direction
+from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
+from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, activate, add_harmonics
+
+TILE = 256  # rays a task
+ROUND = 8  # samples a ray gets before the opaque ones are dropped
+
+_F0, _F1 = np.float32(0.0), np.float32(1.0)
+
+
+@kernel
+def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, harmonics,
+                 max_samples, background, acts, x, line, color, depth, opacity):  # fmt: skip
+    """pixels: float64 (N, 2), image points. color: float32 (N, 3), depth (scene units) and opacity: (N,),
+    all written. max_samples: a ray's samples at most. acts: float32 (W, units, TILE ROUND), x: (W, 3, same),
+    line: (W, 2, same), scratch."""
+    out_row = acts.shape[1] - net.widths[-1]
+    ts, dts = line[worker, 0], line[worker, 1]
+    out = acts[worker, out_row:]
+    way = np.empty((TILE, 6), np.float32)  # direction, distance reached, distance of leaving, optical depth
+    first = np.empty(TILE + 1, np.int64)
+    active = np.empty(TILE, np.int64)
+    taken = np.empty(TILE, np.int64)
+    ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
+    while True:
+        base = fetch_add(counter, 1) * TILE
+        if base >= pixels.shape[0]:
+            return
+        rays = min(TILE, pixels.shape[0] - base)
+        count = 0
+        for r in range(rays):
+            dx, dy, dz = pixel_direction(lens, rotation, pixels[base + r, 0], pixels[base + r, 1])
+            enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
+            way[r, 0], way[r, 1], way[r, 2] = dx, dy, dz
+            way[r, 3], way[r, 4], way[r, 5] = enter + np.float32(0.5) * space.step, leave, _F0
+            taken[r] = 0
+            color[base + r] = _F0
+            depth[base + r] = opacity[base + r] = _F0
+            if leave > enter:
+                active[count] = r
+                count += 1
+        while count > 0:
+            start = n = np.int64(0)  # typed: numba compiles callees anew for a literal
+            first[0] = 0
+            for k in range(count):
+                r = active[k]
+                limit = n + min(ROUND, max_samples - taken[r])
+                before = n
+                n, t, _ = march(space, ox, oy, oz, way[r, 0], way[r, 1], way[r, 2], way[r, 3], way[r, 4],
+                             x[worker], ts, dts, n, limit, NEVER)  # fmt: skip
+                way[r, 3] = t
+                taken[r] += n - before
+                first[k + 1] = n
+            query_density(encoding, levels, net, x[worker], start, n, acts[worker])
+            query_color(encoding, levels, net, x[worker], start, n, acts[worker])
+            if harmonics > 1:
+                for k in range(count):
+                    r = active[k]
+                    add_harmonics(out, harmonics, first[k], first[k + 1], way[r, 0], way[r, 1], way[r, 2])
+            activate(out, start, n)
+            left = 0
+            for k in range(count):
+                r = active[k]
+                pixel = base + r
+                through = exp32(-way[r, 5])
+                for s in range(first[k], first[k + 1]):
+                    way[r, 5] += out[0, s] * dts[s]
+                    after = exp32(-way[r, 5])
+                    w = through - after
+                    color[pixel, 0] += w * out[1, s]
+                    color[pixel, 1] += w * out[2, s]
+                    color[pixel, 2] += w * out[3, s]
+                    depth[pixel] += w * ts[s]
+                    opacity[pixel] += w
+                    through = after
+                if way[r, 5] <= np.float32(OPAQUE_DEPTH) and way[r, 3] < way[r, 4] and taken[r] < max_samples:
+                    active[left] = r
+                    left += 1
+            count = left
+        for r in range(rays):
+            pixel = base + r
+            through = max(_F1 - opacity[pixel], _F0)
+            # Empty rays have no depth; dividing by what opacity there is keeps thin surfaces in place.
+            if opacity[pixel] > np.float32(1e-3):
+                depth[pixel] /= opacity[pixel]
+            else:
+                depth[pixel] = _F0
+            for c in range(3):
+                value = color[pixel, c] + through * background[c]
+                color[pixel, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
+            if not is_finite(depth[pixel]) or not is_finite(opacity[pixel]):
+                depth[pixel] = opacity[pixel] = _F0

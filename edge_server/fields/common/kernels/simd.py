@@ -1,0 +1,281 @@
+"""What numba lacks on CPUs: an atomic counter, a number's bits, a vectorisable exp, counter-based noise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from edge_server.fields.common.kernels.jit import part
+
+
+@intrinsic
+def fetch_add(typingctx: Any, array: Any, value: Any) -> Any:
+    """Add ``value`` to ``array[0]`` (int64) atomically; returns what was there before."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", data, args[1], "seq_cst")
+
+    return types.int64(array, types.int64), codegen
+
+
+@intrinsic
+def _fetch_add_at(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """``fetch_add`` of any element."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.atomic_rmw("add", builder.gep(data, [args[1]]), args[2], "seq_cst")
+
+    return types.int64(array, types.int64, types.int64), codegen
+
+
+# Elements of a counter for each worker: a cache line.
+COUNTER = 8
+
+
+@part
+def draw(counter, worker, tasks):
+    """The number of a task that nobody has drawn, ``tasks`` or more where none is left. Each worker has a
+    range of its own to begin with, the same in every kernel, so that its core still has in its cache what it
+    wrote there the last time; then it helps the others."""
+    workers = max(counter.size // COUNTER, 1)
+    for k in range(workers):
+        of = (worker + k) % workers
+        task = tasks * of // workers + _fetch_add_at(counter, of * COUNTER, 1)
+        if task < tasks * (of + 1) // workers:
+            return task
+    return tasks
+
+
+@intrinsic
+def float_from_bits(typingctx: Any, bits: Any) -> Any:
+    """The float32 whose IEEE representation is the int32 ``bits``."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.FloatType())
+
+    return types.float32(types.int32), codegen
+
+
+@intrinsic
+def bits_of_float(typingctx: Any, value: Any) -> Any:
+    """The IEEE representation of a float32 as int32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.IntType(32))
+
+    return types.int32(types.float32), codegen
+
+
+@intrinsic
+def count_bits(typingctx: Any, value: Any) -> Any:
+    """How many bits of a uint64 are set, int64."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.ctpop(args[0])
+
+    return types.int64(types.uint64), codegen
+
+
+@intrinsic
+def lowest_bit(typingctx: Any, value: Any) -> Any:
+    """The number of the lowest bit of a uint64 that is set, int64; 64 if none is."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.IntType(1)(0))
+
+    return types.int64(types.uint64), codegen
+
+
+_PAIR = ir.VectorType(ir.FloatType(), 2)
+
+
+def _pair_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    pairs = builder.bitcast(data, _PAIR.as_pointer())
+    return builder.gep(pairs, [builder.zext(index, ir.IntType(64))])
+
+
+def _pair_of(builder: Any, a: Any, b: Any) -> Any:
+    pair = builder.insert_element(ir.Constant(_PAIR, ir.Undefined), a, ir.IntType(32)(0))
+    return builder.insert_element(pair, b, ir.IntType(32)(1))
+
+
+@intrinsic
+def add_pair(typingctx: Any, table: Any, row: Any, weight: Any, a: Any, b: Any) -> Any:
+    """``table[row] += weight * (a, b)``; table contiguous float32 (N, 2), row uint32, the rest float32.
+
+    One load and one store where LLVM makes two of each: the scatter takes half the time.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = _pair_pointer(context, builder, signature.args[0], args[0], args[1])
+        step = builder.fmul(
+            _pair_of(builder, args[2], args[2]), _pair_of(builder, args[3], args[4]), flags=("contract",)
+        )
+        old = builder.load(pointer)
+        old.align = 4
+        builder.store(builder.fadd(old, step, flags=("contract",)), pointer).align = 4
+        return context.get_dummy_value()
+
+    f32 = types.float32
+    return types.void(table, types.uint32, f32, f32, f32), codegen
+
+
+@intrinsic
+def weighted_pairs(typingctx: Any, table: Any, rows: Any, weights: Any) -> Any:
+    """``sum_k weights[k] * table[rows[k]]`` as two float32; table contiguous float32 (N, 2), tuples of
+    equal length of uint32 rows and float32 weights."""
+    signature = types.UniTuple(types.float32, 2)(table, rows, weights)
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        total = None
+        for k in range(len(signature.args[1])):
+            row, weight = builder.extract_value(args[1], k), builder.extract_value(args[2], k)
+            pair = builder.load(_pair_pointer(context, builder, signature.args[0], args[0], row))
+            pair.align = 4
+            term = builder.fmul(pair, _pair_of(builder, weight, weight), flags=("contract",))
+            total = term if total is None else builder.fadd(total, term, flags=("contract", "reassoc"))
+        parts = [builder.extract_element(total, ir.IntType(32)(k)) for k in (0, 1)]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return signature, codegen
+
+
+_LANES, _VECTORS = 16, 2
+AT_ONCE = _LANES * _VECTORS
+_WIDE = ir.VectorType(ir.FloatType(), _LANES)
+
+
+@intrinsic
+def add_products(typingctx: Any, w: Any, first: Any, out_stride: Any, in_stride: Any, n_in: Any, x: Any,
+                 x_row: Any, y: Any, y_row: Any, a: Any, b: Any) -> Any:  # fmt: skip
+    """``y[y_row + o, s] += sum_i w[first + o out_stride + i in_stride] x[x_row + i, s]``, o < 4, a <= s < b.
+
+    w: contiguous float32; x, y: contiguous float32 (rows, N), or one array whose rows read and written are
+    not the same; the rest int64, b - a a multiple of ``AT_ONCE``. With AVX-512 the sums stay in registers
+    while all inputs pass: left to LLVM, they are read and written once for every four inputs, which takes
+    twice as long.
+    """
+    wide = types.int64
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        i64 = ir.IntType(64)
+        w_data, x_data, y_data = (
+            context.make_array(signature.args[k])(context, builder, args[k]).data for k in (0, 5, 7)
+        )
+        x_side, y_side = (
+            builder.extract_value(context.make_array(signature.args[k])(context, builder, args[k]).shape, 1)
+            for k in (5, 7)
+        )
+        _, w_first, out_stride, in_stride, n_in, _, x_row, _, y_row, a, b = args
+        sums = [cgutils.alloca_once(builder, _WIDE) for _ in range(4 * _VECTORS)]
+
+        def at(data: Any, row: Any, side: Any, s: Any) -> Any:
+            return builder.bitcast(
+                builder.gep(data, [builder.add(builder.mul(row, side), s)]), _WIDE.as_pointer()
+            )
+
+        with cgutils.for_range_slice(builder, a, b, i64(AT_ONCE)) as (s, _):
+            places = [
+                at(y_data, builder.add(y_row, i64(o)), y_side, builder.add(s, i64(_LANES * v)))
+                for o in range(4) for v in range(_VECTORS)
+            ]  # fmt: skip
+            for total, place in zip(sums, places, strict=True):
+                old = builder.load(place)
+                old.align = 4
+                builder.store(old, total)
+            with cgutils.for_range(builder, n_in) as loop:
+                row = builder.add(x_row, loop.index)
+                given = []
+                for v in range(_VECTORS):
+                    given.append(builder.load(at(x_data, row, x_side, builder.add(s, i64(_LANES * v)))))
+                    given[-1].align = 4
+                here = builder.add(w_first, builder.mul(loop.index, in_stride))
+                for o in range(4):
+                    place = builder.gep(w_data, [builder.add(here, builder.mul(out_stride, i64(o)))])
+                    weight = builder.insert_element(
+                        ir.Constant(_WIDE, ir.Undefined), builder.load(place), ir.IntType(32)(0)
+                    )
+                    same = ir.Constant(ir.VectorType(ir.IntType(32), _LANES), [0] * _LANES)
+                    weight = builder.shuffle_vector(weight, ir.Constant(_WIDE, ir.Undefined), same)
+                    for v in range(_VECTORS):
+                        total = sums[_VECTORS * o + v]
+                        product = builder.fmul(weight, given[v], flags=("contract",))
+                        added = builder.fadd(builder.load(total), product, flags=("contract",))
+                        builder.store(added, total)
+            for total, place in zip(sums, places, strict=True):
+                builder.store(builder.load(total), place).align = 4
+        return context.get_dummy_value()
+
+    return types.void(w, wide, wide, wide, wide, x, wide, y, wide, wide, wide), codegen
+
+
+_F = np.float32
+_LOG2_E, _LN2_HIGH, _LN2_LOW = _F(1.44269504), _F(0.693359375), _F(-2.12194440e-4)
+_P0, _P1, _P2 = _F(1.9875691500e-4), _F(1.3981999507e-3), _F(8.3334519073e-3)
+_P3, _P4, _P5 = _F(4.1665795894e-2), _F(1.6666665459e-1), _F(5.0000001201e-1)
+_HALF, _ONE, _LOWEST, _HIGHEST = _F(0.5), _F(1.0), _F(-87.0), _F(88.0)
+
+
+@part
+def exp32(x):
+    """exp in float32, argument clamped to [-87, 88], relative error below 2e-7; NaN stays NaN.
+
+    The Cephes polynomial, because a call into libm would keep LLVM from vectorising the loop around it.
+    """
+    clamped = min(max(x if x == x else _ONE, _LOWEST), _HIGHEST)  # a NaN has no integer part
+    n = np.floor(clamped * _LOG2_E + _HALF)
+    r = clamped - n * _LN2_HIGH - n * _LN2_LOW
+    p = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5
+    p = p * r * r + r + _ONE
+    power = float_from_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))
+    return p * power if x == x else x
+
+
+_ROOT = np.int32(0x3F3504F3)  # the bits of sqrt(1/2)
+_L0, _L1, _L2 = _F(7.0376836292e-2), _F(-1.1514610310e-1), _F(1.1676998740e-1)
+_L3, _L4, _L5 = _F(-1.2420140846e-1), _F(1.4249322787e-1), _F(-1.6668057665e-1)
+_L6, _L7, _L8 = _F(2.0000714765e-1), _F(-2.4999993993e-1), _F(3.3333331174e-1)
+
+
+@part
+def log32(x):
+    """The natural logarithm of a normal positive float32, relative error below 2e-7 but for arguments within
+    .001 of 1 (absolute error below 1e-8 there); of anything else some number or none.
+
+    The Cephes polynomial, for the same reason as ``exp32``.
+    """
+    n = (bits_of_float(x) - _ROOT) >> np.int32(23)
+    m = float_from_bits(np.int32(bits_of_float(x) - (n << np.int32(23)))) - _ONE
+    square = m * m
+    p = (((((((_L0 * m + _L1) * m + _L2) * m + _L3) * m + _L4) * m + _L5) * m + _L6) * m + _L7) * m + _L8
+    e = np.float32(n)
+    return m + (p * m * square + e * _LN2_LOW - _HALF * square) + e * _LN2_HIGH
+
+
+@part
+def is_finite(x):
+    """Whether float x is a number. np.isfinite subtracts x from itself, which fast mathematics folds to 0."""
+    return abs(x) <= np.float32(3.4e38)
+
+
+@part
+def random_bits(key, n):
+    """64 random bits: the n-th output (uint64) of the splitmix64 stream ``key`` (uint64)."""
+    z = np.uint64(key + np.uint64(n) * np.uint64(0x9E3779B97F4A7C15))
+    z = np.uint64((z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9))
+    z = np.uint64((z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB))
+    return np.uint64(z ^ (z >> np.uint64(31)))
+
+
+@part
+def uniform(key, n):
+    """A float32 in [0, 1): the n-th number of stream ``key``."""
+    return np.float32(random_bits(key, n) >> np.uint64(40)) * np.float32(5.9604645e-08)

@@ -1,0 +1,186 @@
+"""Volume rendering along rays (thesis 3.20-3.22) and its gradient, with the regularisers that live there.
+
+Transmittance is the exponential of an exclusive cumulative sum of optical depths: its gradient is right
+where a sample is opaque, which that of a cumulative product is not.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.simd import exp32, is_finite
+
+# Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
+# step opaque many times over, the smallest makes a whole ray transparent.
+RAW_LOW, RAW_HIGH = -12.0, 9.0
+OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance of 1e-4
+
+# Weight so much nearer or farther than a guide, as a share of its distance, is half as wrong as can be.
+GUIDE_REACH = 0.04
+
+_F0, _F1 = np.float32(0.0), np.float32(1.0)
+
+# A density beyond these was clamped, whatever the exponential's last bit: it has no gradient.
+_CLAMPED_LOW = np.float32(np.exp(RAW_LOW) * 1.00001)
+_CLAMPED_HIGH = np.float32(np.exp(RAW_HIGH) * 0.99999)
+
+
+class Weights(NamedTuple):
+    """Strengths of the regularisers, float32. distortion: mip-NeRF 360's, gathers a ray's weight in one
+    place. sparsity: on optical depth itself, empties what no picture needs. near: distance in scene units
+    below which gradients fall with the square of distance, against haze before the lens (0: off). guide: on
+    weight that is not where a ray's guide says, or nowhere (the robust estimator of Geman and McClure, so
+    that a wrong guide pulls no harder than a doubtful one)."""
+
+    distortion: np.float32
+    sparsity: np.float32
+    near: np.float32
+    guide: np.float32 = np.float32(0.0)
+
+
+@part
+def harmonic(k, x, y, z):
+    """Real spherical harmonics 1 to 8 of a unit direction, float32; harmonic 0 is the colour itself."""
+    if k == 1:
+        return np.float32(0.4886025) * y
+    if k == 2:
+        return np.float32(0.4886025) * z
+    if k == 3:
+        return np.float32(0.4886025) * x
+    if k == 4:
+        return np.float32(1.0925485) * x * y
+    if k == 5:
+        return np.float32(1.0925485) * y * z
+    if k == 6:
+        return np.float32(0.3153916) * (np.float32(3.0) * z * z - _F1)
+    if k == 7:
+        return np.float32(1.0925485) * x * z
+    return np.float32(0.5462742) * (x * x - y * y)
+
+
+@part
+def activate(out, a, b):
+    """Both of the following."""
+    activate_density(out, a, b)
+    activate_color(out, a, b)
+
+
+@part
+def activate_density(out, a, b):
+    """Raw density -> density, in place, samples a to b of row 0."""
+    sigma = out[0, a:b]
+    for s in range(sigma.size):
+        sigma[s] = exp32(min(max(sigma[s], np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
+
+
+@part
+def activate_color(out, a, b):
+    """Raw colours -> colours in [0, 1], in place, samples a to b of rows 1 to 3."""
+    for c in range(1, 4):
+        row = out[c, a:b]
+        for s in range(row.size):
+            row[s] = _F1 / (_F1 + exp32(-row[s]))
+
+
+@part
+def seen_samples(out, dts, first, end):
+    """How many samples of a ray there are until it is opaque: density in row 0 of out."""
+    depth = _F0
+    for s in range(first, end):
+        depth += out[0, s] * dts[s]
+        if depth > np.float32(OPAQUE_DEPTH):
+            return s + 1 - first
+    return end - first
+
+
+@part
+def add_harmonics(out, harmonics, first, end, dx, dy, dz):
+    """Add the direction's share to the raw colours of samples first to end: rows 1 to 3 of out."""
+    for k in range(1, harmonics):
+        y = harmonic(k, dx, dy, dz)
+        for c in range(3):
+            base, share = out[1 + c, first:end], out[1 + 3 * k + c, first:end]
+            for s in range(base.size):
+                base[s] += y * share[s]
+
+
+@part
+def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
+    """The gradient of ``add_harmonics``: rows 4 on from rows 1 to 3 of d_out."""
+    for k in range(1, harmonics):
+        y = harmonic(k, dx, dy, dz)
+        for c in range(3):
+            base, share = d_out[1 + c, first:end], d_out[1 + 3 * k + c, first:end]
+            for s in range(base.size):
+                share[s] = y * base[s]
+
+
+@part
+def ray_loss(out, d_out, ts, dts, w, first, end, target, background, guide, weights):
+    """Squared colour error of one ray (3.22) and its gradient.
+
+    out: float32 (>= 4, N), activated density and colour of samples first to end. d_out: like out, rows 0
+    to 3 receive dLoss / draw. ts, dts: float32 (N,). w: float32 (N,), scratch. target, background: float32
+    (3,). guide: float32, the distance at which the ray ends as far as is known, 0: it is not. Returns the
+    colour error, or -1 for a ray that is not finite: its gradient is 0.
+    """
+    depth, shade_r, shade_g, shade_b = _F0, _F0, _F0, _F0
+    transmitted, weight, moment = _F1, _F0, _F0
+    last = end
+    for s in range(first, end):
+        depth += out[0, s] * dts[s]
+        after = exp32(-depth)
+        w[s] = transmitted - after
+        shade_r += w[s] * out[1, s]
+        shade_g += w[s] * out[2, s]
+        shade_b += w[s] * out[3, s]
+        weight += w[s]
+        moment += w[s] * ts[s]
+        transmitted = after
+        if depth > np.float32(OPAQUE_DEPTH):
+            last = s + 1
+            break
+    e_r = shade_r + transmitted * background[0] - target[0]
+    e_g = shade_g + transmitted * background[1] - target[1]
+    e_b = shade_b + transmitted * background[2] - target[2]
+    loss = e_r * e_r + e_g * e_g + e_b * e_b
+    if not is_finite(loss):
+        d_out[:4, first:end] = _F0
+        return np.float32(-1.0)
+    d_out[:4, last:end] = _F0
+    two = np.float32(2.0)
+    d_r, d_g, d_b = two * e_r, two * e_g, two * e_b
+    behind = transmitted * (d_r * background[0] + d_g * background[1] + d_b * background[2])
+    guided = weights.guide if guide > _F0 else _F0
+    across = _F1 / (np.float32(GUIDE_REACH) * guide) if guide > _F0 else _F0
+    behind += transmitted * guided
+    weight_before, moment_before = weight, moment
+    after = transmitted
+    for s in range(last - 1, first - 1, -1):
+        r, g, b, t, delta = out[1, s], out[2, s], out[3, s], ts[s], dts[s]
+        weight_before -= w[s]
+        moment_before -= w[s] * t
+        weight_after = weight - weight_before - w[s]
+        moment_after = moment - moment_before - w[s] * t
+        spread = t * (weight_before - weight_after) - moment_before + moment_after
+        d_w = d_r * r + d_g * g + d_b * b
+        d_w += weights.distortion * (two * spread + np.float32(2.0 / 3.0) * w[s] * delta)
+        if guided > _F0:
+            off = (t - guide) * across
+            d_w += guided * off * off / (_F1 + off * off)
+        d_depth = d_w * after - behind + weights.sparsity
+        behind += w[s] * d_w
+        after += w[s]
+        scale = _F1
+        if t < weights.near:
+            scale = t * t / (weights.near * weights.near)
+        sigma = out[0, s]
+        free = sigma > _CLAMPED_LOW and sigma < _CLAMPED_HIGH
+        d_out[0, s] = d_depth * delta * sigma * scale if free else _F0
+        d_out[1, s] = w[s] * d_r * r * (_F1 - r) * scale
+        d_out[2, s] = w[s] * d_g * g * (_F1 - g) * scale
+        d_out[3, s] = w[s] * d_b * b * (_F1 - b) * scale
+    return loss

@@ -1,0 +1,102 @@
+"""The field's knowledge of where something is: an occupancy grid fed by the field and by the cameras."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.mlp import Net
+from edge_server.fields.common.kernels.occupancy import CELLS_A_TASK, count_views, sample_density, threshold
+from edge_server.fields.common.kernels.rays import COARSE, Space
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.kernels.train import CHUNK
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.supervision import pack_cameras
+from edge_server.fields.common.trainer_settings import TrainerSettings
+from edge_server.fields.common.view_store import Rig
+
+EVERY = 8  # steps between refreshes
+PHASES = 4  # refreshes until every cell has been looked at
+FADE = 0.75  # of a cell's density per look
+EMPTY = 0.5  # density per scene unit that counts as nothing: a step of it dims by a hundredth or two
+
+
+class Occupancy:
+    """density: float32 (cells^3,), x fastest; seen: uint16, cameras that look at each cell. unknown: the
+    density of what was never looked at; with ``EMPTY`` the first look decides."""
+
+    def __init__(
+        self, cells: int, contracted: bool, near: float, min_views: int, unknown: float = EMPTY
+    ) -> None:
+        self.cells, self.contracted, self.near, self.min_views = cells, contracted, near, min_views
+        self.density = np.full(cells**3, unknown, np.float32)
+        self.seen = np.zeros(cells**3, np.uint16)
+        self.occupied = np.zeros(cells**3, np.uint8)
+        self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
+        self.needed = 1
+
+    @classmethod
+    def for_box(cls, settings: TrainerSettings, box: SceneBox | None, unknown: float = EMPTY) -> Occupancy:
+        """An occupancy that knows nothing yet of the scene in ``box``."""
+        near = box.near_m / box.radius_m if box else 0.1
+        return cls(settings.cells, box.contracted if box else False, near, settings.min_views, unknown)
+
+    def space(self, step: float) -> Space:
+        """The grid as the kernels read it: a view on the living arrays."""
+        return Space(
+            self.occupied,
+            self.coarse,
+            self.density,
+            self.cells,
+            self.contracted,
+            np.float32(step),
+            np.float32(self.near),
+        )
+
+    def look(self, pool: Pool, rig: Rig, empty: float = EMPTY) -> NDArray[np.bool_] | None:
+        """Count anew which cells the known cameras see, and open those where something moved.
+
+        A cell where something moved is seen to change by most cameras that see it at all: the hull of the
+        changed pixels. Without it a moving body could not grow where space was known to be empty.
+        empty: the density below which a cell gets no samples. Returns the opened cells (cells^3,), if any.
+        """
+        assert rig.box is not None
+        views = pack_cameras(rig.views, rig.box)
+        masks = [m.moved for m in rig.memory.values()]
+        mask_first = np.full(len(masks), -1, np.int64)
+        parts, length = [np.zeros(0, np.uint8)], 0
+        for k, mask in enumerate(masks):
+            if mask is not None:
+                mask_first[k] = length
+                parts.append(mask.reshape(-1).astype(np.uint8))
+                length += mask.size
+        marked = np.zeros_like(self.seen)
+        pool.run(
+            count_views, self.cells, self.contracted, self.near, views, mask_first, np.concatenate(parts),
+            self.seen, marked,
+        )  # fmt: skip
+        self.needed = min(self.min_views, len(rig.memory))
+        moving = None
+        if length:
+            moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
+            np.maximum(self.density, np.float32(1.5 * empty), out=self.density, where=moving)
+        self.mark(empty)
+        return moving
+
+    def refresh(self, pool: Pool, key: np.uint64, turn: int, encoding: Any, levels: int, net: Net,
+                acts: NDArray[np.float32], x: NDArray[np.float32]) -> None:  # fmt: skip
+        """Look at a part of the cells again."""
+        pool.run(
+            sample_density, key, turn % PHASES, PHASES, np.float32(FADE), encoding, levels, net, self.cells,
+            self.contracted, self.seen, self.needed, self.density, acts, x,
+        )  # fmt: skip
+        self.mark()
+
+    def mark(self, empty: float = EMPTY) -> None:
+        """Decide anew which cells get samples: those with a density of ``empty`` or more."""
+        threshold(self.density, self.seen, self.needed, empty, self.cells, self.occupied, self.coarse)
+
+
+assert CELLS_A_TASK <= CHUNK, "a task's samples must fit the scratch of a training chunk"

@@ -1,0 +1,185 @@
+"""From views to what the kernels read: packed pixels, cameras in scene units, and what has moved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.scene_box import SceneBox
+from freshfield.geometry import GeometryError, Pinhole, Pose, invertible
+
+CHANGE = 16  # of 255, after blurring: above the noise of sensors and of video compression
+MARGIN_PX = 2
+# What no camera has and float32 would not bear: positions (geographic grids reach 1e7 m), and focal lengths,
+# as a share of the image's longer side.
+FARTHEST_M = 1e9
+FOCAL = (1e-3, 1e6)
+
+
+@dataclass
+class CameraMemory:
+    """The newest view of one camera, and the pixels that moved in it: bool (H, W), or None. credit: how many
+    views that contradict the field will still be refused (``trust.refused``)."""
+
+    view: View
+    moved: NDArray[np.bool_] | None = None
+    credit: int = 0
+
+
+def lens_row(camera: Pinhole) -> list[float]:
+    return [camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]
+
+
+def check_view(view: View) -> None:
+    """Refuse what would poison a field; ValueError says which camera and why."""
+    image, camera = view.image, view.intrinsics
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise ValueError(f"camera {view.camera}: image must be uint8 (H, W, 3 or 4), not {image.shape}")
+    if image.shape[:2] != (camera.height, camera.width):
+        raise ValueError(
+            f"camera {view.camera}: image is {image.shape[1]} x {image.shape[0]}, "
+            f"its intrinsics say {camera.width} x {camera.height}"
+        )
+    if np.shape(view.camera_to_world) != (4, 4) or not np.all(np.isfinite(view.camera_to_world)):
+        raise ValueError(f"camera {view.camera}: camera_to_world must be a finite (4, 4) matrix")
+    try:
+        Pose.from_matrix(view.camera_to_world)
+    except GeometryError as error:
+        raise ValueError(f"camera {view.camera}: {error}") from None
+    if np.abs(view.camera_to_world[:3, 3]).max() > FARTHEST_M:
+        raise ValueError(f"camera {view.camera}: its position is more than {FARTHEST_M:g} m from the origin")
+    if not np.all(np.isfinite(lens_row(camera))) or camera.fx <= 0 or camera.fy <= 0:
+        raise ValueError(f"camera {view.camera}: intrinsics must be finite, focal lengths positive")
+    shortest, longest = (limit * max(camera.width, camera.height) for limit in FOCAL)
+    if not (shortest <= camera.fx <= longest and shortest <= camera.fy <= longest):
+        raise ValueError(
+            f"camera {view.camera}: focal lengths of {camera.fx:g} and {camera.fy:g} pixels are no lens "
+            f"for an image of {camera.width} x {camera.height}"
+        )
+    if not invertible(camera):
+        raise ValueError(f"camera {view.camera}: its distortion cannot be undone over the whole image")
+    weight = view.weight
+    if weight is not None and not (
+        weight.dtype == np.float32
+        and weight.shape == image.shape[:2]
+        and bool(((weight >= 0.0) & (weight <= 1.0)).all())  # not of NaN
+    ):
+        raise ValueError(
+            f"camera {view.camera}: weight must be float32 of shape {image.shape[:2]} within 0..1, "
+            f"not {weight.dtype} of shape {weight.shape}"
+        )
+
+
+def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
+    """Where a camera that stood still sees something else than before; None where that cannot be said."""
+    if before.image.shape != now.image.shape or before.intrinsics != now.intrinsics:
+        return None
+    if not np.allclose(before.camera_to_world, now.camera_to_world, atol=1e-6):
+        return None
+    difference = cv2.absdiff(cv2.blur(before.image, (3, 3)), cv2.blur(now.image, (3, 3)))
+    channels = cv2.split(difference)  # a maximum along so short an axis takes numpy ten times as long
+    most = channels[0]
+    for channel in channels[1:]:
+        most = cv2.max(most, channel)
+    moved = (most > CHANGE).astype(np.uint8)
+    if not moved.any():
+        return None
+    size = 2 * MARGIN_PX + 1
+    return cv2.dilate(moved, np.ones((size, size), np.uint8)).astype(bool)
+
+
+def remember(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
+    """Take in the newest view of each camera; whether one is new, has moved or has a new lens."""
+    news = False
+    for view in views:
+        known = memory.get(view.camera)
+        if known is not None and known.view is view:
+            continue
+        stood = known is not None and (
+            known.view.intrinsics == view.intrinsics
+            and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3)
+        )
+        news = news or not stood
+        moved = None
+        if known is not None:
+            # The same frame decoded once more says nothing new; an equal but newer one says: nothing moved.
+            # What one wrong picture seemed to move would otherwise count as moving for as long as all stands.
+            again = known.view.shows_ns == view.shows_ns
+            same = again and np.array_equal(known.view.image, view.image)
+            moved = known.moved if same else moved_pixels(known.view, view)
+        # What a camera sees from elsewhere may be what no other camera has seen: no reason to doubt it.
+        memory[view.camera] = CameraMemory(view, moved, known.credit if known is not None and stood else 0)
+    return news
+
+
+def pack_cameras(views: Sequence[View], box: SceneBox) -> Views:
+    """The cameras of ``views`` in scene units, without pixels."""
+    size = np.array([[v.intrinsics.width, v.intrinsics.height] for v in views], dtype=np.int64)
+    pose = np.stack([np.asarray(v.camera_to_world, dtype=np.float64) for v in views])
+    return Views(
+        first=np.concatenate([[0], np.cumsum(size[:, 0] * size[:, 1])]).astype(np.int64),
+        size=size,
+        lens=np.array([lens_row(v.intrinsics) for v in views], dtype=np.float64),
+        rotation=np.ascontiguousarray(pose[:, :3, :3]),
+        origin=np.ascontiguousarray(box.normalise(pose[:, :3, 3])),
+        pixels=np.zeros((0, 3), np.uint8),
+        changed=np.zeros(0, np.int64),
+    )
+
+
+def pack_views(
+    views: Sequence[View],
+    box: SceneBox,
+    memory: dict[str, CameraMemory],
+    weights: Sequence[NDArray[np.float32]] | None = None,
+) -> Views:
+    """Everything one fit reads. Opaque and transparent pictures may be mixed.
+
+    weights: float32 (H, W) of each view (``trust.weights``); None: all 1.
+    """
+    packed = pack_cameras(views, box)
+    channels = max(v.image.shape[2] for v in views)
+    pixels = np.full((int(packed.first[-1]), channels), 255, np.uint8)
+    changed = []
+    for k, view in enumerate(views):
+        a, b = packed.first[k], packed.first[k + 1]
+        pixels[a:b, : view.image.shape[2]] = view.image.reshape(int(b - a), -1)
+        known = memory.get(view.camera)
+        if known is not None and known.view is view and known.moved is not None:
+            changed.append(a + np.flatnonzero(known.moved))
+    moved = np.concatenate(changed) if changed else np.zeros(0, np.int64)
+    if weights is None:
+        return packed._replace(pixels=pixels, changed=moved)
+    weight = np.concatenate([w.reshape(-1) for w in weights])
+    return _weighted(packed._replace(pixels=pixels, changed=moved), weight)
+
+
+def leave_out(data: Views, refused: NDArray[np.bool_]) -> Views:
+    """``data`` without the pixels of the views (V,) that are refused."""
+    if not refused.any():
+        return data
+    weight = data.weight.copy() if data.weight.size else np.ones(len(data.pixels), np.float32)
+    for k in np.flatnonzero(refused):
+        weight[data.first[k] : data.first[k + 1]] = 0.0
+    return _weighted(data, weight)
+
+
+def asked_views(data: Views) -> list[int]:
+    """The views that have pixels of more weight than 0."""
+    spans = zip(data.first[:-1], data.first[1:])
+    return [k for k, (a, b) in enumerate(spans) if not data.weight.size or data.weight[a:b].any()]
+
+
+def _weighted(data: Views, weight: NDArray[np.float32]) -> Views:
+    drawn = np.flatnonzero(weight)
+    return data._replace(
+        changed=data.changed[weight[data.changed] > 0],
+        weight=weight,
+        drawn=drawn if drawn.size < weight.size else np.zeros(0, np.int64),
+    )

@@ -1,0 +1,1 @@
+"""Nerfacto: hash grid with proposal sampling (Tancik et al. 2023)."""

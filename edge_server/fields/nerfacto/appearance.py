@@ -1,0 +1,122 @@
+"""What a field learns of each camera's look: a few numbers that colours may depend on, density never.
+
+Nerfacto's appearance embedding (Tancik et al. 2023; from NeRF in the Wild, Martin-Brualla et al. 2021),
+with two differences. The network gives colour's dependence on the numbers directly (``add_looks``) instead
+of taking them as input, since density and colour are one network here. And the mean over cameras is kept
+at 0, so that rendering with the mean embedding is rendering without any, and costs nothing.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.common.camera_refinement import CameraErrors
+from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.ray_snapshot import NgpSnapshot
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.training_schedule import BETA1, BETA2
+
+Array = NDArray[np.float64]
+
+_FIRST = 0.3  # standard deviation of first values: at 0 the network could not learn what to do with them
+_RATE = 2e-2
+_EPSILON = 1e-4
+_LIMIT = 3.0  # bound of every number
+
+
+class Appearances:
+    """Embeddings by camera, learnt by Adam. size: numbers a camera."""
+
+    def __init__(self, size: int, seed: int) -> None:
+        self.size, self.seed = size, seed
+        self.known: dict[str, Array] = {}  # camera -> (3, size): value, and Adam's two moments
+        self.steps = 0
+
+    def rows(self, cameras: Sequence[str]) -> NDArray[np.float32]:
+        """float32 (V, size) for the kernels. First values depend on the camera's name only, and the seed."""
+        fresh = [name for name in cameras if name not in self.known]
+        for name in fresh:
+            rng = np.random.default_rng(np.random.SeedSequence([self.seed, zlib.crc32(name.encode())]))
+            value = rng.normal(0.0, _FIRST, self.size)
+            self.known[name] = np.stack([value, np.zeros(self.size), np.zeros(self.size)])
+        if fresh:
+            self._centre()
+        return np.array([self.known[name][0] for name in cameras], dtype=np.float32)
+
+    def learn(self, cameras: Sequence[str], gradient: NDArray[np.float32], rays: int) -> None:
+        """One step of Adam. gradient: float32 (chunks, V, size), summed over ``rays`` rays."""
+        self.steps += 1
+        total = gradient.astype(np.float64).sum(axis=0) / max(rays, 1) * len(cameras)
+        for name, g in zip(cameras, total):
+            if not np.isfinite(g).all():
+                continue
+            value, m, v = self.known[name]
+            m = BETA1 * m + (1.0 - BETA1) * g
+            v = BETA2 * v + (1.0 - BETA2) * g * g
+            root = np.sqrt(v / (1.0 - BETA2**self.steps)) + _EPSILON
+            value = value - _RATE * m / (1.0 - BETA1**self.steps) / root
+            self.known[name] = np.stack([np.clip(value, -_LIMIT, _LIMIT), m, v])
+        self._centre()
+
+    def _centre(self) -> None:
+        mean = np.mean([known[0] for known in self.known.values()], axis=0)
+        for known in self.known.values():
+            known[0] -= mean
+
+
+class CameraLooks(CameraErrors):
+    """What one field knows of its cameras: errors (``refinement``) and, where asked for, appearances.
+
+    now: float32 (V, A), the embeddings of the views in training. gradient: float32 (chunks, V, A), filled
+    by each step. rays: of that step.
+    """
+
+    def __init__(self, exposure: bool, most_m: float, most_deg: float, size: int, seed: int) -> None:
+        super().__init__(exposure, most_m, most_deg)
+        self.appearances = Appearances(size, seed) if size else None
+        self.now = np.zeros((0, 0), np.float32)
+        self.gradient, self.rays = np.zeros((0, 0, 0), np.float32), 0
+
+    @property
+    def asked(self) -> bool:
+        """Whether any error or look is to be learnt."""
+        return super().asked or self.appearances is not None
+
+    def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
+        """``data`` as it is to be read with what is known by now; takes note of the embeddings."""
+        if self.appearances is not None:
+            self.now = self.appearances.rows([v.camera for v in views])
+        else:
+            self.now = np.zeros((len(views), 0), np.float32)
+        return super().corrected(views, data, box)
+
+    def learn(
+        self, views: Sequence[View], data: Views, box: SceneBox, step: int, seed: int,
+        sums: NDArray[np.float64], live: Callable[[], NgpSnapshot],
+    ) -> Views:  # fmt: skip
+        """After ``step``: learn from it; returns the corrected data."""
+        if self.appearances is not None:
+            cameras = [v.camera for v in views]
+            self.appearances.learn(cameras, self.gradient, self.rays)
+            self.now = self.appearances.rows(cameras)
+        return super().learn(views, data, box, step, seed, sums, live)
+
+    def meta(self) -> dict[str, Any]:
+        """What a state keeps, ready for JSON, to the last bit."""
+        own = self.appearances
+        known = {name: k.tolist() for name, k in own.known.items()} if own else {}
+        return {**super().meta(), "appearances": known, "appearance_steps": own.steps if own else 0}
+
+    def load(self, meta: dict[str, Any]) -> None:
+        """Undo ``meta``."""
+        super().load(meta)
+        if self.appearances is not None:
+            known = meta.get("appearances", {})
+            self.appearances.known = {name: np.array(k, dtype=np.float64) for name, k in known.items()}
+            self.appearances.steps = int(meta.get("appearance_steps", 0))

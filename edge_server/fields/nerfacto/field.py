@@ -1,0 +1,173 @@
+"""Nerfacto for CPUs (Tancik et al. 2023): the hash grid of ``ngp``, sampled where a learnt proposal says.
+
+``trained_field`` does everything; here is what is particular: samples from a proposal instead of a raster
+(``kernels.proposal``), appearance embeddings (``appearance``), and rendering from the proposal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Field
+from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
+from edge_server.fields.common.kernels.mlp import Net
+from edge_server.fields.common.kernels.rays import Space, Views
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, Recipe
+from edge_server.fields.common.kernels.volume_rendering import Weights
+from edge_server.fields.common.model_layout import first_net, make_grid
+from edge_server.fields.common.ray_snapshot import NgpSnapshot
+from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.common.trained_field import TINY, TrainedField
+from edge_server.fields.common.training_schedule import active_levels, smoothing
+from edge_server.fields.nerfacto.appearance import CameraLooks
+from edge_server.fields.nerfacto.kernels.proposal import Plan, Proposed, scatter_proposal
+from edge_server.fields.nerfacto.kernels.render import ROOM, render_proposed
+from edge_server.fields.nerfacto.kernels.train import Bins, BinScratch, train_proposed
+from edge_server.fields.nerfacto.settings import NerfactoSettings, make_settings
+from freshfield.geometry import Pinhole
+
+
+@dataclass(frozen=True)
+class NerfactoSnapshot(NgpSnapshot):
+    """A snapshot that is rendered with samples from its proposal, at the mean appearance."""
+
+    plan: Plan
+
+    def render_pixels(
+        self,
+        camera_to_world: NDArray[np.float64],
+        intrinsics: Pinhole,
+        pixels: NDArray[np.float64],
+        max_samples: int | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Colour (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
+        pose = np.asarray(camera_to_world, dtype=np.float64)
+        n, workers = len(pixels), self.pool.threads
+        color, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
+        opacity = np.empty(n, np.float32)
+        samples = min(self.plan.samples, max_samples or self.plan.samples)
+        self.pool.run(
+            render_proposed,
+            np.array(lens_row(intrinsics), dtype=np.float64),
+            np.ascontiguousarray(pose[:3, :3]),
+            self.box.normalise(pose[:3, 3]),
+            np.ascontiguousarray(pixels, dtype=np.float64),
+            self.plan._replace(samples=samples),
+            self.space,
+            self.encoding,
+            self.levels,
+            self.net,
+            self.harmonics,
+            self.background,
+            np.empty((workers, int(self.net.widths.sum()), ROOM), np.float32),
+            np.empty((workers, 3, ROOM), np.float32),
+            np.empty((workers, 3, ROOM), np.float32),
+            color,
+            depth,
+            opacity,
+        )
+        depth *= np.float32(self.box.radius_m)
+        return color, depth, opacity
+
+
+class NerfactoField(TrainedField):
+    """A hash grid, a proposal and a small network. See ``fields.Field`` for the protocol."""
+
+    name = "nerfacto"
+    shape = (
+        "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers",
+        "harmonics", "cells", "proposal_cells", "appearance",
+    )  # fmt: skip
+    settings: NerfactoSettings
+    _cameras: CameraLooks
+
+    def __init__(self, settings: NerfactoSettings | None = None, pool: Pool | None = None) -> None:
+        super().__init__(settings or NerfactoSettings(), pool)
+
+    def _make(self, rng: np.random.Generator) -> tuple[Proposed, Net]:
+        s = self.settings
+        grid = make_grid(s, self.rig.box, rng)
+        per_segment = SEGMENT * FEATURES
+        rows = -(-(s.proposal_cells**3) // per_segment) * SEGMENT
+        table = np.concatenate([grid.table, np.zeros((rows, FEATURES), np.float32)])
+        net = first_net(FEATURES * s.levels, s, rng, s.appearance)
+        return Proposed(grid.resolution, grid.first, grid.dense, table, s.proposal_cells), net
+
+    def _tiny(self) -> NerfactoSettings:
+        return replace(self.settings, **TINY, log2_table=10, proposal_cells=8)
+
+    def _levels(self) -> int:
+        return active_levels(self.settings, self.step)
+
+    def _forget_parameters(self) -> None:
+        super()._forget_parameters()
+        s, chunks, workers = self.settings, len(self._batch.samples), self.pool.threads
+        self._cameras = CameraLooks(s.exposure, s.refine_m, s.refine_deg, s.appearance, s.seed)
+        most = CHUNK_RAYS * s.bins
+        self._bins = Bins(
+            cell=np.zeros((chunks, most), np.int32),
+            grad=np.zeros((chunks, most), np.float32),
+            counts=np.zeros(chunks, np.int64),
+            looks=np.zeros((chunks, 0, s.appearance), np.float32),
+        )
+        self._bin_scratch = BinScratch(
+            line=np.zeros((workers, 4, CHUNK), np.float32),
+            depth=np.zeros((workers, most), np.float32),
+            weight=np.zeros((workers, most), np.float32),
+            group=np.zeros((workers, most), np.int32),
+            first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
+        )
+
+    def _plan(self) -> Plan:
+        """How rays are sampled at this step."""
+        s = self.settings
+        ramp = min(self.step / s.samples_ramp, 1.0) if s.samples_ramp else 1.0
+        fresh = max(1.0 - self.step / s.anneal, 0.0) if s.anneal else 0.0
+        even = s.even + (1.0 - s.even) * fresh if s.interlevel > 0 else 1.0
+        return Plan(
+            bins=s.bins,
+            samples=round(s.samples_start + ramp * (s.samples - s.samples_start)),
+            even=np.float32(even),
+            interlevel=np.float32(s.interlevel),
+            decay=np.float32(s.proposal_decay),
+        )
+
+    def _train(self, data: Views, recipe: Recipe, space: Space, weights: Weights) -> None:
+        cameras, bins = self._cameras, self._bins
+        if bins.looks.shape[1:] != cameras.now.shape:
+            bins = self._bins = bins._replace(
+                looks=np.zeros((len(bins.counts), *cameras.now.shape), np.float32)
+            )
+        self.pool.run(
+            train_proposed, data, recipe, self._plan(), space, self._encoding, self._net, cameras.now,
+            weights, self._batch, bins, self._scratch, self._bin_scratch,
+        )  # fmt: skip
+        cameras.gradient, cameras.rays = bins.looks, int(self._batch.rays.sum())
+
+    def _gather(self, levels: int, scale: float) -> None:
+        batch, bins, e = self._batch, self._bins, self._encoding
+        grid = Grid(e.resolution, e.first, e.dense, e.table)
+        self.pool.run(
+            scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
+        )
+        if weight := smoothing(self.settings, self.step):
+            self.pool.run(smooth_grid, grid, levels, np.float32(weight / scale), self._table_g, self._dirty)
+        self.pool.run(scatter_proposal, e, bins.cell, bins.grad, bins.counts, self._table_g, self._dirty)
+
+    def _live(self) -> NerfactoSnapshot:
+        live = super()._live()
+        known = {f.name: getattr(live, f.name) for f in fields(live)}
+        return NerfactoSnapshot(**known, plan=self._plan())
+
+
+def make(options: dict[str, Any], seed: int = 0) -> Field:
+    """A field from plain options (``nerfacto_settings``). ValueError where CUDA is asked for."""
+    settings = make_settings(options, seed)
+    if settings.device == "cuda":
+        raise ValueError("nerfacto: runs on CPUs only; use device cpu or auto, or the field ngp")
+    return NerfactoField(settings)

@@ -1,0 +1,70 @@
+"""Settings of the proposal-sampled field: one dataclass whose texts become help and error messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from edge_server.fields.common.trainer_settings import help_of, option, settings_from
+from edge_server.fields.ngp.settings import NgpSettings
+
+
+@dataclass(frozen=True)
+class NerfactoSettings(NgpSettings):
+    """What can be chosen about a ``NerfactoField``. Lengths in metres; None: found from the cameras."""
+
+    name = "nerfacto"
+
+    rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
+    samples: int = option(24, "samples of a ray, drawn where the proposal says")
+    samples_start: int = option(24, "the same at first")
+    samples_ramp: int = option(200, "steps after which ``samples`` is reached")
+    bins: int = option(96, "bins a ray is cut into: where the proposal is looked up")
+    proposal_cells: int = option(64, "cells a side of the proposal")
+    interlevel: float = option(5.0, "weight of the proposal's loss; 0: it stays even")
+    proposal_decay: float = option(3e-2, "pull of the proposal's raw densities back to thin fog")
+    even: float = option(0.4, "share of a ray's samples that is dealt evenly, whatever the proposal says")
+    anneal: int = option(40, "steps over which that share falls from 1: first there is nothing to follow")
+    smooth: float = option(3e-3, "weight of the total variation of the levels that are not hashed")
+    device: str = option("auto", "cpu or auto: it runs on CPUs only")
+    appearance: int = option(0, "numbers learnt of each camera's look (exposure, tint); 0: none")
+
+    def __post_init__(self) -> None:
+        self._within(
+            ("bins", 8, 1024),
+            ("samples", 8, 512),
+            ("samples_start", 8, 512),
+            ("proposal_cells", 8, 256),
+            ("interlevel", 0.0, 1e3),
+            ("proposal_decay", 0.0, 1e3),
+            ("even", 0.0, 1.0),
+            ("anneal", 0, 1 << 30),
+            ("appearance", 0, 16),
+        )
+        if self.proposal_cells % 4:
+            raise ValueError(
+                f"{self.name}: proposal_cells must be a multiple of 4, not {self.proposal_cells}"
+            )
+        if self.appearance and self.exposure:
+            # Measured: together they undo each other, and the field is worse than with neither.
+            raise ValueError(f"{self.name}: appearance and exposure explain the same thing: choose one")
+        super().__post_init__()
+
+
+EFFORTS: dict[str, dict[str, Any]] = {
+    "low": {"levels": 6, "log2_table": 14, "finest_resolution": 96, "batch_samples": 8192, "samples": 16,
+            "samples_start": 16},
+    "medium": {},
+    "high": {"log2_table": 17, "hidden": 64, "batch_samples": 32768, "rays": 8192, "samples": 32,
+             "samples_start": 32, "bins": 128},
+}  # fmt: skip
+
+
+def make_settings(options: dict[str, Any], seed: int = 0) -> NerfactoSettings:
+    """Settings from plain options: see ``trainer_settings.settings_from``."""
+    return settings_from(NerfactoSettings, EFFORTS, options, seed)
+
+
+def help_text() -> dict[str, str]:
+    """Option name -> what it means, for command lines and documentation."""
+    return help_of(NerfactoSettings)

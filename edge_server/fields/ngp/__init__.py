@@ -1,0 +1,1 @@
+"""Instant-NGP style hash grid (Mueller et al. 2022)."""

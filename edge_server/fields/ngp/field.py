@@ -1,0 +1,78 @@
+"""Instant-NGP style radiance field on CPUs: hash grid, small network, numba kernels (thesis 3.1, 4.4.4).
+
+``trained_field`` does everything; here is what is particular to the hash grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from edge_server.fields import Field
+from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
+from edge_server.fields.common.kernels.mlp import Net
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.model_layout import make_grid, make_net
+from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
+from edge_server.fields.common.training_schedule import active_levels, smoothing
+from edge_server.fields.ngp.cuda_driver import driver_present
+from edge_server.fields.ngp.settings import NgpSettings, make_settings
+
+assert SEGMENT * FEATURES == DIRTY, "scatter and adam must mean the same by a dirty flag"
+
+
+class NgpField(TrainedField):
+    """A multiresolution hash grid and a small network. See ``fields.Field`` for the protocol."""
+
+    name = "ngp"
+    shape = (
+        "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers",
+        "harmonics", "cells", "samples",
+    )  # fmt: skip
+    settings: NgpSettings
+
+    def __init__(self, settings: NgpSettings | None = None, pool: Pool | None = None) -> None:
+        super().__init__(settings or NgpSettings(), pool)
+
+    @property
+    def _grid(self) -> Grid:
+        grid: Grid = self._encoding
+        return grid
+
+    def _make(self, rng: np.random.Generator) -> tuple[Grid, Net]:
+        return make_grid(self.settings, self.rig.box, rng), make_net(self.settings, rng)
+
+    def _tiny(self) -> NgpSettings:
+        return replace(self.settings, **TINY, log2_table=10)
+
+    def _levels(self) -> int:
+        return active_levels(self.settings, self.step)
+
+    def _gather(self, levels: int, scale: float) -> None:
+        batch = self._batch
+        self.pool.run(
+            scatter, self._grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
+        )
+        if weight := smoothing(self.settings, self.step):
+            self.pool.run(
+                smooth_grid, self._grid, levels, np.float32(weight / scale), self._table_g, self._dirty
+            )
+
+
+def make(options: dict[str, Any], seed: int = 0) -> Field:
+    """A field from plain options (``ngp_settings``), for the device they ask for; ``auto`` takes a GPU only
+    where it can do all that they ask for. ValueError where ``cuda`` is asked for and cannot."""
+    settings = make_settings(options, seed)
+    if settings.device == "cpu" or (settings.device == "auto" and not driver_present()):
+        return NgpField(settings)
+    from edge_server.fields.ngp.torch_field import (  # torch, only where it may be used
+        NgpTorchField,
+        cuda_present,
+        lacks,
+    )
+
+    if settings.device == "cuda" or (cuda_present() and not lacks(settings)):
+        return NgpTorchField(settings)
+    return NgpField(settings)

@@ -1,0 +1,388 @@
+"""``NgpField`` for CUDA devices, in plain torch (also runs on a CPU, slowly, which is how it is tested).
+
+The same state as ``NgpField``: a checkpoint of one loads into the other. The same settings, too, but for
+those in ``ONLY_KERNELS``, which are refused, ``smooth`` and the depth guide where none is asked for by
+name, which are left out, and ``batch_samples``: every ray
+of a step is taken, however many samples it has.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edge_server.fields import Budget, FitReport, Rendering, View
+from edge_server.fields.common.field_state import all_or_nothing, fill, pack, unpack_meta
+from edge_server.fields.common.kernels.adam import GRADIENT_LIMIT, PARAMETER_LIMIT
+from edge_server.fields.common.kernels.rays import HORIZON, Views
+from edge_server.fields.common.kernels.thread_pool import shared_pool
+from edge_server.fields.common.model_layout import make_grid, make_net
+from edge_server.fields.common.occupancy_grid import EVERY, FADE, Occupancy
+from edge_server.fields.common.ray_snapshot import surface_points
+from edge_server.fields.common.scene_box import NOWHERE, SceneBox
+from edge_server.fields.common.training_schedule import (
+    BETA1_FIELD,
+    BETA2,
+    NOMINAL_RAYS,
+    Pace,
+    Usual,
+    active_levels,
+    step_key,
+    step_length,
+)
+from edge_server.fields.common.view_store import Arrays, Rig
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.ngp.torch_model import TorchGrid, encode, mlp, ray_losses, shade, to_torch, weights_of
+from freshfield.geometry import Pinhole
+
+RENDER_RAYS = 8192  # at a time
+ONLY_KERNELS = (
+    "exposure",
+    "refine_m",
+    "refine_deg",
+    "near_fade",
+    "depth_guide",
+)  # options that have no code here
+
+
+def lacks(settings: NgpSettings) -> tuple[str, ...]:
+    """The options in ``settings`` that ask for what only the kernels do."""
+    return tuple(name for name in ONLY_KERNELS if getattr(settings, name))
+
+
+@contextmanager
+def _repeatable() -> Iterator[None]:
+    """Sums of gradients in a fixed order, where torch has that (on CUDA, cumulative sums may lack it)."""
+    before = torch.are_deterministic_algorithms_enabled()
+    warn = torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before, warn_only=warn)
+
+
+def cuda_present() -> bool:
+    """Whether torch can use a CUDA device here."""
+    return torch.cuda.is_available()
+
+
+@dataclass(frozen=True)
+class TorchModel:
+    """Parameters of one instant and how to sample them; occupied: uint8 (cells, cells, cells), z first."""
+
+    settings: NgpSettings
+    box: SceneBox
+    grid: TorchGrid
+    levels: int
+    widths: list[int]
+    net: Tensor
+    occupied: Tensor
+    background: Tensor
+    step: float  # scene units
+
+    def march(self, o: Tensor, d: Tensor, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Origins and directions (R, 3), jitter (R,) -> t, delta (R, S), unit-cube points (R, S, 3) and
+        which of them lie in occupied cells (R, S): ``kernels.rays.march`` without skipping."""
+        box, s = self.box, self.settings
+        step = self.step
+        half = HORIZON if box.contracted else 1.0
+        safe = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
+        a, b = (-half - o) / safe, (half - o) / safe
+        enter = torch.minimum(a, b).amax(-1).clamp(min=box.near_m / box.radius_m)
+        leave = torch.maximum(a, b).amin(-1)
+        t = enter + jitter * step
+        ts, deltas = [], []
+        while bool((t < leave).any()):
+            m = (o + t[:, None] * d).abs().amax(-1)
+            delta = step * m.clamp(min=1.0).square() if box.contracted else torch.full_like(t, step)
+            ts.append(t)
+            deltas.append(delta)
+            t = torch.where(t < leave, t + delta, t)  # or steps that grow with distance overflow
+        if not ts:
+            ts, deltas = [t], [torch.zeros_like(t)]
+        t, delta = torch.stack(ts, -1), torch.stack(deltas, -1)
+        p = o[:, None] + t[..., None] * d[:, None]
+        if box.contracted:
+            m = p.abs().amax(-1, keepdim=True).clamp(min=1.0)
+            p = p * (2.0 - 1.0 / m) / m * 0.5
+        u = (p * 0.5 + 0.5).clamp(0.0, 0.9999999)
+        cell = (u * s.cells).long()
+        inside = self.occupied[cell[..., 2], cell[..., 1], cell[..., 0]] > 0
+        return t, delta, u, inside & (t < leave[:, None])
+
+    def query(self, d: Tensor, u: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
+        """Density (R, S) and colour (R, S, 3) of marched samples; 0 where not ``inside``."""
+        direction = d[:, None].expand(-1, u.shape[1], -1)[inside]
+        raw = mlp(self.widths, self.net, encode(self.grid, self.levels, u[inside]))
+        sigma, color = shade(raw, self.settings.harmonics, direction)
+        shape = inside.shape
+        whole = torch.zeros(shape, device=u.device).masked_scatter(inside, sigma)
+        colors = torch.zeros((*shape, 3), device=u.device)
+        return whole, colors.masked_scatter(inside[..., None].expand(-1, -1, 3), color)
+
+    @torch.no_grad()
+    def render_pixels(
+        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Colour (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
+        device, pose = self.net.device, np.asarray(camera_to_world, dtype=np.float64)
+        rays = (intrinsics.rays(pixels) @ pose[:3, :3].T).astype(np.float32)
+        origin = self.box.normalise(pose[:3, 3]).astype(np.float32)
+        parts = []
+        for a in range(0, len(rays), RENDER_RAYS):
+            d = torch.as_tensor(rays[a : a + RENDER_RAYS], device=device)
+            o = torch.as_tensor(origin, device=device).expand_as(d)
+            t, delta, u, inside = self.march(o, d, torch.full((len(d),), 0.5, device=device))
+            sigma, color = self.query(d, u, inside)
+            weight, left = weights_of(sigma, delta)
+            opacity = 1.0 - left
+            depth = (weight * t).sum(-1) / opacity.clamp(min=1e-3)
+            rgb = (weight[..., None] * color).sum(1) + left[:, None] * self.background
+            depth = torch.where(opacity > 1e-3, depth, torch.zeros_like(depth)) * self.box.radius_m
+            parts.append((rgb.clamp(0, 1).cpu().numpy(), depth.cpu().numpy(), opacity.cpu().numpy()))
+        color_, depth_, opacity_ = (np.concatenate(p) for p in zip(*parts))
+        return color_, depth_, opacity_
+
+
+@dataclass(frozen=True)
+class TorchSnapshot:
+    """``NgpSnapshot`` of a torch field."""
+
+    model: TorchModel
+    cameras: tuple[View, ...]
+
+    def render(
+        self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, max_samples: int | None = None
+    ) -> Rendering:
+        """The picture a camera at this pose would take; max_samples is for the kernels only."""
+        w, h = intrinsics.width, intrinsics.height
+        v, u = np.mgrid[0:h, 0:w]
+        pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
+        color, depth, opacity = self.model.render_pixels(camera_to_world, intrinsics, pixels)
+        return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """As ``NgpSnapshot.points``."""
+        return surface_points(self.model, self.cameras, count)
+
+
+class NgpTorchField:
+    """See ``NgpField``: the protocol and its meaning are the same. ValueError for a device that is not here,
+    and for options that only the kernels have (``lacks``)."""
+
+    def __init__(self, settings: NgpSettings | None = None, device: str | None = None) -> None:
+        self.settings = settings or NgpSettings()
+        if missing := lacks(self.settings):
+            raise ValueError(f"ngp: {', '.join(missing)} needs device cpu; the field in torch has it not")
+        self.device = device or ("cuda" if cuda_present() else "cpu")
+        if self.device.startswith("cuda") and not cuda_present():
+            raise ValueError("ngp: device cuda was asked for, but torch finds none here; use cpu or auto")
+        self.pool = shared_pool(self.settings.threads, self.settings.nice)
+        self._lock = threading.RLock()
+        self.now = time.perf_counter  # the clock of budgets in seconds
+        self.reset()
+
+    def reset(self) -> None:
+        with self._lock:
+            self.rig, self.dropped = Rig(self.settings), 0
+            self._forget_parameters()
+
+    def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
+        if not views:
+            return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
+        pace, losses, samples, dropped = Pace(budget, self.now), [0.0], 0, 0
+        with self._lock:
+            intake = self.rig.take_in(views)
+            if intake.new_box:
+                self._forget_parameters()
+            if intake.look:
+                self._occupancy.look(self.pool, self.rig)
+            data = self.rig.trusted(views, intake, self.step, self._model())
+        while (progress := pace.begin(self._usual)) is not None:
+            with self._lock:
+                loss, used, bad = self._one_step(data, progress)
+            losses, samples, dropped = [*losses[-31:], loss], samples + used, dropped + bad
+            pace.end()
+        self.dropped += dropped
+        rays = pace.steps * self.settings.rays
+        refused = self.rig.left_out_of(views)
+        return FitReport(pace.steps, pace.seconds(), float(np.mean(losses)), rays, samples, dropped, refused)
+
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        return self.snapshot().render(camera_to_world, intrinsics)
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return self.snapshot().points(count)
+
+    def snapshot(self, present_ns: int | None = None) -> TorchSnapshot:
+        with self._lock:
+            model = self._model()
+            grid = replace(model.grid, table=model.grid.table.detach().clone())
+            model = replace(model, grid=grid, net=model.net.detach().clone())
+            return TorchSnapshot(model, self.rig.views)
+
+    def warm_up(self) -> float:
+        """Nothing to compile; the same call as the kernels' field has."""
+        return 0.0
+
+    def state(self) -> Arrays:
+        with self._lock:
+            counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
+            counters["needed"] = self._occupancy.needed
+            return pack(NgpField.name, self.settings, self.rig, counters, self._arrays())
+
+    def load_state(self, state: Arrays) -> None:
+        with self._lock, all_or_nothing(self):
+            meta = unpack_meta(self.settings, state, NgpField.name, NgpField.shape)
+            self.rig = Rig(self.settings)
+            self.rig.load(meta, state)
+            self._forget_parameters()
+            arrays = {name: array.copy() for name, array in self._arrays().items()}
+            fill(arrays, state)
+            for name, tensor in self._tensors().items():
+                tensor.copy_(torch.as_tensor(arrays[name]))
+            for name in ("density", "seen", "occupied"):
+                getattr(self._occupancy, name)[...] = arrays[name]
+            self.step, self._updates = int(meta["step"]), int(meta["updates"])
+            self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
+            self._occupancy.mark()
+
+    # --- inside -------------------------------------------------------------------------------
+
+    def _tensors(self) -> dict[str, Tensor]:
+        names = ("table", "table_m", "table_v", "net", "net_m", "net_v")
+        return dict(zip(names, (self._grid.table, *self._moments[0], self._net, *self._moments[1])))
+
+    def _arrays(self) -> Arrays:
+        o = self._occupancy
+        arrays = {name: tensor.cpu().numpy() for name, tensor in self._tensors().items()}
+        return {**arrays, "density": o.density, "seen": o.seen, "occupied": o.occupied}
+
+    def _forget_parameters(self) -> None:
+        rng = np.random.default_rng(np.random.SeedSequence(self.settings.seed))
+        self.step = self._updates = 0
+        self._usual = Usual()
+        self._grid = to_torch(make_grid(self.settings, self.rig.box, rng), self.device)
+        net = make_net(self.settings, rng)
+        self._widths = net.widths.tolist()
+        self._net = torch.as_tensor(net.params, device=self.device)
+        self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in (self._grid.table, self._net)]
+        self._occupancy: Occupancy = Occupancy.for_box(self.settings, self.rig.box)
+
+    def _model(self) -> TorchModel:
+        o, s = self._occupancy, self.settings
+        occupied = torch.as_tensor(o.occupied, device=self.device).view(s.cells, s.cells, s.cells)
+        return TorchModel(
+            settings=s,
+            box=self.rig.box or NOWHERE,
+            grid=self._grid,
+            levels=active_levels(s, self.step),
+            widths=self._widths,
+            net=self._net,
+            occupied=occupied,
+            background=torch.as_tensor(self.rig.background(), device=self.device),
+            step=step_length(s, self.step),
+        )
+
+    def _one_step(self, data: Views, progress: float) -> tuple[float, int, int]:
+        s, box, model = self.settings, self.rig.box, self._model()
+        assert box is not None
+        rng = np.random.default_rng(int(step_key(s.seed, self.step)))
+        if self.step % EVERY == 0:
+            self._refresh(model, rng)
+            model = self._model()
+        o, d, target, background, weight = self._draw(data, rng)
+        jitter = torch.as_tensor(rng.random(len(d), dtype=np.float32), device=self.device)
+        table = self._grid.table.requires_grad_(True)
+        net = self._net.requires_grad_(True)
+        t, delta, u, inside = model.march(o, d, jitter)
+        sigma, color = model.query(d, u, inside)
+        error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion, s.sparsity)
+        error, loss = error * weight, loss * weight
+        good = torch.isfinite(error)
+        with _repeatable():
+            torch.where(good, loss, torch.zeros_like(loss)).sum().backward()
+        self.step += 1
+        self._updates += 1
+        with torch.no_grad():
+            scale, bad, fall = NOMINAL_RAYS / len(d), int((~good).sum()), s.rate_end**progress
+            rates = (s.rate * fall, s.rate_net * fall)
+            for p, (m, v), rate, decay in zip((table, net), self._moments, rates, (s.decay, 0.0)):
+                bad += self._adam(p, m, v, scale, rate, decay)
+        self._grid.table.requires_grad_(False)
+        self._net.requires_grad_(False)
+        used = int(inside.sum())
+        return error[good].mean().item() / 3.0 if bool(good.any()) else 0.0, used, bad
+
+    def _adam(self, p: Tensor, m: Tensor, v: Tensor, scale: float, rate: float, decay: float) -> int:
+        """``kernels.adam``: entries without gradient, or with one that is not finite, stay as they are."""
+        assert p.grad is not None
+        g = p.grad * scale
+        p.grad = None
+        finite = torch.isfinite(g)
+        use = finite & (g != 0)
+        g = torch.where(use, g, torch.zeros_like(g)).clamp(-GRADIENT_LIMIT, GRADIENT_LIMIT)
+        m.copy_(torch.where(use, BETA1_FIELD * m + (1 - BETA1_FIELD) * g, m))
+        v.copy_(torch.where(use, BETA2 * v + (1 - BETA2) * g * g, v))
+        root = (v / (1 - BETA2**self._updates)).sqrt() + self.settings.epsilon
+        new = p - rate * (m / (1 - BETA1_FIELD**self._updates) / root + decay * p)
+        new = torch.where(use, new, p).nan_to_num(0.0, 0.0, 0.0)
+        p.copy_(new.clamp(-PARAMETER_LIMIT, PARAMETER_LIMIT))
+        return int((~finite).sum())
+
+    def _draw(self, data: Views, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Origins, directions, targets and backgrounds (R, 3) of one step's rays, and their weights (R,)."""
+        count = self.settings.rays
+        pixel = rng.integers(0, len(data.drawn) or len(data.pixels), count)
+        if len(data.drawn):
+            pixel = data.drawn[pixel]
+        if len(data.changed):
+            moved = rng.choice(data.changed, count)
+            pixel = np.where(rng.random(count) < self.settings.changed_share, moved, pixel)
+        view = np.searchsorted(data.first, pixel, side="right") - 1
+        directions = np.empty((count, 3), np.float32)
+        for k in np.unique(view):
+            rows = np.flatnonzero(view == k)
+            local, width = pixel[rows] - data.first[k], int(data.size[k, 0])
+            fx, fy, cx, cy, k1, k2, p1, p2 = data.lens[k].tolist()
+            camera = Pinhole(width, int(data.size[k, 1]), fx, fy, cx, cy, (k1, k2, p1, p2))
+            rays = camera.rays(np.stack([local % width + 0.5, local // width + 0.5], axis=-1))
+            directions[rows] = rays @ data.rotation[k].T
+        rgb = data.pixels[pixel].astype(np.float32) / 255.0
+        background = np.broadcast_to(self.rig.background(), (count, 3))
+        if self.settings.background == "random":
+            background = rng.random((count, 3), dtype=np.float32)
+        alpha = rgb[:, 3:] if rgb.shape[1] == 4 else np.ones((count, 1), np.float32)
+        target = rgb[:, :3] * alpha + background * (1 - alpha)
+        weight = data.weight[pixel] if len(data.weight) else np.ones(count, np.float32)
+        arrays = (data.origin[view].astype(np.float32), directions, target, background.copy(), weight)
+        o, d, wanted, behind, counts = (torch.as_tensor(a, device=self.device) for a in arrays)
+        return o, d, wanted, behind, counts
+
+    @torch.no_grad()
+    def _refresh(self, model: TorchModel, rng: np.random.Generator) -> None:
+        o, cells = self._occupancy, self.settings.cells
+        k, j, i = np.meshgrid(*[np.arange(cells)] * 3, indexing="ij")
+        corner = np.stack([i.ravel(), j.ravel(), k.ravel()], axis=-1)
+        u = ((corner + rng.random(corner.shape)) / cells).astype(np.float32)
+        fresh = np.empty(len(u), np.float32)
+        for a in range(0, len(u), 1 << 18):
+            x = torch.as_tensor(u[a : a + (1 << 18)], device=self.device)
+            raw = mlp(model.widths, model.net, encode(model.grid, model.levels, x))
+            fresh[a : a + (1 << 18)] = shade(raw, 1, x)[0].cpu().numpy()
+        if o.contracted:
+            m = np.abs((corner + 0.5) * (4.0 / cells) - 2.0).max(axis=-1)
+            fresh *= np.where(m > 1.0, 1.0 / np.maximum(2.0 - m, 1e-6), 1.0) ** 2
+        fresh = np.where(np.isfinite(fresh), fresh, np.float32(1e3))
+        o.density[:] = np.where(o.seen >= o.needed, np.maximum(o.density * np.float32(FADE), fresh), 0.0)
+        o.mark()

@@ -1,0 +1,117 @@
+"""The hash-grid field once more, in plain torch: what the kernels are compared with, and what
+``ngp_torch_field`` runs on CUDA devices.
+
+Same parameters, same layout, same formulas as ``kernels``; autograd finds the gradients. The functions
+take torch tensors on any device; shapes are noted beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from edge_server.fields.common.kernels.hash_grid import Grid
+from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, RAW_HIGH, RAW_LOW
+
+PRIMES = (1, 2654435761, 805459861)
+
+
+@dataclass(frozen=True)
+class TorchGrid:
+    """``kernels.grid.Grid`` as tensors: table (vertices, 2) float."""
+
+    resolution: list[int]
+    first: list[int]
+    dense: list[bool]
+    table: Tensor
+
+
+def to_torch(grid: Grid, device: str = "cpu", dtype: torch.dtype = torch.float32) -> TorchGrid:
+    """A copy of a grid on a torch device."""
+    table = torch.as_tensor(grid.table, dtype=dtype, device=device).clone()
+    return TorchGrid(grid.resolution.tolist(), grid.first.tolist(), grid.dense.tolist(), table)
+
+
+def encode(grid: TorchGrid, levels: int, x: Tensor) -> Tensor:
+    """Points (N, 3) in the unit cube -> features (N, 2 L); levels from ``levels`` on are 0. Eq. 3.23."""
+    out = []
+    corner = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], device=x.device)  # (8, 3)
+    for l, res in enumerate(grid.resolution):
+        if l >= levels:
+            out.append(torch.zeros_like(x[:, :2]).to(grid.table.dtype))
+            continue
+        scaled = x * res
+        cell = scaled.floor().clamp(0, res - 1)  # (N, 3)
+        fraction = (scaled - cell)[:, None, :]  # (N, 1, 3)
+        vertex = cell.long()[:, None, :] + corner  # (N, 8, 3)
+        size = grid.first[l + 1] - grid.first[l]
+        if grid.dense[l]:
+            row = vertex[..., 0] + (res + 1) * (vertex[..., 1] + (res + 1) * vertex[..., 2])
+        else:
+            mixed = (vertex * torch.tensor(PRIMES, device=x.device)) & 0xFFFFFFFF
+            row = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) % size
+        weight = torch.where(corner == 1, fraction, 1 - fraction).prod(dim=-1)  # (N, 8)
+        out.append((weight[..., None] * grid.table[grid.first[l] + row]).sum(dim=1))
+    return torch.cat(out, dim=-1)
+
+
+def mlp(widths: Sequence[int], params: Tensor, x: Tensor) -> Tensor:
+    """x (N, up to widths[0]), padded with zeros -> (N, widths[-1]); ReLU between layers."""
+    x = torch.nn.functional.pad(x, (0, widths[0] - x.shape[-1]))
+    first = 0
+    for layer, (n_in, n_out) in enumerate(pairwise(widths)):
+        matrix = params[first : first + n_out * n_in].view(n_out, n_in)
+        first += n_out * n_in
+        x = x @ matrix.T + params[first : first + n_out]
+        first += n_out
+        x = x if layer == len(widths) - 2 else torch.relu(x)
+    return x
+
+
+def harmonics(count: int, d: Tensor) -> Tensor:
+    """Real spherical harmonics 1 .. count - 1 of unit directions (N, 3) -> (N, count - 1)."""
+    x, y, z = d.unbind(-1)
+    values = [0.4886025 * y, 0.4886025 * z, 0.4886025 * x, 1.0925485 * x * y, 1.0925485 * y * z]
+    values += [0.3153916 * (3 * z * z - 1), 1.0925485 * x * z, 0.5462742 * (x * x - y * y)]
+    return torch.stack(values[: count - 1], dim=-1) if count > 1 else d[:, :0]
+
+
+def shade(raw: Tensor, count: int, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Net output (N, >= 1 + 3 count) and directions (N, 3) -> density (N,), colour (N, 3). The clamp has
+    no gradient outside its bounds, forward and backward alike."""
+    sigma = raw[:, 0].clamp(RAW_LOW, RAW_HIGH).exp()
+    shares = raw[:, 4 : 1 + 3 * count].view(len(raw), count - 1, 3)
+    color = raw[:, 1:4] + (shares * harmonics(count, d)[..., None]).sum(dim=1)
+    return sigma, color.sigmoid()
+
+
+def weights_of(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
+    """Density and step length (R, S), 0 where there is no sample -> weights (R, S) and what light is left
+    behind the last sample (R,). Samples behind the point of opacity have no weight. Eq. 3.21."""
+    depth = (sigma * delta).cumsum(dim=-1)
+    before = torch.nn.functional.pad(depth, (1, 0))[:, :-1]
+    seen = before <= OPAQUE_DEPTH
+    weight = torch.where(seen, torch.exp(-before) - torch.exp(-depth), torch.zeros_like(depth))
+    return weight, 1.0 - weight.sum(dim=-1)
+
+
+def ray_losses(
+    sigma: Tensor, color: Tensor, t: Tensor, delta: Tensor, target: Tensor, background: Tensor,
+    distortion: float, sparsity: float,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Colour errors (R,) and losses (R,) of rays with samples (R, S): 3.22, mip-NeRF 360's distortion
+    loss, and optical depth of what is seen."""
+    weight, left = weights_of(sigma, delta)
+    rendered = (weight[..., None] * color).sum(dim=1) + left[:, None] * background
+    error = (rendered - target).square().sum(dim=-1)
+    apart = (t[:, :, None] - t[:, None, :]).abs()
+    spread = (weight[:, :, None] * weight[:, None, :] * apart).sum(dim=(1, 2))
+    spread = spread + (weight.square() * delta).sum(dim=-1) / 3.0
+    depth = (sigma * delta).cumsum(dim=-1)
+    seen = torch.nn.functional.pad(depth, (1, 0))[:, :-1] <= OPAQUE_DEPTH
+    optical = torch.where(seen, sigma * delta, torch.zeros_like(sigma)).sum(dim=-1)
+    return error, error + distortion * spread + sparsity * optical

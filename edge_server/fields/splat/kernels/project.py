@@ -1,0 +1,324 @@
+"""From a Gaussian in space to one in the picture (Kerbl et al. 2023, after Zwicker et al. 2001).
+
+Everything is in scene units and float32. A lens with distortion is part of the projection: the mean is
+distorted, and the Jacobian that flattens the covariance is that of the distorted projection, so pictures
+need no undistortion at intake and any camera can be rendered.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, is_finite, log32
+from edge_server.fields.common.kernels.volume_rendering import harmonic
+
+# Columns of a Gaussian's parameters; from COLOR + 3 on, three for each further spherical harmonic.
+POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
+BASE = 14
+# Columns of a projected Gaussian.
+MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, HALF_HEIGHT, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 12
+# Columns of what a Gaussian reaches: tiles x0, x1, y0, y1 (x1 <= x0: none); and which of them, bit by bit,
+# x fastest, the first 64 (from there on, all of them); and the depth as ``deal`` sorts by it.
+FIRST_64, ORDER, REACHED = 4, 6, 7
+# Columns of a camera.
+ORIGIN, LENS, LIMITS, NEAR, SIZE, TIME, CAMERA = 9, 12, 20, 24, 25, 27, 28
+
+TILE = 8  # pixels a side
+BLOCK = 128  # Gaussians a task
+
+# The bits of a positive float32 sort as the number does. From .01 to 1e5 scene units the upper 23 of them
+# take 380 thousand values: what is nearer to another than 6e-5 of its depth may come before or after it.
+ORDER_BITS = 20
+_NEAREST, _UPPER = np.int32(0x3C23D70A), np.int32(9)  # the bits of .01; lower bits that are left out
+
+LOW_PASS = 0.3  # of a pixel squared: nothing is sharper than a pixel
+ALPHA_LEAST = 1.0 / 255.0  # a Gaussian ends where it adds less than this
+# Bounds of raw parameters, applied forward; where they bind the gradient is 0.
+SCALE_LOW, SCALE_HIGH = -12.0, 4.0
+RAW_OPACITY = 12.0
+FAR = 1e5  # scene units: beyond it float32 squares lose their meaning
+_NO_DIRECTION = 1e-20  # squared length of a quaternion that has none
+
+# Rows of BLOCK numbers in which a block of Gaussians is projected side by side.
+_X, _VX, _M, _ALPHA, _REACH, _Q, _S = (n * BLOCK for n in (0, 3, 6, 15, 16, 17, 21))
+_PX, _PY, _PZ, _A, _B, _C, _WIDE, _HIGH, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLOCK for n in range(17, 29))
+_ROWS = 29
+
+_F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
+
+
+class Gaussians(NamedTuple):
+    """params: float32 (N, BASE + 3 (harmonics - 1)). harmonics: 1, 4 or 9. velocity: float32 (N, 3), scene
+    units a second: a camera whose column TIME is t (seconds from the instant of ``params``) sees a Gaussian
+    where it was then."""
+
+    params: NDArray[np.float32]
+    harmonics: int
+    velocity: NDArray[np.float32]
+
+
+@part
+def held(cams, b):
+    """Camera b's columns as a tuple of CAMERA numbers. A loop that writes to arrays then need not read the
+    camera again for every Gaussian, which would keep LLVM from vectorising it; and no row of an array is
+    made an array of its own, whose owners the threads would count."""
+    return (
+        cams[b, 0], cams[b, 1], cams[b, 2], cams[b, 3], cams[b, 4], cams[b, 5], cams[b, 6],
+        cams[b, 7], cams[b, 8], cams[b, 9], cams[b, 10], cams[b, 11], cams[b, 12], cams[b, 13],
+        cams[b, 14], cams[b, 15], cams[b, 16], cams[b, 17], cams[b, 18], cams[b, 19], cams[b, 20],
+        cams[b, 21], cams[b, 22], cams[b, 23], cams[b, 24], cams[b, 25], cams[b, 26], cams[b, 27],
+    )  # fmt: skip
+
+
+@part
+def bent(cam, x, y):
+    """Distorted normalised coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
+    its derivatives xxx, xxy, xyy, yyy. cam: ``held``."""
+    k1, k2, p1, p2 = cam[LENS + 4], cam[LENS + 5], cam[LENS + 6], cam[LENS + 7]
+    six, eight = np.float32(6.0), np.float32(8.0)
+    r2 = x * x + y * y
+    radial = _F1 + r2 * (k1 + r2 * k2)
+    g = k1 + _F2 * k2 * r2
+    u = x * radial + _F2 * p1 * x * y + p2 * (r2 + _F2 * x * x)
+    v = y * radial + p1 * (r2 + _F2 * y * y) + _F2 * p2 * x * y
+    dxx = radial + _F2 * x * x * g + _F2 * p1 * y + six * p2 * x
+    dxy = _F2 * x * y * g + _F2 * p1 * x + _F2 * p2 * y
+    dyy = radial + _F2 * y * y * g + six * p1 * y + _F2 * p2 * x
+    xxx = six * x * g + eight * k2 * x * x * x + six * p2
+    xxy = _F2 * y * g + eight * k2 * x * x * y + _F2 * p1
+    xyy = _F2 * x * g + eight * k2 * x * y * y + _F2 * p2
+    yyy = six * y * g + eight * k2 * y * y * y + six * p1
+    return u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy
+
+
+@part
+def unit_quaternion(w, x, y, z):
+    """The quaternion's direction and 1 / length; (1, 0, 0, 0) and 0 where it has none."""
+    square = w * w + x * x + y * y + z * z
+    has = (square > np.float32(_NO_DIRECTION)) & (square < np.float32(1e20))
+    inverse = _F1 / np.sqrt(square if has else _F1)
+    return (
+        w * inverse if has else _F1, x * inverse if has else _F0, y * inverse if has else _F0,
+        z * inverse if has else _F0, inverse if has else _F0,
+    )  # fmt: skip
+
+
+@part
+def rotation(w, x, y, z):
+    """The matrix of a unit quaternion, row by row."""
+    return (
+        _F1 - _F2 * (y * y + z * z), _F2 * (x * y - w * z), _F2 * (x * z + w * y),
+        _F2 * (x * y + w * z), _F1 - _F2 * (x * x + z * z), _F2 * (y * z - w * x),
+        _F2 * (x * z - w * y), _F2 * (y * z + w * x), _F1 - _F2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@part
+def held_scale(raw):
+    """A length, of its raw parameter."""
+    return exp32(min(max(raw, np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
+
+
+@part
+def camera_point(cam, params, velocity, i):
+    """Gaussian i in the axes of camera ``held``, where it is when that looks."""
+    t = cam[TIME]
+    x = params[i, 0] + t * velocity[i, 0] - cam[ORIGIN]
+    y = params[i, 1] + t * velocity[i, 1] - cam[ORIGIN + 1]
+    z = params[i, 2] + t * velocity[i, 2] - cam[ORIGIN + 2]
+    return turned(cam, x, y, z)
+
+
+@part
+def turned(cam, x, y, z):
+    """A vector of world axes in those of the camera."""
+    return (
+        cam[0] * x + cam[1] * y + cam[2] * z,
+        cam[3] * x + cam[4] * y + cam[5] * z,
+        cam[6] * x + cam[7] * y + cam[8] * z,
+    )
+
+
+@part
+def flattener(cam, x, y, z):
+    """What takes world axes to pixels at a camera point: mean (u, v), the rows of J W (2 x 3), and what its
+    gradient needs. The ratios x / z and y / z are held to 1.3 of the field of view, where J is taken."""
+    inverse = _F1 / z
+    a, c = x * inverse, y * inverse
+    ta = min(max(a, cam[LIMITS]), cam[LIMITS + 1])
+    tc = min(max(c, cam[LIMITS + 2]), cam[LIMITS + 3])
+    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = bent(cam, ta, tc)
+    # Beyond the limits the lens goes on straight: its polynomial folds back into the picture out there.
+    u += dxx * (a - ta) + dxy * (c - tc)
+    v += dxy * (a - ta) + dyy * (c - tc)
+    return a, c, ta, tc, u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse
+
+
+@part
+def times(cam, j0, j1, j2):
+    """A row of camera axes -> of world axes."""
+    return (
+        j0 * cam[0] + j1 * cam[3] + j2 * cam[6],
+        j0 * cam[1] + j1 * cam[4] + j2 * cam[7],
+        j0 * cam[2] + j1 * cam[5] + j2 * cam[8],
+    )
+
+
+@part
+def _unfold(gaussians, base, count, s):
+    """Gaussians base, ..., base + count - 1 as no camera has seen them yet, to the rows of ``s``: place,
+    velocity, the axes of the ellipsoid times their lengths, opacity, and how far the Gaussian reaches, in
+    standard deviations squared (0: nowhere)."""
+    params, velocity = gaussians.params, gaussians.velocity
+    for j in range(count):
+        i = base + j
+        for k in range(3):
+            s[_X + k * BLOCK + j], s[_VX + k * BLOCK + j] = params[i, k], velocity[i, k]
+            s[_S + k * BLOCK + j] = params[i, SCALE + k]
+        for k in range(4):
+            s[_Q + k * BLOCK + j] = params[i, QUATERNION + k]
+        s[_ALPHA + j] = params[i, OPACITY]
+    for j in range(BLOCK):
+        w, x, y, z, _ = unit_quaternion(
+            s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
+        )
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(w, x, y, z)
+        s0, s1, s2 = held_scale(s[_S + j]), held_scale(s[_S + BLOCK + j]), held_scale(s[_S + 2 * BLOCK + j])
+        s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j] = r0 * s0, r1 * s1, r2 * s2
+        s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j] = r3 * s0, r4 * s1, r5 * s2
+        s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j] = r6 * s0, r7 * s1, r8 * s2
+        raw = s[_ALPHA + j]
+        alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY)), np.float32(RAW_OPACITY))))
+        shows = is_finite(raw) & (alpha > np.float32(ALPHA_LEAST))
+        s[_ALPHA + j] = alpha
+        s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_LEAST)) if shows else _F0
+
+
+@part
+def _flatten(cam, s):
+    """What camera ``held`` sees of the Gaussians in the rows of ``s``: mean, depth and covariance in the
+    picture, and the edges of what each reaches in tiles, LEFT > RIGHT where it is not in the picture."""
+    fx, fy, width, height = cam[LENS], cam[LENS + 1], cam[SIZE], cam[SIZE + 1]
+    low, over, t = np.float32(LOW_PASS), np.float32(1.0 / TILE), cam[TIME]
+    for j in range(BLOCK):
+        x, y, z = turned(
+            cam,
+            s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
+            s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
+            s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
+        )
+        shows = (z > cam[NEAR]) & (z < np.float32(FAR)) & (s[_REACH + j] > _F0)
+        _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = flattener(cam, x, y, z if shows else _F1)
+        gx, gy = fx * inverse, fy * inverse
+        t0, t1, t2 = times(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
+        t3, t4, t5 = times(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
+        m0, m1, m2 = s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j]
+        m3, m4, m5 = s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j]
+        m6, m7, m8 = s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j]
+        v0, v1, v2 = t0 * m0 + t1 * m3 + t2 * m6, t0 * m1 + t1 * m4 + t2 * m7, t0 * m2 + t1 * m5 + t2 * m8
+        w0, w1, w2 = t3 * m0 + t4 * m3 + t5 * m6, t3 * m1 + t4 * m4 + t5 * m7, t3 * m2 + t4 * m5 + t5 * m8
+        # The covariance is V V^T + low-pass: symmetric, and its determinant a sum of squares by Lagrange's
+        # identity, which a difference of products would lose for needles.
+        e, g = v0 * v0 + v1 * v1 + v2 * v2, w0 * w0 + w1 * w1 + w2 * w2
+        n0, n1, n2 = v1 * w2 - v2 * w1, v2 * w0 - v0 * w2, v0 * w1 - v1 * w0
+        determinant = max(n0 * n0 + n1 * n1 + n2 * n2 + low * (e + g) + low * low, np.float32(1e-10))
+        e, g, f = e + low, g + low, v0 * w0 + v1 * w1 + v2 * w2
+        px, py = fx * u + cam[LENS + 2], fy * v + cam[LENS + 3]
+        shows = shows & is_finite(determinant) & (abs(px) + abs(py) < np.float32(1e6)) & is_finite(e + g)
+        rx, ry = np.sqrt(s[_REACH + j] * e), np.sqrt(s[_REACH + j] * g)
+        shows = shows & (px + rx > _F0) & (px - rx < width) & (py + ry > _F0) & (py - ry < height)
+        inv = _F1 / determinant
+        s[_PX + j], s[_PY + j], s[_PZ + j] = px, py, z
+        s[_A + j], s[_B + j], s[_C + j] = g * inv, -f * inv, e * inv
+        s[_WIDE + j], s[_HIGH + j] = np.sqrt(max(e, g)), ry
+        s[_LEFT + j] = max(px - rx, _F0) * over if shows else _F1
+        s[_RIGHT + j] = min(px + rx, width - _HALF) * over if shows else -_F1
+        s[_TOP + j], s[_BOTTOM + j] = max(py - ry, _F0) * over, min(py + ry, height - _HALF) * over
+
+
+@part
+def _touched(px, py, a, b, c, reach, x0, x1, y0, y1):
+    """Which tiles of a box an ellipse has pixels in, as bits: those in whose nearest point to its middle
+    a dx^2 + 2 b dx dy + c dy^2 is no more than ``reach``. A box is twice as large as a slanting needle's
+    ellipse, and every tile of its costs as much as one that it touches."""
+    bits, bit = np.uint64(0), np.uint64(0)
+    most = reach * np.float32(1.001) + np.float32(1e-3)
+    slope_x, slope_y = -b / a, -b / c
+    for ty in range(y0, y1):
+        # From the middle to the centres of the tile's outermost pixels.
+        low_y = np.float32(TILE * ty) + _HALF - py
+        high_y = low_y + np.float32(TILE - 1)
+        dy = max(low_y, min(high_y, _F0))
+        for tx in range(x0, x1):
+            low_x = np.float32(TILE * tx) + _HALF - px
+            high_x = low_x + np.float32(TILE - 1)
+            dx = max(low_x, min(high_x, _F0))
+            # The least over a rectangle lies on one of the two edges that face the middle.
+            ex, ey = min(max(slope_x * dy, low_x), high_x), min(max(slope_y * dx, low_y), high_y)
+            least = min(
+                a * ex * ex + (b + b) * ex * dy + c * dy * dy, a * dx * dx + (b + b) * dx * ey + c * ey * ey
+            )
+            if least <= most:
+                bits |= np.uint64(1) << bit
+            bit += np.uint64(1)
+            if bit == np.uint64(64):
+                return bits
+    return bits
+
+
+@part
+def _write(cam, gaussians, i, s, j, row, edges):
+    """Fill row (PROJECTED,) and edges (REACHED,) from lane j of ``s``. conic: the inverse of the picture
+    covariance, upper triangle."""
+    params, harmonics = gaussians.params, gaussians.harmonics
+    row[MX], row[MY], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
+    row[QA], row[QB], row[QC] = s[_A + j], s[_B + j], s[_C + j]
+    row[ALPHA], row[RADIUS], row[HALF_HEIGHT] = s[_ALPHA + j], s[_WIDE + j], s[_HIGH + j]
+    for k in range(3):
+        row[RED + k] = params[i, COLOR + k]
+    if harmonics > 1:
+        ox, oy, oz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (
+            params[i, 2] - cam[ORIGIN + 2])  # fmt: skip
+        length = _F1 / max(np.sqrt(ox * ox + oy * oy + oz * oz), np.float32(1e-9))
+        ox, oy, oz = ox * length, oy * length, oz * length
+        for h in range(1, harmonics):
+            value = harmonic(h, ox, oy, oz)
+            for k in range(3):
+                row[RED + k] += value * params[i, BASE + 3 * (h - 1) + k]
+    if is_finite(row[RED] + row[RED + 1] + row[RED + 2]):
+        edges[0], edges[1] = np.int32(s[_LEFT + j]), np.int32(s[_RIGHT + j]) + 1
+        edges[2], edges[3] = np.int32(s[_TOP + j]), np.int32(s[_BOTTOM + j]) + 1
+        bits = _touched(
+            row[MX], row[MY], row[QA], row[QB], row[QC], s[_REACH + j], edges[0], edges[1], edges[2], edges[3]
+        )
+        far = (bits_of_float(row[DEPTH]) - _NEAREST) >> _UPPER
+        edges[ORDER] = min(max(far, np.int32(0)), np.int32((1 << ORDER_BITS) - 1))
+        edges[FIRST_64] = np.int32(bits & np.uint64(0xFFFFFFFF))
+        edges[FIRST_64 + 1] = np.int32(bits >> np.uint64(32))
+
+
+@kernel
+def project(counter, worker, cams, gaussians, count, projected, tiles):
+    """Fill projected: float32 (B, >= count, PROJECTED), and tiles: int32 (B, >= count, REACHED). Tasks are
+    blocks of Gaussians, each for all the cameras (float32 (B, CAMERA)): what no camera changes is worked out
+    once."""
+    s = np.zeros(_ROWS * BLOCK, np.float32)
+    while True:
+        base = draw(counter, worker, (count + BLOCK - 1) // BLOCK) * BLOCK
+        if base >= count:
+            return
+        here = min(BLOCK, count - base)
+        _unfold(gaussians, base, here, s)
+        for b in range(cams.shape[0]):
+            cam = held(cams, b)
+            _flatten(cam, s)
+            for j in range(here):
+                i = base + j
+                edges = tiles[b, i]
+                edges[0] = edges[1] = edges[2] = edges[3] = 0
+                if s[_LEFT + j] <= s[_RIGHT + j]:
+                    _write(cam, gaussians, i, s, j, projected[b, i], edges)

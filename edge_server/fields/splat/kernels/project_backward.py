@@ -1,0 +1,243 @@
+"""The gradient of ``splat_project``: from what a Gaussian's pixels say to its parameters, block by block.
+
+As there, a block's Gaussians lie side by side in rows of BLOCK numbers of one piece of memory, so that every
+line is a loop that LLVM vectorises; what a camera does not see is worked out, too, and left out at the end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_server.fields.common.kernels.jit import part
+from edge_server.fields.common.kernels.volume_rendering import harmonic
+from edge_server.fields.splat.kernels.project import (
+    ALPHA,
+    BASE,
+    BLOCK,
+    COLOR,
+    LENS,
+    OPACITY,
+    ORIGIN,
+    QA,
+    QB,
+    QC,
+    QUATERNION,
+    RAW_OPACITY,
+    SCALE,
+    SCALE_HIGH,
+    SCALE_LOW,
+    TIME,
+    flattener,
+    held_scale,
+    rotation,
+    times,
+    turned,
+    unit_quaternion,
+)
+
+# Rows of BLOCK numbers: place, velocity, raw scale, quaternion, raw opacity; of what a camera sees: opacity,
+# conic, the pairs' sums, whether there were any, and the length of the gradient of the mean; from GRADIENT on
+# a row for each parameter.
+_X, _VX, _S, _Q, _RAW, _ALPHA, _QA, _QB, _QC, _SUM = (n * BLOCK for n in (0, 3, 6, 9, 13, 14, 15, 16, 17, 18))
+SEEN, SLOPE, GRADIENT = (n * BLOCK for n in (27, 28, 29))
+_ROWS = 29
+
+_F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
+
+
+@part
+def scratch(width):
+    """Memory for a block of Gaussians of ``width`` parameters."""
+    return np.zeros((_ROWS + width) * BLOCK, np.float32)
+
+
+@part
+def begin_block(gaussians, ids, count, s):
+    """Gaussians ids[:count] to the rows of ``s``; their gradients are 0."""
+    params, velocity = gaussians.params, gaussians.velocity
+    for j in range(count):
+        i = ids[j]
+        for k in range(3):
+            s[_X + k * BLOCK + j], s[_VX + k * BLOCK + j] = params[i, k], velocity[i, k]
+            s[_S + k * BLOCK + j] = params[i, SCALE + k]
+        for k in range(4):
+            s[_Q + k * BLOCK + j] = params[i, QUATERNION + k]
+        s[_RAW + j] = params[i, OPACITY]
+    for k in range(GRADIENT, GRADIENT + params.shape[1] * BLOCK):
+        s[k] = _F0
+
+
+@part
+def take_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
+    """What camera slot b's pairs say to the block: their sums, in the order they have. Returns to how many
+    Gaussians they say anything."""
+    seen = 0
+    for j in range(count):
+        i = ids[j]
+        first, pairs = np.int64(own_first[b, i]), np.int64(own_count[b, i])
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _F0
+        for p in range(first, first + pairs):
+            row = pair_sums[b, p]
+            s0, s1, s2, s3, s4 = s0 + row[0], s1 + row[1], s2 + row[2], s3 + row[3], s4 + row[4]
+            s5, s6, s7, s8 = s5 + row[5], s6 + row[6], s7 + row[7], s8 + row[8]
+        for k, value in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8)):
+            s[_SUM + k * BLOCK + j] = value
+        row = projected[b, i]
+        s[_ALPHA + j], s[_QA + j], s[_QB + j], s[_QC + j] = row[ALPHA], row[QA], row[QB], row[QC]
+        s[SEEN + j] = _F1 if pairs > 0 else _F0
+        seen += np.int64(pairs > 0)
+    for j in range(count, BLOCK):
+        s[SEEN + j] = _F0
+    return seen
+
+
+@part
+def back(cam, s):
+    """Add to the rows from GRADIENT on what camera ``held`` makes of the sums: over the pixels a Gaussian
+    covers, d loss / d power (h), h dx, h dy, h dx^2, h dx dy, h dy^2 with (dx, dy) from the mean to the
+    pixel, and d loss / d colour. Row SLOPE: the length of the gradient of the mean in the picture (pixels),
+    0 where it is not seen."""
+    fx, fy, t = cam[LENS], cam[LENS + 1], cam[TIME]
+    for j in range(BLOCK):
+        seen = s[SEEN + j] > _F0
+        x, y, z = turned(
+            cam,
+            s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
+            s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
+            s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
+        )
+        a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = flattener(
+            cam, x, y, z if seen else _F1
+        )
+        gx, gy = fx * inverse, fy * inverse
+        j0, j1, j2 = gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc)
+        j3, j4, j5 = gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc)
+        t0, t1, t2 = times(cam, j0, j1, j2)
+        t3, t4, t5 = times(cam, j3, j4, j5)
+        qw, qx, qy, qz, q_inverse = unit_quaternion(
+            s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
+        )
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(qw, qx, qy, qz)
+        raw0, raw1, raw2 = s[_S + j], s[_S + BLOCK + j], s[_S + 2 * BLOCK + j]
+        s0, s1, s2 = held_scale(raw0), held_scale(raw1), held_scale(raw2)
+        v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
+            t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
+        w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
+            t3 * r2 + t4 * r5 + t5 * r8) * s2  # fmt: skip
+        # mean and conic
+        qa, qb, qc = s[_QA + j], s[_QB + j], s[_QC + j]
+        hx, hy = s[_SUM + BLOCK + j], s[_SUM + 2 * BLOCK + j]
+        du, dv = qa * hx + qb * hy, qb * hx + qc * hy
+        hxx, hxy, hyy = s[_SUM + 3 * BLOCK + j], s[_SUM + 4 * BLOCK + j], s[_SUM + 5 * BLOCK + j]
+        ga, gb, gc = -_HALF * hxx, -_HALF * hxy, -_HALF * hyy
+        # d cov = - Q G Q
+        m0, m1 = qa * ga + qb * gb, qa * gb + qb * gc
+        m2, m3 = qb * ga + qc * gb, qb * gb + qc * gc
+        e, f, g = -(m0 * qa + m1 * qb), -(m0 * qb + m1 * qc), -(m2 * qb + m3 * qc)
+        # cov = V V^T
+        a0, a1, a2 = _F2 * (e * v0 + f * w0), _F2 * (e * v1 + f * w1), _F2 * (e * v2 + f * w2)
+        b0, b1, b2 = _F2 * (f * v0 + g * w0), _F2 * (f * v1 + g * w1), _F2 * (f * v2 + g * w2)
+        low, high, bounded = np.float32(SCALE_LOW), np.float32(SCALE_HIGH), np.float32(RAW_OPACITY)
+        d0, d1, d2 = a0 * v0 + b0 * w0, a1 * v1 + b1 * w1, a2 * v2 + b2 * w2
+        at = GRADIENT + SCALE * BLOCK + j
+        s[at] += d0 if seen & (raw0 > low) & (raw0 < high) else _F0
+        s[at + BLOCK] += d1 if seen & (raw1 > low) & (raw1 < high) else _F0
+        s[at + 2 * BLOCK] += d2 if seen & (raw2 > low) & (raw2 < high) else _F0
+        a0, a1, a2, b0, b1, b2 = a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2
+        # rotation: T^T dU, then the quaternion and its normalisation
+        d0, d1, d2 = t0 * a0 + t3 * b0, t0 * a1 + t3 * b1, t0 * a2 + t3 * b2
+        d3, d4, d5 = t1 * a0 + t4 * b0, t1 * a1 + t4 * b1, t1 * a2 + t4 * b2
+        d6, d7, d8 = t2 * a0 + t5 * b0, t2 * a1 + t5 * b1, t2 * a2 + t5 * b2
+        nw = _F2 * (qx * (d7 - d5) + qy * (d2 - d6) + qz * (d3 - d1))
+        nx = _F2 * (qy * (d1 + d3) + qz * (d2 + d6) + qw * (d7 - d5) - _F2 * qx * (d4 + d8))
+        ny = _F2 * (qx * (d1 + d3) + qz * (d5 + d7) + qw * (d2 - d6) - _F2 * qy * (d0 + d8))
+        nz = _F2 * (qx * (d2 + d6) + qy * (d5 + d7) + qw * (d3 - d1) - _F2 * qz * (d0 + d4))
+        along = nw * qw + nx * qx + ny * qy + nz * qz
+        at = GRADIENT + QUATERNION * BLOCK + j
+        directed = seen & (q_inverse > _F0)
+        s[at] += (nw - along * qw) * q_inverse if directed else _F0
+        s[at + BLOCK] += (nx - along * qx) * q_inverse if directed else _F0
+        s[at + 2 * BLOCK] += (ny - along * qy) * q_inverse if directed else _F0
+        s[at + 3 * BLOCK] += (nz - along * qz) * q_inverse if directed else _F0
+        # dT = dU R^T, then dJ = dT W^T
+        c0, c1, c2 = a0 * r0 + a1 * r1 + a2 * r2, a0 * r3 + a1 * r4 + a2 * r5, a0 * r6 + a1 * r7 + a2 * r8
+        c3, c4, c5 = b0 * r0 + b1 * r1 + b2 * r2, b0 * r3 + b1 * r4 + b2 * r5, b0 * r6 + b1 * r7 + b2 * r8
+        k0, k1, k2 = turned(cam, c0, c1, c2)
+        k3, k4, k5 = turned(cam, c3, c4, c5)
+        dz = -inverse * (k0 * j0 + k1 * j1 + k2 * j2 + k3 * j3 + k4 * j4 + k5 * j5)
+        # J by the ratios: J = D P with P = (1, 0, -ta; 0, 1, -tc) / z
+        dda = fx * du * dxx + fy * dv * dxy
+        ddc = fx * du * dxy + fy * dv * dyy
+        p0, p1 = gx * (k0 - ta * k2), gx * (k1 - tc * k2)  # by dxx and dxy through the first row
+        p2, p3 = gy * (k3 - ta * k5), gy * (k4 - tc * k5)  # by dxy and dyy through the second
+        bent_a = p0 * xxx + (p1 + p2) * xxy + p3 * xyy - (gx * dxx * k2 + gy * dxy * k5)
+        bent_c = p0 * xxy + (p1 + p2) * xyy + p3 * yyy - (gx * dxy * k2 + gy * dyy * k5)
+        dda += bent_a if a == ta else _F0
+        ddc += bent_c if c == tc else _F0
+        dx, dy = dda * inverse, ddc * inverse
+        dz -= (dda * a + ddc * c) * inverse
+        o0 = cam[0] * dx + cam[3] * dy + cam[6] * dz
+        o1 = cam[1] * dx + cam[4] * dy + cam[7] * dz
+        o2 = cam[2] * dx + cam[5] * dy + cam[8] * dz
+        at = GRADIENT + j
+        s[at] += o0 if seen else _F0
+        s[at + BLOCK] += o1 if seen else _F0
+        s[at + 2 * BLOCK] += o2 if seen else _F0
+        opaque = s[_SUM + j] * (_F1 - s[_ALPHA + j])
+        s[at + OPACITY * BLOCK] += opaque if seen & (abs(s[_RAW + j]) < bounded) else _F0
+        s[at + COLOR * BLOCK] += s[_SUM + 6 * BLOCK + j]
+        s[at + (COLOR + 1) * BLOCK] += s[_SUM + 7 * BLOCK + j]
+        s[at + (COLOR + 2) * BLOCK] += s[_SUM + 8 * BLOCK + j]
+        s[SLOPE + j] = np.sqrt(du * du + dv * dv) if seen else _F0
+
+
+@part
+def _harmonic_slope(h, x, y, z):
+    """Derivatives of harmonic h by x, y and z."""
+    a, b, c = np.float32(0.4886025), np.float32(1.0925485), np.float32(0.3153916)
+    if h == 1:
+        return _F0, a, _F0
+    if h == 2:
+        return _F0, _F0, a
+    if h == 3:
+        return a, _F0, _F0
+    if h == 4:
+        return b * y, b * x, _F0
+    if h == 5:
+        return _F0, b * z, b * y
+    if h == 6:
+        return _F0, _F0, np.float32(6.0) * c * z
+    if h == 7:
+        return b * z, _F0, b * x
+    d = np.float32(2.0 * 0.5462742)
+    return d * x, -d * y, _F0
+
+
+@part
+def tint_back(cam, gaussians, ids, count, s):
+    """What ``back`` leaves out: the colour by the direction it is seen from, if there are harmonics."""
+    params, harmonics = gaussians.params, gaussians.harmonics
+    if harmonics == 1:
+        return
+    for j in range(count):
+        if s[SEEN + j] == _F0:
+            continue
+        i, at = ids[j], GRADIENT + j
+        nx, ny, nz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (
+            params[i, 2] - cam[ORIGIN + 2])  # fmt: skip
+        length = _F1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-9))
+        nx, ny, nz = nx * length, ny * length, nz * length
+        lx, ly, lz = _F0, _F0, _F0
+        for h in range(1, harmonics):
+            value = harmonic(h, nx, ny, nz)
+            hx, hy, hz = _harmonic_slope(h, nx, ny, nz)
+            share = _F0
+            for k in range(3):
+                column, given = BASE + 3 * (h - 1) + k, s[_SUM + (6 + k) * BLOCK + j]
+                s[at + column * BLOCK] += value * given
+                share += params[i, column] * given
+            lx, ly, lz = lx + share * hx, ly + share * hy, lz + share * hz
+        along = lx * nx + ly * ny + lz * nz
+        s[at] += (lx - along * nx) * length
+        s[at + BLOCK] += (ly - along * ny) * length
+        s[at + 2 * BLOCK] += (lz - along * nz) * length

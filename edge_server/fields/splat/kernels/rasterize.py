@@ -1,0 +1,333 @@
+"""Compositing a tile's Gaussians (thesis 3.20 with alphas in place of densities), losses of its pixels, and
+back.
+
+A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with offsets that
+are constants, which is what lets LLVM vectorise it without tests for overlap; the Gaussians are laid down
+strip by strip, in ``splat_strips``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.simd import draw, exp32, fetch_add, is_finite, uniform
+from edge_server.fields.splat.kernels.composite import (
+    ALPHA_MOST,
+    KEPT,
+    PIXELS,
+    STOP,
+    STRIP,
+    STRIPS,
+    SUMS,
+    lay,
+    lift,
+    sort_into_strips,
+)
+from edge_server.fields.splat.kernels.project import (
+    ALPHA,
+    ALPHA_LEAST,
+    MX,
+    MY,
+    QA,
+    QB,
+    QC,
+    RED,
+    TILE,
+)
+
+# Rows of a tile's memory: light, colour and depth, in ``lay``'s order; what the loss makes of each colour,
+# and what lies behind, in ``lift``'s.
+_T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
+_ER, _EG, _EB, _BEHIND = (n * PIXELS for n in range(5, 9))
+ROWS = 9
+
+_F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
+_BYTE = np.float32(1.0 / 255.0)
+_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # of SSIM
+
+
+class Loss(NamedTuple):
+    """What is minimised, per pixel and summed. absolute: L1 rather than squared errors. dssim: weight of
+    (1 - SSIM) / 2 over the tile as one window. background: float32 (3,); random: another one for each tile,
+    from stream ``key``."""
+
+    absolute: bool
+    dssim: np.float32
+    background: NDArray[np.float32]
+    random: bool
+    key: np.uint64
+
+
+@part
+def begin_tile(s):
+    """All light, no colour."""
+    for k in range(PIXELS):
+        s[_T + k] = _F1
+        s[_R + k] = s[_G + k] = s[_B + k] = s[_Z + k] = _F0
+
+
+@part
+def room(lists):
+    """Scratch of ``sort_into_strips`` for the longest list: who and count."""
+    longest = np.int64(1)
+    for b in range(lists.longest.shape[0]):
+        for r in range(lists.longest.shape[1]):
+            longest = max(longest, lists.longest[b, r])
+    return np.empty((STRIPS, longest), np.int32), np.empty(STRIPS, np.int64)
+
+
+@part
+def lay_tile(s, lists, b, t, x0, y0, projected, who, count, store):
+    """Lay all Gaussians of tile t of camera slot b over the tile memory ``s``; nothing is kept of them."""
+    begin_tile(s)
+    sort_into_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, who, count)
+    for n in range(STRIPS):
+        lay(
+            who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+            _T + n * STRIP, store, 0,
+        )  # fmt: skip
+
+
+@part
+def dissimilarity(s, row, error_row, target, count, weight):
+    """Add the gradient of weight * count * (1 - SSIM) / 2 between a colour row of ``s`` and target (PIXELS,)
+    over their first ``count`` pixels that lie in the picture; returns that loss."""
+    n = _F1 / np.float32(count)
+    mx = my = xx = yy = xy = _F0
+    for k in range(PIXELS):
+        inside = target[k] >= _F0
+        x, y = s[row + k] if inside else _F0, target[k] if inside else _F0
+        mx += x
+        my += y
+        xx += x * x
+        yy += y * y
+        xy += x * y
+    mx, my = mx * n, my * n
+    # Rounding can make a variance negative.
+    xx, yy, xy = max(xx * n - mx * mx, _F0), max(yy * n - my * my, _F0), xy * n - mx * my
+    a1, a2, b1, b2 = _F2 * mx * my + _C1, _F2 * xy + _C2, mx * mx + my * my + _C1, xx + yy + _C2
+    ssim = min(max(a1 * a2 / (b1 * b2), -_F1), _F1)
+    by_mean = _F2 * my * a2 / (b1 * b2) - _F2 * mx * ssim / b1
+    by_xy, by_xx = _F2 * a1 / (b1 * b2), -ssim / b2
+    scale = -_HALF * weight
+    for k in range(PIXELS):
+        if target[k] >= _F0:
+            x, y = s[row + k], target[k]
+            s[error_row + k] += scale * (by_mean + by_xy * (y - my) + _F2 * by_xx * (x - mx))
+    return _HALF * weight * np.float32(count) * (_F1 - ssim)
+
+
+@part
+def _target(views, view, x0, y0, loss, task, target, back):
+    """Fill target (3, PIXELS), -1 outside the picture; back (3,). Returns how many pixels are inside."""
+    width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
+    for c in range(3):
+        back[c] = loss.background[c]
+        if loss.random:
+            back[c] = uniform(loss.key, np.uint64(3 * task + c))
+    count = 0
+    transparent = views.pixels.shape[1] == 4
+    for k in range(PIXELS):
+        x, y = x0 + k % TILE, y0 + k // TILE
+        if x >= width or y >= height:
+            target[0, k] = target[1, k] = target[2, k] = -_F1
+            continue
+        count += 1
+        pixel = first + y * width + x
+        opaque = np.float32(views.pixels[pixel, 3]) * _BYTE if transparent else _F1
+        for c in range(3):
+            target[c, k] = np.float32(views.pixels[pixel, c]) * _BYTE * opaque + back[c] * (_F1 - opaque)
+    return count
+
+
+@part
+def _trust(views, view, x0, y0, target, share):
+    """Fill share (PIXELS,) with the pixels' weights; those of none count as outside the picture, -1 in
+    target. Returns how many are left, and their mean weight."""
+    width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
+    count, total = 0, _F0
+    for k in range(PIXELS):
+        x, y = x0 + k % TILE, y0 + k // TILE
+        inside = x < width and y < height
+        share[k] = views.weight[first + y * width + x] if inside else _F0
+        if share[k] > _F0:
+            count += 1
+            total += share[k]
+        else:
+            target[0, k] = target[1, k] = target[2, k] = -_F1
+    return count, total / np.float32(max(count, 1))
+
+
+@part
+def _weigh(s, target, share, absolute):
+    """Multiply the error rows of ``s`` by the pixels' shares; returns loss and squared error, so weighed."""
+    total, square = _F0, _F0
+    for c in range(3):
+        for k in range(PIXELS):
+            e = s[_R + c * PIXELS + k] - target[c, k] if share[k] > _F0 else _F0
+            square += share[k] * (e * e)
+            total += share[k] * (abs(e) if absolute else e * e)
+            s[_ER + c * PIXELS + k] *= share[k]
+    return total, square
+
+
+@kernel
+def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, kept,
+                sums, losses):  # fmt: skip
+    """Render, compare, differentiate. views: ``rays.Views``; picked: int64 (B,), the view of each camera
+    slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), kept: float32
+    (W, longest * STRIPS * KEPT), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written.
+    losses: float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not
+    finite.
+
+    With ``views.weight``, a pixel's loss is multiplied by its own, that of a tile's SSIM by their mean over
+    the pixels that have any; the others are not part of the window."""
+    s, store = memory[worker], kept[worker]
+    weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
+    target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
+    (who, count), laid = room(lists), np.empty(STRIPS, np.int64)
+    while True:
+        task = draw(counter, worker, tasks.shape[0])
+        if task >= tasks.shape[0]:
+            return
+        b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
+        x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
+        inside, dssim = _target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
+        if weighed:
+            inside, mean = _trust(views, picked[b], x0, y0, target, share)
+            dssim *= mean
+        begin_tile(s)
+        begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
+        size = (end - begin) * KEPT
+        sort_into_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, who, count)
+        for n in range(STRIPS):
+            laid[n] = lay(
+                who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+                _T + n * STRIP, store[n * size : (n + 1) * size], KEPT,
+            )  # fmt: skip
+        total, square = _F0, _F0
+        for c in range(3):
+            for k in range(PIXELS):
+                s[_R + c * PIXELS + k] += s[_T + k] * back[c]
+                known = target[c, k] >= _F0
+                e = s[_R + c * PIXELS + k] - target[c, k] if known else _F0
+                square += e * e
+                total += abs(e) if loss.absolute else e * e
+                sign = _F1 if e > _F0 else (-_F1 if e < _F0 else _F0)
+                s[_ER + c * PIXELS + k] = sign if loss.absolute else _F2 * e
+        if weighed:
+            total, square = _weigh(s, target, share, loss.absolute)
+        if dssim > _F0:
+            for c in range(3):
+                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], inside, dssim)
+        finite = is_finite(total)
+        losses[task, 0], losses[task, 1] = total if finite else 0.0, square if finite else 0.0
+        losses[task, 2] = 0.0 if finite else 1.0
+        for j in range(begin, end):
+            rest = sums[b, lists.pair[b, j]]
+            for k in range(SUMS):
+                rest[k] = _F0
+        if not finite:
+            continue
+        for k in range(PIXELS):
+            s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
+        for n in range(STRIPS):
+            lift(
+                who[n], laid[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+                _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
+            )  # fmt: skip
+
+
+@kernel
+def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, kept,
+                 color, depth, opacity):  # fmt: skip
+    """The picture of camera slot 0. color: float32 (H, W, 3), depth (z) and opacity (H, W), all written."""
+    s, store = memory[worker], kept[worker]
+    who, count = room(lists)
+    while True:
+        t = fetch_add(counter, 1)
+        if t >= columns * rows:
+            return
+        x0, y0 = TILE * (t % columns), TILE * (t // columns)
+        lay_tile(s, lists, 0, t, x0, y0, projected, who, count, store)
+        for k in range(PIXELS):
+            x, y = x0 + k % TILE, y0 + k // TILE
+            if x >= width or y >= height:
+                continue
+            left = s[_T + k]
+            for c in range(3):
+                value = s[_R + c * PIXELS + k] + left * background[c]
+                color[y, x, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
+            seen = _F1 - left
+            far = s[_Z + k] / max(seen, np.float32(1e-3))
+            healthy = is_finite(far) and is_finite(seen)
+            depth[y, x] = far if healthy and seen > np.float32(1e-3) else _F0
+            opacity[y, x] = min(max(seen, _F0), _F1) if healthy else _F0
+
+
+@kernel
+def render_points(counter, worker, columns, slots, points, projected, lists, background, color):
+    """The same at image points, float32 (N, 2), of which the tiles are wanted: some of them cost much less
+    than their tiles. color: float32 (N, 3), depth and opacity (N,), all written. Tasks are runs of 16."""
+    most, least, stop = np.float32(ALPHA_MOST), np.float32(ALPHA_LEAST), np.float32(STOP)
+    while True:
+        base = fetch_add(counter, 1) * 16
+        if base >= points.shape[0]:
+            return
+        for n in range(base, min(base + 16, points.shape[0])):
+            x, y = points[n, 0], points[n, 1]
+            v = slots[n]
+            t = (np.int64(y) // TILE) * columns[v] + np.int64(x) // TILE
+            r = g = b = _F0
+            left = _F1
+            for j in range(lists.first[v, t], lists.first[v, t + 1]):
+                row = projected[v, lists.owner[v, lists.pair[v, j]]]
+                dx, dy = x - row[MX], y - row[MY]
+                power = -_HALF * (row[QA] * dx * dx + row[QC] * dy * dy) - row[QB] * dx * dy
+                a = min(row[ALPHA] * exp32(power), most)
+                if a >= least:
+                    w = a * left
+                    r += w * row[RED]
+                    g += w * row[RED + 1]
+                    b += w * row[RED + 2]
+                    left -= w
+                    if not left >= stop:
+                        break
+            for c, value in enumerate((r, g, b)):
+                value += left * background[c]
+                color[n, c] = min(max(value, _F0), _F1) if is_finite(value) else background[c]
+
+
+@kernel
+def compare_tiles(
+    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, kept, error
+):
+    """How far off each pixel is: error, float32 (P,), the largest difference of a channel, written for the
+    pixels of the tasks' tiles. picked: int64 (B,), the view of each camera slot. tasks: int32 (M, 2), slot
+    and tile."""
+    s, store = memory[worker], kept[worker]
+    who, count = room(lists)
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= tasks.shape[0]:
+            return
+        b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
+        x0, y0, v = TILE * (t % columns[b]), TILE * (t // columns[b]), picked[b]
+        width, height, first = views.size[v, 0], views.size[v, 1], views.first[v]
+        transparent = views.pixels.shape[1] == 4
+        lay_tile(s, lists, b, t, x0, y0, projected, who, count, store)
+        for k in range(PIXELS):
+            x, y = x0 + k % TILE, y0 + k // TILE
+            if x >= width or y >= height:
+                continue
+            pixel, worst = first + y * width + x, _F0
+            opaque = np.float32(views.pixels[pixel, 3]) * _BYTE if transparent else _F1
+            for c in range(3):
+                wanted = np.float32(views.pixels[pixel, c]) * _BYTE * opaque + background[c] * (_F1 - opaque)
+                shown = s[_R + c * PIXELS + k] + s[_T + k] * background[c]
+                worst = max(worst, abs(shown - wanted))
+            error[pixel] = worst if is_finite(worst) else _F1

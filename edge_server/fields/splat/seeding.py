@@ -1,0 +1,85 @@
+"""First Gaussians without structure-from-motion: pixels placed where the cameras agree on their colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import View
+from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.plane_sweep import empty_color, score, shows, sweep
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.supervision import asked_views, pack_cameras
+from edge_server.fields.splat.kernels.optimizer_step import bound_all
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
+from edge_server.fields.splat.settings import SplatSettings
+
+_CANDIDATES = 4  # rays a Gaussian: those without a surface are left out
+
+
+def seeds(
+    settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
+    masks: Sequence[NDArray[np.bool_] | None] | None, weight: NDArray[np.float32], count: int,
+    rng: np.random.Generator, moved: Sequence[NDArray[np.bool_] | None] | None = None,
+) -> NDArray[np.float32]:  # fmt: skip
+    """Parameters of up to ``count`` new Gaussians, float32 (N, P). masks: for each view bool (H, W), where
+    they may begin (None in the list: nowhere); no list at all: anywhere. weight: ``Views.weight``, pixels of
+    none have no say. moved: bool (H, W) each: only places that most cameras see move are looked at."""
+    width = BASE + 3 * (settings.harmonics - 1)
+    data = pack_cameras(views, box)._replace(weight=weight)
+    where = _pixels(settings, views, data, masks)
+    if count <= 0 or where.size == 0:
+        return np.zeros((0, width), np.float32)
+    drawn = rng.choice(where, min(_CANDIDATES * count, where.size), replace=False)
+    view_of = np.searchsorted(data.first, drawn, side="right") - 1
+    local = drawn - data.first[view_of]
+    if settings.seed_cells:
+        cells = max(settings.seed_cells, 8)
+        distance = sweep(
+            pool, box, data, view_of, local, score(settings, pool, box, views, moved, data, cells), cells
+        )
+    else:
+        middle = box.distance_m / box.radius_m
+        near = max(0.01, box.near_m / box.radius_m)
+        distance = np.maximum(near, middle * rng.uniform(0.4, 1.6, drawn.size)).astype(np.float32)
+    found = np.flatnonzero(distance > 0)[:count]
+    params = np.zeros((found.size, width), np.float32)
+    if found.size == 0:
+        return params
+    focal = data.lens[:, 0]
+    # Several views see each place: the spacing in space is that of all their rays together.
+    spacing = np.sqrt(where.size / found.size / min(max(len(views) / 3.0, 1.0), 6.0))
+    view_of, local, distance = view_of[found], local[found], distance[found]
+    for v in np.unique(view_of):
+        mine, lens = np.flatnonzero(view_of == v), views[v].intrinsics
+        x, y = local[mine] % lens.width, local[mine] // lens.width
+        rays = lens.rays(np.stack([x + 0.5, y + 0.5], axis=-1)) @ data.rotation[v].T
+        params[mine, :3] = data.origin[v] + rays * distance[mine, None]
+        params[mine, COLOR : COLOR + 3] = views[v].image[y, x, :3] / 255.0
+        size = settings.seed_scale * spacing * distance[mine] / focal[v]
+        params[mine, SCALE : SCALE + 3] = np.log(size)[:, None]
+    params[:, QUATERNION] = 1.0
+    params[:, OPACITY] = np.log(settings.seed_opacity / (1.0 - settings.seed_opacity))
+    bound_all(params, np.float32(settings.largest), np.float32(np.log(settings.aspect)))
+    return params
+
+
+def _pixels(
+    settings: SplatSettings, views: Sequence[View], data: Views,
+    masks: Sequence[NDArray[np.bool_] | None] | None,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Numbers of the pixels that show something, over all views."""
+    plain = empty_color(settings, [views[k] for k in asked_views(data)])
+    parts = [np.zeros(0, np.int64)]
+    for k, view in enumerate(views):
+        there = shows(view.image, plain)
+        if masks is not None:
+            mask = masks[k]
+            there = there & mask if mask is not None else np.zeros_like(there)
+        if data.weight.size:
+            there = there & (data.weight[data.first[k] : data.first[k + 1]] > 0).reshape(there.shape)
+        parts.append(data.first[k] + np.flatnonzero(there))
+    return np.concatenate(parts).astype(np.int64)

@@ -1,0 +1,135 @@
+"""Settings of the Gaussian field: one dataclass whose texts become help and error messages."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from edge_server.fields.common.trainer_settings import COMMON_BOUNDS, MOST_THREADS, shared_option
+from edge_server.fields.common.trainer_settings import option as _option
+
+
+@dataclass(frozen=True)
+class SplatSettings:
+    """What can be chosen about a ``SplatField``. Lengths in metres; None means: found from the cameras."""
+
+    gaussians: int = _option(8192, "Gaussians at most")
+    start: int = _option(4096, "Gaussians at first, at most ``gaussians``")
+    harmonics: int = _option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
+    views_a_step: int = _option(1, "pictures a step draws tiles from")
+    tile_share: float = _option(1.0, "share of each of those pictures' tiles that a step looks at")
+    loss: str = _option("mse", "mse or l1")
+    dssim: float = _option(0.0, "weight of (1 - SSIM) / 2, tile by tile (Kerbl et al.: 0.2 beside l1)")
+    seed_cells: int = _option(64, "cells a side of the grid that finds first positions; 0: random ones")
+    seed_scale: float = _option(0.5, "first size of Gaussians, in distances to their neighbours")
+    seed_opacity: float = _option(0.3, "opacity of new Gaussians")
+    centre_m: tuple[float, float, float] | None = _option(None, "centre of the scene's box")
+    radius_m: float | None = _option(None, "half the side of the scene's box")
+    near_m: float | None = _option(None, "nothing is seen nearer to a camera than this")
+    contracted: bool | None = _option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
+    background: str = _option("auto", "auto (plain, or the mean colour), white, black, random, or '#rrggbb'")
+    min_views: int = _option(2, "no Gaussian starts where fewer cameras than this look")
+    rate_position: float = _option(0.4, "learning rate of positions at the start of a fit, in pixels")
+    rate_scale: float = _option(0.08, "of the logarithms of sizes")
+    rate_rotation: float = _option(0.02, "of quaternions")
+    rate_opacity: float = _option(0.15, "of opacities before the sigmoid")
+    rate_color: float = _option(0.02, "of colours; a tenth of it for harmonics")
+    rate_end: float = _option(0.1, "share of the learning rates that is left at the end of a fit")
+    settle_after: float = _option(300.0, "steps of a Gaussian at full rates; then they fall as 1 / steps")
+    rate_settled: float = _option(0.1, "share of the rates that a Gaussian keeps for good")
+    epsilon: float = _option(1e-3, "Adam's epsilon, on gradients summed over pixels")
+    fade: float = _option(0.0, "pull on opacities: empties what no picture needs")
+    densify_every: int = _option(50, "steps between growth and pruning, at least one pass over all views")
+    grow: float = _option(0.15, "share of Gaussians that are split at once, steepest picture gradient first")
+    prune: float = _option(0.02, "Gaussians of less opacity are removed")
+    opacity_reset: int = _option(0, "steps after which opacities are lowered to a tenth; 0: never")
+    largest: float = _option(0.5, "largest standard deviation in scene units (half the box's side is 1)")
+    widest: float = _option(0.2, "Gaussians wider than this share of a picture are split first")
+    aspect: float = _option(20.0, "longest to shortest axis at most")
+    changed_share: float = _option(0.25, "steps that look only at tiles that changed since the last view")
+    follow: int = _option(8, "steps at the start of an update that carry along what moves; 0: none")
+    reseed: float = _option(0.25, "of ``gaussians``, how many are made anew where something moved, at most")
+    flatten: float = _option(
+        0.0, "pull on each Gaussian's smallest size, in its logarithm a step, for surfaces (.02); 0: none"
+    )
+    align: float = _option(
+        0.0, "share by which Gaussians turn to the normals of the depth they show, for surfaces (.3); 0: none"
+    )
+    align_every: int = _option(5, "steps between two turns of ``align``")
+    age_tau_ms: float = shared_option("age_tau_ms")
+    mask_stale_ms: float = shared_option("mask_stale_ms")
+    mask_grow_px_s: float = shared_option("mask_grow_px_s")
+    refuse_beyond: float = shared_option("refuse_beyond")
+    seed: int = _option(0, "seed of initial values and of all sampling")
+    threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
+    nice: int = _option(0, "how far workers lower their own priority (Linux); in a server 5")
+    device: str = _option("auto", "cpu (numba) or cuda (gsplat, only where asked for); auto: cpu")
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("gaussians", 1, 1 << 20), ("start", 1, 1 << 20), ("views_a_step", 1, 64), ("seed_cells", 0, 256),
+            ("densify_every", 1, 1 << 30), ("opacity_reset", 0, 1 << 30),
+            ("follow", 0, 1000), ("settle_after", 1.0, 1e9), ("rate_settled", 0.0, 1.0),
+            ("tile_share", 0.01, 1.0), ("dssim", 0.0, 1e3), ("seed_scale", 0.01, 100.0),
+            ("seed_opacity", 0.001, 0.99), ("fade", 0.0, 1e3),
+            ("grow", 0.0, 1.0), ("prune", 0.0, 0.9), ("largest", 1e-3, 50.0), ("widest", 1e-3, 1e3),
+            ("aspect", 1.0, 1e4), ("reseed", 0.0, 1.0),
+            ("rate_position", 0.0, 100.0), ("rate_scale", 0.0, 10.0), ("rate_rotation", 0.0, 10.0),
+            ("rate_opacity", 0.0, 10.0), ("rate_color", 0.0, 10.0), ("flatten", 0.0, 1.0),
+            ("align", 0.0, 1.0), ("align_every", 1, 1 << 30), *COMMON_BOUNDS,
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"splat: {name} must be in {low}..{high}, not {getattr(self, name)}")
+        if self.threads is not None and not 1 <= self.threads <= MOST_THREADS:
+            raise ValueError(f"splat: threads must be in 1..{MOST_THREADS}, not {self.threads}")
+        for name, allowed in (
+            ("harmonics", (1, 4, 9)), ("loss", ("mse", "l1")), ("device", ("auto", "cpu", "cuda")),
+        ):  # fmt: skip
+            if getattr(self, name) not in allowed:
+                raise ValueError(
+                    f"splat: {name} must be one of {', '.join(map(str, allowed))}, "
+                    f"not {getattr(self, name)!r}"
+                )
+        named = self.background in ("auto", "white", "black", "random")
+        if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
+            raise ValueError(
+                "splat: background must be auto, white, black, random or a colour like '#80c0ff', "
+                f"not {self.background!r}"
+            )
+        for name in ("radius_m", "near_m"):
+            if getattr(self, name) is not None and not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"splat: {name} must be positive, not {getattr(self, name)}")
+
+    @property
+    def planar(self) -> bool:
+        """Whether Gaussians are made to lie on surfaces, so that their planes tell the depth."""
+        return self.flatten > 0.0 or self.align > 0.0
+
+
+EFFORTS: dict[str, dict[str, Any]] = {
+    "low": {"gaussians": 4096, "start": 2048},
+    "medium": {},
+    "high": {"gaussians": 32768, "start": 8192},
+}
+
+
+def make_settings(options: dict[str, Any], seed: int = 0) -> SplatSettings:
+    """Settings from plain options (a scenario's ``field`` section). ``effort`` (low, medium, high) chooses
+    a preset that the other options override. ValueError names an unknown option and lists the valid ones."""
+    options = dict(options)
+    effort = options.pop("effort", "medium")
+    if effort not in EFFORTS:
+        raise ValueError(f"splat: effort must be one of {', '.join(EFFORTS)}, not {effort!r}")
+    valid = [f.name for f in fields(SplatSettings)]
+    unknown = sorted(set(options) - set(valid))
+    if unknown:
+        raise ValueError(f"splat has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}")
+    if options.get("centre_m") is not None:
+        options["centre_m"] = tuple(float(c) for c in options["centre_m"])
+    return replace(SplatSettings(), **{"seed": seed, **EFFORTS[effort], **options})
+
+
+def help_text() -> dict[str, str]:
+    """Option name -> what it means, for command lines and documentation."""
+    return {f.name: f.metadata["help"] for f in fields(SplatSettings)}

@@ -1,0 +1,101 @@
+"""An immutable copy of a Gaussian field: renders from any thread while the field itself trains on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import Rendering, View
+from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.splat.buffers import Passes, camera_rows, ray_lengths
+from edge_server.fields.splat.kernels.project import TILE, Gaussians
+from edge_server.fields.splat.kernels.rasterize import render_points, render_tiles
+from freshfield.geometry import Pinhole
+
+SOLID = 0.5  # opacity from which on a pixel shows a surface
+
+
+@dataclass(frozen=True)
+class SplatSnapshot:
+    """Gaussians and cameras of one instant. Nothing in it is written after it is made. ahead_s: by how much
+    that instant is later than the newest view. passes: buffers to render pixels with, if one thread alone
+    uses this. planar: the Gaussians are flat, so that planes tell their depth (``render_surface``)."""
+
+    box: SceneBox
+    gaussians: Gaussians
+    background: NDArray[np.float32]
+    cameras: tuple[View, ...]
+    pool: Pool
+    step: int
+    ahead_s: float = 0.0
+    passes: Passes | None = None
+    planar: bool = False
+
+    def render_surface(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """The picture, with the depth at which rays meet the Gaussians' planes (``splat_planar``)."""
+        from edge_server.fields.splat.planar import plane_depth  # numba compiles it where it is asked for
+
+        picture, passes = self.render(camera_to_world, intrinsics), Passes(self.pool)
+        cams = camera_rows([camera_to_world], [intrinsics], self.box)
+        passes.look(cams, self.gaussians, [None], differentiate=False)
+        depth, opacity = plane_depth(passes, self.pool, self.gaussians, cams[0], intrinsics)
+        return Rendering(picture.color, depth * np.float32(self.box.radius_m), opacity)
+
+    def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
+        """The picture a camera at this pose would take."""
+        w, h = intrinsics.width, intrinsics.height
+        passes = Passes(self.pool)
+        cams = camera_rows([camera_to_world], [intrinsics], self.box)
+        passes.look(cams, self.gaussians, [None], differentiate=False)
+        color, depth = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
+        opacity = np.empty((h, w), np.float32)
+        self.pool.run(
+            render_tiles, int(passes.columns[0]), int(passes.rows[0]), w, h, passes.projected, passes.lists,
+            self.background, passes.memory, passes.kept, color, depth, opacity,
+        )  # fmt: skip
+        depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
+        return Rendering(color, depth, opacity)
+
+    def colors_at(
+        self, views: Sequence[View], points: Sequence[NDArray[np.float64]]
+    ) -> list[NDArray[np.float32]]:
+        """What is seen of each view at image points (N, 2) within its picture: colours (N, 3). All at once:
+        most of the work is to project the Gaussians, and views share it out among the cores."""
+        passes = self.passes or Passes(self.pool)
+        cams = camera_rows([v.camera_to_world for v in views], [v.intrinsics for v in views], self.box)
+        wanted = []
+        for view, where in zip(views, points):
+            lens = view.intrinsics
+            tiles = np.zeros((-(-lens.height // TILE), -(-lens.width // TILE)), np.uint8)
+            tiles[tuple((where[:, ::-1] // TILE).astype(np.int64).T)] = 1
+            wanted.append(tiles.reshape(-1))
+        passes.look(cams, self.gaussians, wanted, differentiate=False)
+        counts = [len(where) for where in points]
+        slots = np.repeat(np.arange(len(views)), counts)
+        color = np.empty((len(slots), 3), np.float32)
+        self.pool.run(
+            render_points, passes.columns, slots, np.concatenate(points).astype(np.float32), passes.projected,
+            passes.lists, self.background, color,
+        )  # fmt: skip
+        return np.split(color, np.cumsum(counts)[:-1])
+
+    def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras see a
+        surface: their pictures are rendered small and lifted by their depth."""
+        positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
+        if len(self.gaussians.params):
+            share = max(count // max(len(self.cameras), 1), 1)
+            for view in self.cameras:
+                lens = view.intrinsics
+                small = lens.scaled(min(float(np.sqrt(share / (lens.width * lens.height))), 1.0))
+                out = self.render(view.camera_to_world, small)
+                solid = (out.opacity > SOLID) & (out.depth > 0)
+                pose = np.asarray(view.camera_to_world, dtype=np.float64)
+                rays = small.rays()[solid] @ pose[:3, :3].T
+                positions.append((pose[:3, 3] + rays * out.depth[solid, None]).astype(np.float32))
+                colors.append(out.color[solid])
+        return np.concatenate(positions)[:count], np.concatenate(colors)[:count]

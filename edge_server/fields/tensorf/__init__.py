@@ -1,0 +1,1 @@
+"""TensoRF: vector-matrix factors (Chen et al. 2022)."""

@@ -1,0 +1,342 @@
+"""Vector-matrix factors (TensoRF; Chen et al. 2022, eq. 6 and 8): features of points and their gradient.
+
+A group is eight components: a plane over two axes times a line along the third. Density is the sum over all
+components of its groups; colour's components feed the network (the paper's basis matrix is the network's
+first layer). Groups take turns at the three orientations. A point is given in the unit cube; planes are
+interpolated bilinearly, lines linearly, eight channels at a time in one vector register.
+
+Density needs no network: it is known before colour is asked for.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, overload
+from numpy.typing import NDArray
+
+from edge_server.fields.common.kernels.jit import kernel, part
+from edge_server.fields.common.kernels.mlp import backward, forward
+from edge_server.fields.common.kernels.radiance_model import is_a, query_back, query_color, query_density
+from edge_server.fields.common.kernels.simd import fetch_add
+
+CHANNELS = 8  # of a group; one 256-bit register
+ROWS = 4  # of a table that a dirty flag stands for
+MODES = 3  # orientations: plane xy and line z, plane xz and line y, plane yz and line x
+TILE = 16  # samples side by side: a cache line of each row of ``acts`` is written as a whole
+
+_F0, _F1 = np.float32(0.0), np.float32(1.0)
+
+
+class Planes(NamedTuple):
+    """The factors of one field.
+
+    size: vertices a side. density_groups, groups: multiples of 3; the first density_groups make up density,
+    the others feed the network. rows: of ``table`` a group, a multiple of ROWS. bias: float32, raw density
+    where all factors are 0. table: float32 (groups * rows, 8); per group the plane's size^2 vertices, the
+    first axis fastest, then the line's.
+    """
+
+    size: int
+    density_groups: int
+    groups: int
+    rows: int
+    bias: np.float32
+    table: NDArray[np.float32]
+
+
+_VECTOR = ir.VectorType(ir.FloatType(), CHANNELS)
+_I32 = ir.IntType(32)
+_MAY_FUSE = ("contract",)
+
+
+def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    pointer = builder.bitcast(data, _VECTOR.as_pointer())
+    return builder.gep(pointer, [builder.zext(row, ir.IntType(64))])
+
+
+def _load(builder: Any, pointer: Any) -> Any:
+    value = builder.load(pointer)
+    value.align = 4
+    return value
+
+
+def _store(builder: Any, value: Any, pointer: Any) -> None:
+    builder.store(value, pointer).align = 4
+
+
+def _spread(builder: Any, number: Any) -> Any:
+    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), number, _I32(0))
+    return builder.shuffle_vector(
+        one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_I32, CHANNELS), [0] * CHANNELS)
+    )
+
+
+def _blend(context: Any, builder: Any, array_type: Any, array: Any, rows: Any, weights: Any) -> Any:
+    total = None
+    for row, weight in zip(rows, weights):
+        value = _load(builder, _address(context, builder, array_type, array, row))
+        term = builder.fmul(value, weight, flags=_MAY_FUSE)
+        total = term if total is None else builder.fadd(total, term, flags=_MAY_FUSE)
+    return total
+
+
+def _unpack(builder: Any, rows: Any, weights: Any) -> tuple[list[Any], list[Any]]:
+    places = [builder.extract_value(rows, k) for k in range(6)]
+    shares = [_spread(builder, builder.extract_value(weights, k)) for k in range(6)]
+    return places, shares
+
+
+@intrinsic
+def store_products(typingctx: Any, table: Any, rows: Any, weights: Any, out: Any, at: Any) -> Any:
+    """``out[at] = (sum_k<4 weights[k] table[rows[k]]) * (sum_k>=4 weights[k] table[rows[k]])``.
+
+    table, out: contiguous float32 (N, 8); rows: 6 uint32, weights: 6 float32 (four vertices of the plane,
+    two of the line); at: uint32.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        places, shares = _unpack(builder, args[1], args[2])
+        plane = _blend(context, builder, signature.args[0], args[0], places[:4], shares[:4])
+        line = _blend(context, builder, signature.args[0], args[0], places[4:], shares[4:])
+        target = _address(context, builder, signature.args[3], args[3], args[4])
+        _store(builder, builder.fmul(plane, line), target)
+        return context.get_dummy_value()
+
+    return types.void(table, rows, weights, out, types.uint32), codegen
+
+
+@intrinsic
+def add_factors(typingctx: Any, table: Any, rows: Any, weights: Any, d: Any, at: Any, gradient: Any) -> Any:
+    """The gradient of ``store_products``: d[at] is dLoss / dout[at]; added to ``gradient``, like table."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        places, shares = _unpack(builder, args[1], args[2])
+        plane = _blend(context, builder, signature.args[0], args[0], places[:4], shares[:4])
+        line = _blend(context, builder, signature.args[0], args[0], places[4:], shares[4:])
+        above = _load(builder, _address(context, builder, signature.args[3], args[3], args[4]))
+        steps = [builder.fmul(above, line)] * 4 + [builder.fmul(above, plane)] * 2
+        for place, share, step in zip(places, shares, steps):
+            pointer = _address(context, builder, signature.args[5], args[5], place)
+            term = builder.fmul(step, share, flags=_MAY_FUSE)
+            _store(builder, builder.fadd(_load(builder, pointer), term, flags=_MAY_FUSE), pointer)
+        return context.get_dummy_value()
+
+    return types.void(table, rows, weights, d, types.uint32, gradient), codegen
+
+
+@part
+def _place(x, size):
+    """Lower vertex (uint32) and fraction of coordinate x in [0, 1] among ``size`` vertices."""
+    scaled = x * np.float32(size - 1)
+    i = min(max(np.int32(scaled), np.int32(0)), np.int32(size - 2))
+    return np.uint32(i), scaled - np.float32(i)
+
+
+@part
+def _neighbours(size, u, v, w):
+    """Rows within a group and weights: the plane's four vertices around (u, v), the line's two around w."""
+    one = np.uint32(1)
+    i, fu = _place(u, size)
+    j, fv = _place(v, size)
+    k, fw = _place(w, size)
+    side = np.uint32(size)
+    a = np.uint32(i + np.uint32(j * side))
+    b = np.uint32(a + side)
+    c = np.uint32(k + np.uint32(side * side))
+    gu, gv = _F1 - fu, _F1 - fv
+    rows = (a, np.uint32(a + one), b, np.uint32(b + one), c, np.uint32(c + one))
+    return rows, (gu * gv, fu * gv, gu * fv, fu * fv, _F1 - fw, fw)
+
+
+@part
+def _axes(x, group):
+    """The coordinates of a group's plane, first and second axis, and of its line."""
+    mode = group % MODES
+    u, v, w = x[0], x[1], x[2]
+    if mode == 1:
+        v, w = x[2], x[1]
+    elif mode == 2:
+        u, v, w = x[1], x[2], x[0]
+    return u, v, w
+
+
+@part
+def products(table, size, x, group, a, count, tile):
+    """The components of one group at samples a to a + count (at most TILE): tile, float32 (TILE, 8).
+    table: the group's own rows."""
+    u, v, w = _axes(x, group)
+    for s in range(count):
+        rows, weights = _neighbours(size, u[a + s], v[a + s], w[a + s])
+        store_products(table, rows, weights, tile, np.uint32(s))
+
+
+@part
+def density(planes, x, start, end, out):
+    """Raw density (eq. 6) of samples start to end into ``out``, float32 (N,)."""
+    tile = np.empty((TILE, CHANNELS), np.float32)
+    for a in range(start, end, TILE):
+        count = min(TILE, end - a)
+        raw = out[a : a + count]
+        for s in range(count):
+            raw[s] = planes.bias
+        for g in range(planes.density_groups):
+            table = planes.table[g * planes.rows : (g + 1) * planes.rows]
+            products(table, planes.size, x, g, a, count, tile)
+            for s in range(count):
+                total = _F0
+                for c in range(CHANNELS):
+                    total += tile[s, c]
+                raw[s] += total
+
+
+@part
+def components(planes, x, start, end, acts):
+    """The colour groups' components of samples start to end into the first rows of acts."""
+    tile = np.empty((TILE, CHANNELS), np.float32)
+    for a in range(start, end, TILE):
+        count = min(TILE, end - a)
+        for g in range(planes.density_groups, planes.groups):
+            table = planes.table[g * planes.rows : (g + 1) * planes.rows]
+            products(table, planes.size, x, g, a, count, tile)
+            first = (g - planes.density_groups) * CHANNELS
+            for c in range(CHANNELS):
+                row = acts[first + c, a : a + count]
+                for s in range(count):
+                    row[s] = tile[s, c]
+
+
+@part
+def _mark(dirty, a, b):
+    """Flag the segments of two neighbouring vertices."""
+    i, j = a >> np.uint32(2), b >> np.uint32(2)
+    dirty[i] = True
+    if j != i:
+        dirty[j] = True
+
+
+@kernel
+def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dirty):
+    """Add the factors' gradient of all samples to ``gradient``; a task is a group, so nothing races.
+
+    x: float32 (chunks, 3, N). d_features: float32 (chunks, 8 colour groups + 1, N), dLoss / dcomponent;
+    the last row is dLoss / draw density. counts: int64 (chunks,), columns in use. gradient: float32 like
+    ``planes.table``. dirty: bool (table rows / ROWS,), set where a segment received anything.
+    """
+    d = np.empty((TILE, CHANNELS), np.float32)
+    last = d_features.shape[1] - 1
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= planes.groups:
+            return
+        g = np.int64(task)
+        a0, b0 = g * planes.rows, (g + 1) * planes.rows
+        table, to = planes.table[a0:b0], gradient[a0:b0]
+        flags = dirty[a0 // ROWS : b0 // ROWS]
+        first = (g - planes.density_groups) * CHANNELS
+        for chunk in range(counts.size):
+            u, v, w = _axes(x[chunk], g)
+            n = counts[chunk]
+            for a in range(0, n, TILE):
+                count = min(TILE, n - a)
+                for c in range(CHANNELS):
+                    row = d_features[chunk, last if g < planes.density_groups else first + c, a : a + count]
+                    for s in range(count):
+                        d[s, c] = row[s]
+                for s in range(count):
+                    # Samples without weight, and dead units of the network, have no gradient at all.
+                    some = False
+                    for c in range(CHANNELS):
+                        some |= d[s, c] != _F0
+                    if not some:
+                        continue
+                    rows, weights = _neighbours(planes.size, u[a + s], v[a + s], w[a + s])
+                    add_factors(table, rows, weights, d, np.uint32(s), to)
+                    _mark(flags, rows[0], rows[1])
+                    _mark(flags, rows[2], rows[3])
+                    _mark(flags, rows[4], rows[5])
+
+
+@kernel
+def regularise(counter, worker, planes, smooth, sparse, gradient, dirty):
+    """Add the gradients of two regularisers (section 4.4) to what is about to be updated; a task is a group.
+
+    smooth: float32, weight of half the squared differences between neighbouring vertices of the planes
+    (total variation). sparse: float32, weight of the absolute values of the density's factors (L1). Only
+    segments that are dirty already: what no ray reaches stays as it is.
+    """
+    size = planes.size
+    while True:
+        task = fetch_add(counter, 1)
+        if task >= planes.groups:
+            return
+        first = np.int64(task) * planes.rows
+        table, to = planes.table[first : first + planes.rows], gradient[first : first + planes.rows]
+        l1 = sparse if task < planes.density_groups else _F0
+        for row in range(size * size + size):
+            if not dirty[(first + row) // ROWS]:
+                continue
+            if row < size * size and smooth > _F0:
+                i, j = row % size, row // size
+                left, right = row - 1 if i > 0 else row, row + 1 if i < size - 1 else row
+                below, above = row - size if j > 0 else row, row + size if j < size - 1 else row
+                for c in range(CHANNELS):
+                    p = table[row, c]
+                    apart = (p - table[left, c]) + (p - table[right, c])
+                    apart += (p - table[below, c]) + (p - table[above, c])
+                    to[row, c] += smooth * apart
+            if l1 > _F0:
+                for c in range(CHANNELS):
+                    to[row, c] += np.float32(np.sign(table[row, c])) * l1
+
+
+@overload(query_density)
+def _query_density(encoding, levels, net, x, start, end, acts):
+    if not is_a(encoding, Planes):
+        return None
+
+    def run(encoding, levels, net, x, start, end, acts):
+        density(encoding, x, start, end, acts[acts.shape[0] - net.widths[-1]])
+
+    return run
+
+
+@overload(query_color)
+def _query_color(encoding, levels, net, x, start, end, acts):
+    if not is_a(encoding, Planes):
+        return None
+
+    def run(encoding, levels, net, x, start, end, acts):
+        # The network has an output in density's place, which means nothing: what stands there is kept.
+        sigma = acts[acts.shape[0] - net.widths[-1], start:end]
+        kept = sigma.copy()
+        components(encoding, x, start, end, acts)
+        forward(net, acts, start, end)
+        for s in range(kept.size):
+            sigma[s] = kept[s]
+
+    return run
+
+
+@overload(query_back)
+def _query_back(encoding, net, acts, d_acts, n, d_params, d_features):
+    if not is_a(encoding, Planes):
+        return None
+
+    def run(encoding, net, acts, d_acts, n, d_params, d_features):
+        inputs = net.widths[0]
+        d_raw, d_sigma = d_features[inputs], d_acts[d_acts.shape[0] - net.widths[-1]]
+        for s in range(n):
+            d_raw[s] = d_sigma[s]
+            d_sigma[s] = _F0
+        backward(net, acts, d_acts, n, d_params)
+        for k in range(inputs):
+            to, d = d_features[k], d_acts[k]
+            for s in range(n):
+                to[s] = d[s]
+
+    return run

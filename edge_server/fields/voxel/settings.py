@@ -1,0 +1,139 @@
+"""Settings of the voxel field: one dataclass whose texts become help and error messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.trainer_settings import (
+    TrainerSettings,
+    help_of,
+    option,
+    option_names,
+    settings_from,
+)
+
+# Options of fields with a network, which this one has not.
+_NOT_HERE = (
+    "hidden", "hidden_layers", "harmonics", "batch_samples", "samples", "samples_start", "samples_ramp",
+    "rate_net", "distortion", "sparsity", "near_fade", "exposure", "refine_m", "refine_deg",
+    "depth_guide", "guide_steps",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class VoxelSettings(TrainerSettings):
+    """What can be chosen about a ``VoxelField``. Lengths in metres; None: found from the cameras."""
+
+    name = "voxel"
+
+    sizes: tuple[int, ...] | None = option(None, "vertices a side, coarse to fine; None: to about a pixel")
+    refine_at: tuple[int, ...] = option((15, 40, 80), "steps after which the next of ``sizes`` is taken")
+    rays: int = option(8192, "rays of one step")
+    rate: float = option(0.05, "learning rate of density at the start of a fit")
+    rate_color: float = option(0.06, "learning rate of colour at the start of a fit")
+    settle: float = option(
+        3.0, "passes over all pixels, after which a fit's rates fall as 1 / steps; 0: never"
+    )
+    warm: float = option(0.3, "share of the rates in a fit that starts from a grid of its last size")
+    soften: float = option(0.2, "largest optical depth of one step left where something moved")
+    growth: float = option(20.0, "how much faster density is learnt where there is some: times 1 + growth x")
+    epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
+    l1: float = option(0.003, "pull of density towards zero, in rates: empties what no picture needs")
+    outline: float = option(0.25, "weight of the error of opacity, which alpha or a plain background tells")
+    diffuse: float = option(
+        1.0, "share of the way to its neighbours' mean that a vertex goes in four steps at full rates"
+    )
+    diffuse_edge: float = option(
+        0.025, "difference of two neighbours, of the largest possible, of which no more counts for that"
+    )
+    diffuse_views: int = option(
+        32, "places seen from, of which more weaken ``diffuse``: by so many to all of them"
+    )
+    first: float = option(0.1, "optical depth of one step before anything is known")
+    prune: float = option(0.2, "optical depth of one step below which a cell is taken to be empty")
+    prune_from: int = option(15, "step from which on empty cells are left out, and the others diffuse")
+    cells: int = option(48, "cells a side of the occupancy grid, a multiple of 4")
+    device: str = option("auto", "cpu or auto: it runs on CPUs only")
+    parts: int = option(2, "gradient buffers: so many cores train at once; results depend on it")
+
+    def __post_init__(self) -> None:
+        self._within(
+            ("parts", 1, 64),
+            ("first", 0.0, 4.0),
+            ("rate", 0.0, 10.0),
+            ("rate_color", 0.0, 10.0),
+            ("settle", 0.0, 1e6),
+            ("warm", 0.0, 1.0),
+            ("growth", 0.0, 1e3),
+            ("l1", 0.0, 1e2),
+            ("outline", 0.0, 1e2),
+            ("diffuse", 0.0, 1.0),
+            ("diffuse_edge", 0.0, 1.0),
+            ("diffuse_views", 1, 1 << 20),
+            ("prune", 0.0, 4.0),
+            ("prune_from", 0, 1 << 30),
+            ("soften", 0.0, 4.0),
+        )
+        at = list(self.refine_at)
+        if len(at) > 8:
+            raise ValueError(f"voxel: refine_at has at most 8 step numbers, not {len(at)}")
+        if at != sorted(set(at)) or any(step < 1 for step in at):
+            raise ValueError(f"voxel: refine_at must be rising step numbers, not {at}")
+        if self.sizes is not None:
+            sizes = list(self.sizes)
+            if not sizes or sizes != sorted(set(sizes)) or sizes[0] < 4 or sizes[-1] > 512:
+                raise ValueError(f"voxel: sizes must be rising numbers in 4..512, not {sizes}")
+            if len(at) != len(sizes) - 1:
+                raise ValueError(f"voxel: refine_at must be {len(sizes) - 1} rising step numbers, not {at}")
+        super().__post_init__()
+
+
+EFFORTS: dict[str, dict[str, Any]] = {
+    "low": {"sizes": (32, 64, 96), "refine_at": (15, 40)},
+    "medium": {},
+    "high": {"sizes": (32, 64, 96, 128, 192), "refine_at": (15, 40, 80, 200), "rays": 16384, "cells": 64},
+}
+
+COARSEST, FINEST = (
+    64,
+    192,
+)  # of the last grid where the pictures decide: finer ones outgrow caches and patience
+
+
+def sizes_of(settings: VoxelSettings, box: SceneBox | None) -> tuple[int, ...]:
+    """Vertices a side at each stage: as set, or in even strides to the pixel that cameras see in ``box``."""
+    if settings.sizes is not None:
+        return settings.sizes
+    pixels = box.pixels_across if box is not None else COARSEST
+    stages = len(settings.refine_at) + 1
+    last = -(-int(np.clip(pixels, COARSEST, FINEST)) // 32) * 32
+    return tuple(last * (k + 1) // stages for k in range(stages))
+
+
+def make_settings(options: dict[str, Any], seed: int = 0) -> VoxelSettings:
+    """Settings from plain options: see ``trainer_settings.settings_from``."""
+    valid = voxel_options()
+    if unknown := sorted(set(options) - {"effort", *valid}):
+        raise ValueError(f"voxel has no option {', '.join(unknown)}; it has: effort, {', '.join(valid)}")
+    given = dict(options)
+    for name in ("sizes", "refine_at"):
+        if given.get(name) is not None:
+            try:
+                given[name] = tuple(int(v) for v in given[name])
+            except (TypeError, ValueError):
+                raise ValueError(f"voxel: {name} must be a list like [32, 64], not {given[name]!r}") from None
+    return settings_from(VoxelSettings, EFFORTS, given, seed)
+
+
+def voxel_options() -> list[str]:
+    """The options that mean something here."""
+    return [name for name in option_names(VoxelSettings) if name not in _NOT_HERE]
+
+
+def help_text() -> dict[str, str]:
+    """Option name -> what it means, for command lines and documentation."""
+    return help_of(VoxelSettings, voxel_options())

@@ -1,0 +1,1 @@
+"""The running edge server: ingest, buffer, update loop, scoring, records."""

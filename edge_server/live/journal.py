@@ -1,0 +1,114 @@
+"""What a run leaves behind, written as it goes: edge.json, series.jsonl, ages.jsonl, poses.jsonl.
+
+edge.json is replaced atomically about twice a second (live tables read it); series.jsonl gets one line per
+publication once its scores are final; ages.jsonl samples every camera's age at a fixed rate, so that its
+mean is a time average. poses.jsonl has a line for every view that the field learnt from and that stands
+elsewhere than its camera's last one: a rig that stands still leaves one line a camera.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from edge_server.fields import View
+from edge_server.live.state import Publication
+from freshfield.files import Lines, write_json
+from freshfield.geometry import Pose
+
+log = logging.getLogger(__name__)
+
+# A publication whose scores have not come after this many younger ones will not get any.
+_FINAL_AFTER = 8
+# Some 100 MB: days of an arm that never rests.
+_MOST_POSES = 500_000
+
+
+class Journal:
+    """Files of one run under ``out``. Thread-safe. ``status`` is asked for the contents of edge.json.
+
+    Lines are added to those of an earlier process of the same run: an edge that was restarted goes on. A full
+    disk costs lines, counted in ``lines_lost``, and statuses, never the edge.
+    """
+
+    def __init__(self, out: Path, status: Callable[[], dict[str, Any]]) -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        self._out = out
+        self._status = status
+        self._open: OrderedDict[int, Publication] = OrderedDict()
+        self._lock = threading.Lock()
+        self._series = Lines(out / "series.jsonl")
+        self._ages = Lines(out / "ages.jsonl")
+        self._poses = Lines(out / "poses.jsonl")
+        self._posed: dict[str, Pose] = {}
+        self._poses_left = _MOST_POSES
+        self._status_failed = False
+
+    @property
+    def lines_lost(self) -> int:
+        """Lines that could not be written so far."""
+        return self._series.lost + self._ages.lost + self._poses.lost
+
+    def published(self, publication: Publication) -> None:
+        with self._lock:
+            self._open[publication.number] = publication
+            while len(self._open) > _FINAL_AFTER:
+                self._write_oldest()
+
+    def scored(self, publication: Publication, final: bool) -> None:
+        """``publication`` carries scores; ``final``: all of its held-out cameras are in."""
+        with self._lock:
+            if publication.number not in self._open:
+                return
+            self._open[publication.number] = publication
+            # Lines stand in the order of publication: a final one waits for its elders.
+            if final and next(iter(self._open)) == publication.number:
+                self._write_oldest()
+
+    def ages(self, t_s: float, ages_ms: Mapping[str, float | None]) -> None:
+        line = {
+            "t_s": round(t_s, 4),
+            "age_ms": {c: a if a is None else round(a, 3) for c, a in ages_ms.items()},
+        }
+        self._ages.write(json.dumps(line))
+
+    def poses(self, views: Sequence[View]) -> None:
+        """Where the views of an update were taken from, of those cameras that have moved."""
+        for view in views:
+            pose = Pose.from_matrix(view.camera_to_world)
+            if self._posed.get(view.camera) == pose or not self._poses_left:
+                continue
+            self._posed[view.camera] = pose
+            self._poses_left -= 1
+            q, t_m = pose.quaternion, pose.translation_m
+            line = {"camera": view.camera, "ns": view.generated_ns, "q": q, "t_m": t_m}
+            self._poses.write(json.dumps(line))
+
+    def write_status(self) -> None:
+        """Replace edge.json; where that fails, the old one stays."""
+        status = self._status()
+        try:
+            write_json(self._out / "edge.json", status)
+        except OSError as error:
+            if not self._status_failed:
+                log.warning("%s: cannot be written (%s)", self._out / "edge.json", error.strerror or error)
+            self._status_failed = True
+
+    def close(self) -> None:
+        with self._lock:
+            while self._open:
+                self._write_oldest()
+            self._series.close()
+            self._ages.close()
+            self._poses.close()
+        self.write_status()
+
+    def _write_oldest(self) -> None:
+        _, publication = self._open.popitem(last=False)
+        self._series.write(json.dumps(dataclasses.asdict(publication), allow_nan=False))

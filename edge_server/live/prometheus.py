@@ -1,0 +1,69 @@
+"""Prometheus metrics of a running edge server, read from its state when scraped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from edge_server.live.ingest import Ingest
+from edge_server.live.state import EdgeState
+
+
+class EdgeCollector:
+    """Turns EdgeState into samples at scrape time: nothing is counted twice, nothing runs in between."""
+
+    def __init__(self, state: EdgeState, ingest: Ingest) -> None:
+        self._state = state
+        self._ingest = ingest
+
+    def collect(self) -> Iterator[Metric]:
+        age = GaugeMetricFamily(
+            "freshfield_camera_age_seconds", "age of the newest buffered frame", labels=["camera"]
+        )
+        delivered = CounterMetricFamily("freshfield_frames_delivered", "frames accepted", labels=["camera"])
+        for camera in self._state.cameras():
+            if camera.age_ms is not None:
+                age.add_metric([camera.camera], camera.age_ms / 1e3)
+            delivered.add_metric([camera.camera], camera.delivered)
+        rejected = CounterMetricFamily("freshfield_frames_rejected", "frames refused", labels=["reason"])
+        for reason, count in self._ingest.rejected.items():
+            rejected.add_metric([reason], count)
+        yield from (age, delivered, rejected)
+        check = GaugeMetricFamily(
+            "freshfield_check_seconds", "time to check and buffer a frame", labels=["quantile"]
+        )
+        for percent in (50, 99):
+            value = self._ingest.check_ms.percentile(percent)
+            if value is not None:
+                check.add_metric([str(percent / 100)], value / 1e3)
+        yield check
+        publications = self._state.publications()
+        if not publications:
+            return
+        last = publications[-1]
+        yield CounterMetricFamily("freshfield_updates", "updates published", value=last.number + 1)
+        yield GaugeMetricFamily("freshfield_update_seconds", "last update", value=last.update_ms / 1e3)
+        yield GaugeMetricFamily("freshfield_aaoi_seconds", "mean age of selection", value=last.aaoi_ms / 1e3)
+        yield GaugeMetricFamily("freshfield_selected_views", "views used last", value=len(last.selected))
+        scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
+        if scored is None:
+            return
+        named = (
+            ("psnr_db", scored.psnr_db),
+            ("psnr_moving_db", scored.psnr_moving_db),
+            ("ssim", scored.ssim),
+            ("lpips", scored.lpips),
+            ("perceptual", scored.perceptual),
+        )
+        for name, value in named:
+            if value is not None:
+                yield GaugeMetricFamily(f"freshfield_{name}", "fidelity at the present", value=value)
+
+
+def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int) -> None:
+    """Serve /metrics on a thread of its own until the process ends."""
+    registry = CollectorRegistry()
+    registry.register(EdgeCollector(state, ingest))  # type: ignore[arg-type]
+    start_http_server(port, addr=host, registry=registry)

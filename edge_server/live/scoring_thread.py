@@ -1,0 +1,195 @@
+"""Scores each publication on a thread of its own, so that neither ingest nor the field waits for it.
+
+The edge keeps a publication's renderer; once the held-out capture nearest to the present has arrived it is
+rendered at that capture's pose and compared. If scoring falls behind, publications go unscored (and the
+series says so with nulls); nothing queues up.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fidelity.baselines import Baseline, baseline
+from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fields import View
+from edge_server.live.state import Comparison, Publication, Renderer
+from freshfield import payload
+from freshfield.frame import Frame
+
+log = logging.getLogger(__name__)
+
+# Below the loop's priority and above nothing: scoring is for the observer, not for the field.
+_NICE = 5
+# Held-out frames that wait while one publication is scored; older ones are not needed any more.
+_INBOX = 256
+_BASELINE_EVERY = 5
+_KEPT_RENDERINGS = 32
+
+
+@dataclass
+class _Open:
+    """A publication with some of its held-out cameras still to be scored."""
+
+    publication: Publication
+    scores: list[Score]
+
+
+class Scoring:
+    """Owner of the Scorer. on_scored(publication with scores, comparison or None, final) runs on its thread;
+    final: every held-out camera's score is in."""
+
+    def __init__(
+        self,
+        held_out: Sequence[str],
+        scorer: Scorer,
+        on_scored: Callable[[Publication, Comparison | None, bool], None],
+    ) -> None:
+        self._held_out = tuple(held_out)
+        self._scorer = scorer
+        self._on_scored = on_scored
+        self._inbox: deque[Frame | tuple[Publication, Renderer, list[View]]] = deque(maxlen=_INBOX)
+        self._wake = threading.Condition()
+        self._ending = False
+        self._frames: dict[str, deque[Frame]] = {c: deque(maxlen=128) for c in self._held_out}
+        self._open: dict[int, _Open] = {}
+        self._views: list[View] = []
+        self._rendered: dict[tuple[str, int], NDArray[np.float32]] = {}
+        self.undecodable = 0
+        self.baselines: list[Baseline] = []
+        self._thread = threading.Thread(target=self._main, name="scoring", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """Finish what can be scored now and end."""
+        with self._wake:
+            self._ending = True
+            self._wake.notify()
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+
+    def held_out_frame(self, frame: Frame, received_ns: int) -> None:
+        """A held-out frame has arrived; it stays encoded until it is a truth. Never blocks."""
+        del received_ns  # the truth's time is its generation time
+        self._put(frame)
+
+    def published(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+        self._put((publication, renderer, views))
+
+    def _put(self, item: Frame | tuple[Publication, Renderer, list[View]]) -> None:
+        with self._wake:
+            self._inbox.append(item)
+            self._wake.notify()
+
+    def _main(self) -> None:
+        try:
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        except (OSError, AttributeError):
+            log.debug("thread priority cannot be lowered here")
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._inbox or self._ending)
+                if not self._inbox:
+                    return
+                item = self._inbox.popleft()
+            try:
+                if isinstance(item, Frame):
+                    self._settle(item)
+                elif self._held_out:
+                    self._keep(*item)
+                else:
+                    self._score_selected(*item)
+            except Exception:  # one bad image must not end all scoring; it is logged with its traceback
+                log.exception("a publication could not be scored")
+
+    def _keep(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+        self._open[publication.number] = _Open(publication, [])
+        while len(self._open) > 16:
+            del self._open[min(self._open)]
+        self._views = views
+        for camera in self._held_out:
+            render = self._render_later(camera, renderer, publication.published_ns)
+            self._finish(self._scorer.publish(camera, render, publication.published_ns))
+
+    def _render_later(
+        self, camera: str, renderer: Renderer, published_ns: int
+    ) -> Callable[[int], NDArray[np.float32]]:
+        def render(generated_ns: int) -> NDArray[np.float32]:
+            frame = next(f for f in self._frames[camera] if f.generated_edge_ns == generated_ns)
+            image = renderer.render(frame.pose.matrix(), frame.intrinsics).color
+            self._rendered[(camera, published_ns)] = image
+            while len(self._rendered) > _KEPT_RENDERINGS:  # of publications whose scoring failed afterwards
+                self._rendered.pop(next(iter(self._rendered)))
+            return image
+
+        return render
+
+    def _settle(self, frame: Frame) -> None:
+        self._frames[frame.camera].append(frame)
+        scores = self._scorer.held_out(
+            frame.camera, lambda: self._decode(frame), frame.generated_edge_ns, frame.pose
+        )
+        self._finish(scores)
+
+    def _decode(self, frame: Frame) -> NDArray[np.uint8]:
+        k = frame.intrinsics
+        try:
+            return payload.decode(frame.payload, frame.codec, k.width, k.height)
+        except payload.PayloadError:
+            self.undecodable += 1
+            raise
+
+    def _finish(self, scores: Sequence[Score]) -> None:
+        for score in scores:
+            image = self._rendered.pop((score.camera, score.published_ns), None)
+            entry = next(
+                (o for o in self._open.values() if o.publication.published_ns == score.published_ns), None
+            )
+            if entry is None:
+                continue
+            entry.scores.append(score)
+            comparison = None
+            if image is not None:
+                comparison = self._compare(score, image, entry.publication.number)
+            final = len(entry.scores) == len(self._held_out)
+            self._on_scored(entry.publication.scored(mean_score(entry.scores)), comparison, final)
+            if final:
+                self._open.pop(entry.publication.number, None)
+
+    def _compare(self, score: Score, image: NDArray[np.float32], number: int) -> Comparison | None:
+        assert score.truth_gap_ms is not None
+        generated_ns = score.published_ns + round(score.truth_gap_ms * 1e6)
+        frames = self._frames[score.camera]
+        frame = min(frames, key=lambda f: abs(f.generated_edge_ns - generated_ns))
+        truth = self._decode(frame)
+        if number % _BASELINE_EVERY == 0 and self._views:
+            self.baselines.append(baseline(self._views, truth, frame.pose.matrix()))
+        return Comparison(score.camera, truth[..., :3], to_bytes(image), number)
+
+    def _score_selected(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+        with self._wake:
+            if any(isinstance(i, tuple) for i in self._inbox):
+                return  # a younger publication waits already: this one goes unscored
+        renderings = [
+            (v.camera, renderer.render(v.camera_to_world, v.intrinsics).color, v.image) for v in views
+        ]
+        score = self._scorer.score_selected(renderings, publication.published_ns)
+        if score is None:
+            return
+        camera, image, truth = renderings[0]
+        comparison = Comparison(camera, truth[..., :3], to_bytes(image), publication.number)
+        self._on_scored(publication.scored(score), comparison, True)
+
+
+def to_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """float (H, W, 3) in [0, 1] -> uint8, rounded."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

@@ -1,0 +1,168 @@
+"""Decisions on disk, so that they can be explained after a run: OUT/decisions/000123.npz.
+
+One file a decision: the state, the action, and the frames that were embedded, as they were delivered. What
+decided is written once, policy-HASH.npz. The newest decisions are kept, as many as fit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_server.fields import checkpoint
+from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.bandit import Decided
+from edge_server.scheduler.learned.state import State
+from freshfield import payload
+
+log = logging.getLogger(__name__)
+
+FOLDER = "decisions"
+MOST = 500
+MOST_BYTES = 64_000_000
+_KIND = "decision"
+
+
+class DecisionRecord:
+    """Writes decisions under ``out``. embedding: settings of the embedder, for who embeds the frames again.
+    A full disk costs decisions, counted in ``lost``, never the edge. One owner: not thread-safe."""
+
+    def __init__(
+        self,
+        out: Path,
+        embedding: Mapping[str, Any] | None = None,
+        most: int = MOST,
+        most_bytes: int = MOST_BYTES,
+    ) -> None:
+        self._folder = out / FOLDER
+        self._embedding = dict(embedding) if embedding else None
+        self._most, self._most_bytes = most, most_bytes
+        # Decision, the policy's file, bytes of what was written for it; those of an earlier process first.
+        self._kept = deque((p, "", p.stat().st_size) for p in _numbered(self._folder))
+        self._policy: tuple[Actor, str] | None = None
+        self.lost = 0
+
+    def write(self, decided: Decided) -> None:
+        """Keep a decision; the oldest make room for it."""
+        path = self._folder / f"{decided.number:06d}.npz"
+        try:
+            self._forget_from(decided.number)
+            policy, its_bytes = self._policy_of(decided.actor)
+            arrays, about = _as_arrays(decided, policy, self._embedding)
+            checkpoint.save(path, arrays, about, _KIND, durable=False)
+            self._kept.append((path, policy, path.stat().st_size + its_bytes))
+            self._make_room()
+        except OSError as error:
+            self.lost += 1
+            if self.lost == 1:
+                log.warning("%s: cannot be written (%s): decisions are lost", path, error.strerror or error)
+
+    def _policy_of(self, actor: Actor) -> tuple[str, int]:
+        """File of the policy, and how many bytes it took to write it, which is done when it first decides."""
+        size = 0
+        if self._policy is None or self._policy[0] is not actor:
+            digest = hashlib.sha256(repr(actor.spec.as_json()).encode())
+            for _, w in sorted(actor.weights.items()):
+                digest.update(w.tobytes())
+            name = f"policy-{digest.hexdigest()[:12]}.npz"
+            if not (self._folder / name).exists():
+                actor.save(self._folder / name)
+                size = (self._folder / name).stat().st_size
+            self._policy = (actor, name)
+        return self._policy[1], size
+
+    def _forget_from(self, number: int) -> None:
+        """Decisions of this number and later ones are of an earlier run that used the same folder."""
+        while self._kept and int(self._kept[-1][0].stem) >= number:
+            self._kept.pop()[0].unlink(missing_ok=True)
+
+    def _make_room(self) -> None:
+        while len(self._kept) > 1 and (
+            len(self._kept) > self._most or sum(size for *_, size in self._kept) > self._most_bytes
+        ):
+            path, policy, _ = self._kept.popleft()
+            path.unlink(missing_ok=True)
+            if policy and all(policy != other for _, other, _ in self._kept):
+                (self._folder / policy).unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A decision as it was kept. images: pictures of the frames that were embedded, by camera; embedding:
+    settings of what embedded them, None where nothing did."""
+
+    decided: Decided
+    images: dict[str, NDArray[np.uint8]]
+    embedding: dict[str, Any] | None
+
+
+def read_decision(run: Path, number: int | None = None) -> Recorded:
+    """Decision ``number`` of the run in ``run``; None: the newest there is. ValueError in one line where
+    there is no such decision, or its file is damaged."""
+    known = _numbered(run / FOLDER)
+    if not known:
+        raise ValueError(
+            f"{run}: no decisions are recorded: edge-server run, and simulate with --out, keep those of a "
+            "policy that was learnt (bandit:FILE)"
+        )
+    path = known[-1] if number is None else run / FOLDER / f"{number:06d}.npz"
+    if path not in known:
+        raise ValueError(
+            f"{run}: decision {number} is not recorded; from {int(known[0].stem)} to {int(known[-1].stem)} "
+            "there are some: every update has one, the newest are kept"
+        )
+    arrays, about = checkpoint.load(path, kind=_KIND)
+    try:
+        actor = Actor.load(path.with_name(Path(about["policy"]).name))
+        cameras = tuple(str(camera) for camera in about["cameras"])
+        state = State(
+            arrays["ages_ms"], arrays["poses"], arrays.get("embeddings"), arrays["reported"], cameras
+        )
+        decided = Decided(
+            int(about["number"]), int(about["now_ns"]), state, arrays["action"], float(about["logp"]), actor
+        )
+        images = {}
+        for camera, (codec, width, height) in about["frames"].items():
+            try:
+                images[camera] = payload.decode(arrays[f"frame.{camera}"].tobytes(), codec, width, height)
+            except payload.PayloadError:
+                continue  # it was damaged when it was delivered: nobody saw it
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: damaged: {error}") from None
+    return Recorded(decided, images, about["embedding"])
+
+
+def _as_arrays(
+    decided: Decided, policy: str, embedding: dict[str, Any] | None
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    s = decided.state
+    arrays: dict[str, NDArray[Any]] = {
+        "ages_ms": s.ages_ms, "poses": s.poses, "reported": s.reported, "action": decided.action,
+    }  # fmt: skip
+    if s.embeddings is not None:
+        arrays["embeddings"] = s.embeddings
+    for camera, frame in s.frames.items():
+        arrays[f"frame.{camera}"] = np.frombuffer(frame.payload, np.uint8)
+    about = {
+        "number": decided.number,
+        "now_ns": decided.now_ns,
+        "logp": decided.logp,
+        "cameras": list(s.cameras),
+        "policy": policy,
+        "embedding": embedding,
+        "frames": {c: (f.codec, f.intrinsics.width, f.intrinsics.height) for c, f in s.frames.items()},
+    }
+    return arrays, about
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """Decisions in a folder, oldest first."""
+    return sorted((p for p in folder.glob("*.npz") if p.stem.isdigit()), key=lambda p: int(p.stem))

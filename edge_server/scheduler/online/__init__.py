@@ -1,0 +1,1 @@
+"""A learned policy that keeps learning while it is used."""

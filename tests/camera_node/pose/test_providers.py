@@ -1,0 +1,84 @@
+"""Pairing instants with poses: nearest, interpolated, bounded."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from camera_node.pose.providers import FixedPose, PoseGapError, Trajectory, TrajectoryError, read_tum
+from freshfield.geometry import Pose, so3_exp
+
+MS = 1_000_000
+
+
+def turn(angle: float, x: float = 0.0) -> Pose:
+    m = np.eye(4)
+    m[:3, :3] = so3_exp([0, 0, angle])
+    m[0, 3] = x
+    return Pose.from_matrix(m)
+
+
+def test_nearest_and_interpolated():
+    times, poses = [0, 100 * MS, 130 * MS], [turn(0.0, 0), turn(1.0, 10), turn(1.0, 10)]
+    nearest = Trajectory(times, poses, interpolate=False, max_gap_ns=50 * MS)
+    assert nearest.at(40 * MS).pose == poses[0] and nearest.at(40 * MS).gap_ns == 40 * MS
+    assert nearest.at(70 * MS).pose == poses[1] and nearest.at(70 * MS).gap_ns == 30 * MS
+    between = Trajectory(times, poses, max_gap_ns=50 * MS).at(40 * MS)
+    assert between.gap_ns == 40 * MS  # still the distance to the nearest sample
+    np.testing.assert_allclose(between.pose.matrix(), turn(0.4, 4).matrix(), atol=1e-12)
+
+
+def test_beyond_the_bound_there_is_no_pose():
+    track = Trajectory([0, 200 * MS], [turn(0), turn(1)], max_gap_ns=50 * MS)
+    assert track.at(-50 * MS).pose == turn(0) and track.at(250 * MS).pose == turn(1)
+    for t_ms in (-51, 100, 251):
+        with pytest.raises(PoseGapError, match="nearest pose"):
+            track.at(t_ms * MS)
+
+
+@given(
+    st.lists(st.integers(-(10**12), 10**12), min_size=1, max_size=30, unique=True),
+    st.integers(-(10**12), 10**12),
+)
+def test_the_gap_is_the_distance_to_the_nearest_sample(times, t_ns):
+    times.sort()
+    track = Trajectory(times, [turn(k / 30, k) for k in range(len(times))], max_gap_ns=10**13)
+    found = track.at(t_ns)
+    assert found.gap_ns == min(abs(t - t_ns) for t in times)
+    if t_ns in times:
+        assert found.pose == turn(times.index(t_ns) / 30, times.index(t_ns))
+    assert 0 <= found.pose.translation_m[0] <= len(times) - 1
+
+
+def test_a_fixed_pose_has_no_gap():
+    assert FixedPose(turn(0.3)).at(123).gap_ns == 0
+
+
+def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
+    file = tmp_path / "groundtruth.txt"
+    file.write_text("# comment\n\n1305031102.175304 1 2 3 0 0 0.5 0.8660254\n1305031102.2 1,2,3,0,0,0,1\n")
+    track = read_tum(file)
+    exact = track.at(1305031102_175304000)
+    assert exact.gap_ns == 0
+    np.testing.assert_allclose(exact.pose.matrix()[:3, :3], so3_exp([0, 0, np.pi / 3]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "at least one sample"),
+        ("1 2 3\n", ":1: expected t tx ty tz"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 zero\n", ":2: expected"),
+        ("0 0 0 0 0 0 0 0\n", ":1: quaternion"),
+        ("0 nan 0 0 0 0 0 1\n", ":1: expected"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "must increase"),
+    ],
+)
+def test_bad_lines_are_named(tmp_path, text, message):
+    file = tmp_path / "track.txt"
+    file.write_text(text)
+    with pytest.raises(TrajectoryError, match=message) as error:
+        read_tum(file)
+    assert str(file) in str(error.value)

@@ -1,0 +1,249 @@
+"""``camera-node drive-arm`` with the real control interface and a simulated arm."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+from camera_node.cli import main
+from camera_node.config import source_config
+from camera_node.robot.arm import drive as driving
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
+from camera_node.robot.arm.joint_states import ArmError, ArmStream
+from camera_node.robot.arm.viewpoint_tour import tour
+from camera_node.robot.hand_camera import Truth
+from camera_node.robot.simulated_controller.controller import HOME_RAD
+from freshfield.clock import WallClock
+from freshfield.scenario import load
+from tests.camera_node.robot.arm.simulated import (
+    own_address,
+    require_ur_rtde,
+    simulated_arm,
+    wait_until_moving,
+)
+
+
+@pytest.fixture
+def cell(tmp_path):
+    """A cell with a short and fast path: its file, its address."""
+    data = yaml.safe_load(load("cell").path.read_text())
+    arm = data["source"]["arm"]
+    arm["host"] = own_address()
+    arm["cameras"] = {"hand": None}
+    arm["path"] |= {
+        "azimuths_deg": [-150, -120],
+        "elevations_deg": [60],
+        "rolls_deg": [0],
+        "speed_rad_s": 3.0,
+    }
+    arm["path"]["acceleration_rad_s2"] = 20.0
+    file = tmp_path / "cell.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return file, arm["host"]
+
+
+def real(file):
+    """The same cell, its arm taken for a real one: no patience, and questions."""
+    data = yaml.safe_load(file.read_text())
+    data["source"]["arm"]["simulated"] = False
+    file.write_text(yaml.safe_dump(data))
+    return file
+
+
+def near(file):
+    """--joints of an arm that stands some 30 degrees before the first viewpoint."""
+    angles = np.add(np.rad2deg(stops_of(file)[0]), [30, 10, 0, 0, 0, 0])
+    return "--joints=" + ",".join(f"{angle:.3f}" for angle in angles)
+
+
+def at_rest(truth, within_s=5.0):
+    clock, until = WallClock(), time.monotonic() + within_s
+    while time.monotonic() < until:
+        before = truth.joints(clock.now_ns())
+        time.sleep(0.1)
+        if np.array_equal(truth.joints(clock.now_ns()), before):
+            return True
+    return False
+
+
+def shown(text):
+    """Joint angles (N, 6) of the numbered lines, degrees."""
+    lines = [line.split() for line in text.splitlines()]
+    return np.array([line[1:] for line in lines if line and line[0].isdigit() and len(line) == 7], float)
+
+
+def drive(file, *options):
+    command = [sys.executable, "-m", "camera_node.cli", "drive-arm", str(file), *options]
+    # Under nohup a hang-up is ignored, and whoever is started ignores it, too.
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def stops_of(file):
+    scenario = load(file)
+    config = source_config(scenario).arm
+    mount = hand_eyes(scenario, config, ["hand"])["hand"].transform
+    return tour(arm_model(scenario, config), base_matrix(config), mount, config.path, HOME_RAD).stops
+
+
+def test_a_round_visits_every_viewpoint_and_ends(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host):
+        truth, clock = Truth(host), WallClock()
+        process = drive(file, "--rounds", "1")
+        seen = []
+        while process.poll() is None:
+            seen.append(truth.joints(clock.now_ns()))
+            time.sleep(0.005)
+        said = process.communicate()
+        assert process.returncode == 0, said
+        np.testing.assert_allclose(shown(said[0]), np.rad2deg(stops_of(file)), atol=0.006)
+        for stop in stops_of(file):
+            assert min(np.abs(q - stop).max() for q in seen) < 0.02
+        assert np.abs(truth.joints(clock.now_ns()) - stops_of(file)[-1]).max() < 2e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_arm_where_it_is(cell, number):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host):
+        truth = Truth(host)
+        process = drive(file)
+        wait_until_moving(truth, process)
+        process.send_signal(number)
+        assert process.wait(20.0) == 0
+        assert at_rest(truth, 0.3)
+
+
+@pytest.mark.slow
+def test_an_arm_that_vanishes_ends_the_drive_with_one_line(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host, near(file)) as arm:
+        process = drive(real(file), "--yes")
+        wait_until_moving(Truth(host), process)
+        arm.kill()
+        assert process.wait(30.0) == 1
+        assert f"camera-node: arm at {host}" in process.communicate()[1]
+
+
+def test_a_drive_that_is_killed_leaves_no_arm_moving(cell):
+    """The controller's own watchdog misses it."""
+    require_ur_rtde()
+    file, host = cell
+    data = yaml.safe_load(file.read_text())
+    data["source"]["arm"]["path"]["speed_rad_s"] = 0.1  # the first move takes many seconds
+    file.write_text(yaml.safe_dump(data))
+    with simulated_arm(host, near(file)):
+        truth = Truth(host)
+        process = drive(real(file), "--yes")
+        wait_until_moving(truth, process)
+        process.kill()
+        process.communicate()
+        assert at_rest(truth)
+        assert np.abs(truth.joints(WallClock().now_ns()) - stops_of(file)[0]).max() > 0.2
+
+
+def test_a_program_that_is_stopped_at_the_pendant_ends_the_drive(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host):
+        truth = Truth(host)
+        process = drive(file)
+        wait_until_moving(truth, process)
+        with socket.create_connection((host, 29999), 5.0) as dashboard:
+            dashboard.sendall(b"stop\n")
+            assert process.wait(20.0) == 1
+        assert "its program was ended" in process.communicate()[1]
+        assert at_rest(truth)
+
+
+def test_an_arm_that_stands_still_on_the_way_is_not_waited_for(monkeypatch):
+    require_ur_rtde()
+    monkeypatch.setattr(driving, "_STILL_S", 0.3)
+    host = own_address()
+    with simulated_arm(host):
+        stream = ArmStream(host, WallClock(), 50.0, max_gap_ms=5000.0, stale_s=5.0)
+        stream.start()
+        control = driving.connect_control(host)
+        try:
+            goal = np.array(HOME_RAD) + np.deg2rad([0, 0, 30, 0, 0, 0])  # where nobody has sent it
+            with pytest.raises(ArmError, match=r"stands still, 30.0 degrees from its goal"):
+                driving._arrive(stream, control, goal, threading.Event(), 0.3)
+        finally:
+            control.stopScript()
+            stream.stop()
+
+
+def test_a_first_move_through_half_the_bench_is_refused(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host, "--joints=-20,-90,90,-90,90,0"):
+        process = drive(real(file), "--yes")
+        said = process.communicate(timeout=20)
+        assert process.returncode == 2
+        assert "the first move would turn a joint by" in said[1] and "with the pendant" in said[1]
+
+
+def test_a_real_arm_is_asked_about_first(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host, near(file)):
+        process = drive(real(file))
+        said = process.communicate(timeout=20)
+        assert "say that its space is clear with --yes" in said[1]
+        assert process.returncode == 2
+        # Before the question, and from the nearest viewpoint on.
+        stands = next(line.split()[2:] for line in said[0].splitlines() if "stands at" in line)
+        first_deg = np.abs(shown(said[0])[0] - np.array(stands, float)).max()
+        assert f"the first move turns a joint by {first_deg:.0f}" in said[0] and 0 < first_deg <= 30
+
+
+def test_what_is_shown_is_what_would_be_driven(cell):
+    require_ur_rtde()
+    file, host = cell
+    with simulated_arm(host):
+        process = drive(file, "--show")
+        said = process.communicate(timeout=20)[0]
+        assert process.returncode == 0 and at_rest(Truth(host), 0.3)
+    np.testing.assert_allclose(shown(said), np.rad2deg(stops_of(file)), atol=0.006)
+    assert "stands at     0.00   -90.00" in said
+
+
+def test_the_tour_is_shown_without_an_arm(cell, capsys):
+    require_ur_rtde()
+    file, host = cell
+    assert main(["drive-arm", str(file), "--show"]) == 0
+    said = capsys.readouterr()
+    assert len(shown(said.out)) == 3 and "first move" not in said.out
+    assert f"arm at {host}: nothing listens" in said.err and "--joints" in said.err
+    home = ",".join(f"{a:g}" for a in np.rad2deg(HOME_RAD))
+    assert main(["drive-arm", str(file), "--show", f"--joints={home}"]) == 0
+    np.testing.assert_allclose(shown(capsys.readouterr().out), np.rad2deg(stops_of(file)), atol=0.006)
+    assert main(["drive-arm", str(file), f"--joints={home}"]) == 2
+    assert "--joints: goes with --show" in capsys.readouterr().err
+
+
+def test_a_scenario_without_an_arm_or_a_path_is_refused(cell, capsys):
+    file, _ = cell
+    assert main(["drive-arm", "tile"]) == 2
+    assert "source.arm: missing" in capsys.readouterr().err
+    data = yaml.safe_load(file.read_text())
+    del data["source"]["arm"]["path"]
+    file.write_text(yaml.safe_dump(data))
+    assert main(["drive-arm", str(file)]) == 2
+    assert "source.arm.path: missing" in capsys.readouterr().err

@@ -1,0 +1,72 @@
+"""The saved hand-eye calibration: T_W^C = T_W^EE T_EE^C (4.7), on the arm's clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from camera_node.pose.pairing import PoseBuffer
+from camera_node.robot.arm.hand_eye_mount import HandEyeError, read_hand_eye
+from freshfield.geometry import Pose, so3_exp
+
+MS = 1_000_000
+
+
+def transform(turn, shift) -> np.ndarray:
+    m = np.eye(4)
+    m[:3, :3], m[:3, 3] = so3_exp(turn), shift
+    return m
+
+
+def written(tmp_path, **change):
+    data = {"setup": "eye-in-hand", "transform": transform((0.1, 0, 0), (0.05, 0, 0.1)).round(9).tolist(),
+            "time_offset_s": 0.02, "method": "refined", **change}  # fmt: skip
+    file = tmp_path / "hand.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return file
+
+
+def test_a_camera_on_a_moving_hand(tmp_path):
+    calibration = read_hand_eye(written(tmp_path))
+    assert calibration.details == {"method": "refined"}
+    hand = PoseBuffer()
+    for k in range(10):
+        hand.add(k * 10 * MS, Pose.from_matrix(transform((0, 0, 0.1 * k), (0.01 * k, 0, 0))))
+    # The arm's stamps are 20 ms ahead: the camera's 30 ms are the arm's 50 ms.
+    found = calibration.camera_poses(hand).at(30 * MS)
+    expected = transform((0, 0, 0.5), (0.05, 0, 0)) @ transform((0.1, 0, 0), (0.05, 0, 0.1))
+    np.testing.assert_allclose(found.pose.matrix(), expected, atol=1e-8)
+    assert found.gap_ns == 0
+
+
+def test_a_camera_that_stands_does_not_follow_the_hand(tmp_path):
+    calibration = read_hand_eye(written(tmp_path, setup="eye-to-hand"))
+    poses = calibration.camera_poses(PoseBuffer())
+    np.testing.assert_allclose(poses.at(7).pose.matrix(), calibration.transform, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"setup": "eye-on-foot"}, "setup: expected eye-in-hand or eye-to-hand"),
+        ({"transform": [[1, 2], [3, 4]]}, "transform: expected 4 x 4"),
+        ({"transform": (2 * np.eye(4)).tolist()}, "transform: expected 4 x 4 numbers with the last row"),
+        ({"transform": np.diag([1.0, 1, -1, 1]).tolist()}, "transform: the pose's rotation"),
+        ({"transform": "none"}, "transform"),
+        ({"time_offset_s": float("nan")}, "time_offset_s"),
+        ({"time_offset_s": "soon"}, "time_offset_s"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named(tmp_path, change, message):
+    with pytest.raises(HandEyeError, match=message) as error:
+        read_hand_eye(written(tmp_path, **change))
+    assert "hand.yaml" in str(error.value)
+
+
+def test_a_file_of_something_else(tmp_path):
+    (tmp_path / "x.yaml").write_text("[1, 2]")
+    with pytest.raises(HandEyeError, match="expected setup and transform"):
+        read_hand_eye(tmp_path / "x.yaml")
+    with pytest.raises(HandEyeError, match="cannot be read"):
+        read_hand_eye(tmp_path / "none.yaml")

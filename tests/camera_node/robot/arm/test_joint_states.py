@@ -1,0 +1,200 @@
+"""Joint states from a controller, and every way in which they can stop coming."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from camera_node.clocks import ArrivalClock
+from camera_node.pose.providers import PoseGapError
+from camera_node.robot.arm.joint_states import ArmError, ArmStream, HandPoses, probe
+from camera_node.robot.arm.kinematics import UR3E
+from camera_node.robot.hand_camera import Truth
+from camera_node.robot.simulated_controller.controller import HOME_RAD
+from freshfield.clock import WallClock
+from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+
+WITHIN_S = 20.0  # of a busy machine; what is waited for takes a fraction of it
+
+
+@pytest.fixture(autouse=True)
+def library():
+    require_ur_rtde()
+
+
+@contextlib.contextmanager
+def running(host, clock=None, **options):
+    stream = ArmStream(host, clock or WallClock(), **options)
+    stream.start()
+    try:
+        yield stream
+    finally:
+        stream.stop()
+
+
+def wait_until(condition):
+    until = time.monotonic() + WITHIN_S
+    while not condition():
+        assert time.monotonic() < until, "it did not happen"
+        time.sleep(0.02)
+
+
+@contextlib.contextmanager
+def listening(answer):
+    """A program on a controller's port that says ``answer`` to everybody, and then nothing."""
+    host = own_address()
+    with socket.create_server((host, 30004)) as server:
+        held = []
+
+        def serve():
+            with contextlib.suppress(OSError):
+                while True:
+                    link, _ = server.accept()
+                    held.append(link)
+                    if answer:
+                        link.recv(100)
+                        link.sendall(answer)
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield host
+        server.shutdown(socket.SHUT_RDWR)
+        for link in held:
+            link.close()
+
+
+def test_joints_come_with_their_times():
+    host, clock = own_address(), WallClock()
+    with simulated_arm(host), running(host, clock, max_gap_ms=1000.0) as stream:
+        joints, gap_ns = stream.at(clock.now_ns(), WITHIN_S)
+        assert np.allclose(joints, HOME_RAD) and gap_ns < 1_000_000_000
+        wait_until(lambda: stream.status()["samples"] > 20)
+        assert stream.trouble == "" and stream.connections == 1
+        hand = HandPoses(stream, UR3E, np.eye(4), WITHIN_S)
+        assert np.allclose(hand.at(clock.now_ns()).pose.matrix(), UR3E.forward(HOME_RAD), atol=1e-12)
+
+
+def test_no_controller_is_one_clear_line():
+    begin = time.monotonic()
+    with pytest.raises(ArmError, match=r"nothing listens on port 30004.*simulate-arm"):
+        ArmStream(own_address(), WallClock()).start()
+    assert time.monotonic() - begin < 3.0
+
+
+def test_a_host_that_says_nothing_is_one_clear_line():
+    begin = time.monotonic()
+    with listening(b"") as host, pytest.raises(ArmError, match="no answer on port 30004"):
+        ArmStream(host, WallClock()).start()
+    assert time.monotonic() - begin < 3.0
+
+
+def test_another_program_on_the_port_is_told_apart():
+    with (
+        listening(b"HTTP/1.1 400 Bad Request\r\n\r\n") as host,
+        pytest.raises(ArmError, match="does not speak"),
+    ):
+        probe(host)
+
+
+@pytest.mark.slow
+def test_a_controller_that_goes_silent_while_it_is_connected_to_does_not_hang_us():
+    begin = time.monotonic()
+    with listening(b"\x00\x04V\x01") as host, pytest.raises(ArmError, match="no joint states come"):
+        ArmStream(host, WallClock()).start()
+    assert time.monotonic() - begin < 4.0
+
+
+@pytest.mark.slow
+def test_a_lost_connection_gives_no_poses_and_comes_back():
+    host, clock = own_address(), WallClock()
+    with simulated_arm(host) as first, running(host, clock) as stream:
+        first.kill()
+        first.wait()
+        wait_until(lambda: stream.trouble)
+        time.sleep(0.1)
+        with pytest.raises(PoseGapError, match=host):
+            stream.at(clock.now_ns(), 0.0)
+        with simulated_arm(host, "--joints", "10,-90,-90,-90,90,0"):
+            wait_until(lambda: stream.connections == 2 and not stream.trouble)
+            wait_until(lambda: _agrees(stream, clock, np.deg2rad(10)))
+
+
+def _agrees(stream, clock, first_rad):
+    with contextlib.suppress(PoseGapError):
+        return abs(stream.at(clock.now_ns(), 0.05)[0][0] - first_rad) < 1e-9
+    return False
+
+
+def test_a_state_that_stands_still_is_not_believed():
+    """The library goes on returning the last joints of a controller that has stopped: stamps tell."""
+    host, clock = own_address(), WallClock()
+    with simulated_arm(host) as process, running(host, clock) as stream:
+        process.send_signal(signal.SIGSTOP)
+        wait_until(lambda: "stood still" in stream.trouble or "no answer" in stream.trouble)
+        with pytest.raises(PoseGapError):
+            stream.at(clock.now_ns(), 0.0)
+        process.send_signal(signal.SIGCONT)
+        wait_until(lambda: not stream.trouble)
+
+
+@pytest.mark.slow
+def test_poses_follow_a_moving_arm_whose_clock_drifts():
+    """Against the truth, which only a simulated controller knows: the stamps are mapped well."""
+    from rtde_control import RTDEControlInterface
+
+    host, clock = own_address(), WallClock()
+    with simulated_arm(host, "--drift-ppm", "300") as _, running(host, clock, max_gap_ms=500.0) as stream:
+        control, truth = RTDEControlInterface(host), Truth(host)
+        goal = [2.0, *HOME_RAD[1:]]
+        control.moveJ(goal, 1.0, 8.0, True)
+        off_rad = []
+        while len(off_rad) < 40:
+            time.sleep(0.02)
+            now_ns = clock.now_ns()
+            off_rad.append(abs(stream.at(now_ns, 0.1)[0][0] - truth.joints(now_ns)[0]))
+        control.stopJ(10.0)
+        control.stopScript()
+        # At 1 rad/s, 10 mrad are 10 ms: the median leaves out what a busy machine delays.
+        assert np.median(off_rad) < 0.01
+
+
+def test_arrivals_tell_the_offset_of_a_clock_that_drifts():
+    rng = np.random.default_rng(1)
+    clock, worst_ms = ArrivalClock(), []
+    for k in range(20_000):  # 160 s at 125 a second
+        true_ns = k * 8_000_000
+        stamp_ns = round(true_ns * (1 - 50e-6)) + 77_000_000_000
+        arrived_ns = true_ns + 300_000 + round(rng.exponential(2e6))
+        worst_ms.append(abs(clock.ours_ns(stamp_ns, arrived_ns) - true_ns) / 1e6)
+    settled = np.array(worst_ms[625:])
+    # The delay that all samples share (0.3 ms) stays in, and what drifts within the window (0.25 ms).
+    assert settled.max() < 0.6 and settled.min() > 0.04
+
+
+def test_stamps_that_go_back_or_stand_still_break_nothing():
+    clock = ArrivalClock()
+    assert clock.ours_ns(5_000, 1_000_000) == 1_000_000
+    assert clock.ours_ns(5_000, 2_000_000) == 1_000_000
+    assert clock.ours_ns(1_000, 3_000_000) == 996_000
+    assert clock.ours_ns(10_000_000_000, 10_003_000_000) <= 10_003_000_000
+
+
+@pytest.mark.parametrize(
+    "mode, safety, says",
+    [
+        (7, 1, ""),
+        (7, 2, ""),
+        (5, 1, "idle: brakes engaged"),
+        (7, 3, "safety: protective stop"),
+        (99, 1, "99"),
+    ],
+)
+def test_an_arm_that_cannot_move_says_why(mode, safety, says):
+    stream = ArmStream("127.0.0.1", WallClock())
+    stream._judge(mode, safety)
+    assert says in stream.trouble and bool(stream.trouble) == bool(says)

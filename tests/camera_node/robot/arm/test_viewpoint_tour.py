@@ -1,0 +1,197 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from camera_node.config import PathConfig, source_config
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
+from camera_node.robot.arm.capsules import Shape, links
+from camera_node.robot.arm.kinematics import UR3E, calibrated
+from camera_node.robot.arm.roadmap import FARTHEST_RAD, Roadmap, clear
+from camera_node.robot.arm.viewpoint_tour import PathError, tour, viewpoints
+from camera_node.robot.simulated_controller.controller import HOME_RAD
+from freshfield.scenario import ScenarioError, load, parse
+from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
+
+CELL = load("cell")
+ARM = source_config(CELL).arm
+BASE = base_matrix(ARM)
+MOUNT = hand_eyes(CELL, ARM, ["hand"])["hand"].transform
+
+
+def test_viewpoints_look_at_their_target_from_their_radius():
+    path = PathConfig(target_m=(0.1, 0.2, 0.3), radius_m=0.5, elevations_deg=(20.0, 70.0), step_deg=30.0)
+    poses = viewpoints(path)
+    assert len(poses) == 14
+    for pose in poses:
+        to = np.array(path.target_m) - pose[:3, 3]
+        assert np.isclose(np.linalg.norm(to), 0.5) and np.allclose(pose[:3, 2], to / 0.5)
+    azimuths = [np.arctan2(pose[0, 3] - 0.1, 0.2 - pose[1, 3]) for pose in poses]
+    heights = [pose[2, 3] for pose in poses]
+    assert heights[0] > heights[1] and np.isclose(azimuths[0], azimuths[1])  # down, and beside that up again
+    assert np.isclose(heights[1], heights[2]) and azimuths[1] < azimuths[2]
+
+
+def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
+    found = tour(UR3E, BASE, MOUNT, ARM.path)
+    assert ARM.path.radius_m == 0.34 and found.reached >= 45
+    reached = found.reached_by_ring(ARM.path)
+    assert sum(reached) == found.reached and min(reached) >= 10
+    shape, poses = Shape(UR3E, 0.08, 0.04), viewpoints(ARM.path)
+    eyes = []
+    for before, joints, place in zip([found.stops[0], *found.stops], found.stops, found.places):
+        camera = BASE @ UR3E.forward(joints) @ MOUNT
+        np.testing.assert_allclose(camera[:3, 2:], poses[place][:3, 2:], atol=1e-6)  # whatever its roll
+        assert not UR3E.singularities(joints)
+        assert np.abs(joints - before).max() <= FARTHEST_RAD
+        on_the_way = links(UR3E, before + np.linspace(0, 1, 60)[:, None] * (joints - before))
+        assert (BASE @ on_the_way)[:, 2:, 2, 3].min() > 0.04
+        assert shape.clearance(on_the_way)[0].min() > 0.0
+        eyes.append(camera[:3, 3] - ARM.path.target_m)
+    azimuths = np.rad2deg(np.arctan2([e[0] for e in eyes], [-e[1] for e in eyes]))
+    assert np.ptp(np.unwrap(np.sort(azimuths), period=360)) > 200
+
+
+def rolled(quarters):
+    turn = np.eye(4)
+    turn[:2, :2] = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters)
+    return turn
+
+
+def test_what_no_straight_way_leads_to_is_reached_by_way_of_others():
+    """All that the arm could stand at without touching anything."""
+    found = tour(UR3E, BASE, MOUNT, ARM.path)
+    free = set()
+    for place, pose in enumerate(viewpoints(ARM.path)):
+        goals = [np.linalg.inv(BASE) @ pose @ rolled(turn) @ np.linalg.inv(MOUNT) for turn in (0, 1, 2, 3)]
+        sound = [p.joints for goal in goals for p in UR3E.inverse(goal) if not p.singular]
+        if any(clear(UR3E, BASE, joints, joints, ARM.path.floor_m).all() for joints in sound):
+            free.add(place)
+    assert set(found.places) == free and len(found.stops) > found.reached
+
+
+def test_a_way_is_the_shortest_of_those_that_are_free():
+    home = np.array(HOME_RAD)
+    steps = [home + np.array([turn, 0, 0, 0, 0, 0]) for turn in (1.5, -1.5, 3.0, -2.8)]
+    roadmap = Roadmap(UR3E, BASE, steps, [0, 1, 2, 2], -1.0)
+    way = roadmap.way(home, {2})
+    assert [place for _, place in way] == [1, 2]  # 2.8 rad are too far for one go, and shorter than 3
+    np.testing.assert_allclose([joints for joints, _ in way], [steps[1], steps[3]])
+    assert roadmap.way(home, {7}) is None and Roadmap(UR3E, BASE, [], [], -1.0).way(home, {0}) is None
+    # A whole turn is not gone round: the same posture from the other side is nearer.
+    assert roadmap.way(np.array([2 * np.pi - 2.0, *home[1:]]), {0})[0][0][0] > np.pi
+    under = Roadmap(UR3E, BASE, steps, [0, 1, 2, 2], 5.0)
+    assert under.way(home, {0, 1, 2}) is None
+
+
+def test_the_tour_begins_where_it_can_be_begun():
+    free = tour(UR3E, BASE, MOUNT, ARM.path).stops[0]
+    again = tour(UR3E, BASE, MOUNT, ARM.path, start=free).stops[0]
+    assert np.allclose(again, free, atol=1e-9)
+
+
+def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
+    """The height of its joints, not of the frames that its calibration puts metres beside them."""
+    file = tmp_path / "calibration.conf"
+    file.write_text(CALIBRATION)
+    arm = calibrated(UR3E, file)
+    shape, free = Shape(UR3E, 0.08, 0.04), 0
+    for joints in np.random.default_rng(6).uniform(-3, 3, (200, 6)):
+        if shape.clearance(links(UR3E, joints[None]))[0].min() < 0.03:
+            continue
+        free += 1
+        lowest_m = (BASE @ UR3E.links(joints))[2:, 2, 3].min()
+        for floor_m in (lowest_m - 0.006, lowest_m + 0.006):
+            assert clear(arm, BASE, joints, joints, floor_m).all() == (floor_m < lowest_m)
+    assert free > 50
+
+
+def test_an_arm_is_not_driven_through_itself():
+    """Between two postures that are free the straight way in joint space need not be."""
+    folded = np.array(HOME_RAD)
+    folded[2] = -np.pi + 0.05
+    other = np.array(HOME_RAD)
+    other[2] = -2 * np.pi + np.pi / 2
+    home = np.array(HOME_RAD)
+    assert clear(UR3E, BASE, home, home, -1.0) and clear(UR3E, BASE, other, other, -1.0)
+    assert not clear(UR3E, BASE, folded, folded, -1.0)
+    assert not clear(UR3E, BASE, home, other, -1.0)
+
+
+def test_a_tour_out_of_reach_says_what_to_change():
+    with pytest.raises(PathError, match=r"reaches 0 of .* viewpoints: change radius_m"):
+        tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, radius_m=2.0))
+
+
+def cell(**changed):
+    arm = {"host": "127.0.0.2", "cameras": {"hand": None}, **changed}
+    data = {
+        "cameras": {"ids": ["hand", "still"]},
+        "source": {"kind": "world", "scene": "tile", "arm": arm},
+    }
+    return parse(data, CELL.path)
+
+
+def test_a_camera_that_is_not_calibrated_yet_has_the_hands_poses():
+    scenario = cell()
+    mounts = hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+    assert list(mounts) == ["hand"] and np.array_equal(mounts["hand"].transform, np.eye(4))
+
+
+def test_where_the_base_stands():
+    base = base_matrix(source_config(cell(base_m=[1.0, 2.0, 3.0], base_yaw_deg=90.0)).arm)
+    assert np.allclose(base @ [1, 0, 0, 1], [1, 3, 3, 1])
+
+
+@pytest.mark.parametrize(
+    "changed, says",
+    [
+        ({"robot": "ur99"}, "arm: robot is 'ur99', expected one of ur3e"),
+        ({"frequency_hz": 1000}, "frequency_hz is 1000, expected 10 to 500"),
+        ({"host": "192.168.56.101", "simulated": True}, "simulated: host is 192.168.56.101"),
+        ({"cameras": {}}, "cameras: expected at least one camera"),
+        ({"pairing": "guessed"}, "pairing is 'guessed'"),
+        ({"path": {"radius_m": -1}}, "radius_m above 0"),
+        ({"hosts": "x"}, "arm.hosts: unknown key"),
+    ],
+)
+def test_a_wrong_arm_is_refused_by_key(changed, says):
+    with pytest.raises(ScenarioError, match=says):
+        source_config(cell(**changed))
+
+
+@pytest.mark.parametrize(
+    "changed, says",
+    [
+        ({"cameras": {"nobody": None}}, "arm.cameras: 'nobody' is not one of the scenario's cameras"),
+        (
+            {"cameras": {"hand": "no-such-file.yaml"}},
+            r"arm.cameras.hand: .*no-such-file.yaml: cannot be read",
+        ),
+    ],
+)
+def test_a_wrong_mount_is_refused_by_camera(changed, says):
+    scenario = cell(**changed)
+    with pytest.raises(ScenarioError, match=says):
+        hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+
+
+def test_a_wrong_calibration_of_the_robot_is_refused():
+    scenario = cell(calibration="no-such.conf")
+    with pytest.raises(ScenarioError, match=r"source.arm.calibration: .*no-such.conf: cannot be read"):
+        arm_model(scenario, source_config(scenario).arm)
+
+
+def test_a_camera_that_may_roll_comes_to_more_viewpoints():
+    """A camera beside the flange's axis has its arm on one side at one roll, on the other at another."""
+    reached = [
+        tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, rolls_deg=rolls), HOME_RAD).reached
+        for rolls in ((0.0,), ARM.path.rolls_deg)
+    ]
+    assert reached[1] > reached[0] + 5
+
+
+@pytest.mark.parametrize("rolls", [(), (400.0,), (float("nan"),)])
+def test_rolls_that_are_none_are_refused(rolls):
+    with pytest.raises(ValueError, match="rolls_deg"):
+        PathConfig(rolls_deg=rolls)

@@ -1,0 +1,354 @@
+"""The guided calibration with an arm in a scenario: in whose axes poses are, and by whose clock."""
+
+from __future__ import annotations
+
+import _thread
+import dataclasses
+import io
+import json
+import subprocess
+import sys
+import threading
+import time
+from fractions import Fraction
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from camera_node.cli import main
+from camera_node.config import source_config
+from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
+from camera_node.robot.arm.kinematics import UR3E
+from camera_node.robot.arm.roadmap import clear
+from camera_node.robot.arm.viewpoint_tour import PathError
+from camera_node.robot.calibration import ArmStopped
+from camera_node.robot.calibration.accuracy_cost import streams
+from camera_node.robot.calibration.files import read_track
+from camera_node.robot.calibration.hand_eye import live
+from camera_node.robot.calibration.hand_eye import simulated as simulate
+from camera_node.robot.calibration.hand_eye.arm_mover import Mover
+from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, calibrate_tracks, distance_mm
+from camera_node.robot.calibration.hand_eye.samples import inverse
+from camera_node.robot.calibration.hand_eye.session import Session
+from camera_node.robot.calibration.hand_eye.tracks import HAND_FILE, LEAST_S, TARGET_FILE, Tracks
+from camera_node.robot.calibration.targets import parse
+from camera_node.robot.hand_camera import Truth
+from camera_node.sources import Shot
+from freshfield.clock import WallClock
+from freshfield.geometry import Pose
+from freshfield.scenario import load
+from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+from tests.camera_node.robot.calibration.pictures import BOARD, LENS, taken
+
+X = simulate.CAMERA_IN_HAND
+
+
+class Replay:
+    """A recording: rendered pictures, ``each`` times over, with poses (N, 4, 4) as a scenario's arm gives
+    them, in the world."""
+
+    camera, fps, intrinsics = "eye", Fraction(500), LENS
+
+    def __init__(self, poses, stamps_ns=None, each=1):
+        self._pictures = [cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB) for picture in taken()[0]]
+        self._poses, self._stamps_ns = poses, stamps_ns
+        self.contents, self._each = each * len(poses), each
+
+    def content(self, tick):
+        return tick
+
+    def read(self, content):
+        content //= self._each
+        stamp_ns = None if self._stamps_ns is None else self._stamps_ns[content]
+        return Shot(self._pictures[content], Pose.from_matrix(self._poses[content]), LENS, 0, stamp_ns)
+
+    def release(self):
+        pass
+
+
+def scenario(folder, camera=None):
+    arm = {"host": "127.0.0.9", "simulated": True, "base_m": [0.4, -0.3, 0.1], "base_yaw_deg": 30.0,
+           "cameras": {"eye": camera}}  # fmt: skip
+    source = {"kind": "world", "scene": "tile", "codec": "png", "fps": 500, "arm": arm}
+    file = folder / "bench.yaml"
+    file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
+    return file
+
+
+def hands_of(setup):
+    """Poses of the hand in base, of which ``taken``'s pictures are."""
+    return taken()[1] if setup == EYE_IN_HAND else inverse(taken()[1])
+
+
+@pytest.mark.parametrize("setup", [EYE_IN_HAND, EYE_TO_HAND])
+def test_what_it_saves_is_what_the_node_takes_it_for(setup, tmp_path, monkeypatch, capsys):
+    """In the axes of the arm's base, wherever that stands in the world."""
+    file, out = scenario(tmp_path), tmp_path / "eye.yaml"
+    plan = load(str(file))
+    config = source_config(plan).arm
+    base = base_matrix(config)
+    recording = Replay(base @ hands_of(setup), each=2)  # each place twice: the hand holds still
+    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": recording})
+    held = ["--eye-to-hand"] if setup == EYE_TO_HAND else []
+    arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out)]
+    assert main(["calibrate", "hand-eye", *arguments, *held, "--json"]) == 0
+    found = np.array(json.loads(capsys.readouterr().out)["transform"])
+    assert distance_mm(found, X) < 0.6 and angle_deg(found, X) < 0.1
+    if setup == EYE_TO_HAND:
+        used = dataclasses.replace(config, cameras={"eye": str(out)})
+        place = camera_poses(plan, used, ["eye"])["eye"].at(0).pose.matrix()
+        assert distance_mm(place, base @ X) < 0.6
+
+
+def test_a_camera_that_is_calibrated_already_has_no_hands_poses(tmp_path, capsys):
+    file = scenario(tmp_path, "eye.yaml")
+    assert main(["calibrate", "hand-eye", "--live", str(file), "--camera", "eye", "--board", BOARD]) == 2
+    assert "source.arm.cameras: set eye: null for the calibration" in capsys.readouterr().err
+
+
+def test_tracks_need_an_arm_and_motion(tmp_path, capsys):
+    options = ["--live", str(scenario(tmp_path)), "--camera", "eye", "--board", BOARD]
+    assert main(["calibrate", "hand-eye", *options, "--tracks", str(tmp_path)]) == 2
+    assert "--tracks: goes with --moving" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main(["calibrate", "hand-eye", *options, "--moving", "--tracks", str(tmp_path / "file")]) == 2
+    assert "--tracks: " in capsys.readouterr().err, "before the camera is opened"
+
+
+def test_the_cameras_own_stamps_are_kept_with_what_was_seen():
+    stamps = [10**18 + 70_000_001 * k for k in range(6)]
+    hands, tracks = hands_of(EYE_IN_HAND)[:6], Tracks()
+    session = Session(parse(BOARD), EYE_IN_HAND, moving=True)
+    step = live.guide(
+        Replay(hands, stamps), "png", None, session, lambda tick: True, lambda *_: None, tracks=tracks
+    )
+    seen = tracks.target()
+    assert seen.times_ns.tolist() == stamps
+    expected = simulate.seen_targets(hands)
+    assert max(distance_mm(a, b) for a, b in zip(seen.poses, expected)) < 2.0
+    assert tracks.seen_s == pytest.approx(0.35, abs=1e-3) and not step.enough
+
+
+def test_streams_give_the_time_offset_also_when_read_from_their_files(tmp_path):
+    hand, target = streams(simulate.Sweep(0.15), LEAST_S + 3, 0.0371, np.random.default_rng(1))
+    epoch_ns = 1_790_000_000 * 10**9
+    tracks = Tracks()
+    for stream, add in ((hand, tracks.add_hand), (target, tracks.add_target)):
+        for t_ns, pose in zip(stream.times_ns, stream.poses):
+            add(int(t_ns) + epoch_ns, pose)
+    assert LEAST_S < tracks.seen_s < LEAST_S + 3.1
+    tracks.write(tmp_path)
+    for a, b in ((tracks.hand(), tracks.target()),
+                 (read_track(tmp_path / HAND_FILE), read_track(tmp_path / TARGET_FILE))):  # fmt: skip
+        found = calibrate_tracks(a, b, EYE_IN_HAND)
+        assert found.time_offset_s == pytest.approx(0.0371, abs=5e-4)
+        assert distance_mm(found.transform, X) < 1.0
+
+
+def test_it_is_not_enough_before_there_is_motion_to_tell_the_offset_from():
+    pictures, hands = taken()
+    session, tracks = Session(parse(BOARD), EYE_IN_HAND, moving=True), Tracks()
+    for picture, hand in zip(pictures, hands):
+        step = session.offer(picture, LENS, hand)
+    assert step.enough
+    waiting = tracks.judged(step)
+    assert not waiting.enough and "10 s more" in waiting.advice
+    for k in range(round(LEAST_S * 15) + 2):
+        tracks.add_target(k * 10**9 // 15, session.seen.pose)
+    assert tracks.judged(step).enough
+
+
+MOVES = """
+import sys
+import numpy as np
+from rtde_control import RTDEControlInterface
+from camera_node.robot.calibration.hand_eye.simulated import random_hands
+from camera_node.robot.arm.kinematics import UR3E
+
+host, at = sys.argv[1], np.array(eval(sys.argv[2]))
+control, rng = RTDEControlInterface(host), np.random.default_rng(4)
+while True:
+    postures = UR3E.inverse(random_hands(1, rng, 30.0)[0], at)
+    if postures and np.abs(postures[0].joints - at).max() < 1.5:
+        at = postures[0].joints
+        control.moveJ(at.tolist(), rng.uniform(0.3, 0.9), rng.uniform(1.0, 3.0))
+"""
+
+
+class OnArm:
+    """What a camera on a simulated arm sees of the board, stamped ``late_ns`` after it saw it."""
+
+    camera, fps, contents, intrinsics = "eye", Fraction(15), None, LENS
+
+    def __init__(self, host, late_ns):
+        self._truth, self._late_ns, self._clock = Truth(host), late_ns, WallClock()
+
+    def content(self, tick):
+        return tick
+
+    def read(self, content):
+        t_ns = self._clock.now_ns()
+        hand = UR3E.forward(self._truth.joints(t_ns))
+        picture = simulate.render(parse(BOARD), LENS, simulate.camera_in_target(hand), 1)
+        image = cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB)
+        return Shot(image, Pose.from_matrix(hand), LENS, 0, t_ns + self._late_ns)
+
+    def release(self):
+        self._truth.close()
+
+
+def bench(folder, host, **arm):
+    """A scenario whose arm stands at ``host``, in the middle of the world; its file."""
+    data = yaml.safe_load(scenario(folder).read_text())
+    data["source"]["arm"] |= {"host": host, "base_m": [0.0, 0.0, 0.0], "base_yaw_deg": 0.0, **arm}
+    file = folder / "bench.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return file
+
+
+def looking():
+    """--joints of an arm whose camera sees the board."""
+    hands = simulate.random_hands(60, np.random.default_rng(9), 30.0)
+    postures = (p.joints for hand in hands for p in UR3E.inverse(hand) if not p.singular)
+    begin = next(joints for joints in postures if clear(UR3E, np.eye(4), joints, joints, 0.05).all())
+    return begin, "--joints=" + ",".join(f"{a:.4f}" for a in np.rad2deg(begin))
+
+
+@pytest.mark.slow
+def test_the_arm_goes_by_itself_where_it_is_wanted(tmp_path, monkeypatch, capsys):
+    """The real client library moves a simulated arm, from one look at the board to the answer."""
+    require_ur_rtde()
+    host = own_address()
+    path = {"speed_rad_s": 3.0, "acceleration_rad_s2": 20.0, "floor_m": 0.02}
+    file = bench(tmp_path, host, path=path)
+    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
+    samples = tmp_path / "samples.json"
+    with simulated_arm(host, looking()[1]):
+        arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--drive", "--json"]
+        limits = ["--seconds", "100", "--want-mm", "1", "--samples", str(samples)]
+        assert main(["calibrate", "hand-eye", *arguments, *limits]) == 0
+    said = capsys.readouterr()
+    assert distance_mm(np.array(json.loads(said.out)["transform"]), X) < 2.0
+    hands = np.array([hand for hand, _ in json.loads(samples.read_text())])
+    assert len(hands) >= 10 and "enough" in said.err
+    assert np.linalg.norm(np.ptp(hands[:, :3, 3], axis=0)) > 0.1  # nobody else has moved it
+
+
+def test_a_pose_that_the_arm_cannot_have_is_refused_and_an_arm_that_is_lost_ends_the_session(tmp_path):
+    require_ur_rtde()
+    host = own_address()
+    plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 3.0, "floor_m": 0.02})))
+    begin, joints = looking()
+    with simulated_arm(host, joints) as process:
+        mover = Mover(plan, source_config(plan).arm, agreed_to=False)
+        try:
+            hand = UR3E.forward(begin)
+            for down_m, why in ((2.0, "at all"), (hand[2, 3] - 0.01, "the floor")):
+                lower = hand.copy()
+                lower[2, 3] -= down_m
+                with pytest.raises(PathError, match=why):
+                    mover(lower)
+            process.kill()
+            process.wait()
+            with pytest.raises(ArmStopped, match=host):
+                mover(hand)
+        finally:
+            mover.close()
+
+
+def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path):
+    require_ur_rtde()
+    host = own_address()
+    plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 0.2, "floor_m": 0.02})))
+    begin, joints = looking()
+    goal = begin + np.array([0.8, 0, 0, 0, 0, 0])  # four seconds away
+    with simulated_arm(host, joints):
+        truth, clock = Truth(host), WallClock()
+        mover = Mover(plan, source_config(plan).arm, agreed_to=False)
+
+        def press() -> None:
+            watched = Truth(host)
+            while np.abs(watched.joints(clock.now_ns()) - begin).max() < 0.05:
+                time.sleep(0.01)
+            _thread.interrupt_main()
+
+        thread = threading.Thread(target=press, daemon=True)
+        thread.start()
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                mover(UR3E.forward(goal))
+            stopped = truth.joints(clock.now_ns())
+            time.sleep(0.3)
+            # On its way it would have turned by .06.
+            np.testing.assert_allclose(truth.joints(clock.now_ns()), stopped, atol=1e-4)
+            assert 0.05 < np.abs(stopped - begin).max() < 0.6
+        finally:
+            thread.join()
+            mover.close()
+
+
+def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, capsys):
+    require_ur_rtde()
+    host = own_address()
+    file = bench(tmp_path, host, simulated=False)
+    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
+    begin, joints = looking()
+    words = ["calibrate", "hand-eye", "--live", str(file), "--camera", "eye", "--board", BOARD, "--drive"]
+    with simulated_arm(host, joints):
+        assert main(words) == 2
+        assert "say that its space is clear with --yes" in capsys.readouterr().err
+        terminal = io.StringIO("n\n")
+        terminal.isatty = lambda: True
+        monkeypatch.setattr("sys.stdin", terminal)
+        assert main([*words, "--json"]) == 2
+        said = capsys.readouterr()
+        assert "Is its space clear" in said.err and "nothing was moved" in said.err and not said.out
+        np.testing.assert_allclose(Truth(host).joints(WallClock().now_ns()), begin, atol=1e-5)
+
+
+@pytest.mark.parametrize("more", [["--moving"], ["--eye-to-hand"], ["--hand", "hand.csv"]])
+def test_an_arm_is_driven_only_where_its_surroundings_are_known(tmp_path, capsys, more):
+    words = ["--live", str(scenario(tmp_path)), "--camera", "eye", "--board", BOARD]
+    assert main(["calibrate", "hand-eye", *words, "--drive", *more]) == 2
+    assert "--drive: goes with" in capsys.readouterr().err
+    assert main(["calibrate", "hand-eye", *words, "--yes"]) == 2
+    assert "--yes: goes with --drive" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkeypatch, capsys):
+    """A simulated controller with the real client library, and a camera whose stamps are 60 ms late."""
+    require_ur_rtde()
+    host = own_address()
+    file = bench(tmp_path, host)
+    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 60_000_000)})
+    begin, joints = looking()
+    with simulated_arm(host, joints):
+        moving = subprocess.Popen([sys.executable, "-c", MOVES, host, str(begin.tolist())])
+        try:
+            # Real clocks on a machine that may be held up for a moment: of two recordings, one is not.
+            for tracks in ("first", "second"):
+                arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--moving", "--json",
+                             "--tracks", str(tmp_path / tracks), "--seconds", "60"]  # fmt: skip
+                assert main(["calibrate", "hand-eye", *arguments]) == 0
+                found = json.loads(capsys.readouterr().out)
+                if distance_mm(np.array(found["transform"]), X) < 2.0:
+                    break
+        finally:
+            moving.kill()
+            moving.wait()
+    assert found["time_offset_s"] == pytest.approx(-0.060, abs=0.006)  # joint states take their time too
+    assert distance_mm(np.array(found["transform"]), X) < 2.0
+    words = [
+        "--hand",
+        str(tmp_path / tracks / HAND_FILE),
+        "--target",
+        str(tmp_path / tracks / TARGET_FILE),
+    ]
+    assert main(["calibrate", "hand-eye", *words, "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["time_offset_s"] == pytest.approx(found["time_offset_s"], abs=1e-5)

@@ -1,0 +1,71 @@
+"""Proposed poses: the target stays in the picture, the promise is kept, and fewer are needed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
+from camera_node.robot.calibration.accuracy_cost import _planned
+from camera_node.robot.calibration.hand_eye import simulated
+from camera_node.robot.calibration.hand_eye.joint_refinement import bound
+from camera_node.robot.calibration.hand_eye.next_pose import MAX_TILT_DEG, in_words, propose
+from camera_node.robot.calibration.hand_eye.samples import Samples, inverse
+from freshfield.geometry import so3_exp
+
+X, Y = simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE
+NOISE = (simulated.ARM_RAD, simulated.ARM_M)
+MIDDLE = (inverse(Y) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
+
+
+def known(count: int, seed: int, setup: str = EYE_IN_HAND) -> Samples:
+    hands = simulated.random_hands(count, np.random.default_rng(seed))
+    targets = simulated.seen_targets(hands)
+    return Samples(hands if setup == EYE_IN_HAND else inverse(hands), targets, setup)
+
+
+@pytest.mark.parametrize("setup", [EYE_IN_HAND, EYE_TO_HAND])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_target_is_seen_and_the_promise_is_kept(seed, setup):
+    samples = known(5, seed, setup)
+    found = propose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(seed))
+    # What the camera will see follows from where the hand will be, and the other way round.
+    moved = found.hand if setup == EYE_IN_HAND else inverse(found.hand)
+    np.testing.assert_allclose(moved @ X @ found.target, Y, atol=1e-9)
+    at = found.target @ np.append(MIDDLE, 1.0)
+    assert 0.1 < at[2] < 0.4 and np.all(np.abs(at[:2]) < 0.1 * at[2])
+    assert found.target[2, 2] > np.cos(np.deg2rad(MAX_TILT_DEG)) - 1e-9  # faces the camera
+    hands, targets = np.append(samples.hand, [found.hand], 0), np.append(samples.target, [found.target], 0)
+    with_it = Samples(hands, targets, setup)
+    assert bound(with_it, X, Y, NOISE)[1] == pytest.approx(found.std_mm, rel=1e-6)
+    assert found.std_mm < 0.85 * bound(samples, X, Y, NOISE)[1]
+
+
+def test_eight_planned_poses_are_worth_fifteen_of_chance():
+    planned = [bound(_planned(8, np.random.default_rng(k))[0], X, Y, NOISE) for k in range(8)]
+    chance = [bound(known(15, k), X, Y, NOISE) for k in range(8)]
+    assert np.mean(planned, axis=0)[1] < 1.05 * np.mean(chance, axis=0)[1]
+
+
+def test_same_seed_same_proposal():
+    samples = known(5, 1)
+    a, b = (propose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(a.hand, b.hand)
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift", "words"),
+    [
+        (
+            (0.5, 0.1, 0),
+            (0.1, 0, -0.03),
+            "by about 29 degrees, mostly about its +x, move +10 cm x, -3 cm z",
+        ),
+        ((0, -1.0, 0), (0, 0, 0.001), "by about 57 degrees, mostly about its -y"),
+    ],
+)
+def test_a_way_in_words(turn, shift, words):
+    now = simulated.random_hands(1, np.random.default_rng(0))[0]
+    step = np.eye(4)
+    step[:3, :3], step[:3, 3] = so3_exp(turn), shift
+    assert in_words(now, now @ step) == f"turn {words}"

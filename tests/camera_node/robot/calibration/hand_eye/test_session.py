@@ -1,0 +1,190 @@
+"""The guided calibration, with the real detector on rendered pictures, and through the command."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.cli import main
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, read_hand_eye
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.files import read_lens, read_pairs, read_visp_pose
+from camera_node.robot.calibration.hand_eye import simulated
+from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, calibrate, distance_mm
+from camera_node.robot.calibration.hand_eye.live import guide
+from camera_node.robot.calibration.hand_eye.session import Session, preview
+from camera_node.robot.calibration.targets import parse
+from camera_node.sources import Shot
+from freshfield.geometry import Pose
+from tests.camera_node.robot.calibration.pictures import BOARD, LENS, as_scenario, taken
+from tests.conftest import data_dir
+
+X = simulated.CAMERA_IN_HAND
+
+
+def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough():
+    pictures, hands = taken()
+    hands = simulated.disturbed(hands, np.random.default_rng(0), 1e-4, 2e-4)
+    session = Session(parse(BOARD), EYE_IN_HAND, want_mm=0.5)
+    steps = []
+    for picture, hand in zip(pictures, hands):
+        assert session.offer(picture, LENS, hand).outcome == "hand moving"
+        steps.append(session.offer(picture, LENS, hand))
+        assert steps[-1].outcome == "kept"
+        again = session.offer(picture, LENS, hand)
+        assert again.outcome == f"like pose {len(steps)}" and again.count == len(steps)
+    assert [s.count for s in steps] == list(range(1, 13))
+    assert steps[0].std_mm is None and "turn by about" in steps[0].advice and not steps[0].enough
+    assert "turn by about" in steps[5].advice  # where to, from where the hand is
+    assert steps[-1].enough and steps[-1].std_mm < 0.5 and "enough" in steps[-1].line
+    found = calibrate(session.samples())
+    assert distance_mm(found.transform, X) < 3 * steps[-1].std_mm
+    assert angle_deg(found.transform, X) < 0.1
+    assert 0.01 < session.pixel_noise < 0.2
+    picture = preview(pictures[-1], session.corners, steps[-1])
+    assert picture.shape == (LENS.height + 40, LENS.width, 3)
+
+
+def test_a_picture_without_the_target_is_not_kept():
+    _, hands = taken()
+    session = Session(parse(BOARD), EYE_IN_HAND, moving=True)
+    step = session.offer(np.zeros((240, 320, 3), np.uint8), LENS, hands[0])
+    assert (step.outcome, step.count, step.enough) == ("target not found", 0, False)
+    with pytest.raises(CalibrationError, match="too few poses: 0"):
+        calibrate(session.samples())
+
+
+def test_an_earlier_session_is_gone_on_with():
+    pictures, hands = taken()
+    kept = []
+    first = Session(parse(BOARD), EYE_IN_HAND, moving=True, kept=kept.append)
+    for picture, hand in zip(pictures[:6], hands):
+        first.offer(picture, LENS, hand)
+    second = Session(parse(BOARD), EYE_IN_HAND, moving=True, before=kept[-1])
+    assert second.offer(pictures[2], LENS, hands[2]).outcome == "like pose 3"
+    step = second.offer(pictures[6], LENS, hands[6])
+    assert (step.outcome, step.count) == ("kept", 7)
+    assert distance_mm(calibrate(second.samples()).transform, X) < 1.0
+
+
+def test_real_pictures_replayed():
+    """The Franka's eight pictures as an operator would have taken them."""
+    folder = data_dir("handeye_visp_franka")
+    lens = read_lens(folder / "franka_camera.xml")
+    session = Session(parse("chessboard:9x6:23.6mm"), EYE_IN_HAND, want_mm=3.0, moving=True)
+    for k in range(1, 9):
+        hand = read_visp_pose(folder / f"franka_pose_rPe_{k}.yaml")
+        step = session.offer(cv2.imread(str(folder / f"franka_image-{k}.png")), lens, hand)
+        assert step.outcome == "kept"
+    # This arm is off by millimetres: eight poses are not enough, and it says so.
+    assert not step.enough and 1.0 < step.std_mm < 6.0
+    published = np.loadtxt(folder / "expected_eMc.txt")
+    found = calibrate(session.samples(), "park").transform
+    assert angle_deg(found, published) < 0.1 and distance_mm(found, published) < 1.0
+
+
+class Cell:
+    """A camera on a hand that goes where it is sent, at once or not at all; it renders what it sees."""
+
+    camera, fps, contents, intrinsics = "eye", Fraction(30), None, LENS
+
+    def __init__(self, hand: np.ndarray, reach_m: float) -> None:
+        self.hand, self.reach_m, self.refused = hand, reach_m, 0
+        self._seen: tuple[bytes, Shot] | None = None
+
+    def content(self, tick: int) -> int:
+        return tick
+
+    def read(self, content: int) -> Shot:
+        if self._seen is None or self._seen[0] != self.hand.tobytes():
+            picture = simulated.render(parse(BOARD), LENS, simulated.camera_in_target(self.hand), 2)
+            noisy = simulated.disturbed(self.hand[None], np.random.default_rng(content), 1e-4, 2e-4)[0]
+            shot = Shot(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB), Pose.from_matrix(noisy), LENS)
+            self._seen = self.hand.tobytes(), shot
+        return self._seen[1]
+
+    def move(self, hand: np.ndarray) -> None:
+        if np.linalg.norm(hand[:3, 3]) > self.reach_m:
+            self.refused += 1
+            raise ValueError("out of reach")
+        self.hand = hand
+
+
+@pytest.mark.parametrize("reach_m", [pytest.param(simulated.REACH_M, marks=pytest.mark.slow), 0.285])
+def test_it_moves_a_hand_by_itself_from_one_look_at_the_target(reach_m):
+    """Also an arm that refuses some of the places: others are proposed."""
+    cell = Cell(taken()[1][0], reach_m)
+    session = Session(parse(BOARD), EYE_IN_HAND, want_mm=0.4)
+    outcomes = []
+    last = guide(
+        cell, "png", None, session, lambda tick: tick < 100,
+        lambda image, step, session: outcomes.append(step.outcome), move=cell.move,
+    )  # fmt: skip
+    assert last.enough and last.std_mm <= 0.4 and last.count <= 16
+    assert (cell.refused > 0) == (reach_m < simulated.REACH_M)
+    assert outcomes.count("kept") == last.count and "hand moving" in outcomes
+    found = calibrate(session.samples())
+    assert distance_mm(found.transform, X) < 3 * last.std_mm
+    assert angle_deg(found.transform, X) < 3 * last.std_deg
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    """A recorded camera whose poses are the hand's: photos with transforms.json."""
+    return as_scenario(tmp_path, LENS, *taken())
+
+
+def test_live_from_the_command_line(scenario, tmp_path, capsys):
+    base = ["calibrate", "hand-eye", "--live", str(scenario), "--board", BOARD, "--camera"]
+    out, samples, seen = tmp_path / "hand.yaml", tmp_path / "kept.json", tmp_path / "seen.png"
+    arguments = [
+        *base,
+        "eye",
+        "--moving",
+        "--out",
+        str(out),
+        "--samples",
+        str(samples),
+        "--preview",
+        str(seen),
+    ]
+    assert main([*arguments, "--json"]) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert distance_mm(np.array(found["transform"]), X) < 0.5
+    assert said.err.splitlines()[-1].endswith("kept: enough") and "10 poses" in said.err
+    np.testing.assert_allclose(read_hand_eye(out).transform, found["transform"], atol=1e-8)
+    assert len(read_pairs(samples, EYE_IN_HAND)) == 10 and cv2.imread(str(seen)) is not None
+    # Again, with what is kept: it is enough from the first new one on.
+    assert main([*arguments, "--json"]) == 0
+    assert "going on with its 10 samples" in capsys.readouterr().err
+    assert main([*base, "other"]) == 2
+    assert "has eye, got other" in capsys.readouterr().err
+
+
+def test_hand_poses_from_a_file_by_time(scenario, tmp_path, capsys):
+    """The same pictures, their poses from the side: one of them too far in time from any."""
+    _, hands = taken()
+    lines = ["t,x,y,z,qx,qy,qz,qw"]
+    for k, hand in enumerate(hands):
+        pose = Pose.from_matrix(hand)
+        w, x, y, z = pose.quaternion
+        if k != 4:
+            lines.append(",".join(map(repr, [k / 500, *pose.translation_m, x, y, z, w])))
+    (tmp_path / "hand.csv").write_text("\n".join(lines))
+    arguments = ["--live", str(scenario), "--camera", "eye", "--board", BOARD, "--moving", "--json",
+                 "--hand", str(tmp_path / "hand.csv"), "--max-gap-ms", "1"]  # fmt: skip
+    assert main(["calibrate", "hand-eye", *arguments]) == 0
+    said = capsys.readouterr()
+    assert "nearest pose is 2.0 ms away" in said.err
+    assert distance_mm(np.array(json.loads(said.out)["transform"]), X) < 0.5
+
+
+def test_time_that_runs_out_ends_with_what_there_is(scenario, capsys):
+    assert main(["calibrate", "hand-eye", "--live", str(scenario), "--board", BOARD, "--camera", "eye",
+                 "--moving", "--seconds", "0.003"]) == 2  # fmt: skip
+    assert "too few poses: 2" in capsys.readouterr().err

@@ -1,0 +1,287 @@
+"""``camera-node calibrate`` as a person meets it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.cli import main
+from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND, read_hand_eye
+from camera_node.robot.calibration.accuracy_cost import streams
+from camera_node.robot.calibration.files import Track, pairs_json, read_visp_pose
+from camera_node.robot.calibration.hand_eye import simulated
+from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance_mm
+from camera_node.robot.calibration.hand_eye.samples import inverse
+from camera_node.robot.calibration.targets import parse
+from freshfield.geometry import Pose
+from tests.conftest import data_dir
+
+X = simulated.CAMERA_IN_HAND
+
+
+def hand_eye(*arguments) -> int:
+    return main(["calibrate", "hand-eye", *map(str, arguments)])
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    file = tmp_path / "pairs.json"
+    file.write_text(json.dumps(pairs_json(simulated.samples(15, np.random.default_rng(1)))))
+    return file
+
+
+def write_csv(file, track: Track) -> None:
+    lines = ["t,x,y,z,qx,qy,qz,qw"]
+    for t_ns, matrix in zip(track.times_ns, track.poses):
+        pose = Pose.from_matrix(matrix)
+        w, x, y, z = pose.quaternion
+        lines.append(",".join(map(repr, [int(t_ns) / 1e9, *pose.translation_m, x, y, z, w])))
+    file.write_text("\n".join(lines) + "\n")
+
+
+def test_json_is_the_answer_and_what_it_is_worth_and_nothing_else_is_printed(pairs, capsys):
+    assert hand_eye("--pairs", pairs, "--json") == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert list(found) == ["transform", "time_offset_s", "residual_mm", "residual_deg", "method",
+                           "std_mm", "std_deg", "warnings"]  # fmt: skip
+    assert 0.0 < found["std_mm"] < 1.0 and 0.0 < found["std_deg"] < 0.2 and found["warnings"] == []
+    assert found["method"] == "refined" and found["time_offset_s"] == 0.0 and said.err == ""
+    assert distance_mm(np.array(found["transform"]), X) < 1.5
+    assert hand_eye("--pairs", pairs, "--json", "--method", "tsai") == 0
+    assert json.loads(capsys.readouterr().out)["method"] == "tsai"
+
+
+def test_scripts_are_warned_too(tmp_path, capsys):
+    few = tmp_path / "few.json"
+    few.write_text(json.dumps(pairs_json(simulated.samples(6, np.random.default_rng(1)))))
+    assert hand_eye("--pairs", few, "--json") == 0
+    said = capsys.readouterr()
+    assert "6 poses: 10 to 20 well spread ones" in json.loads(said.out)["warnings"][0]
+    assert said.err.startswith("note: 6 poses: 10 to 20")
+
+
+@pytest.mark.parametrize("wrong", ["inverted", "millimetres"])
+def test_nonsense_is_refused_and_not_an_answer(wrong, tmp_path, capsys):
+    good = simulated.samples(15, np.random.default_rng(1))
+    hand, target = good.hand.copy(), good.target.copy()
+    if wrong == "inverted":
+        target = inverse(target)
+    else:
+        hand[:, :3, 3] *= 1e3
+        target[:, :3, 3] *= 1e3
+    file, out = tmp_path / "pairs.json", tmp_path / "hand.yaml"
+    file.write_text(json.dumps([[h.tolist(), t.tolist()] for h, t in zip(hand, target)]))
+    assert hand_eye("--pairs", file, "--json", "--out", out) == 2
+    said = capsys.readouterr()
+    assert "not their inverses, in metres" in said.err and said.out == "" and not out.exists()
+
+
+def test_an_offset_between_two_clocks_beginnings_is_told_and_not_written(tmp_path, capsys):
+    hand, target = streams(simulated.Sweep(0.15), 12.0, 1.7e9, np.random.default_rng(5))
+    write_csv(tmp_path / "hand.csv", hand)
+    write_csv(tmp_path / "seen.csv", target)
+    tracks = "--hand", tmp_path / "hand.csv", "--target", tmp_path / "seen.csv", "--json"
+    assert hand_eye(*tracks) == 0
+    assert "the two streams count from different beginnings" in capsys.readouterr().err
+    out = tmp_path / "hand.yaml"
+    assert hand_eye(*tracks, "--out", out) == 2
+    assert "the node would refuse a time offset of 1700000000 s" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_the_table_the_file_and_the_picture(pairs, tmp_path, capsys):
+    out, plot = tmp_path / "hand.yaml", tmp_path / "hand.png"
+    assert hand_eye("--pairs", pairs, "--out", out, "--plot", plot) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("tsai", "park", "horaud", "andreff", "daniilidis", "refined"))
+    assert "leaving out one of 15" in said and "the arm's noise, estimated" in said
+    loaded = read_hand_eye(out)
+    assert distance_mm(loaded.transform, X) < 1.5
+    assert loaded.details["poses"] == 15 and 0.2 < loaded.details["arm_noise_mm"] < 1.0
+    assert cv2.imread(str(plot)) is not None
+
+
+def test_eye_to_hand(tmp_path, capsys):
+    samples = simulated.samples(15, np.random.default_rng(2), setup=EYE_TO_HAND)
+    (tmp_path / "pairs.json").write_text(json.dumps(pairs_json(samples)))
+    assert hand_eye("--pairs", tmp_path / "pairs.json", "--eye-to-hand", "--out", tmp_path / "eye.yaml") == 0
+    assert "camera in base" in capsys.readouterr().out
+    found = read_hand_eye(tmp_path / "eye.yaml")
+    assert found.setup == EYE_TO_HAND and distance_mm(found.transform, X) < 1.5
+
+
+def test_streams_with_an_unknown_offset_and_untidy_stamps(tmp_path, capsys):
+    hand, target = streams(simulated.Sweep(0.15), 12.0, 0.4321, np.random.default_rng(5))
+    order = np.arange(len(hand.times_ns))
+    order[100:104] = [103, 100, 102, 101]
+    order = np.insert(order, 500, 499)
+    write_csv(tmp_path / "hand.csv", Track(hand.times_ns[order], hand.poses[order], hand.counts))
+    write_csv(tmp_path / "seen.csv", target)
+    assert hand_eye("--hand", tmp_path / "hand.csv", "--target", tmp_path / "seen.csv", "--json") == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert found["time_offset_s"] == pytest.approx(0.4321, abs=5e-4)
+    assert distance_mm(np.array(found["transform"]), X) < 1.0
+    assert "hand: 1 stamps came twice (the first is used), 3 out of order" in said.err
+
+
+def test_a_real_folder(capsys):
+    folder = data_dir("handeye_visp_franka")
+    assert hand_eye(folder, "--board", "chessboard:9x6:23.6mm", "--method", "park", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    published = np.loadtxt(folder / "expected_eMc.txt")
+    assert distance_mm(np.array(found["transform"]), published) < 1.0
+    assert angle_deg(np.array(found["transform"]), published) < 0.1
+
+
+def test_mistakes_are_one_line(tmp_path, capsys, pairs):
+    def fails(*arguments) -> str:
+        assert hand_eye(*arguments) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("camera-node: ") and said.count("\n") == 1, said
+        return said
+
+    assert "expected one of FOLDER" in fails()
+    assert "expected one of FOLDER" in fails("--pairs", pairs, "--live", "room")
+    assert "expected one of FOLDER" in fails("--hand", pairs)
+    assert "expected one of FOLDER" in fails("--live", "room", "--target", pairs)
+    assert "none.json: cannot be read: No such file" in fails("--pairs", tmp_path / "none.json")
+    for ignored in (
+        ("--board", "qr:60mm"),
+        ("--lens", "x"),
+        ("--camera", "eye"),
+        ("--samples", "x"),
+        ("--moving",),
+    ):
+        assert f"{ignored[0]}: goes with " in fails("--pairs", pairs, *ignored)
+    assert "--max-gap-ms: goes with --hand CSV or --live" in fails(tmp_path, "--max-gap-ms", "5")
+    assert "--camera ID: say which" in fails("--live", "room", "--board", "qr:60mm")
+    flat = [[matrix[:3] for matrix in pair] for pair in json.loads(pairs.read_text())]
+    (tmp_path / "flat.json").write_text(json.dumps(flat))
+    assert "pair 1: expected [hand in base, target in camera], 4 x 4 each: got 3 x 4" in fails(
+        "--pairs", tmp_path / "flat.json"
+    )
+    assert "--method: expected one of tsai" in fails("--pairs", pairs, "--method", "magic")
+    assert "--board SPEC" in fails(tmp_path)
+    assert "has 0 camera XML files" in fails(tmp_path, "--board", "qr:60mm")
+    assert "expected positive" in fails(
+        "--live", "room", "--camera", "cam00", "--board", "qr:60mm", "--want-mm", "-1"
+    )
+    assert "--out" in fails("--pairs", pairs, "--out", tmp_path / "no" / "folder.yaml")
+    assert "--plot" in fails("--pairs", pairs, "--plot", tmp_path / "no" / "folder.png")
+    (tmp_path / "x.csv").write_text("t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,2,3\n")
+    assert "x.csv:3: expected t tx ty tz" in fails(
+        "--hand", tmp_path / "x.csv", "--target", tmp_path / "x.csv"
+    )
+    (tmp_path / "three.json").write_text(json.dumps(json.loads(pairs.read_text())[:2]))
+    assert "too few poses: 2" in fails("--pairs", tmp_path / "three.json")
+
+
+@pytest.mark.parametrize("option", ["--out", "--plot"])
+def test_an_answer_is_not_lost_with_its_file(option, tmp_path, capsys, pairs):
+    assert hand_eye("--pairs", pairs, "--json", option, tmp_path / "no" / "folder.png") == 2
+    said = capsys.readouterr()
+    assert distance_mm(np.array(json.loads(said.out)["transform"]), X) < 1.5
+    assert said.err.startswith(f"camera-node: {option}: ")
+
+
+@pytest.mark.parametrize("spelling", ["charuco:7x5:30mm:22mm", "apriltag:36h11:0:80mm", "qr:60mm:hello"])
+def test_a_printed_target_is_one(spelling, tmp_path, capsys):
+    file = tmp_path / "board.png"
+    assert main(["calibrate", "target", spelling, "--out", str(file), "--dpi", "200"]) == 0
+    assert "must measure" in capsys.readouterr().out
+    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    corners = parse(spelling).find(picture)
+    # Metres a pixel, over the whole target: what --dpi says.
+    pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
+    assert pixels == pytest.approx(200 / 0.0254, rel=0.02)
+
+
+def test_a_printed_chessboard_measures_what_is_said(tmp_path, capsys):
+    """To half a pixel over the whole board, also where a square is not whole pixels (118.1 of them here)."""
+    file = tmp_path / "board.png"
+    assert main(["calibrate", "target", "chessboard:9x6:10mm", "--out", str(file), "--dpi", "300"]) == 0
+    assert "it must measure 100.0 x 70.0 mm" in capsys.readouterr().out
+    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    dark = np.argwhere(picture < 128)
+    measured_mm = (np.ptp(dark, axis=0) + 1)[::-1] / 300 * 25.4
+    assert measured_mm == pytest.approx((100.0, 70.0), abs=0.1)
+    corners = parse("chessboard:9x6:10mm").find(picture)
+    assert np.ptp(corners.pixels[:, 0]) / 300 * 25.4 == pytest.approx(80.0, abs=0.05)
+
+
+@pytest.mark.parametrize("what", ["hand-eye --pairs x", "intrinsics x --board x", "accuracy"])
+def test_without_scipy_it_says_what_to_install(what, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    assert main(["calibrate", *what.split()]) == 2
+    assert "pip install 'freshfield[calibrate]'" in capsys.readouterr().err
+
+
+def test_a_streaming_node_imports_none_of_it():
+    code = (
+        "import sys, camera_node.cli, camera_node.robot.arm.hand_eye_mount, camera_node.pose.pairing\n"
+        "unasked = ('scipy', 'camera_node.robot.calibration.hand_eye.samples')\n"
+        "assert not [m for m in sys.modules if m.startswith(unasked)]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_help_teaches(capsys):
+    with pytest.raises(SystemExit) as end:
+        hand_eye("--help")
+    assert end.value.code == 0
+    said = capsys.readouterr().out
+    assert "camera-node calibrate hand-eye --pairs samples.json --json" in said and "--want-mm" in said
+
+
+def test_visps_poses_are_rotation_vectors(tmp_path):
+    file = tmp_path / "pose_rPe_1.yaml"
+    values = map(float, (0.1, 0.2, 0.3, 0, 0, np.pi / 2))
+    file.write_text("rows: 6\ncols: 1\ndata: \n" + "".join(f"  - [{v!r}]\n" for v in values))
+    found = read_visp_pose(file)
+    np.testing.assert_allclose(found[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    assert found[:3, 3].tolist() == [0.1, 0.2, 0.3]
+
+
+def test_the_study_prints_its_tables(tmp_path, capsys):
+    from camera_node.robot.calibration import accuracy_cost
+
+    tables = {
+        "pairing": accuracy_cost.pairing(1.0, (8.0, 100.0), (0.25,)),
+        "poses": accuracy_cost.poses((6, 15), 2),
+        "offset": accuracy_cost.offset(1, (5.0,)),
+    }
+    of = {(r["arm_period_ms"], r["pairing"]): r for r in tables["pairing"]}
+    for period_ms in (8.0, 100.0):
+        for better in ("line", "screw"):
+            assert of[period_ms, better]["mm_p95"] < 0.2 * of[period_ms, "nearest"]["mm_p95"]
+    assert of[100.0, "nearest"]["mm_p95"] > 5 * of[8.0, "nearest"]["mm_p95"]
+    by = {(r["poses"], r["method"]): r for r in tables["poses"]}
+    assert by[15, "refined"]["bound_mm"] < by[6, "refined"]["bound_mm"]
+    assert all(r["trials"] == 2 and r["rms_mm_std"] > 0 and r["rms_deg_std"] > 0 for r in tables["poses"])
+    assert all(r["error_ms"] < 1.0 and not r["failed"] for r in tables["offset"])
+    for name, rows in tables.items():
+        accuracy_cost.write(name, rows, tmp_path / "out")
+        assert accuracy_cost.show(name, rows).count("\n") == len(rows) + 2
+    accuracy_cost.draw(tables, tmp_path / "out" / "accuracy.png")
+    assert (tmp_path / "out" / "pairing.csv").read_text().count("\n") == 7
+    assert cv2.imread(str(tmp_path / "out" / "accuracy.png")) is not None
+
+
+def test_the_deviation_of_an_rms_is_what_it_deviates_by():
+    from camera_node.robot.calibration.accuracy_cost import rms
+
+    rng = np.random.default_rng(4)
+    errors = np.linalg.norm(rng.normal(size=(500, 20, 2, 3)), axis=-1) * [1.0, 5.0]
+    found, deviations = map(np.array, zip(*map(rms, errors)))
+    np.testing.assert_allclose(found.mean(axis=0), np.sqrt(3) * np.array([1.0, 5.0]), rtol=0.02)
+    np.testing.assert_allclose(deviations.mean(axis=0), found.std(axis=0), rtol=0.1)
+    few, unknown = rms(np.array([[3.0, 4.0]]))
+    assert few.tolist() == [3.0, 4.0] and np.isnan(unknown).all()
+    assert np.isnan(rms(np.zeros((0, 2)))).all() and np.array_equal(rms(np.zeros((3, 2))), np.zeros((2, 2)))

@@ -1,0 +1,143 @@
+"""The real detectors on pictures that the project's own ray caster made, so that the true pose is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.hand_eye import simulated
+from camera_node.robot.calibration.hand_eye.calibrate import angle_deg
+from camera_node.robot.calibration.hand_eye.samples import inverse
+from camera_node.robot.calibration.targets import Corners, locate, parse
+from freshfield.geometry import Pinhole, look_at, so3_exp
+
+LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001))
+# Where a picture's own origin lies in its target's axes: a chessboard's is its first inner corner.
+ORIGIN = {"chessboard": 2 * 0.02}
+# (spelling, degrees, mm) allowed: boards have dozens of corners, tags four.
+KINDS = [
+    ("charuco:7x5:24mm:18mm", 0.1, 0.1),
+    ("chessboard:7x4:20mm", 0.1, 0.1),
+    ("apriltag:36h11:3:80mm", 0.2, 0.5),
+    ("qr:80mm:here", 0.2, 0.5),
+]
+
+
+def cameras(target) -> list[np.ndarray]:
+    """Two cameras in the picture's axes (z into the paper), one of them upside down."""
+    width, height = target.size_m
+    middle = np.array([width / 2, height / 2, 0.0])
+    out = []
+    for x, y, z, roll in ((0.05, 0.08, -0.22, 0.4), (-0.07, 0.03, -0.20, 3.3)):
+        camera = look_at(middle + np.array([x, y, z]), middle, up=(0.0, -1.0, 0.0))
+        camera[:3, :3] = camera[:3, :3] @ so3_exp([0, 0, roll])
+        out.append(camera)
+    return out
+
+
+@pytest.mark.parametrize(("spelling", "deg", "mm"), KINDS)
+def test_a_rendered_target_is_found_where_it_is(spelling, deg, mm):
+    target = parse(spelling)
+    for camera in cameras(target):
+        picture = simulated.render(target, LENS, camera, 2)
+        corners = target.find(picture)
+        assert corners is not None
+        found = locate(corners, LENS)
+        truth = inverse(camera)
+        truth[:3, 3] += truth[:3, :3] @ ([ORIGIN.get(spelling.split(":")[0], 0.0)] * 2 + [0.0])
+        assert angle_deg(found.pose, truth) < deg
+        assert np.linalg.norm(found.pose[:3, 3] - truth[:3, 3]) * 1e3 < mm
+        assert found.error_px < 0.25
+
+
+@pytest.mark.parametrize(("spelling", "deg", "mm"), KINDS)
+def test_nothing_is_found_where_nothing_is(spelling, deg, mm):
+    noise = np.random.default_rng(0).integers(0, 256, (120, 160)).astype(np.uint8)
+    for picture in (np.zeros((120, 160), np.uint8), np.full((120, 160), 255, np.uint8), noise):
+        assert parse(spelling).find(picture) is None
+
+
+def test_the_wrong_tag_and_the_wrong_text_are_not_taken():
+    printed = np.pad(parse("apriltag:36h11:3:80mm").draw(200), 40, constant_values=255)
+    assert parse("apriltag:36h11:3:80mm").find(printed) is not None
+    assert parse("apriltag:36h11:4:80mm").find(printed) is None
+    twice = np.hstack([printed, printed])
+    assert parse("apriltag:36h11:3:80mm").find(twice) is None
+    printed = np.pad(parse("qr:80mm:here").draw(400), 60, constant_values=255)
+    assert parse("qr:80mm:here").find(printed) is not None and parse("qr:80mm").find(printed) is not None
+    assert parse("qr:80mm:there").find(printed) is None
+
+
+@pytest.mark.parametrize(
+    "turn", [None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE]
+)
+def test_a_chessboard_is_the_same_way_up_however_it_is_held(turn):
+    """Its first corner stays the first: the picture is turned and the corners with it."""
+    target = parse("chessboard:7x4:20mm")
+    straight = cv2.GaussianBlur(target.draw(600), (0, 0), 1.0)
+    first = target.find(straight).pixels[0]
+    height, width = straight.shape
+    if turn is None:
+        picture, expected = straight, first
+    else:
+        picture = cv2.rotate(straight, turn)
+        x, y = first
+        expected = {
+            cv2.ROTATE_90_CLOCKWISE: (height - y, x),
+            cv2.ROTATE_180: (width - x, height - y),
+            cv2.ROTATE_90_COUNTERCLOCKWISE: (y, width - x),
+        }[turn]
+    np.testing.assert_allclose(target.find(picture).pixels[0], expected, atol=0.1)
+
+
+@pytest.mark.parametrize("roll", [0.0, np.pi])
+def test_the_covariance_is_what_noisy_corners_scatter_by(roll):
+    """Also for a target turned by half a turn, where rotation vectors are at their worst."""
+    target = parse("charuco:7x5:24mm:18mm")
+    camera = cameras(target)[0]
+    camera[:3, :3] = camera[:3, :3] @ so3_exp([0, 0, roll - 0.4])
+    points = np.array([[x, y, 0] for y in (0, 0.03, 0.06) for x in (0, 0.04, 0.08, 0.12)])
+    truth = inverse(camera)
+    exact = LENS.project(points @ truth[:3, :3].T + truth[:3, 3])
+    rng = np.random.default_rng(1)
+    poses = [locate(Corners(exact + rng.normal(0, 0.1, exact.shape), points), LENS).pose for _ in range(400)]
+    turns = np.array([cv2.Rodrigues(truth[:3, :3].T @ p[:3, :3])[0].ravel() for p in poses])
+    off = np.concatenate([turns, np.array(poses)[:, :3, 3] - truth[:3, 3]], axis=1)
+    said = locate(Corners(exact, points), LENS).per_pixel * 0.1**2
+    scatter = np.cov(off.T)
+    np.testing.assert_allclose(np.sqrt(np.diag(scatter)), np.sqrt(np.diag(said)), rtol=0.15)
+    # Whitened by what was said, the scatter is round.
+    root = np.linalg.inv(np.linalg.cholesky(said))
+    np.testing.assert_allclose(np.linalg.eigvalsh(root @ scatter @ root.T), 1.0, atol=0.45)
+
+
+def test_a_small_tag_seen_straight_on_may_be_tilted_either_way():
+    points = np.array([[0, 0, 0], [0.02, 0, 0], [0.02, 0.02, 0], [0, 0.02, 0]])
+    pixels = LENS.project(points - [0.01, 0.01, -0.8])
+    wobble = np.random.default_rng(0).normal(0, 0.05, pixels.shape)
+    with pytest.raises(CalibrationError, match="tilted either way"):
+        locate(Corners(pixels + wobble, points), LENS)
+
+
+@pytest.mark.parametrize(
+    ("spelling", "why"),
+    [
+        ("", "expected for example"),
+        ("circles:3x4", "no kind 'circles'"),
+        ("charuco:7x5", "expected for example"),
+        ("charuco:7x5:20mm:30mm", "smaller than the squares"),
+        ("charuco:7x5:30mm:20mm:9X9_50", "no dictionary 9X9_50"),
+        ("chessboard:9x6:23.6", "needs a unit"),
+        ("chessboard:8x6:20mm", "odd and the other even"),
+        ("chessboard:2x6:20mm", "3x3"),
+        ("apriltag:99h9:0:80mm", "families are"),
+        ("apriltag:36h11:9999:80mm", "has numbers 0 to 586"),
+        ("qr:90m", "not within"),
+    ],
+)
+def test_spellings_that_are_none_say_what_is_one(spelling, why):
+    with pytest.raises(CalibrationError, match=why) as error:
+        parse(spelling)
+    assert "charuco:7x5:30mm:22mm" in str(error.value)

@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+import csv
+import json
+import math
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+
+from camera_node.cli import main
+from camera_node.robot.arm.joint_states import ArmError
+from camera_node.robot.arm.kinematics import UR3E
+from camera_node.robot.hand_camera import Truth
+from camera_node.robot.teleop import sinks
+from camera_node.robot.teleop.command import teleop_config
+from camera_node.robot.teleop.network_stylus import encode
+from camera_node.robot.teleop.teleoperator import Command
+from freshfield.clock import WallClock
+from freshfield.scenario import load
+from tests.camera_node.robot.arm.simulated import (
+    own_address,
+    require_ur_rtde,
+    simulated_arm,
+    wait_until_moving,
+)
+from tests.camera_node.robot.teleop.checks import HOME, sample
+from tests.conftest import ROOT
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+class Sender(threading.Thread):
+    """A stylus that moves along x for as long as the block lasts; its clutch is pressed after a while."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(daemon=True)
+        self._port, self._over = port, threading.Event()
+
+    def run(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+            k = 0
+            while not self._over.wait(0.005):
+                k += 1
+                position = (0.0, 0.06 * math.sin(0.02 * k), 0.0)
+                one.sendto(encode(sample(k * 5_000_000, position, k % 200 > 20)), ("127.0.0.1", self._port))
+
+    def __enter__(self) -> Sender:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self.join()
+
+
+def cell(folder: Path, host: str, teleop: str = "") -> Path:
+    text = (ROOT / "deploy/scenarios/cell.yaml").read_text().replace("127.0.0.2", host)
+    mount = ROOT / "deploy/lab/hand-eye-example.yaml"
+    text = text.replace("../lab/hand-eye-example.yaml", str(mount))
+    path = folder / "cell.yaml"
+    path.write_text(text.replace("    path:\n", f"    teleop: {{{teleop}}}\n    path:\n") if teleop else text)
+    return path
+
+
+def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
+    port, file = free_port(), tmp_path / "path.csv"
+    scenario = cell(tmp_path, "127.0.0.2", "solver: dls, speed_rad_s: 0.5, scale: [1, 2, 1]")
+    with Sender(port):
+        status = main(
+            ["teleop", str(scenario), "--stylus", f"network:{port}", "--seconds", "2", "--dry-run", str(file),
+             "--json"]
+        )  # fmt: skip
+    assert status == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["messages"]["engaged"] >= 1 and summary["solver"] == "dls"
+    rows = list(csv.DictReader(file.open()))
+    assert len(rows) == summary["ticks"]
+    joints = np.array([[float(row[f"q{k}_rad"]) for k in range(1, 7)] for row in rows])
+    assert np.allclose(joints[0], HOME, atol=0.01)
+    assert np.abs(np.diff(joints, axis=0)).max() * 125.0 <= 0.5 + 1e-6
+    flange = np.array([[float(row[f"{axis}_m"]) for axis in "xyz"] for row in rows])
+    assert np.ptp(flange[:, 1]) > 0.01
+    assert np.allclose(flange[-1], UR3E.forward(joints[-1])[:3, 3], atol=1e-6)
+    assert np.allclose(joints[-1], joints[-2]), "it ends at rest"
+
+
+def test_the_real_library_moves_a_simulated_controller(tmp_path, capsys):
+    require_ur_rtde()
+    host, port = own_address(), free_port()
+    with simulated_arm(host), Sender(port):
+        command = [
+            sys.executable, "-m", "camera_node.cli", "teleop", str(cell(tmp_path, host, "solver: dls")),
+            "--stylus", f"network:{port}", "--seconds", "3", "--json",
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+        summary = json.loads(done.stdout)
+        assert summary["messages"]["engaged"] >= 1
+        with socket.create_connection((host, 30010)) as truth:
+            truth.sendall(b"9223372036854775807\n")
+            joints = np.array(json.loads(truth.makefile().readline())["q"])
+    assert np.abs(joints - HOME).max() > 1e-3, "the arm has moved"
+
+
+@pytest.mark.slow
+def test_an_arm_that_goes_silent_ends_it_with_one_line(tmp_path):
+    require_ur_rtde()
+    host, port = own_address(), free_port()
+    file = cell(tmp_path, host, "solver: dls")
+    file.write_text(file.read_text().replace("simulated: true", "simulated: false"))  # patience as on a bench
+    command = [
+        sys.executable, "-m", "camera_node.cli", "teleop", str(file), "--stylus", f"network:{port}",
+        "--yes", "--json",
+    ]  # fmt: skip
+    with simulated_arm(host) as arm, Sender(port):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        wait_until_moving(Truth(host), process)
+        arm.send_signal(signal.SIGSTOP)
+        try:
+            assert process.wait(30.0) == 1
+        finally:
+            process.kill()
+            arm.send_signal(signal.SIGCONT)
+    out, said = process.communicate()
+    assert f"camera-node: arm at {host}" in said
+    assert json.loads(out)["messages"]["engaged"] >= 1  # and nothing else, whatever the library prints
+    assert "Reconnecting" in said
+
+
+def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
+    control, stream = MagicMock(), MagicMock(host="10.0.0.1", trouble="")
+    stream.at.return_value = HOME, 0
+    monkeypatch.setattr(sinks, "connect_control", lambda host: control)
+    sink, still = sinks.ServoSink(stream, WallClock(), 0.01), Command(HOME, np.zeros(6), "holding")
+    sink.send(0.0, still)
+    assert control.servoJ.call_count == 1
+    stream.trouble = "arm at 10.0.0.1: safety: protective stop"
+    with pytest.raises(ArmError, match="protective stop: stopped"):
+        sink.send(0.01, still)
+    assert control.servoJ.call_count == 1
+
+
+def test_an_arm_that_is_not_there_is_one_line_and_moves_nothing(tmp_path, capsys):
+    require_ur_rtde()
+    scenario = cell(tmp_path, own_address())
+    assert main(["teleop", str(scenario), "--stylus", f"network:{free_port()}"]) == 2
+    assert "nothing listens on port 30004" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "section, part",
+    [
+        ("speed_rad_s: 99", "source.arm.teleop: speed_rad_s: expected 0.001 to 6.28"),
+        ("scale: [1, 0, 1]", "source.arm.teleop: scale"),
+        ("sped: 1", "source.arm.teleop.sped"),
+        ("acceleration_rad_s2: 0.06", "too low to come to rest"),
+        ("workspace_low_m: [0, 0, 1]", "workspace_low_m must be below"),
+        ("solver: best", "solver: expected one of"),
+    ],
+)
+def test_wrong_settings_are_one_line(tmp_path, capsys, section, part):
+    scenario = cell(tmp_path, "127.0.0.2", section)
+    out = str(tmp_path / "x.csv")
+    assert main(["teleop", str(scenario), "--stylus", f"network:{free_port()}", "--dry-run", out]) == 2
+    said = capsys.readouterr().err
+    assert part in said and said.count("\n") == 1
+
+
+def test_the_settings_of_a_scenario_without_a_section_are_the_defaults():
+    from camera_node.robot.simulated_controller.command import arm_of
+
+    scenario = load("cell")
+    assert teleop_config(scenario, arm_of(scenario)).rate_hz == 125.0
+
+
+def test_a_node_that_streams_imports_nothing_of_teleoperation():
+    code = (
+        "import sys; import camera_node.node, camera_node.build, camera_node.cli; "
+        "sys.exit(any(name.startswith('camera_node.robot.teleop') for name in sys.modules))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

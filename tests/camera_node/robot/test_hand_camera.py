@@ -1,0 +1,107 @@
+"""A world camera in the hand of a simulated arm."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.config import source_config
+from camera_node.pose.providers import PoseGapError
+from camera_node.robot.arm.camera_poses import base_matrix, hand_eyes
+from camera_node.robot.arm.joint_states import ArmError
+from camera_node.robot.arm.kinematics import UR3E
+from camera_node.robot.hand_camera import Truth
+from freshfield import payload
+from freshfield.clock import WallClock
+from freshfield.scenario import Scenario, ScenarioError, load
+from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
+
+CELL = load("cell")
+LOOKING = (-95.90, 9.29, -109.38, 0.72, 262.47, 38.48)  # degrees, from a viewpoint of the cell's tour
+
+
+def at(host: str, **source: object) -> Scenario:
+    arm = {**CELL.source["arm"], "host": host, "max_gap_ms": 2000.0}
+    changed = {"width": 48, "height": 48, "params": {"supersample": 1}, "codec": "png", **source}
+    return dataclasses.replace(CELL, source={**CELL.source, "arm": arm, **changed})
+
+
+def take(camera):
+    """One frame of now; a busy machine may need a second look."""
+    for _ in range(20):
+        tick = int(time.time() * camera.fps)
+        try:
+            return camera.capture(tick)
+        except PoseGapError:
+            time.sleep(0.1)
+    return camera.capture(int(time.time() * camera.fps))
+
+
+def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands():
+    require_ur_rtde()
+    host = own_address()
+    scenario = at(host)
+    with simulated_arm(host, f"--joints={','.join(map(str, LOOKING))}"):
+        fixed, hand = build_cameras(scenario, source_config(scenario), scenario.cameras)
+        shot = take(hand)
+        config = source_config(scenario).arm
+        mount = hand_eyes(scenario, config, ["hand"])["hand"].transform
+        place = base_matrix(config) @ UR3E.forward(np.deg2rad(LOOKING)) @ mount
+        assert np.allclose(shot.pose.matrix(), place, atol=1e-12)
+        scene = fixed.source._frames.scene
+        expected = scene.view(shot.intrinsics, place).image(0.0)
+        assert np.array_equal(payload.decode(shot.payload, "png", 48, 48), expected)
+        assert shot.intrinsics == fixed.source.intrinsics
+        hand.source._poses._hand._stream.stop()
+
+
+def test_the_truth_of_another_instant_is_not_taken():
+    require_ur_rtde()
+    host = own_address()
+    with simulated_arm(host):
+        truth, clock = Truth(host), WallClock()
+        assert truth.joints(clock.now_ns()).shape == (6,)
+        for away_ns in (-3600 * 10**9, 10**9):
+            with pytest.raises(PoseGapError, match="ms away: is this machine too busy"):
+                truth.joints(clock.now_ns() + away_ns)
+
+
+def test_without_an_arm_one_line_says_what_to_start():
+    require_ur_rtde()
+    scenario = at(own_address())
+    begin = time.monotonic()
+    with pytest.raises(ArmError, match="camera-node simulate-arm"):
+        build_cameras(scenario, source_config(scenario), scenario.cameras)
+    assert time.monotonic() - begin < 3.0
+
+
+def test_fixed_cameras_of_the_scenario_need_no_arm():
+    scenario = at(own_address())
+    (camera,) = build_cameras(scenario, source_config(scenario), ["cam00"])
+    assert len(camera.capture(0).payload) > 100
+
+
+def test_effects_that_take_the_camera_to_stand_still_are_refused():
+    scenario = at(own_address(), effects={"motion_blur": None})
+    with pytest.raises(ScenarioError, match=r"motion_blur: not for a camera that an arm carries \(hand\)"):
+        build_cameras(scenario, source_config(scenario), ["hand"])
+
+
+def test_a_world_without_an_arm_loads_nothing_of_one():
+    code = """
+import sys
+from camera_node.build import build_cameras
+from camera_node.config import source_config
+from freshfield.scenario import load
+build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
+unasked = ("camera_node.pose", "camera_node.robot.hand_camera", "camera_node.sources.devices.device", "rtde",
+           "depthai")
+print([name for name in sys.modules if name.startswith(unasked)])
+"""
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -1,0 +1,417 @@
+"""Every data set's loader against a set in its exact format: conventions by reprojection, damage by name."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.config import source_config
+from camera_node.sources import open_sources
+from camera_node.sources.datasets import colmap, dynerf, eyeful, zju
+from camera_node.sources.datasets.formats import FORMATS, open_dataset
+from camera_node.sources.datasets.lens import Lens, exact, pinhole, straighten
+from camera_node.sources.datasets.photo import Look
+from camera_node.sources.datasets.records import DatasetError
+from camera_node.synthetic import make_scene
+from freshfield.geometry import Pinhole, se3_inverse
+from freshfield.scenario import parse
+from tests.camera_node.sources.datasets import sets
+from tests.conftest import data_dir
+
+BENT = Pinhole(64, 48, 60.0, 61.0, 31.2, 24.9, (-0.08, 0.02, 0.002, -0.003))
+NEAR_PX = 0.01
+
+
+def seen(record, points=sets.POINTS):
+    """Where a record's camera sees points."""
+    inverse = se3_inverse(record.camera_to_world)
+    return record.intrinsics.project(points @ inverse[:3, :3].T + inverse[:3, 3])
+
+
+def agree(records, cameras, *more):
+    """Every record sees every point where OpenCV sees it."""
+    assert len(records) == len(cameras)
+    for record, camera in zip(records, cameras):
+        assert np.abs(seen(record) - camera.pixels(sets.POINTS, *more)).max() < NEAR_PX
+
+
+def shows_the_world(record, t_s=0.0):
+    """The record's picture is what our world looks like from where the record says it was taken, and from
+    nowhere near: not a step to the side or upside down."""
+    lens, pose = record.intrinsics, record.camera_to_world
+    aside, turned = pose.copy(), pose.copy()
+    aside[:3, 3] += 0.1 * pose[:3, 0]
+    turned[:3, :2] *= -1
+    scene = make_scene("room", {"count": 3, "width": 64, "height": 48})
+    scene = scene.with_cameras({"here": (lens, pose), "aside": (lens, aside), "turned": (lens, turned)})
+    picture = record.read().astype(float)
+    off = {name: np.abs(picture - scene.render(name, t_s)).mean() for name in scene.cameras}
+    # What is left is compression, of videos at a quarter of the colours.
+    assert off["here"] < 15 and 1.5 * off["here"] < min(off["aside"], off["turned"]), off
+
+
+# --- DyNeRF -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("written_at", [1.0, 2.0], ids=["same size", "videos halved"])
+def test_dynerf_sees_points_where_they_are(tmp_path, written_at):
+    cameras = sets.rig(3)
+    dataset = dynerf.load_dataset(sets.write_dynerf(tmp_path, cameras, 6, written_at))
+    assert dataset.moving and dataset.fps == 10 and len(dataset) == 18
+    assert dataset.cameras == tuple(camera.name for camera in cameras)
+    agree([dataset.of(camera.name)[0] for camera in cameras], cameras)
+    shows_the_world(dataset.of("cam01")[4], 0.4)
+
+
+def test_dynerf_and_transforms_tell_the_same_of_one_scene():
+    folder = data_dir("blender_kitchen")
+    (_, ours), (file, theirs) = open_dataset(folder, name="transforms"), open_dataset(folder, name="dynerf")
+    assert file.name == "poses_bounds.npy" and ours.cameras == theirs.cameras and len(ours) == len(theirs)
+    for camera in ours.cameras:
+        a, b = ours.of(camera), theirs.of(camera)
+        assert np.abs(seen(a[0]) - seen(b[0])).max() < NEAR_PX
+        assert [r.time_s for r in b] == pytest.approx([r.time_s for r in a])
+
+
+def test_dynerf_damage_is_named(tmp_path):
+    folder = sets.write_dynerf(tmp_path, sets.rig(3))
+    file = folder / "poses_bounds.npy"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-40])
+    fails(r"poses_bounds\.npy: cannot be read .* complete", dynerf.load_dataset, folder)
+    for of, becomes in ((b"}", b" "), (b"'shape': (3", b"'shape': (9" + b"9" * 10)):
+        file.write_bytes(whole.replace(of, becomes, 1))
+        fails(r"poses_bounds\.npy: cannot be read", dynerf.load_dataset, folder)
+    np.save(file, np.zeros((3, 15)))
+    fails(r"expected numbers of shape \(cameras, 17\), got \(3, 15\)", dynerf.load_dataset, folder)
+    rows = np.load(io.BytesIO(whole))
+    np.save(file, rows[:2])
+    fails("poses of 2 cameras, its folder 3 videos", dynerf.load_dataset, folder)
+    np.save(file, np.where(np.arange(3)[:, None] == 1, np.nan, rows))
+    fails("row 1 is not finite", dynerf.load_dataset, folder)
+    wide = rows.copy()
+    wide[:, 9] *= 1.5
+    np.save(file, wide)
+    fails(r"row 0: is of images of 96 x 48, cam00\.mp4 has 64 x 48", dynerf.load_dataset, folder)
+    np.save(file, {"rows": 3}, allow_pickle=True)
+    fails("cannot be read as numbers", dynerf.load_dataset, folder)
+    fails("no such file", dynerf.load_dataset, tmp_path / "nowhere")
+
+
+# --- ZJU-MoCap ----------------------------------------------------------------------------------
+
+
+def test_zju_sees_points_where_they_are(tmp_path):
+    cameras = sets.rig(3, BENT)
+    dataset = zju.load_dataset(sets.write_zju(tmp_path, cameras), fps=10.0)
+    assert dataset.moving and dataset.cameras == ("Camera_B1", "Camera_B2", "Camera_B3")
+    first = [dataset.of(name)[0] for name in dataset.cameras]
+    agree(first, cameras)
+    assert first[0].intrinsics.distorted and first[0].path is not None
+    shows_the_world(dataset.of("Camera_B2")[3], 0.3)
+    assert dataset.of("Camera_B2")[3].time_s == pytest.approx(0.3)
+
+
+def test_zju_lenses_with_k3_are_straightened(tmp_path):
+    dataset = zju.load_dataset(sets.write_zju(tmp_path, sets.rig(2, BENT), k3=0.01))
+    assert not any(r.intrinsics.distorted or r.path for r in dataset)
+
+
+def test_zju_masks_cut_the_person_out(tmp_path):
+    folder = sets.write_zju(tmp_path, sets.rig(2))
+    (kept,) = zju.load_dataset(folder, masks="mask_cihp").of("Camera_B2")[:1]
+    image = kept.read()
+    inside = np.zeros((48, 64), bool)
+    inside[8:40, 16:48] = True
+    np.testing.assert_array_equal(image[..., 3], np.where(inside, 255, 0))
+    laid = zju.load_dataset(folder, Look(background="black"), "mask_cihp").of("Camera_B2")[0].read()
+    np.testing.assert_array_equal(laid[inside], image[inside][:, :3])
+    assert laid[~inside].max() == 0
+    (folder / "mask_cihp/Camera_B1/000002.png").unlink()
+    fails(r"mask_cihp.Camera_B1.000002\.png: missing", zju.load_dataset, folder, None, "mask_cihp")
+    fails("no such folder of masks", zju.load_dataset, folder, None, "mask")
+
+
+def test_zju_damage_is_named(tmp_path):
+    folder = sets.write_zju(tmp_path, sets.rig(3))
+    file = folder / "annots.npy"
+    whole = file.read_bytes()
+    (folder / "Camera_B2/000001.jpg").unlink()
+    (folder / "Camera_B1/extra.jpg").write_bytes(b"nobody lists it")
+    dataset = zju.load_dataset(folder)
+    assert dataset.missing == 1 and len(dataset) == 11
+    assert [r.time_s for r in dataset.of("Camera_B2")] == [0.0, 2 / 50, 3 / 50]
+    for cut in (40, len(whole) // 2, len(whole) - 1):
+        file.write_bytes(whole[:cut])
+        fails("annots.npy: cannot be read: .* complete", zju.load_dataset, folder)
+    found = np.load(io.BytesIO(whole), allow_pickle=True).item()
+    found["ims"][1]["ims"].pop()
+    np.save(file, found, allow_pickle=True)
+    fails(r"numbers of cameras differ: K 3, .*ims\[1\] 2", zju.load_dataset, folder)
+    del found["cams"]["D"]
+    np.save(file, found, allow_pickle=True)
+    fails("expected 'cams' with K, D, R, T", zju.load_dataset, folder)
+
+
+def test_a_pickle_runs_nothing(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (exec, (f"open({str(tmp_path / 'sprung')!r}, 'w')",))
+
+    np.save(tmp_path / "annots.npy", {"cams": Trap()}, allow_pickle=True)
+    fails("asks for builtins.exec", zju.load_dataset, tmp_path)
+    assert not (tmp_path / "sprung").exists()
+    with pytest.raises(pickle.UnpicklingError):
+        pickle.loads(pickle.dumps(Trap())[:-1])
+
+
+# --- Eyeful Tower -------------------------------------------------------------------------------
+
+
+def test_eyeful_sees_points_where_they_are(tmp_path):
+    cameras = sets.rig(3, BENT)
+    dataset = eyeful.load_dataset(sets.write_eyeful(tmp_path, cameras))
+    assert dataset.cameras == ("10", "11", "12") and not dataset.moving
+    agree([dataset.of(name)[0] for name in dataset.cameras], cameras)
+    assert dataset.held_out == {"10/10_DSC0000", "10/10_DSC0001"}
+    shows_the_world(dataset.of("12")[0])
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("RadialAndTangential", [-0.08, 0.02, 0.002, -0.003, 0.015]),
+        ("Fisheye", [-0.02, 0.004, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_eyeful_lenses_that_are_none_of_ours_are_straightened(tmp_path, model, distortion):
+    cameras = sets.rig(2)
+    dataset = eyeful.load_dataset(sets.write_eyeful(tmp_path, cameras, 1, model, distortion))
+    record = dataset[1]
+    assert not record.intrinsics.distorted and record.path is None
+    # A picture of straight lines through the lens is a picture of straight lines again: known by its points.
+    lens = Lens(
+        64, 48, *cameras[1].k[[0, 1], [0, 1]], *(cameras[1].k[:2, 2] + 0.5), *as_lens(model, distortion)
+    )
+    assert record.intrinsics == pinhole(lens)
+    local = (sets.POINTS - record.camera_to_world[:3, 3]) @ record.camera_to_world[:3, :3]
+    truth = (
+        cameras[1].pixels(sets.POINTS, *distortion)
+        if model == "RadialAndTangential"
+        else cameras[1].fisheye(sets.POINTS, [*distortion[:3], 0.0])
+    )
+    assert np.abs(lens.project(local) - truth).max() < NEAR_PX
+
+
+def as_lens(model, d):
+    if model == "Fisheye":
+        return tuple(d[:3]), (d[6], d[7]), True
+    return (d[0], d[1], d[4]), (d[2], d[3]), False
+
+
+def test_eyeful_as_metashape_wrote_it(tmp_path):
+    cameras = sets.rig(3, BENT)
+    dataset = eyeful.load_dataset(sets.write_metashape(tmp_path, cameras))
+    agree(list(dataset), cameras)
+    shows_the_world(dataset[2])
+
+
+def test_eyeful_damage_is_named(tmp_path):
+    folder = sets.write_eyeful(tmp_path, sets.rig(2))
+    (folder / "images-jpeg-2k/11/11_DSC0001.jpg").unlink()
+    assert eyeful.load_dataset(folder).missing == 1
+    fails(r"no folder images-jpeg-4k;", eyeful.load_dataset, folder, None, "images-jpeg-4k")
+    file = folder / "cameras.json"
+    whole = file.read_text()
+    for change, message in (
+        (lambda e: e.pop("T"), r"KRT\[1\] \(10/10_DSC0001\): T is missing"),
+        (lambda e: e.update(K=[1, 2]), "K is no matrix of 3 x 3"),
+        (lambda e: e.update(distortion=[0.1]), "RadialAndTangential' with 1 coefficients"),
+        (lambda e: e.update(cameraId="../../x"), r"cameraId is '\.\./\.\./x'"),
+        (lambda e: e.update(width=100), "another shape"),
+    ):
+        data = json.loads(whole)
+        change(data["KRT"][1])
+        if "width" in message or message == "another shape":
+            change(data["KRT"][0])
+        file.write_text(json.dumps(data))
+        fails(message, eyeful.load_dataset, folder)
+    file.write_text(whole[:-30])
+    fails("cameras.json: cannot be read as JSON", eyeful.load_dataset, folder)
+    xml = sets.write_metashape(tmp_path / "xml", sets.rig(2)) / "cameras.xml"
+    text = xml.read_text()
+    xml.write_text(text.replace('label="10_DSC0009"/>', 'master_id="0" label="10_DSC0009"/>'))
+    fails("placed by its rig's master; use cameras.json", eyeful.load_dataset, xml)
+    xml.write_text(text[:-40])
+    fails("cameras.xml: cannot be read as XML", eyeful.load_dataset, xml)
+
+
+# --- COLMAP -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+@pytest.mark.parametrize("model", list(sets.COLMAP_MODELS))
+def test_colmap_sees_points_where_they_are(tmp_path, model, binary):
+    names = list(sets.COLMAP_MODELS)
+    bends = [0, 0, 1, 2, 4, 0][names.index(model)]
+    fy = BENT.fx if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else BENT.fy
+    bend = (*BENT.distortion[:bends], 0.0, 0.0, 0.0, 0.0)[:4]
+    cameras = sets.rig(3, Pinhole(64, 48, BENT.fx, fy, BENT.cx, BENT.cy, bend))
+    file, dataset = open_dataset(sets.write_colmap(tmp_path, cameras, model, binary))
+    assert file == tmp_path / f"sparse/0/cameras.{'bin' if binary else 'txt'}"
+    assert [r.name for r in dataset] == [f"{camera.name} x.jpg" for camera in cameras]
+    if model == "OPENCV_FISHEYE":
+        assert not dataset[0].intrinsics.distorted
+        return
+    agree(list(dataset), cameras)
+    shows_the_world(dataset[1])
+
+
+def test_colmap_written_by_pycolmap_reads_the_same(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed (extra colmap)")
+    cameras = sets.rig(3, BENT)
+    sets.write_colmap(tmp_path, cameras, "OPENCV", True)
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse/0"))
+    for place, write in (("bin", model.write_binary), ("txt", model.write_text)):
+        (tmp_path / place).mkdir()
+        write(str(tmp_path / place))
+        agree(list(colmap.load_dataset(tmp_path / place)), cameras)
+
+
+def test_colmap_pictures_may_be_smaller_than_the_model(tmp_path):
+    cameras = sets.rig(2)
+    folder = sets.write_colmap(tmp_path, cameras, "PINHOLE", True)
+    for camera in cameras:
+        small = cv2.resize(camera.shows(0), (32, 24), interpolation=cv2.INTER_AREA)
+        sets.write_image(folder / f"images_2/{camera.name} x.jpg", small)
+    dataset = colmap.load_dataset(folder, images="images_2")
+    for record, camera in zip(dataset, cameras):
+        assert np.abs(2.0 * seen(record) - camera.pixels()).max() < NEAR_PX
+    assert dataset[0].read().shape == (24, 32, 3)
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+def test_colmap_damage_is_named(tmp_path, binary):
+    folder = sets.write_colmap(tmp_path, sets.rig(3), "PINHOLE", binary)
+    cameras, images = (
+        folder / f"sparse/0/{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images")
+    )
+    (folder / "images/cam01 x.jpg").unlink()
+    assert colmap.load_dataset(folder).missing == 1
+    whole = {file: file.read_bytes() for file in (cameras, images)}
+    if binary:
+        for file in (cameras, images):
+            for cut in (3, 20, len(whole[file]) - 1):
+                file.write_bytes(whole[file][:cut])
+                fails(rf"{file.name}: ends at byte {cut}", colmap.load_dataset, folder)
+            file.write_bytes(whole[file] + b"more")
+            fails("4 bytes follow its last entry", colmap.load_dataset, folder)
+            file.write_bytes(whole[file])
+        cameras.write_bytes(whole[cameras][:12] + struct_i32(9) + whole[cameras][16:])
+        fails("camera 1: model 9: expected one of", colmap.load_dataset, folder)
+    else:
+        text = whole[cameras].decode()
+        for old, new, message in (
+            ("PINHOLE", "FOV", "camera model FOV: expected one of"),
+            ("PINHOLE", "OPENCV", "OPENCV has 8 parameters, not 4"),
+            ("1 PINHOLE 64", "1 PINHOLE", "expected CAMERA_ID MODEL|has 4 parameters"),
+        ):
+            cameras.write_text(text.replace(old, new))
+            fails(message, colmap.load_dataset, folder)
+        cameras.write_text(text)
+        lines = whole[images].decode().splitlines()
+        images.write_text("\n".join(lines[:-1]))
+        fails("points is missing: cut", colmap.load_dataset, folder)
+        images.write_text("\n".join([*lines[:3], "2 0.1 0.2"]))
+        fails(r"images\.txt:4: expected IMAGE_ID QW", colmap.load_dataset, folder)
+    cameras.write_bytes(whole[cameras])
+    images.write_bytes(whole[images])
+    for file in (folder / "images").iterdir():
+        file.unlink()
+    fails("none of its 3 images exists", colmap.load_dataset, folder)
+
+
+def struct_i32(value):
+    return int(value).to_bytes(4, "little")
+
+
+# --- all of them --------------------------------------------------------------------------------
+
+
+def fails(message, load, *args):
+    with pytest.raises(DatasetError, match=message) as error:
+        load(*args)
+    assert "\n" not in str(error.value)
+
+
+WRITERS = {
+    "dynerf": sets.write_dynerf,
+    "zju": sets.write_zju,
+    "eyeful": sets.write_eyeful,
+    "colmap": lambda folder, cameras: sets.write_colmap(folder, cameras, "PINHOLE", True),
+}
+
+
+@pytest.mark.parametrize("name", list(WRITERS))
+def test_formats_are_recognised_and_streamed_at_their_pace(tmp_path, name):
+    cameras = sets.rig(3)
+    folder = WRITERS[name](tmp_path / "set", cameras)
+    _, dataset = open_dataset(folder)
+    _, named = open_dataset(folder, name=name)
+    assert [r.name for r in dataset] == [r.name for r in named]
+    for other in set(FORMATS) - {name}:
+        fails("holds no data set of the format", open_dataset, folder, 1.0, other)
+    ids = list(dataset.cameras) if name != "colmap" else ["a", "b", "c"]
+    plan = {"cameras": {"ids": ids}, "source": {"kind": name, "data": "set"}}
+    scenario = parse(plan, tmp_path / "s.yaml")
+    sources = open_sources(scenario, source_config(scenario), ids, tmp_path)
+    assert [float(sources[c].fps) for c in ids] == [{"dynerf": 10.0, "zju": 50.0}.get(name, 10.0)] * 3
+    for index, camera in enumerate(ids):
+        shot = sources[camera].read(sources[camera].content(0))
+        np.testing.assert_allclose(shot.pose.matrix(), cameras[index].camera_to_world, atol=1e-9)
+        # What is a JPEG already is sent as it is.
+        assert isinstance(shot.image, bytes) == (name != "dynerf")
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(96, 64, 70.0, 72.0, 47.0, 33.0, (-0.2, 0.05, 0.01), (0.002, -0.003)),
+        Lens(96, 64, 70.0, 72.0, 47.0, 33.0, (0.15, 0.02, 0.01), (0.0, 0.001)),
+        Lens(96, 64, 40.0, 40.0, 48.0, 32.0, (-0.02, 0.004), fisheye=True),
+    ],
+    ids=["barrel", "pincushion", "fisheye"],
+)
+def test_straightened_pictures_show_each_ray_where_it_belongs(lens):
+    assert not exact(lens)
+    straight = pinhole(lens)
+    u, v = np.meshgrid(np.arange(96) + 0.5, np.arange(64) + 0.5)
+    found = straighten(lens, np.dstack([u, v]).astype(np.float32))  # a picture of where its pixels are
+    k = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
+    rays = straight.rays().reshape(-1, 1, 3)
+    if lens.fisheye:
+        truth, _ = cv2.fisheye.projectPoints(
+            rays, np.zeros(3), np.zeros(3), k, np.array([*lens.radial, 0.0, 0.0])
+        )
+    else:
+        bend = np.array([*lens.radial[:2], *lens.tangential, lens.radial[2]])
+        truth, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), k, bend)
+    truth = truth.reshape(64, 96, 2) + 0.5
+    inner = (truth > 0.5).all(axis=-1) & (truth < (95.5, 63.5)).all(axis=-1)
+    assert inner.mean() > 0.9
+    # OpenCV interpolates on a grid of 1/32 pixel.
+    assert np.abs(found - truth)[inner].max() < 1 / 32
+    # Nothing comes from beyond the picture, and it is as wide as that allows: some border touches the edge.
+    assert (truth >= -1e-9).all() and (truth <= (96, 64)).all()
+
+
+def test_lenses_that_nobody_made_are_refused():
+    with pytest.raises(DatasetError, match="belong to no lens"):
+        pinhole(Lens(64, 48, 10.0, 10.0, 32.0, 24.0, (-50.0, 900.0, -4000.0)))
+    with pytest.raises(DatasetError, match="not finite"):
+        Lens(64, 48, float("nan"), 1.0, 0.0, 0.0)

@@ -1,0 +1,202 @@
+"""transforms.json data sets: written ones for every corner, real ones for conventions."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.datasets.transforms import load_dataset
+from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
+from tests.camera_node.sources.datasets.photos import opencv_pose, picture, write_photos
+from tests.conftest import data_dir
+
+
+def edit(file, change):
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))
+    return file
+
+
+def test_poses_become_opencv_and_images_rgb(tmp_path):
+    dataset = load_dataset(write_photos(tmp_path, 3))
+    assert len(dataset) == 3 and dataset.cameras == ("",) and not dataset.moving
+    for index, record in enumerate(dataset):
+        np.testing.assert_allclose(record.camera_to_world, opencv_pose(index), atol=1e-12)
+        np.testing.assert_array_equal(record.read(), picture(index)[..., ::-1])
+        assert record.intrinsics == Pinhole(32, 24, 40.0, 41.0, 16.0, 12.0)
+
+
+def test_scale_divides_images_and_intrinsics(tmp_path):
+    (record,) = load_dataset(write_photos(tmp_path, 1), scale=2)
+    assert record.intrinsics == Pinhole(16, 12, 20.0, 20.5, 8.0, 6.0)
+    means = picture(0)[..., ::-1].reshape(12, 2, 16, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(record.read(), means, atol=0.51)
+    with pytest.raises(DatasetError, match="scale"):
+        load_dataset(tmp_path, scale=0.5)
+
+
+def test_entries_without_a_file_are_counted(tmp_path):
+    file = write_photos(tmp_path, 5)
+    (tmp_path / "images/001.png").unlink()
+    (tmp_path / "images/003.png").unlink()
+    dataset = load_dataset(file)
+    assert [r.name for r in dataset] == ["images/000.png", "images/002.png", "images/004.png"]
+    assert dataset.missing == 2
+
+
+def test_extensions_and_sizes_may_be_left_out(tmp_path):
+    def nerf_synthetic(data):
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del data[key]
+        data["camera_angle_x"] = 0.8
+        for frame in data["frames"]:
+            frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+
+    dataset = load_dataset(edit(write_photos(tmp_path, 2), nerf_synthetic))
+    f = 16 / np.tan(0.4)
+    assert dataset[1].intrinsics == Pinhole(32, 24, pytest.approx(f), pytest.approx(f), 16.0, 12.0)
+    assert dataset[1].read().shape == (24, 32, 3)
+
+
+def test_intrinsics_of_a_frame_stand_above_those_of_the_file(tmp_path):
+    file = edit(write_photos(tmp_path, 2), lambda d: d["frames"][1].update(fl_x=50.0, k1=0.1, p2=-0.01))
+    first, second = load_dataset(file)
+    assert first.intrinsics.fx == 40.0 and not first.intrinsics.distorted
+    assert second.intrinsics.fx == 50.0 and second.intrinsics.distortion == (0.1, 0.0, 0.0, -0.01)
+
+
+def test_time_and_camera_make_a_recording(tmp_path):
+    dataset = load_dataset(write_photos(tmp_path, 4, cameras=3))
+    assert dataset.moving and dataset.cameras == ("cam00", "cam01", "cam02")
+    assert [r.time_s for r in dataset.of("cam01")] == [0.0, 0.1, 0.2, 0.3]
+
+
+def test_alpha_is_kept_laid_on_a_colour_and_weighted_when_shrinking(tmp_path):
+    file = write_photos(tmp_path, 1)
+    rgba = np.zeros((24, 32, 4), np.uint8)
+    rgba[:, :, :3] = (0, 255, 0)  # green, as BGR and as RGB, hidden where alpha is 0
+    rgba[:, 1::2] = (200, 100, 50, 255)  # every second column is seen
+    cv2.imwrite(str(tmp_path / "images/000.png"), rgba)
+    kept = load_dataset(file, scale=2)[0].read()
+    assert kept.shape == (12, 16, 4)
+    assert np.unique(kept.reshape(-1, 4), axis=0).tolist() == [[50, 100, 200, 128]]  # no green
+    white = load_dataset(file, scale=2, background="white")[0].read()
+    np.testing.assert_allclose(white[0, 0], (np.array([50, 100, 200]) + 255) / 2, atol=0.51)
+    black = load_dataset(file, background="black")[0].read()
+    assert black[0, 0].tolist() == [0, 0, 0] and black[0, 1].tolist() == [50, 100, 200]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("frames"), "frames"),
+        (lambda d: d["frames"][0].pop("transform_matrix"), r"frames\[0\].*transform_matrix"),
+        (
+            lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]),
+            r"frames\[0\].*transform_matrix",
+        ),
+        (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(0, 7.0), "orthonormal"),
+        (lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(3, float("nan")), "finite"),
+        (lambda d: d.update(fl_x="long"), "fl_x"),
+        (lambda d: d.update(fl_x=-1.0), "impossible"),
+        (lambda d: d.pop("fl_x"), "camera_angle_x"),
+        (lambda d: d.update(k3=0.5), "k3"),
+        (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "FISHEYE"),
+        (lambda d: [f.update(file_path="images/none") for f in d["frames"]], "missing"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path, change, message):
+    file = edit(write_photos(tmp_path, 2), change)
+    with pytest.raises(DatasetError, match=message) as error:
+        load_dataset(file)
+    assert str(file.parent) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_image_of_another_size_or_damaged_is_refused_when_read(tmp_path):
+    dataset = load_dataset(write_photos(tmp_path, 2))
+    cv2.imwrite(str(tmp_path / "images/000.png"), np.zeros((24, 30, 3), np.uint8))
+    (tmp_path / "images/001.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
+    with pytest.raises(DatasetError, match="30 x 24"):
+        dataset[0].read()
+    with pytest.raises(DatasetError, match="001"):
+        dataset[1].read()
+
+
+def test_a_folder_uses_the_first_file_whose_images_exist():
+    dataset = load_dataset(data_dir("fox"), scale=4)
+    # transforms.json names full-size images that are not there; transforms_2.json those that are.
+    assert len(dataset) == 50 and dataset.missing == 0
+    assert (dataset[0].intrinsics.width, dataset[0].intrinsics.height) == (135, 240)
+    assert dataset[0].read().shape == (240, 135, 3)
+    assert load_dataset(data_dir("fox") / "transforms_2.json").records[3].intrinsics.distorted
+
+
+def test_matches_between_fox_photos_agree_with_their_poses():
+    """SIFT matches lie on the epipolar lines of the loaded poses, which no other axis convention gives."""
+    dataset = load_dataset(data_dir("fox") / "transforms_2.json")
+    errors = []
+    for i, j in ((0, 2), (10, 12), (20, 23)):
+        a, b = dataset[i], dataset[j]
+        points = _matches(a.read(), b.read())
+        essential = _essential(np.linalg.inv(b.camera_to_world) @ a.camera_to_world)
+        ra, rb = a.intrinsics.rays(points[:, :2]), b.intrinsics.rays(points[:, 2:])
+        lines = ra @ essential.T
+        distance = np.abs((rb * lines).sum(1)) / np.linalg.norm(np.cross(lines, [0, 0, 1.0]), axis=1)
+        errors.append(np.median(distance / rb[:, 2]) * b.intrinsics.fx)
+    assert max(errors) < 1.0  # pixels, at 540 x 960
+
+
+def _matches(a, b):
+    sift, (one, two) = cv2.SIFT_create(), ([], [])
+    (ka, da), (kb, db) = (sift.detectAndCompute(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), None) for x in (a, b))
+    for m, n in cv2.BFMatcher().knnMatch(da, db, k=2):
+        if m.distance < 0.7 * n.distance:
+            one.append(ka[m.queryIdx].pt)
+            two.append(kb[m.trainIdx].pt)
+    assert len(one) > 50
+    return np.hstack([one, two]) + 0.5  # OpenCV's key points count pixel centres as whole numbers
+
+
+def _essential(b_from_a):
+    t = b_from_a[:3, 3]
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ b_from_a[:3, :3]
+
+
+def test_lego_looks_at_its_middle():
+    dataset = load_dataset(data_dir("lego_synthetic"), scale=2, background="white")
+    assert len(dataset) == 100
+    image = dataset[7].read()
+    assert image.shape == (200, 200, 3) and image[0, 0].tolist() == [255, 255, 255]
+    assert dataset[7].intrinsics.fx == pytest.approx(555.56 / 2, rel=1e-4)
+    for record in dataset:
+        middle = np.linalg.inv(record.camera_to_world)[:3, 3]  # the world's origin in camera axes
+        assert middle[2] > 3.5 and np.hypot(middle[0], middle[1]) < 0.1 * middle[2]
+
+
+def test_kitchen_points_project_onto_their_balls():
+    folder = data_dir("blender_kitchen")
+    dataset = load_dataset(folder / "transforms.json")
+    assert dataset.moving and len(dataset.cameras) == 19 and dataset.fps == 30
+    magenta = json.loads((folder / "points.json").read_text())["points"]["table_magenta"]
+    world = np.append(np.array(magenta["xyz"][0]), 1.0)
+    hits = 0
+    for camera in ("cam00", "cam05", "cam11", "cam17"):
+        record = dataset.of(camera)[0]
+        u, v = record.intrinsics.project((np.linalg.inv(record.camera_to_world) @ world)[:3])
+        if not (2 < u < 190 and 2 < v < 142):
+            continue
+        r, g, b = (float(c) for c in record.read()[int(v), int(u)])
+        assert r > 1.3 * g and b > 1.2 * g, (camera, r, g, b)
+        hits += 1
+    assert hits >= 3
+
+
+def test_the_pose_flip_is_its_own_inverse(tmp_path):
+    record = load_dataset(write_photos(tmp_path, 1))[0]
+    stored = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]["transform_matrix"]
+    np.testing.assert_allclose(record.camera_to_world @ OPENGL_TO_OPENCV, stored, atol=1e-12)

@@ -1,0 +1,345 @@
+"""Real cameras as sources, with a camera that streams over the network."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.config import CameraConfig, source_config
+from camera_node.pose.providers import FixedPose
+from camera_node.sources.devices import opencv as opencv_camera
+from camera_node.sources.devices.device import CameraError, LiveSource, meant, open_live
+from freshfield import payload
+from freshfield.clock import WallClock
+from freshfield.geometry import Pinhole, Pose
+from freshfield.scenario import ScenarioError, parse
+from tests.camera_node.sources.devices.mjpeg import SIZE, NetworkCamera, number_of
+
+WITHIN_S = 20.0
+CALIBRATION = {
+    "eye": {
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "K": [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]],
+        "R_world_to_cam": np.eye(3).tolist(),
+        "t_world_to_cam": [0.0, 0.0, 1.0],
+    }
+}
+
+
+@pytest.fixture
+def clock():
+    return WallClock()
+
+
+@pytest.fixture
+def network_camera(clock):
+    camera = NetworkCamera(clock)
+    yield camera
+    camera.close()
+
+
+def scenario(folder: Path, device: str, calibration=CALIBRATION, **source):
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    section = {
+        "kind": "camera",
+        "devices": {"eye": device},
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "fps": 10,
+        "codec": "png",
+        "calibration": "calibration.json",
+        **source,
+    }
+    return parse({"cameras": {"ids": ["eye"]}, "source": section}, folder / "scenario.yaml")
+
+
+def opened(plan):
+    (camera,) = build_cameras(plan, source_config(plan), plan.cameras)
+    return camera
+
+
+def read(camera):
+    return patiently(lambda: camera.source.read(0))
+
+
+def patiently(take):
+    """The next frame; a busy machine may be late."""
+    until = time.monotonic() + WITHIN_S
+    while True:
+        try:
+            return take()
+        except CameraError:
+            assert time.monotonic() < until
+
+
+def test_frames_come_once_each_in_order_and_with_the_time_of_their_arrival(tmp_path, network_camera, clock):
+    camera = opened(scenario(tmp_path, network_camera.address))
+    seen = []
+    for _ in range(8):
+        shot = read(camera)
+        now_ns = clock.now_ns()
+        assert 0 <= now_ns - shot.captured_ns < WITHIN_S * 1e9
+        seen.append((number_of(shot.image), shot.captured_ns))
+    numbers, stamps = zip(*seen)
+    assert list(numbers) == sorted(set(numbers)) and list(stamps) == sorted(set(stamps))
+    # No frame is stamped before it was sent.
+    assert all(stamp > network_camera.sent_ns[number] for number, stamp in seen)
+    assert shot.image[40, 10, 2] > 150 > shot.image[40, 10, 0]  # RGB
+    assert shot.intrinsics.fx == 60.0 and shot.intrinsics.cx == 32.0
+    assert shot.pose.translation_m == (0.0, 0.0, -1.0)
+    encoded = patiently(lambda: camera.capture(1))
+    assert payload.decode(encoded.payload, "png", *SIZE).shape == (48, 64, 3)
+    assert encoded.captured_ns is not None
+    camera.source.close()
+
+
+def test_latency_is_taken_off(tmp_path, network_camera, clock):
+    camera = opened(scenario(tmp_path, network_camera.address, latency_ms=5000.0))
+    assert clock.now_ns() - read(camera).captured_ns >= 5_000_000_000
+    camera.source.close()
+
+
+def test_a_camera_that_falls_silent_gives_no_old_frames_and_comes_back(tmp_path, network_camera):
+    camera = opened(scenario(tmp_path, network_camera.address))
+    read(camera)
+    network_camera.silent.set()
+    with pytest.raises(CameraError, match="eye: no new frame"):
+        for _ in range(200):
+            camera.source.read(0)
+    network_camera.silent.clear()
+    assert read(camera).captured_ns
+    camera.source.close()
+
+
+def test_a_camera_that_was_gone_is_opened_again(tmp_path, clock):
+    first = NetworkCamera(clock)
+    camera = opened(scenario(tmp_path, first.address))
+    read(camera)
+    first.close()
+    with pytest.raises(CameraError, match=r"no new frame: eye: (no camera at|the camera gives no more)"):
+        until = time.monotonic() + WITHIN_S
+        while time.monotonic() < until:
+            try:
+                camera.source.read(0)
+            except CameraError as error:
+                if "eye: no camera" in str(error) or "no more frames" in str(error):
+                    raise
+    second = NetworkCamera(clock, port=first.port)
+    assert read(camera).image.shape == (48, 64, 3)
+    camera.source.close()
+    second.close()
+
+
+@pytest.mark.parametrize(
+    "device, says",
+    [
+        ("http://127.0.0.1:9/none", "eye: no camera at http://127.0.0.1:9/none: is the address right"),
+        ("77", "eye: no camera at 77: is it plugged in"),
+        ("/dev/v4l/by-id/none", "eye: no camera at /dev/v4l/by-id/none: is it plugged in"),
+    ],
+)
+def test_no_camera_is_one_clear_line_within_three_seconds(tmp_path, device, says):
+    begin = time.monotonic()
+    with pytest.raises(CameraError, match=says):
+        opened(scenario(tmp_path, device))
+    assert time.monotonic() - begin < 3.0
+
+
+def test_a_calibration_of_another_shape_is_refused(tmp_path, network_camera):
+    wide = {"eye": {**CALIBRATION["eye"], "width": 100}}
+    with pytest.raises(CameraError, match=r"pictures are 64 x 48, calibrated for 100 x 48"):
+        opened(scenario(tmp_path, network_camera.address, wide))
+
+
+def test_one_of_another_size_is_scaled(tmp_path, network_camera):
+    double = {"eye": {**CALIBRATION["eye"], "width": 128, "height": 96}}
+    camera = opened(scenario(tmp_path, network_camera.address, double))
+    assert camera.source.intrinsics.fx == 30.0 and camera.source.intrinsics.width == 64
+    camera.source.close()
+
+
+def test_what_nobody_calibrated_is_refused(tmp_path, network_camera):
+    plan = scenario(tmp_path, network_camera.address, calibration=None)
+    plan.source.pop("calibration")
+    with pytest.raises(ScenarioError, match=r"camera eye has no pose: name it in arm.cameras"):
+        opened(plan)
+
+
+def test_several_cameras_must_say_which_is_which(tmp_path):
+    plan = scenario(tmp_path, "0")
+    both = {"eye": CALIBRATION["eye"], "other": CALIBRATION["eye"]}
+    (tmp_path / "calibration.json").write_text(json.dumps(both))
+    plan = parse({"cameras": {"ids": ["eye", "other"]}, "source": plan.source}, tmp_path / "scenario.yaml")
+    with pytest.raises(ScenarioError, match=r"source.devices.other: missing: which camera is it"):
+        build_cameras(plan, source_config(plan), plan.cameras)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"width": 3}, {"exposure_us": 0}, {"first_frame_s": 0}, {"kind": "oak", "iso": 1}]
+)
+def test_wrong_settings_are_refused(tmp_path, wrong):
+    plan = scenario(tmp_path, "0", **wrong)
+    plan.source.pop("latency_ms", None)
+    with pytest.raises(ScenarioError, match=next(k for k in wrong if k != "kind")):
+        source_config(plan)
+
+
+LENS = Pinhole.from_fov(*SIZE, 60.0)
+STANDING = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+class Feed:
+    """A camera that gives frames until ``breaks_after`` of them, and then ``trouble``."""
+
+    stamped_by, no_lens = "itself", ""
+
+    def __init__(self, intrinsics=LENS, no_lens="", breaks_after=10**9, trouble=None):
+        self.intrinsics, self.no_lens = intrinsics, no_lens
+        self._left, self._trouble = breaks_after, trouble
+        self.closed = False
+
+    def grab(self, timeout_s):
+        time.sleep(0.01)
+        if self._left == 0:
+            raise self._trouble
+        self._left -= 1
+        return time.time_ns(), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+
+    def close(self):
+        self.closed = True
+        raise RuntimeError("it is gone")
+
+
+@pytest.mark.parametrize("where", ["opening", "grabbing"])
+def test_whatever_a_driver_raises_the_camera_is_opened_again(where):
+    trouble = RuntimeError("failed to set power state")
+    opened = []
+
+    def open_feed():
+        opened.append(
+            Feed(breaks_after=3, trouble=CameraError("eye: gone") if where == "opening" else trouble)
+        )
+        if len(opened) == 2 and where == "opening":
+            raise trouble
+        return opened[-1]
+
+    source = LiveSource("eye", Fraction(30), open_feed, STANDING)
+    until = time.monotonic() + WITHIN_S
+    while len(opened) < 4 and time.monotonic() < until:
+        time.sleep(0.01)
+    assert len(opened) >= 4 and opened[0].closed
+    assert patiently(lambda: source.read(0)).intrinsics == LENS
+    source.close()
+
+
+def test_whatever_a_driver_raises_at_the_start_is_one_line():
+    def open_feed():
+        raise RuntimeError("xioctl(VIDIOC_S_FMT) failed\nlast error: 5")
+
+    with pytest.raises(
+        CameraError, match=r"^eye: RuntimeError: xioctl\(VIDIOC_S_FMT\) failed last error: 5$"
+    ):
+        LiveSource("eye", Fraction(30), open_feed, STANDING)
+    feed = Feed(breaks_after=0, trouble=RuntimeError("no"))
+    with pytest.raises(CameraError, match="eye: RuntimeError: no"):
+        LiveSource("eye", Fraction(30), lambda: feed, STANDING)
+    assert feed.closed
+
+
+def test_a_lens_that_the_device_cannot_tell_is_missed_only_where_no_calibration_is_given():
+    why = "eye: the device holds no calibration: calibrate it"
+    source = LiveSource("eye", Fraction(30), lambda: Feed(None, why), STANDING, calibrated=LENS)
+    assert source.intrinsics == LENS
+    source.close()
+    with pytest.raises(CameraError, match=why):
+        LiveSource("eye", Fraction(30), lambda: Feed(None, why), STANDING)
+
+
+def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
+    first, arms = Feed(), []
+
+    class Arm:
+        def at(self, t_ns):
+            return STANDING.at(t_ns)
+
+        def close(self):
+            arms.append("closed")
+
+    def opener(camera, device, config, fps, clock):
+        def open_feed():
+            if camera == "other":
+                raise CameraError("other: no camera")
+            return first
+
+        return open_feed
+
+    plan = scenario(tmp_path, "0", {"eye": CALIBRATION["eye"], "other": CALIBRATION["eye"]})
+    both = {**plan.source, "devices": {"eye": "0", "other": "1"}}
+    plan = parse({"cameras": {"ids": ["eye", "other"]}, "source": both}, tmp_path / "scenario.yaml")
+    monkeypatch.setattr(
+        "camera_node.sources.devices.device._poses", lambda *_: {"eye": Arm(), "other": STANDING}
+    )
+    with pytest.raises(CameraError, match="other: no camera"):
+        open_live(plan, source_config(plan), plan.cameras, opener)
+    assert first.closed and arms == ["closed"]
+    assert "camera eye" not in [thread.name for thread in threading.enumerate()]
+
+
+class Capture:
+    """OpenCV's, of frames with these stamps (ms before now on the monotonic clock)."""
+
+    def __init__(self, ages_ms, backend="V4L2"):
+        self._ages_ms, self._backend = list(ages_ms), backend
+
+    def getBackendName(self):
+        return self._backend
+
+    def set(self, key, value):
+        return True
+
+    def grab(self):
+        self._stamp_ms = time.monotonic_ns() / 1e6 - self._ages_ms.pop(0)
+        return True
+
+    def get(self, key):
+        return self._stamp_ms
+
+    def retrieve(self):
+        return True, np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    "ages_ms, stamped_by, expected_ms",
+    [
+        ([50, 60, 1e6, -5, 40], "the kernel", [54, 64, None, None, 44]),
+        ([1e6, 50, 40], "their arrival, less latency_ms", [20, 20, 20]),
+    ],
+)
+def test_the_first_frame_decides_whose_stamps_count(monkeypatch, clock, ages_ms, stamped_by, expected_ms):
+    """A stamp of the kernel's is moved to the middle of the exposure; none changes its clock midway."""
+    monkeypatch.setattr(opencv_camera, "_open", lambda *_: Capture(ages_ms))
+    config = CameraConfig(kind="camera", exposure_us=8000, latency_ms=20.0)
+    feed = opencv_camera.OpenCvFeed("eye", "0", config, Fraction(30), clock)
+    for age_ms in expected_ms:
+        taken = feed.grab(1.0)
+        if age_ms is None:
+            assert taken is None
+        else:
+            assert (clock.now_ns() - taken[0]) / 1e6 == pytest.approx(age_ms, abs=3.0)
+    assert feed.stamped_by == stamped_by
+
+
+def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
+    assert meant("eye", "OAK", None, ["a"]) == 0 and meant("eye", "OAK", "b", ["a", "b"]) == 1
+    with pytest.raises(CameraError, match=r"^eye: several OAK cameras, name one in source.devices: a, b$"):
+        meant("eye", "OAK", None, ["a", "b"])
+    with pytest.raises(CameraError, match=r"^eye: no OAK camera c; there are a, b$"):
+        meant("eye", "OAK", "c", ["a", "b"])

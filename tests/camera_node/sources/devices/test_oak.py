@@ -1,0 +1,202 @@
+"""The OAK source with the real depthai and no device: its own replay node makes real frames."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from fractions import Fraction
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.config import source_config
+from camera_node.pose.providers import FixedPose
+from camera_node.sources.devices import oak
+from camera_node.sources.devices.device import CameraError, LiveSource
+from freshfield.clock import WallClock
+from freshfield.geometry import Pose
+from freshfield.scenario import ScenarioError, parse
+
+try:
+    dai = oak.library()
+except CameraError as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+WIDTH, HEIGHT = 64, 48
+
+
+def plan(**source):
+    return parse({"cameras": {"ids": ["eye"]}, "source": {"kind": "oak", **source}}, Path("scenario.yaml"))
+
+
+@pytest.fixture
+def replay(tmp_path):
+    """A running pipeline without a device whose output replays twenty pictures for ever."""
+    file = tmp_path / "pictures.avi"
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (WIDTH, HEIGHT))
+    for k in range(20):
+        image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        image[:, :, 2] = 10 * k  # red in OpenCV's order
+        video.write(image)
+    video.release()
+    pipeline = dai.Pipeline(False)
+    node = pipeline.create(dai.node.ReplayVideo)
+    node.setReplayVideoFile(file)
+    node.setOutFrameType(dai.ImgFrame.Type.BGR888i)
+    node.setSize(WIDTH, HEIGHT)
+    node.setFps(20.0)
+    node.setLoop(True)
+    queue = node.out.createOutputQueue(maxSize=2, blocking=False)
+    pipeline.start()
+    yield pipeline, queue
+    pipeline.stop()
+
+
+def test_real_frames_come_as_rgb_with_their_time_on_our_clock(replay):
+    _, queue = replay
+    clock = WallClock()
+    frames = oak.Frames("eye", queue, clock)
+    seen = []
+    for _ in range(6):
+        captured_ns, image = frames.grab(10.0)
+        assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.uint8
+        assert image[:, :, 1:].max() < 40  # only red
+        assert -1_000_000 < clock.now_ns() - captured_ns < 10_000_000_000
+        seen.append((captured_ns, int(image[0, 0, 0])))
+    stamps = [stamp for stamp, _ in seen]
+    assert stamps == sorted(set(stamps)) and len({red for _, red in seen}) > 3
+
+
+def test_it_is_a_source_like_any_other_and_says_when_it_is_gone(replay):
+    pipeline, queue = replay
+    clock = WallClock()
+
+    class Feed(oak.Frames):
+        intrinsics = oak.lens("eye", calibration(), dai.CameraBoardSocket.CAM_A, (WIDTH, HEIGHT), False)
+
+        def close(self):
+            pass
+
+    def once():
+        if pipeline.isRunning():
+            return Feed("eye", queue, clock)
+        raise CameraError("eye: no OAK camera found")
+
+    fixed = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    source = LiveSource("eye", Fraction(10), once, fixed, first_frame_s=10.0)
+    shot = source.read(0)
+    assert shot.captured_ns and shot.intrinsics.width == WIDTH
+    pipeline.stop()
+    with pytest.raises(CameraError, match="no new frame: eye: "):
+        until = time.monotonic() + 10.0
+        while time.monotonic() < until:
+            try:
+                source.read(0)
+            except CameraError as error:
+                if "OAK" in str(error):
+                    raise
+    source.close()
+
+
+def calibration(distortion=None):
+    """As it is burnt into a device."""
+    handler = dai.CalibrationHandler()
+    matrix = [[1500.0, 0.0, 959.5], [0.0, 1500.0, 719.5], [0.0, 0.0, 1.0]]
+    handler.setCameraIntrinsics(dai.CameraBoardSocket.CAM_A, matrix, 1920, 1440)
+    handler.setDistortionCoefficients(dai.CameraBoardSocket.CAM_A, distortion or [0.0] * 14)
+    return handler
+
+
+def test_intrinsics_are_the_devices_scaled_to_the_picture():
+    socket = dai.CameraBoardSocket.CAM_A
+    lens = oak.lens("eye", calibration(), socket, (640, 480), False)
+    assert (lens.width, lens.height) == (640, 480) and not np.any(np.abs(lens.distortion) > 1e-9)
+    assert lens.fx == pytest.approx(500.0, abs=1e-3) and lens.cx == pytest.approx(320.0, abs=0.6)
+
+
+def test_a_lens_of_many_coefficients_is_fitted_or_straightened(caplog):
+    socket = dai.CameraBoardSocket.CAM_A
+    rational = [8.0, -20.0, 1e-4, -2e-4, 60.0, 7.8, -19.0, 57.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    bent = oak.lens("eye", calibration(rational), socket, (640, 480), False)
+    assert any(bent.distortion)
+    straight = oak.lens("eye", calibration(rational), socket, (640, 480), True)
+    assert not np.any(np.abs(straight.distortion) > 1e-9)
+
+
+def test_a_device_that_was_never_calibrated_is_told():
+    with pytest.raises(CameraError, match="eye: the device holds no calibration"):
+        oak.lens("eye", dai.CalibrationHandler(), dai.CameraBoardSocket.CAM_A, (640, 480), False)
+
+
+def test_a_fisheye_lens_is_not_taken_for_another():
+    fisheye = calibration([0.05, -0.01, 0.004, -0.001] + [0.0] * 10)
+    fisheye.setCameraType(dai.CameraBoardSocket.CAM_A, dai.CameraModel.Fisheye)
+    with pytest.raises(CameraError, match=r"eye: its lens is fisheye: set source.rectify: true"):
+        oak.lens("eye", fisheye, dai.CameraBoardSocket.CAM_A, (640, 480), False)
+    straight = oak.lens("eye", fisheye, dai.CameraBoardSocket.CAM_A, (640, 480), True)
+    assert not straight.distorted
+
+
+def test_a_device_without_calibration_opens_all_the_same(monkeypatch):
+    """Whoever calibrated it themselves names the file: the device is not asked."""
+    device = MagicMock()
+    device.readCalibration.return_value = dai.CalibrationHandler()
+    monkeypatch.setattr(dai, "Device", lambda info: device)
+    monkeypatch.setattr(dai, "Pipeline", MagicMock())
+    monkeypatch.setattr(oak, "find", lambda camera, name: None)
+    scenario = plan()
+    feed = oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock())
+    assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_lens
+    device.readCalibration.return_value = calibration()
+    assert oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock()).intrinsics
+
+
+def test_a_lens_that_can_focus_stays_where_it_was_calibrated(monkeypatch):
+    """Autofocus would change the focal length from picture to picture, and nobody would be told."""
+    device, pipeline = MagicMock(), MagicMock()
+    monkeypatch.setattr(dai, "Device", lambda info: device)
+    monkeypatch.setattr(dai, "Pipeline", pipeline)
+    monkeypatch.setattr(oak, "find", lambda camera, name: None)
+    control = pipeline.return_value.create.return_value.build.return_value.initialControl
+    device.readCalibration.return_value = known = calibration()
+    for position in (0, 131):  # 0: a fixed lens
+        known.setLensPosition(dai.CameraBoardSocket.CAM_A, position)
+        oak.OakFeed("eye", None, source_config(plan()), Fraction(10), WallClock())
+    assert control.setManualFocus.call_args_list == [((131,),)]
+    assert hasattr(dai.CameraControl(), "setManualFocus")
+
+
+def test_without_a_device_one_clear_line_within_three_seconds():
+    if dai.Device.getAllAvailableDevices():
+        pytest.skip("there is an OAK camera here")
+    begin = time.monotonic()
+    scenario = plan()
+    with pytest.raises(CameraError, match="eye: no OAK camera found: is it plugged in"):
+        build_cameras(scenario, source_config(scenario), ["eye"])
+    assert time.monotonic() - begin < 3.0
+
+
+def test_an_unknown_socket_is_refused():
+    scenario = plan(socket="CAM_Q")
+    with pytest.raises(ScenarioError, match=r"source.socket: expected one of .*CAM_A"):
+        build_cameras(scenario, source_config(scenario), ["eye"])
+
+
+def test_the_library_leaves_the_processs_signals_alone():
+    # Of 1 to 31: those above are the C library's own, which any first thread makes it catch.
+    code = (
+        "from camera_node.sources.devices import oak\n"
+        "def caught():\n"
+        "    told = dict(line.split(':', 1) for line in open('/proc/self/status'))\n"
+        "    return [int(told[name], 16) & 0x7FFFFFFF for name in ('SigBlk', 'SigIgn', 'SigCgt')]\n"
+        "before = caught()\n"
+        "oak.library()\n"
+        "assert caught() == before, (before, caught())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,139 @@
+"""Sources as the node uses them: opened from a scenario, asked for ticks."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.config import source_config
+from camera_node.prepare import prepare
+from camera_node.sources import open_sources
+from camera_node.synthetic import make_scene
+from freshfield import payload
+from freshfield.geometry import Pose
+from freshfield.scenario import ScenarioError, parse
+from tests.camera_node.sources.datasets.photos import opencv_pose, photo_scenario, picture, write_photos
+from tests.conftest import data_dir
+
+
+def opened(scenario, cameras=None, data: Path | None = None):
+    return open_sources(scenario, source_config(scenario), cameras or scenario.cameras, data)
+
+
+def rgb(shot, codec="png"):
+    if isinstance(shot.image, bytes):
+        return payload.decode(shot.image, codec, shot.intrinsics.width, shot.intrinsics.height)
+    return shot.image
+
+
+def test_photos_are_streamed_as_moving_cameras(tmp_path):
+    sources = opened(photo_scenario(write_photos(tmp_path, 24), cameras=3, fps=5))
+    held_out, first = sources["cam00"], sources["cam01"]
+    assert first.fps == 5 and held_out.contents == 3 and first.contents == 11
+    for tick, index in ((0, 0), (1, 8), (2, 16), (3, 8), (4, 0)):
+        shot = held_out.read(held_out.content(tick))
+        np.testing.assert_array_equal(rgb(shot), picture(index)[..., ::-1])
+        np.testing.assert_allclose(shot.pose.matrix(), opencv_pose(index), atol=1e-9)
+    np.testing.assert_array_equal(rgb(first.read(first.content(1))), picture(3)[..., ::-1])
+
+
+def test_a_recording_is_assigned_by_name(tmp_path):
+    data = write_photos(tmp_path, 6, cameras=3)
+    source = opened(photo_scenario(data, 3, fps=20), ["cam02"])["cam02"]
+    # Recorded at 10 a second, captured at 20: every frame is seen twice.
+    assert [source.content(k) for k in range(0, 8)] == [0, 1, 1, 2, 2, 3, 3, 4]
+    np.testing.assert_array_equal(rgb(source.read(1)), picture(13)[..., ::-1])
+    other = opened(photo_scenario(data, 3, assignment={"cam00": "cam02", "cam02": "cam00"}), ["cam00"])
+    np.testing.assert_array_equal(rgb(other["cam00"].read(1)), picture(13)[..., ::-1])
+
+
+def test_wrong_assignments_are_named(tmp_path):
+    data = write_photos(tmp_path, 6, cameras=3)
+    with pytest.raises(ScenarioError, match=r"no camera 'cam03'.*cam00, cam01, cam02"):
+        opened(photo_scenario(data, 4))
+    with pytest.raises(ScenarioError, match=r"assignment\.cam09"):
+        opened(photo_scenario(data, 3, assignment={"cam09": "cam00"}))
+    with pytest.raises(ScenarioError, match="more than one camera shows cam00"):
+        opened(photo_scenario(data, 3, assignment={"cam01": "cam00"}))
+
+
+def test_a_jpeg_of_the_right_size_is_sent_as_it_lies(tmp_path):
+    folder = data_dir("blender_kitchen")
+    scenario = photo_scenario(folder / "transforms.json", 2, codec="jpeg", fps=30)
+    source = opened(scenario, ["cam01"])["cam01"]
+    assert source.read(5).image == (folder / "images/cam01/0005.jpg").read_bytes()
+    shrunk = opened(photo_scenario(folder / "transforms.json", 2, codec="jpeg", scale=2), ["cam01"])["cam01"]
+    assert not isinstance(shrunk.read(5).image, bytes) and shrunk.intrinsics.width == 96
+
+
+@pytest.mark.parametrize(("name", "cameras", "scale"), [("fox", 13, 4), ("lego_synthetic", 13, 2)])
+def test_real_photo_sets_stream(name, cameras, scale):
+    scenario = photo_scenario(data_dir(name), cameras, codec="jpeg", scale=scale)
+    for camera in build_cameras(scenario, source_config(scenario), scenario.cameras):
+        shot = camera.capture(12345)
+        image = payload.decode(shot.payload, "jpeg", shot.intrinsics.width, shot.intrinsics.height)
+        assert image.std() > 10
+
+
+def world_scenario(**source):
+    section = {"kind": "world", "scene": "room", "width": 24, "height": 16, "fps": 10, **source}
+    return parse({"cameras": {"count": 3, "held_out": ["cam00"]}, "source": section}, Path("world.yaml"))
+
+
+def test_the_world_repeats_and_is_exact(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = opened(world_scenario(codec="zstd"), ["cam01"])["cam01"]
+    scene = make_scene("room", {"count": 3, "width": 24, "height": 16})
+    assert source.contents == Fraction(scene.period_s).limit_denominator(10) * 10
+    far = 17_000_000_000
+    assert source.content(far) == far % source.contents
+    shot = source.read(source.content(7))
+    np.testing.assert_array_equal(rgb(shot, "zstd"), scene.render("cam01", 0.7))
+    assert shot.pose == Pose.from_matrix(scene.cameras["cam01"][1])
+    source.release()
+    np.testing.assert_array_equal(rgb(source.read(8), "zstd"), scene.render("cam01", 0.8))
+
+
+def test_a_large_world_is_rendered_by_a_child(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("camera_node.synthetic.source._MAX_RAYS", 10)
+    scenario = world_scenario(scene="tile", codec="zstd")
+    source = opened(scenario, ["cam02"])["cam02"]
+
+    def never(*_):
+        raise AssertionError("rendered in this process")
+
+    monkeypatch.setattr("camera_node.synthetic.scene.Scene.renderer", never)
+    source.prepare(lambda: False)
+    shown = rgb(source.read(0), "zstd")
+    monkeypatch.undo()
+    scene = make_scene("tile", {"count": 3, "width": 24, "height": 16})
+    np.testing.assert_array_equal(shown, scene.render("cam02", 0.0))
+
+
+def test_noise_makes_every_tick_its_own_and_spares_the_truth(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    recorded = photo_scenario(
+        write_photos(tmp_path / "data", 24), 3, effects={"sensor_noise": {"read_noise_counts": 4.0}}
+    )
+    for scenario in (recorded, world_scenario(codec="png", effects={"sensor_noise": None})):
+        truth, noisy = build_cameras(scenario, source_config(scenario), ["cam00", "cam01"])
+        assert truth.source.contents is not None and noisy.source.contents is None
+        prepare([truth, noisy], lambda: False)
+        assert truth.cached(3) is not None and noisy.cached(3) is None
+        one, again, later = noisy.capture(3), noisy.capture(3), noisy.capture(3 + 10**6 * 7920)
+        assert one.payload == again.payload  # the noise belongs to the tick
+        assert one.payload != later.payload
+
+
+def test_effects_that_need_a_world_are_refused_elsewhere(tmp_path):
+    scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={"motion_blur": None})
+    with pytest.raises(ScenarioError, match="need source kind world"):
+        build_cameras(scenario, source_config(scenario), scenario.cameras)
+    scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={"sensor_nois": None})
+    with pytest.raises(ScenarioError, match=r"source.effects.*sensor_nois"):
+        build_cameras(scenario, source_config(scenario), scenario.cameras)

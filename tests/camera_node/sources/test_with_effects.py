@@ -1,0 +1,159 @@
+"""Effects from a scenario to the wire: what a frame shows, and what it claims."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from camera_node.build import build_cameras
+from camera_node.capture import Camera
+from camera_node.config import source_config
+from camera_node.synthetic import make_scene
+from camera_node.synthetic.effects import NAMES
+from freshfield import payload
+from freshfield.frame import Frame, from_request, to_request
+from freshfield.geometry import Pose
+from freshfield.scenario import ScenarioError, parse
+from tests.camera_node.sources.datasets.photos import opencv_pose, photo_scenario, picture, write_photos
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+# Seen in a few hundred pixels.
+SEEN = {"hot_pixels": {"hot_ppm": 50_000.0}, "occluder": {"sweep_deg": 180.0, "thickness_share": 0.3}}
+
+
+def cameras(
+    effects: dict[str, Any], count: int = 3, scene: str = "tower", seed: int = 5
+) -> dict[str, Camera]:
+    source = {
+        "kind": "world", "scene": scene, "width": 24, "height": 16, "fps": 10, "codec": "zstd",
+        "effects": effects, "params": {"supersample": 1},
+    }  # fmt: skip
+    top = {"seed": seed, "cameras": {"count": count, "held_out": ["cam00"]}, "source": source}
+    scenario = parse(top, Path("world.yaml"))
+    return {c.name: c for c in build_cameras(scenario, source_config(scenario), scenario.cameras)}
+
+
+def pixels(camera: Camera, tick: int) -> np.ndarray:
+    shot = camera.capture(tick)
+    return payload.decode(shot.payload, "zstd", shot.intrinsics.width, shot.intrinsics.height)
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"clock_drift"}))
+def test_an_effect_reaches_the_frames_but_not_the_truth(name):
+    """Deterministic by the seed, whoever else is there; in_truth reaches the held-out camera, too."""
+    given = SEEN.get(name, {})
+    plain, affected, truth = cameras({}), cameras({name: given}), cameras({name: {**given, "in_truth": True}})
+    fewer = cameras({name: given}, count=2)
+
+    # An arm passes only now and then.
+    ticks = (0, 7, 23, 123_456) if name != "occluder" else range(0, 80, 4)
+
+    def frames(camera: Camera) -> list[tuple[bytes, Pose, Any]]:
+        shots = [camera.capture(tick) for tick in ticks]
+        return [(s.payload, s.pose, s.intrinsics) for s in shots]
+
+    assert frames(affected["cam00"]) == frames(plain["cam00"])
+    assert frames(affected["cam01"]) != frames(plain["cam01"])
+    assert frames(truth["cam00"]) != frames(plain["cam00"])
+    assert frames(truth["cam01"]) == frames(affected["cam01"]) == frames(fewer["cam01"])
+
+
+@pytest.mark.parametrize("name", ["exposure_drift", "hot_pixels", "pose_noise", "sensor_noise"])
+def test_what_is_drawn_is_a_camera_s_own_and_the_seed_s(name):
+    one, other = cameras({name: SEEN.get(name, {})}), cameras({name: SEEN.get(name, {})}, seed=6)
+    plain = cameras({})
+
+    def change(found: dict[str, Camera], camera: str) -> np.ndarray:
+        if name == "pose_noise":
+            moved = [found[camera].capture(k).pose.translation_m for k in range(9)]
+            return np.subtract(moved, plain[camera].capture(0).pose.translation_m)
+        images = [pixels(found[camera], k).astype(int) - pixels(plain[camera], k) for k in range(9)]
+        return np.array(images, dtype=float)
+
+    a, b, c = change(one, "cam01"), change(one, "cam02"), change(other, "cam01")
+    assert np.abs(a - b).max() > 0 and np.abs(a - c).max() > 0
+
+
+def test_a_wrong_pose_is_claimed_of_the_right_image():
+    found = cameras({"pose_noise": {"translation_mm": 20.0, "rotation_deg": 1.0}})["cam01"]
+    plain = cameras({})["cam01"]
+    assert found.source.contents is None and plain.source.contents is not None
+    again = plain.source.contents
+    shots = [found.capture(k) for k in (3, 3 + again)]
+    assert shots[0].payload == shots[1].payload == plain.capture(3).payload
+    assert len({shots[0].pose, shots[1].pose, plain.capture(3).pose}) == 3
+    assert found.capture(3) == shots[0]
+
+
+def test_a_wrong_calibration_is_claimed_of_every_frame_and_costs_nothing_more():
+    bias = {"translation_mm": 0.0, "rotation_deg": 0.0, "translation_bias_mm": 20.0}
+    found, plain = cameras({"pose_noise": bias})["cam02"], cameras({})["cam02"]
+    assert found.source.contents == plain.source.contents is not None
+    assert found.capture(1).pose == found.capture(99).pose != plain.capture(1).pose
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_the_lens_goes_over_the_wire(calibrated):
+    lens = {"k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.0, "calibrated": calibrated}
+    camera = cameras({"lens_distortion": lens})["cam01"]
+    shot = camera.capture(2)
+    frame = Frame("cam01", "s", 2, 1, shot.pose, shot.intrinsics, "zstd", shot.payload)
+    sent = from_request(to_request(frame)).intrinsics
+    assert sent.distortion == ((-0.1, 0.01, 0.001, 0.0) if calibrated else (0.0,) * 4)
+    assert sent == camera.source.intrinsics
+    params = {"count": 3, "width": 24, "height": 16, "supersample": 1, "distortion": [-0.1, 0.01, 0.001, 0.0]}
+    np.testing.assert_array_equal(pixels(camera, 2), make_scene("tower", params).render("cam01", 0.2))
+
+
+def test_a_lens_that_does_not_go_with_the_scene_is_one_line_with_the_file_s_name():
+    with pytest.raises(
+        ScenarioError, match=r"^world.yaml: source.effects: effect lens_distortion: k1 -2"
+    ) as error:
+        cameras({"lens_distortion": {"k1": -2.0}})
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["fog", "lens_distortion", "rolling_shutter", "shadows", "specular", "vignetting"]
+)
+def test_recordings_have_lenses_and_weather_of_their_own(tmp_path, name):
+    scenario = photo_scenario(write_photos(tmp_path, 24), 3, effects={name: None})
+    with pytest.raises(ScenarioError, match="kinds world, lens and exposure need source kind world"):
+        build_cameras(scenario, source_config(scenario), scenario.cameras)
+
+
+def test_a_recording_with_a_wrong_pose_is_sent_as_it_lies(tmp_path):
+    data = write_photos(tmp_path, 24)
+    for parameters, repeats in (({}, False), ({"translation_mm": 0.0, "rotation_deg": 0.0,
+                                               "rotation_bias_deg": 2.0}, True)):  # fmt: skip
+        scenario = photo_scenario(data, cameras=3, fps=5, effects={"pose_noise": parameters})
+        truth, wrong = build_cameras(scenario, source_config(scenario), ["cam00", "cam01"])
+        assert (wrong.source.contents is not None) == repeats
+        shot = wrong.capture(1)
+        image = payload.decode(shot.payload, "png", 32, 24)
+        np.testing.assert_array_equal(image, picture(3)[..., ::-1])
+        assert not np.allclose(shot.pose.matrix(), opencv_pose(3), atol=1e-6)
+        assert np.allclose(shot.pose.matrix(), opencv_pose(3), atol=0.3)
+        np.testing.assert_allclose(truth.capture(1).pose.matrix(), opencv_pose(8), atol=1e-9)
+
+
+def test_the_exposure_of_a_recording_drifts_with_its_time(tmp_path):
+    drift = {"amplitude_stops": 1.0, "period_s": 2.0, "offset_spread_stops": 0.0}
+    scenario = photo_scenario(
+        write_photos(tmp_path, 1, cameras=2), 2, fps=20, effects={"exposure_drift": drift}
+    )
+    (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
+    means = []
+    for tick in range(80):
+        shot = camera.capture(tick)
+        means.append(payload.decode(shot.payload, "png", 32, 24).mean())
+    assert means[:40] == means[40:]  # 40 frames are two seconds
+    assert max(means) > 1.8 * min(means)

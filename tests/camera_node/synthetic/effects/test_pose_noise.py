@@ -1,0 +1,65 @@
+"""Poses err by the standard deviations asked for, per frame and per camera, and images do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic.effects.pose_noise import PoseNoise, PoseNoiseParameters
+from freshfield.geometry import Pose, look_at, so3_log
+
+POSE = Pose.from_matrix(look_at([1.0, -2.0, 1.5], [0.3, 0.2, 0.4]))
+NONE = {"translation_mm": 0.0, "rotation_deg": 0.0}
+
+
+def make(seed: int = 0, **parameters: float) -> PoseNoise:
+    return PoseNoise(PoseNoiseParameters(**{**NONE, **parameters}), np.random.default_rng(seed))
+
+
+def errors(poses: list[Pose]) -> tuple[np.ndarray, np.ndarray]:
+    """Translations (N, 3) in mm and rotation vectors (N, 3) in degrees, in camera axes."""
+    true = POSE.matrix()
+    moved = np.array([p.translation_m for p in poses]) - true[:3, 3]
+    turned = np.array([so3_log(true[:3, :3].T @ p.matrix()[:3, :3]) for p in poses])
+    return 1e3 * moved, np.rad2deg(turned)
+
+
+def test_the_noise_of_many_frames():
+    noise = make(translation_mm=8.0, rotation_deg=0.5)
+    moved, turned = errors([noise.claimed(POSE, k) for k in range(4000)])
+    assert moved.std(axis=0) == pytest.approx([8.0] * 3, rel=0.04)
+    assert turned.std(axis=0) == pytest.approx([0.5] * 3, rel=0.04)
+    assert np.abs(moved.mean(axis=0)).max() < 0.5 and np.abs(turned.mean(axis=0)).max() < 0.03
+    # White: one frame's error says nothing about the next one's, nor one axis about another.
+    both = np.concatenate([moved, turned], axis=1)
+    assert np.abs(np.corrcoef(both.T) - np.eye(6)).max() < 0.06
+    assert max(abs(np.corrcoef(e[1:], e[:-1])[0, 1]) for e in both.T) < 0.06
+
+
+def test_the_bias_is_a_camera_s_own_and_for_good():
+    cameras = [make(k, translation_bias_mm=12.0, rotation_bias_deg=0.8) for k in range(2000)]
+    assert not cameras[0].varies
+    assert cameras[5].claimed(POSE, 0) == cameras[5].claimed(POSE, 900)
+    moved, turned = errors([c.claimed(POSE, 0) for c in cameras])
+    assert moved.std(axis=0) == pytest.approx([12.0] * 3, rel=0.05)
+    assert turned.std(axis=0) == pytest.approx([0.8] * 3, rel=0.05)
+
+
+def test_frames_repeat_in_any_order_and_cameras_differ():
+    noise = make(translation_mm=5.0)
+    poses = {k: noise.claimed(POSE, k) for k in (0, 1, 2**40)}
+    assert len({p.translation_m for p in poses.values()}) == 3
+    again = make(translation_mm=5.0)
+    assert all(again.claimed(POSE, k) == poses[k] for k in (2**40, 1, 0))
+    assert make(1, translation_mm=5.0).claimed(POSE, 0) != poses[0]
+
+
+def test_no_noise_is_the_pose_itself():
+    claimed = make().claimed(POSE, 3)
+    assert np.allclose(claimed.matrix(), POSE.matrix(), atol=1e-15) and not make().varies
+
+
+def test_a_large_error_is_still_a_pose():
+    noise = make(rotation_deg=180.0, translation_mm=1e5)
+    for k in range(200):
+        Pose.from_matrix(noise.claimed(POSE, k).matrix())

@@ -1,0 +1,181 @@
+"""Only what is listed is imported, made or computed."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import pkgutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic import effects as fx
+from camera_node.synthetic import make_scene, render
+from freshfield.geometry import Pose
+
+STREAM = """
+import sys, tracemalloc
+from pathlib import Path
+import numpy as np
+from camera_node.synthetic import effects as fx, make_scene
+from camera_node.synthetic.frame_cache import FrameCache
+
+listed, folder = {listed!r}, Path({folder!r})
+streams = []
+scene = make_scene("tile", dict(width=16, height=16, supersample=1))
+tracemalloc.start(4)
+calls = 0
+def count(frame, event, argument):
+    global calls
+    calls += event == "call" and Path(frame.f_code.co_filename).parent.name == "effects" \\
+        and not frame.f_code.co_filename.endswith("__init__.py")
+effects = fx.load_effects(listed, lambda n: streams.append(n) or np.random.default_rng(0))
+cache = FrameCache(scene, "cam01", 15, effects=effects, folder=folder)
+sys.setprofile(count)
+for k in range(12):
+    cache.read(cache.content(k))
+    effects.node_ns(k)
+sys.setprofile(None)
+held = tracemalloc.take_snapshot().filter_traces(
+    [tracemalloc.Filter(True, "*world/effects/[a-z]*", all_frames=True)]).statistics("filename")
+modules = sorted(m.rsplit(".", 1)[1] for m in sys.modules if m.startswith("camera_node.synthetic.effects."))
+print(modules, streams, calls > 0, sum(s.size for s in held) > 0)
+"""
+
+
+def stream(listed: dict, folder: str) -> str:
+    code = STREAM.format(listed=listed, folder=folder)
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert out.returncode == 0, out.stderr
+    return out.stdout.strip()
+
+
+def test_nothing_listed_is_nothing_imported_called_or_allocated(tmp_path):
+    assert stream({}, str(tmp_path)) == "[] [] False False"
+
+
+def test_what_is_listed_is_all_that_is_imported(tmp_path):
+    """The other way round, so that the test above cannot pass by measuring nothing."""
+    expected = "['sensor_noise'] ['sensor_noise'] True True"
+    assert stream({"sensor_noise": {}}, str(tmp_path)) == expected
+
+
+def test_each_effect_imports_itself_and_no_other():
+    """In one process for all: an effect's module is dropped again before the next is listed."""
+    code = """
+import sys, numpy as np
+from camera_node.synthetic import effects as fx
+prefix = fx.__name__ + "."
+for name in fx.NAMES:
+    fx.load_effects({name: {}}, lambda n: np.random.default_rng(0))
+    print(name, sorted(m.removeprefix(prefix) for m in sys.modules if m.startswith(prefix)) == [name])
+    del sys.modules[prefix + name]
+"""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.split("\n")[:-1] == [f"{name} True" for name in fx.NAMES]
+
+
+def test_without_gloss_shadower_and_veil_none_of_their_light_is_computed(monkeypatch):
+    monkeypatch.setattr(render, "gleam", None)
+    monkeypatch.setattr(render.CameraRenderer, "_shadow", None)
+    scene = make_scene("room", {"width": 16, "height": 16, "supersample": 1})
+    view = scene.renderer("cam00")
+    view.image(0.3)
+    assert view._clear is None and not hasattr(view, "_lit")
+
+
+def test_nothing_listed_passes_everything_through_untouched():
+    effects = fx.load_effects({}, lambda name: pytest.fail("no stream is asked for"))
+    scene, image = make_scene("tile", {"width": 8, "height": 8}), np.zeros((8, 8, 3), np.uint8)
+    assert effects is fx.NO_EFFECTS
+    assert effects.extend(scene) is scene
+    assert effects.apply(image, 3, 0.2) is image
+    view, pose = scene.renderer("cam00"), Pose.from_matrix(scene.cameras["cam00"][1])
+    assert effects.exposed(view) is view
+    assert effects.node_ns(12345) == 12345
+    assert effects.claimed_lens(view.camera) is view.camera
+    assert effects.claimed_pose(pose, 3) is pose and not effects.pose_varies
+
+
+def test_every_file_is_registered_and_follows_the_protocol():
+    on_disk = sorted(m.name for m in pkgutil.iter_modules(fx.__path__))
+    assert sorted(fx.NAMES) == on_disk
+    methods = {
+        "world": "extend", "lens": "through", "exposure": "expose",
+        "image": "apply", "clock": "node_ns", "pose": "claimed",
+    }  # fmt: skip
+    for name in fx.NAMES:
+        cls = getattr(importlib.import_module(f"camera_node.synthetic.effects.{name}"), fx._CLASSES[name])
+        assert callable(getattr(cls, methods[cls.kind]))
+        parameters = cls.Parameters()
+        assert dataclasses.is_dataclass(parameters) and parameters.in_truth is False
+
+
+def test_the_held_out_camera_shows_the_truth_unless_told_otherwise():
+    listed = {"sensor_noise": {}, "occluder": {"in_truth": True}, "clock_drift": None}
+    asked: list[str] = []
+
+    def rng_for(name: str) -> np.random.Generator:
+        asked.append(name)
+        return np.random.default_rng(0)
+
+    held_out = fx.load_effects(listed, rng_for, held_out=True)
+    assert asked == ["occluder"]
+    assert len(held_out.world) == 1 and not held_out.image and not held_out.clock
+    assert fx.load_effects({"sensor_noise": {}}, rng_for, held_out=True) is fx.NO_EFFECTS
+    training = fx.load_effects(listed, rng_for)
+    assert len(training.world) == len(training.image) == len(training.clock) == 1
+
+
+@pytest.mark.parametrize(
+    ("listed", "message"),
+    [
+        (
+            {"smoke": {}},
+            "unknown effect 'smoke'; valid effects: clock_drift, exposure_drift, fog, hot_pixels, lens_dis",
+        ),
+        (
+            {"sensor_noise": {"sigma": 1}},
+            "effect sensor_noise.sigma: unknown key; expected one of read_noise",
+        ),
+        ({"motion_blur": {"exposure_ms": 0}}, "effect motion_blur: exposure_ms must be within"),
+        ({"motion_blur": {"samples": 2.5}}, "whole number"),
+        ({"occluder": {"period_s": "6 s"}}, "expected a number"),
+        ({"clock_drift": {"drift_ppm": 1e9}}, "drift_ppm must be within -100000 to 100000"),
+        ({"sensor_noise": {"read_noise_counts": -1}}, "read_noise_counts must be within 0 to 10000"),
+        ({"fog": {"visibility_m": 0}}, "effect fog: visibility_m must be within 0.01 to 1e.06, got 0"),
+        ({"fog": {"airlight": [0.5, 0.5]}}, "3 values"),
+        ({"fog": {"airlight": [0.5, 0.5, 1.5]}}, "airlight must be three shares"),
+        ({"shadows": {"opacity": 1.5}}, "opacity must be within 0 to 1"),
+        ({"specular": {"roughness": 0}}, "roughness must be within 0.02 to 1"),
+        ({"specular": {"refractive_index": 0.9}}, "refractive_index must be within 1 to 50"),
+        ({"rolling_shutter": {"rows_at_once": 0}}, "rows_at_once must be within 1"),
+        ({"rolling_shutter": {"readout_ms": 5000}}, "readout_ms must be within 0 to 1000"),
+        ({"exposure_drift": {"period_s": 0}}, "period_s must be within 0.01"),
+        ({"exposure_drift": {"amplitude_stops": float("inf")}}, "amplitude_stops"),
+        ({"vignetting": {"exponent": -1}}, "exponent must be within 0 to 64"),
+        ({"lens_distortion": {"k1": 99}}, "k1 must be within -10 to 10"),
+        ({"lens_distortion": {"calibrated": "no"}}, "lens_distortion.calibrated"),
+        ({"hot_pixels": {"hot_ppm": 2e6}}, "hot_ppm must be within 0 to 1e.06"),
+        ({"pose_noise": {"rotation_deg": 181}}, "rotation_deg must be within 0 to 180"),
+        ({"pose_noise": {"translation_mm": float("nan")}}, "translation_mm"),
+    ],
+)
+def test_an_effect_that_cannot_be_is_refused_in_one_line(listed, message):
+    with pytest.raises(fx.EffectError, match=message) as error:
+        fx.load_effects(listed, lambda name: np.random.default_rng(0))
+    assert "\n" not in str(error.value)
+
+
+def test_a_stream_of_its_own_for_each_effect():
+    """What one effect draws does not depend on which others are listed."""
+
+    def rng_for(name: str) -> np.random.Generator:
+        return np.random.default_rng([1, *name.encode()])
+
+    image = np.full((8, 8, 3), 128, np.uint8)
+    alone = fx.load_effects({"sensor_noise": {}}, rng_for)
+    among = fx.load_effects({"clock_drift": {}, "motion_blur": {}, "sensor_noise": {}}, rng_for)
+    assert np.array_equal(alone.apply(image, 0, 0.0), among.apply(image, 0, 0.0))

@@ -1,0 +1,54 @@
+"""Sensor noise has the variance it promises, and the stream and frame number alone decide it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic.effects.sensor_noise import SensorNoise, SensorNoiseParameters
+
+
+def make(seed: int = 0, **parameters: float) -> SensorNoise:
+    return SensorNoise(SensorNoiseParameters(**parameters), np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("level", [20, 128, 220])
+def test_mean_and_variance(level):
+    noise = make(read_noise_counts=2.0, full_well_electrons=2000.0)
+    image = np.full((256, 256, 3), level, np.uint8)
+    out = noise.apply(image, 0).astype(float)
+    # Rounding to whole counts adds 1/12.
+    expected = 4.0 + level * 255 / 2000 + 1 / 12
+    assert out.mean() == pytest.approx(level, abs=0.05)
+    assert out.var() == pytest.approx(expected, rel=0.02)
+
+
+def test_no_noise_is_no_change():
+    image = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    noise = make(read_noise_counts=0.0, full_well_electrons=0.0)
+    assert np.array_equal(noise.apply(image, 5), image)
+
+
+def test_frames_differ_and_repeat_in_any_order():
+    image = np.full((32, 32, 3), 100, np.uint8)
+    noise = make()
+    frames = {k: noise.apply(image, k) for k in (0, 1, 2**40)}
+    assert not np.array_equal(frames[0], frames[1]) and not np.array_equal(frames[1], frames[2**40])
+    again = make()
+    assert all(np.array_equal(again.apply(image, k), frames[k]) for k in (2**40, 1, 0))
+    assert not np.array_equal(make(seed=1).apply(image, 0), frames[0])
+    assert (image == 100).all()
+
+
+def test_neighbours_and_channels_are_independent():
+    image = np.full((256, 256, 3), 128, np.uint8)
+    noise = make(read_noise_counts=4.0)
+    a, b = (noise.apply(image, k).astype(float) - 128 for k in (0, 1))
+    for x, y in ((a, b), (a[..., 0], a[..., 1]), (a[1:], a[:-1]), (a[:, 1:], a[:, :-1])):
+        assert abs(np.corrcoef(x.ravel(), y.ravel())[0, 1]) < 0.01
+
+
+def test_black_and_white_stay_in_range():
+    for level in (0, 255):
+        out = make(read_noise_counts=50.0).apply(np.full((64, 64, 3), level, np.uint8), 0)
+        assert out.dtype == np.uint8 and (out == level).mean() > 0.4  # clipped, not wrapped round

@@ -1,0 +1,26 @@
+"""A view made of a function of time, for effects that ask a view for instants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from camera_node.synthetic.render import Image
+from freshfield.geometry import Pinhole
+
+
+@dataclass
+class Film:
+    """Shows ``render(t_s)``; ``asked`` are the instants and rows that were asked for."""
+
+    render: Callable[[float], NDArray[np.uint8]]
+    camera: Pinhole = field(default_factory=lambda: Pinhole.from_fov(2, 2, 60.0))
+    asked: list[tuple[float, tuple[int, int] | None]] = field(default_factory=list)
+
+    def image(self, t_s: float, rows: tuple[int, int] | None = None) -> Image:
+        self.asked.append((t_s, rows))
+        image = self.render(t_s)
+        return image if rows is None else image[rows[0] : rows[1]]

@@ -1,0 +1,103 @@
+"""Motion is periodic, smooth and as fast as asked; feet stand still while they stand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from camera_node.synthetic import motion, person
+
+WALK = person.Walk((0.0, 1.0), (0.7, 0.5), 4.8)
+
+
+def test_phase_stays_in_range_and_refuses_what_is_not_a_time():
+    for t in (0.0, -1e-18, -1.0, 4.8, 4.8 * 7, 1e9, -1e9, 1e17):
+        assert 0.0 <= motion.phase_of(t, 4.8) < 1.0
+    for t in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match="finite"):
+            motion.phase_of(t, 4.8)
+
+
+@given(st.floats(0, 1, exclude_max=True))
+def test_the_figure_joins_up_at_the_end_of_the_loop(phase):
+    for a, b in zip(person.bones(WALK, phase), person.bones(WALK, phase + 1.0)):
+        assert np.allclose(a, b, atol=1e-9)
+
+
+def test_motion_is_continuous():
+    """No part jumps: between phases 1/4000 apart nothing moves faster than 12 loop lengths a loop."""
+    n = 4000
+    starts = np.stack([person.bones(WALK, k / n)[0] for k in range(n + 1)])
+    step = np.linalg.norm(np.diff(starts, axis=0), axis=2).max()
+    assert step < 12 * 4.8 / n
+
+
+def test_limbs_keep_their_lengths():
+    names = person._NAMES
+    for phase in np.linspace(0, 1, 97):
+        start, end, _ = person.bones(WALK, phase)
+        length = np.linalg.norm(end - start, axis=1)
+        for name, expected in (("upper_arm_l", 0.29), ("forearm_r", 0.25)):
+            assert length[names.index(name)] == pytest.approx(expected)
+        # A leg may be stretched a little at the end of a long step, never folded wrongly.
+        assert length[names.index("thigh_l")] == pytest.approx(0.42, rel=0.07)
+        assert length[names.index("shin_r")] == pytest.approx(0.41, rel=0.07)
+
+
+def test_a_foot_rests_during_its_stance_and_moves_during_its_swing():
+    at = [motion.step_phase(k / 3000, 3, 0.0) for k in range(1000)]
+    stance = [p for p, swing in at if swing == 0.0]
+    assert len(set(stance)) == 1 and len(stance) == pytest.approx(500, abs=2)
+    assert at[-1][0] - at[0][0] == pytest.approx(1 / 3, rel=1e-2)
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.3, 1.0, 2.5, 4.0, 8.0])
+def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
+    """Measured independently: middles of all parts, by finite differences over one period in seconds."""
+    walk = person.walk_at((0.0, 1.0), (0.74, 0.54), speed)
+    assert (walk.period_s / motion.TICK_S) == pytest.approx(round(walk.period_s / motion.TICK_S))
+    mover = person.walking_person(walk)
+    n = 400
+    centres = []
+    for k in range(n + 1):
+        m = mover.matrices(walk.period_s * k / n)
+        local = np.stack([p.shape.bounding_sphere()[0] for p in mover.parts])
+        centres.append((m[:, :3, :3] @ local[:, :, None])[:, :, 0] + m[:, :3, 3])
+    metres = np.linalg.norm(np.diff(np.stack(centres), axis=0), axis=2).sum(axis=0).mean()
+    assert metres / walk.period_s == pytest.approx(speed, rel=0.03)
+
+
+def test_zero_speed_stands_still():
+    mover = person.walking_person(person.walk_at((0.0, 1.0), (0.7, 0.5), 0.0))
+    assert np.array_equal(mover.matrices(0.0), mover.matrices(12.345))
+
+
+@given(
+    st.tuples(*[st.floats(-1, 1)] * 3),
+    st.tuples(*[st.floats(-1, 1)] * 3),
+    st.tuples(*[st.floats(-1, 1)] * 3),
+)
+def test_two_bones_meet_the_joint(root, tip, pole):
+    upper, lower = 0.6, 0.5
+    joint = np.array(motion.two_bone(root, tip, upper, lower, pole))
+    assert np.isfinite(joint).all()
+    distance = float(np.linalg.norm(np.subtract(tip, root)))
+    # Within reach, with a pole that is not along the limb, both bones have their lengths.
+    across = np.cross(np.subtract(tip, root), pole)
+    if 0.11 < distance < 0.98 and np.linalg.norm(across) > 1e-3:
+        assert np.linalg.norm(joint - root) == pytest.approx(upper, rel=1e-6)
+        assert np.linalg.norm(joint - tip) == pytest.approx(lower, rel=1e-6)
+
+
+def test_bone_frames_are_rotations_even_along_their_side_vector():
+    start = np.zeros((4, 3))
+    end = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0], [0, 0, 0]])
+    side = np.array([[1, 0, 0], [1.0, 0, 0], [0, 1, 0], [1, 0, 0]])
+    frames = motion.bone_frames(start, end, side)
+    assert np.isfinite(frames).all()
+    for k in range(4):
+        r = frames[k, :3, :3]
+        assert np.allclose(r @ r.T, np.eye(3)) and np.linalg.det(r) == pytest.approx(1.0)
+        assert k == 3 or np.allclose(r[:, 2], end[k])

@@ -1,0 +1,167 @@
+"""The renderer against geometry it does not use: projections, depths, brute force."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic.render import (
+    CameraRenderer,
+    Light,
+    Mover,
+    Part,
+    World,
+    cast,
+    place_still,
+    rays_within,
+)
+from camera_node.synthetic.shapes import Box, Quad, Sphere, nearest_hit
+from camera_node.synthetic.textures import Checker, Noise, Plain
+from freshfield.geometry import Pinhole, look_at, se3_inverse, world_rays
+
+FLAT = Light(np.array([[0.0, 0.0, 50.0]]), 0.0, 1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
+SOFT = Light(np.array([[0.0, -1.0, 4.0], [1.0, 0.0, 4.0]]), 0.6, 4.0, (0.3,) * 3, (0.5,) * 3)
+CAMERA = Pinhole.from_fov(96, 72, 60.0)
+POSE = look_at([1.5, -3.0, 1.2], [0.0, 0.0, 0.3])
+WHITE, RED = Plain((1.0, 1.0, 1.0)), Plain((0.8, 0.1, 0.1))
+
+
+def at(*xyz: float) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, 3] = xyz
+    return out
+
+
+@pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), (-0.25, 0.06, 0.004, -0.003)])
+def test_a_small_ball_appears_where_the_camera_model_projects_it(distortion):
+    camera = dataclasses.replace(Pinhole.from_fov(256, 192, 70.0), distortion=distortion)
+    for point in ([0.0, 0.0, 0.3], [0.9, 0.4, -0.4], [-1.1, 0.2, 0.9]):
+        world = World((Part(Sphere(0.05), WHITE, at(*point)),), (), FLAT)
+        image = CameraRenderer(world, camera, POSE, supersample=3).image(0.0)[..., 0].astype(float)
+        v, u = np.mgrid[0:192, 0:256] + 0.5
+        centroid = np.array([(u * image).sum(), (v * image).sum()]) / image.sum()
+        in_camera = se3_inverse(POSE) @ [*point, 1.0]
+        assert np.allclose(centroid, camera.project(in_camera[:3]), atol=0.15)
+
+
+def test_distance_is_along_the_ray():
+    world = World((Part(Quad((50.0, 50.0)), WHITE),), (), FLAT)
+    renderer = CameraRenderer(world, CAMERA, POSE)
+    origin, d = world_rays(CAMERA, POSE)
+    expected = np.where(d[..., 2] < 0, -origin[2] / np.minimum(d[..., 2], -1e-12), np.inf)
+    seen = np.abs(origin + np.where(np.isfinite(expected), expected, 0)[..., None] * d).max(axis=-1) < 50
+    assert np.allclose(renderer.distance()[seen], expected[seen])
+    assert np.isinf(renderer.distance()[~seen]).all()
+
+
+def test_cones_leave_out_no_ray_that_hits():
+    """The culled cast equals every ray tried on every part."""
+    rng = np.random.default_rng(0)
+    parts = [Part(Sphere(0.3), WHITE, at(*rng.uniform(-1, 1, 3))) for _ in range(6)]
+    parts += [Part(Box(tuple(rng.uniform(0.1, 0.5, 3))), RED, at(*rng.uniform(-1, 1, 3))) for _ in range(6)]
+    d = rng.standard_normal((3, 4000))
+    d /= np.linalg.norm(d, axis=0)
+    for origin in (np.array([2.0, 1.0, 0.5]), np.array([0.1, 0.0, 0.0]), parts[0].matrix[:3, 3]):
+        t, which = cast(origin, d, place_still(parts), np.full(4000, np.inf))
+        every = np.stack([nearest_hit(p.shape, (origin - p.matrix[:3, 3])[:, None], d) for p in parts])
+        assert np.allclose(t, every.min(axis=0))
+        hit = np.isfinite(t)
+        assert np.array_equal(which[hit], every.argmin(axis=0)[hit]) and (which[~hit] == -1).all()
+
+
+def test_rays_within_takes_all_from_inside_and_none_behind():
+    d = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    assert rays_within(np.zeros(3), d, np.array([0.1, 0.0, 0.0]), 0.5).size == 3
+    assert rays_within(np.zeros(3), d, np.array([-5.0, -5.0, -5.0]), 0.5).size == 0
+
+
+def test_what_moves_is_drawn_as_what_stands():
+    """A mover at rest gives the very pixels of a static part in the same place, in front and behind."""
+    floor = Part(Quad((3.0, 3.0)), Checker((0.2, 0.4, 0.6), (0.9, 0.8, 0.7), 0.3))
+    post = Part(Box((0.1, 0.1, 0.6)), RED, at(0.25, -0.4, 0.6))
+    ball = Part(Sphere(0.4), Noise(WHITE, 0.2, 0.3), at(0.0, 0.0, 0.5) @ np.diag([1.0, 0.6, 1.3, 1.0]))
+    still = World((floor, post, ball), (), FLAT)
+    moving = World((floor, post), (Mover((ball,), lambda t: ball.matrix[None]),), FLAT)
+    for supersample in (1, 2):
+        a = CameraRenderer(still, CAMERA, POSE, supersample).image(0.0)
+        assert np.array_equal(a, CameraRenderer(moving, CAMERA, POSE, supersample).image(0.0))
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_movers_hide_each_other_by_distance_not_by_order(order):
+    near, far = Part(Sphere(0.2), RED, at(0.75, -1.5, 0.75)), Part(Sphere(0.5), WHITE, at(0.0, 0.0, 0.3))
+    movers = [Mover((p,), lambda t, p=p: p.matrix[None]) for p in (near, far)]
+    world = World((), tuple(movers[::-1] if order else movers), FLAT)
+    still = World((near, far), (), FLAT)
+    assert np.array_equal(
+        CameraRenderer(world, CAMERA, POSE).image(0.0), CameraRenderer(still, CAMERA, POSE).image(0.0)
+    )
+
+
+def test_colour_depends_on_the_place_and_not_on_the_viewer():
+    parts = (
+        Part(Quad((3.0, 3.0)), Noise(Plain((0.6, 0.5, 0.4)), 0.8, 0.3)),
+        Part(Sphere(0.5), Noise(Plain((0.3, 0.5, 0.8)), 0.4, 0.3), at(0.2, 0.1, 0.5)),
+    )
+    world = World(parts, (), SOFT)
+    other = look_at([-1.0, -3.2, 1.6], [0.0, 0.0, 0.3])
+    a, b = (CameraRenderer(world, Pinhole.from_fov(320, 240, 60.0), p) for p in (POSE, other))
+    image_a, image_b = a.image(0.0).astype(int), b.image(0.0).astype(int)
+    origin, d = world_rays(Pinhole.from_fov(320, 240, 60.0), POSE)
+    points = origin + np.where(np.isfinite(a.distance()), a.distance(), 0.0)[..., None] * d
+    inverse = se3_inverse(other)
+    uv = Pinhole.from_fov(320, 240, 60.0).project(points @ inverse[:3, :3].T + inverse[:3, 3])
+    inside = np.isfinite(a.distance()) & (uv > 1).all(axis=-1) & (uv < [319, 239]).all(axis=-1)
+    column, row = (np.floor(uv[inside]).astype(int)).T
+    # Seen by both: the other camera's distance there is the point's own.
+    both = np.abs(b.distance()[row, column] - np.linalg.norm(points[inside] - other[:3, 3], axis=1)) < 0.02
+    assert both.sum() > 5000
+    gap = np.abs(image_a[inside][both] - image_b[row, column][both]).max(axis=1)
+    # One pixel is up to some centimetres: smooth textures differ by little, shadow edges by more.
+    assert np.median(gap) <= 2 and np.mean(gap > 12) < 0.03
+
+
+def test_a_shadow_falls_where_the_light_is_hidden():
+    floor, ball = Part(Quad((3.0, 3.0)), WHITE), Part(Sphere(0.4), RED, at(0.0, 0.0, 1.2))
+    lamp = Light(np.array([[0.0, 0.0, 3.0]]), 0.6, 10.0, (0.2,) * 3, (0.2,) * 3)
+    top = look_at([2.0, -2.0, 2.5], [0.0, 0.0, 0.0])
+    with_ball = CameraRenderer(World((floor, ball), (), lamp), CAMERA, top).image(0.0).astype(int)
+    without = CameraRenderer(World((floor,), (), lamp), CAMERA, top).image(0.0).astype(int)
+    u, v = CAMERA.project((se3_inverse(top) @ [0.0, 0.0, 0.0, 1.0])[:3]).astype(int)
+    assert without[v, u, 0] > 150 and with_ball[v, u, 0] == pytest.approx(0.2 * 255, abs=1)
+    u, v = CAMERA.project((se3_inverse(top) @ [1.2, 0.9, 0.0, 1.0])[:3]).astype(int)
+    assert np.array_equal(with_ball[v, u], without[v, u])
+
+
+def test_a_moving_part_darkens_the_floor_beneath_it_only():
+    floor = Part(Quad((3.0, 3.0)), WHITE, takes_contact=True)
+    ball = Part(Sphere(0.1), RED, at(0.0, 0.0, 0.12))
+    mover = Mover((ball,), lambda t: ball.matrix[None], contact=((0, 0.1),))
+    top = look_at([0.0, -1.0, 3.0], [0.0, 0.0, 0.0])
+    image = CameraRenderer(World((floor,), (mover,), FLAT), CAMERA, top).image(0.0)
+    u, v = CAMERA.project((se3_inverse(top) @ [0.16, 0.0, 0.0, 1.0])[:3]).astype(int)
+    assert image[v, u, 1] < 245
+    u, v = CAMERA.project((se3_inverse(top) @ [1.1, 0.0, 0.0, 1.0])[:3]).astype(int)
+    assert (image[v, u] == 255).all()
+
+
+def test_supersampling_averages_the_finer_image():
+    world = World((Part(Quad((3.0, 3.0)), Checker((0.0,) * 3, (1.0,) * 3, 0.11)),), (), FLAT)
+    fine = CameraRenderer(world, CAMERA.scaled(2), POSE).image(0.0).astype(float)
+    mean = fine.reshape(72, 2, 96, 2, 3).mean(axis=(1, 3))
+    assert np.abs(CameraRenderer(world, CAMERA, POSE, 2).image(0.0) - mean).max() <= 1.0
+
+
+def test_a_world_of_nothing_is_its_background():
+    image = CameraRenderer(World((), (), FLAT, (0.2, 0.4, 0.6)), CAMERA, POSE).image(0.0)
+    assert (image == [51, 102, 153]).all() and image.shape == (72, 96, 3) and image.dtype == np.uint8
+
+
+def test_images_are_the_callers_own():
+    renderer = CameraRenderer(World((Part(Sphere(0.5), WHITE),), (), FLAT), CAMERA, POSE)
+    first = renderer.image(0.0)
+    kept = first.copy()
+    first[:] = 7
+    assert np.array_equal(renderer.image(0.0), kept)

@@ -1,0 +1,313 @@
+"""The scenes as their users see them: names, cameras, bounds, motion, and what is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from camera_node.synthetic import SCENES, SceneError, camera_rig, make_scene, preview
+from camera_node.synthetic import person as figure
+from camera_node.synthetic.shapes import Box
+from freshfield.geometry import Pose, world_rays
+
+SMALL = {"width": 48, "height": 48}
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("count", [1, 2, 13, 19])
+def test_cameras_are_named_posed_and_look_at_the_target(name, count):
+    scene = make_scene(name, {"count": count, **SMALL})
+    assert list(scene.cameras) == [f"cam{k:02d}" for k in range(count)]
+    for camera, pose in scene.cameras.values():
+        Pose.from_matrix(pose)
+        assert (camera.width, camera.height) == (48, 48)
+        to = np.asarray(scene.target) - pose[:3, 3]
+        outward = -1.0 if name == "tower" else 1.0
+        assert pose[:3, 2] @ to / np.linalg.norm(to) == pytest.approx(outward)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_held_out_camera_is_15_degrees_from_every_other(name):
+    scene = make_scene(name, {"count": 19, **SMALL})
+    axes = np.stack([pose[:3, 2] for _, pose in scene.cameras.values()])
+    angles = np.degrees(np.arccos(np.clip(axes[1:] @ axes[0], -1, 1)))
+    assert scene.held_out == "cam00" and angles.min() >= 15.0
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_fewer_cameras_keep_their_places_and_stay_spread(name):
+    full = make_scene(name, {"count": 19, **SMALL}).cameras
+    some = make_scene(name, {"count": 13, **SMALL}).cameras
+    assert all(np.array_equal(some[c][1], full[c][1]) for c in some)
+    axes = np.stack([p[:3, 2] for _, p in full.values()])
+    # No camera that was left out is further from a kept one than 35 degrees.
+    nearest = np.degrees(np.arccos(np.clip((axes[13:] @ axes[:13].T).max(axis=1), -1, 1)))
+    assert nearest.max() < 35.0
+
+
+def test_spread_order_is_a_permutation_that_starts_far_apart():
+    d = np.random.default_rng(0).standard_normal((12, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    order = camera_rig.spread_order(d)
+    assert sorted(order) == list(range(12)) and order[0] == 0
+    assert order[1] == int(np.argmin(d @ d[0]))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_everything_seen_lies_within_the_bounds(name):
+    scene = make_scene(name, {"count": 19, **SMALL, "supersample": 1})
+    for camera_id, (camera, pose) in scene.cameras.items():
+        origin, d = world_rays(camera, pose)
+        t = scene.renderer(camera_id).distance()
+        points = (origin + np.where(np.isfinite(t), t, 0.0)[..., None] * d)[np.isfinite(t)]
+        assert (points >= scene.bounds[0] - 1e-6).all() and (points <= scene.bounds[1] + 1e-6).all()
+        assert np.isfinite(t).all() or name == "tile"
+
+
+@pytest.mark.parametrize("name", ["room", "tower"])
+@pytest.mark.parametrize("speed", [0.05, 1.0, 3.0, 8.0])
+def test_what_moves_stays_within_the_bounds_and_off_the_cameras(name, speed):
+    scene = make_scene(name, {"speed_m_per_s": speed, **SMALL})
+    eyes = np.stack([pose[:3, 3] for _, pose in scene.cameras.values()])
+    for mover in scene.world.movers:
+        for t in np.linspace(0, scene.period_s, 41):
+            for part, m in zip(mover.parts, mover.matrices(t)):
+                centre, radius = part.shape.bounding_sphere()
+                at = m[:3, :3] @ centre + m[:3, 3]
+                assert (at + radius < scene.bounds[1]).all() and (at[:2] - radius > scene.bounds[0][:2]).all()
+                assert np.linalg.norm(eyes - at, axis=1).min() > radius + 0.3
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.4, 1.0, 4.0])
+def test_the_cart_of_the_tower_moves_at_the_speed_asked_for(speed):
+    scene = make_scene("tower", {"speed_m_per_s": speed, **SMALL})
+    cart = scene.world.movers[1]
+    deck = np.stack([cart.matrices(t)[0] for t in np.arange(2000) / 2000 * scene.period_s])
+    steps = np.diff(deck[:, :3, 3], axis=0, append=deck[:1, :3, 3])
+    assert np.linalg.norm(steps, axis=1).sum() / scene.period_s == pytest.approx(speed, rel=1e-3)
+    # It drives forwards: its long axis along the way.
+    along = (steps / np.linalg.norm(steps, axis=1, keepdims=True) * deck[:, :3, 0]).sum(axis=1)
+    assert along.min() > 0.99
+
+
+def test_the_tower_looks_all_round_and_few_cameras_see_the_same():
+    """Every held-out pixel is seen by at least one training camera, and by some three on average."""
+    scene = make_scene("tower", {"count": 19, **SMALL, "supersample": 1})
+    camera, pose = scene.cameras["cam00"]
+    origin, d = world_rays(camera, pose)
+    points = origin + scene.renderer("cam00").distance()[..., None] * d
+    seen = np.zeros(points.shape[:2], dtype=int)
+    for name, (lens, other) in scene.cameras.items():
+        if name != "cam00":
+            uv = lens.project((points - other[:3, 3]) @ other[:3, :3])
+            seen += np.isfinite(uv).all(axis=-1) & (uv > 0).all(axis=-1) & (uv < 48).all(axis=-1)
+    assert seen.min() >= 1 and 2.5 < seen.mean() < 5.0
+    axes = np.stack([p[:3, 2] for _, p in scene.cameras.values()])
+    assert np.linalg.norm(axes[:, :2].mean(axis=0)) < 0.2  # no side is preferred
+
+
+def moving_share(scene, instants: int = 16) -> float:
+    """Mean share of held-out pixels that differ by more than .03 in some channel from the truth 60, 120,
+    200 or 300 ms earlier (the definition used for moving pixels everywhere)."""
+    shares = []
+    for t in np.arange(instants) / instants * scene.period_s:
+        now = scene.render("cam00", t).astype(float) / 255
+        moved = np.zeros(now.shape[:2], dtype=bool)
+        for lag in (0.06, 0.12, 0.2, 0.3):
+            moved |= np.abs(now - scene.render("cam00", t - lag) / 255.0).max(axis=-1) > 0.03
+        shares.append(moved.mean())
+    return float(np.mean(shares))
+
+
+def test_the_share_of_moving_pixels():
+    shares = {v: moving_share(make_scene("room", {"speed_m_per_s": v})) for v in (0.0, 0.5, 1.0, 4.0)}
+    assert shares[0.0] == 0.0
+    assert 0.04 <= shares[1.0] <= 0.075
+    assert shares[0.5] < shares[1.0] < shares[4.0]
+
+
+def test_which_of_two_moves_in_the_tower_is_drawn_and_only_it_is_there():
+    small = {**SMALL, "supersample": 1, "movers": "one"}
+    known = [make_scene("tower", {**small, "motion_seed": seed}) for seed in range(24)]
+    assert all(len(scene.world.movers) == 1 for scene in known)
+    people = [len(scene.world.movers[0].parts) != len(known[0].world.movers[0].parts) for scene in known]
+    assert 6 <= sum(people) <= 18
+    both, alone = make_scene("tower", {**SMALL, "motion_seed": 0}), known[0].world.movers[0]
+    like = [mover for mover in both.world.movers if len(mover.parts) == len(alone.parts)]
+    assert [np.allclose(mover.matrices(0.7), alone.matrices(0.7)) for mover in like] == [True]
+    with pytest.raises(ValueError, match="both, one or person"):
+        make_scene("tower", {"movers": "none"})
+
+
+def test_a_person_alone_in_the_tower_walks_on_any_of_four_sides_clear_of_all_that_stands_there():
+    sides = set()
+    for seed in range(24):
+        scene = make_scene("tower", {**SMALL, "supersample": 1, "movers": "person", "motion_seed": seed})
+        (person,) = scene.world.movers
+        path = np.stack(
+            [person.matrices(t)[:, :3, 3].mean(axis=0) for t in np.linspace(0, scene.period_s, 25)]
+        )
+        angle = np.rad2deg(np.arctan2(*path[:, 1::-1].T))
+        side = round(float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(angle)).mean())) / 90.0)) % 4
+        sides.add(side)
+        away = np.abs(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(angle - 90.0 * side)))))
+        assert away.max() < 25.0, "it stays on its side"
+        boxes = [part for part in scene.world.statics if isinstance(part.shape, Box)]
+        for t in np.linspace(0, scene.period_s, 9):
+            for part, m in zip(person.parts, person.matrices(t)):
+                at = m[:3, :3] @ part.shape.bounding_sphere()[0] + m[:3, 3]
+                for box in boxes:
+                    local = np.linalg.inv(box.matrix) @ np.append(at, 1.0)
+                    outside = np.maximum(np.abs(local[:3]) - box.shape.half, 0.0)
+                    assert np.linalg.norm(outside) > 0.1, "nothing is walked through"
+    assert sides == {0, 1, 2, 3}
+
+
+def test_the_share_of_moving_pixels_of_the_tower():
+    tower = {"width": 64, "height": 64, "supersample": 1}
+    shares = {v: moving_share(make_scene("tower", {**tower, "speed_m_per_s": v}), 8) for v in (1.0, 4.0)}
+    assert 0.05 <= shares[1.0] <= 0.09
+    assert shares[1.0] < shares[4.0]
+
+
+@pytest.mark.parametrize("params", [{"speed_m_per_s": 0.0}, None])
+def test_what_does_not_move_is_the_same_at_every_instant(params):
+    scene = make_scene("room" if params else "tile", {**SMALL, **(params or {})})
+    assert not scene.moving
+    first = scene.render("cam00", 0.0)
+    for t in (0.1, 3.21, 1e9, -5.0):
+        assert np.array_equal(scene.render("cam00", t), first)
+
+
+def test_the_same_instant_gives_the_same_bytes_in_another_process():
+    code = (
+        "import zlib; from camera_node.synthetic import make_scene; "
+        "s = make_scene('room', {'width': 48, 'height': 48}); s.render('cam03', 0.7); "
+        "print(zlib.crc32(s.render('cam03', 1.3).tobytes()))"
+    )
+    import zlib
+
+    mine = zlib.crc32(make_scene("room", SMALL).render("cam03", 1.3).tobytes())
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(out.stdout) == mine
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "message"),
+    [
+        ("rooom", {}, "valid scenes: room, tile, tower"),
+        ("room", {"speed": 1.0}, "valid .default.: count .13., width"),
+        ("tile", {"speed_m_per_s": 1.0}, "unknown parameter 'speed_m_per_s'"),
+        ("room", {"count": 20}, "count must be within 1 to 19"),
+        ("room", {"count": 0}, "count must be within 1 to 19"),
+        ("room", {"width": 12.5}, "whole number"),
+        ("room", {"width": 5000}, "width must be within"),
+        ("room", {"speed_m_per_s": -1.0}, "speed_m_per_s must be 0 or within"),
+        ("tower", {"speed_m_per_s": 9.0}, "speed_m_per_s must be 0 or within"),
+        ("room", {"speed_m_per_s": float("nan")}, "expected a number"),
+        ("room", {"distortion": [0.0]}, "4 values"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_refused_in_one_line(name, params, message):
+    with pytest.raises(SceneError, match=message) as error:
+        make_scene(name, params)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_camera_is_refused_by_name():
+    with pytest.raises(SceneError, match="no camera 'cam13'; it has cam00, cam01"):
+        make_scene("room", SMALL).render("cam13", 0.0)
+
+
+def test_only_the_scene_in_use_is_imported_and_no_heavy_library():
+    code = (
+        "import sys; import camera_node.synthetic.frame_cache; from camera_node.synthetic import make_scene; "
+        "s = make_scene('tile', {'width': 16, 'height': 16}); s.render('cam00', 0.0); "
+        "bad = [m for m in sys.modules if m.split('.')[0] in "
+        "('torch', 'numba', 'edge_server', 'channel_emu', 'scipy', 'matplotlib') "
+        "or m in ('camera_node.synthetic.scenes.room', 'camera_node.synthetic.person')]; print(bad)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_distortion_reaches_the_cameras():
+    scene = make_scene("tile", {**SMALL, "distortion": [-0.2, 0.05, 0.0, 0.0]})
+    straight = make_scene("tile", SMALL)
+    assert scene.cameras["cam00"][0].distortion == (-0.2, 0.05, 0.0, 0.0)
+    assert not np.array_equal(scene.render("cam00", 0.0), straight.render("cam00", 0.0))
+
+
+def test_preview_writes_every_camera(tmp_path: Path):
+    out = tmp_path / "sheet.png"
+    preview.main(["tile", "--out", str(out), "--size", "32", "--set", "count=5", "--set", "supersample=1"])
+    sheet = cv2.imread(str(out))
+    assert sheet.shape[0] >= 64 and sheet.shape[1] >= 96
+    assert sheet.std() > 10
+
+
+@pytest.mark.parametrize("name", ["room", "tower"])
+def test_a_motion_that_is_drawn_follows_from_its_seed_alone(name):
+    def seen(**params) -> np.ndarray:
+        scene = make_scene(name, {"count": 3, "supersample": 1, **SMALL, **params})
+        return np.concatenate([m.matrices(0.3).ravel() for m in scene.world.movers])
+
+    own, drawn = seen(), [seen(motion_seed=seed) for seed in range(6)]
+    assert np.array_equal(seen(motion_seed=2), drawn[2])
+    for k, one in enumerate(drawn):
+        assert not np.allclose(one, own) and not any(np.allclose(one, other) for other in drawn[:k])
+    still = seen(speed_m_per_s=0.0)
+    assert np.array_equal(seen(speed_m_per_s=0.0, motion_seed=4), still)
+    with pytest.raises(SceneError, match="motion_seed must be 0 or more"):
+        seen(motion_seed=-1)
+
+
+def test_motions_that_are_drawn_differ_in_speed_sense_start_and_path():
+    walks = [figure.walk_at((0.0, 0.95), (0.74, 0.54), 1.0, seed) for seed in range(40)]
+    speeds = [figure.loop_length_m(w) / w.period_s for w in walks]
+    assert 0.68 < min(speeds) < 0.85 and 1.15 < max(speeds) < 1.42
+    assert {w.turn for w in walks} == {1.0, -1.0}
+    assert np.ptp([w.start_s / w.period_s for w in walks]) > 0.8
+    assert np.ptp([w.centre[0] for w in walks]) > 0.3 and np.ptp([w.radii[1] for w in walks]) > 0.15
+
+
+def test_who_walks_the_other_way_looks_where_he_goes():
+    walk = next(w for s in range(9) if (w := figure.walk_at((0.0, 1.0), (0.7, 0.5), 1.0, s)).turn < 0)
+    for phase in np.linspace(0, 1, 13):
+        step = np.subtract(walk.at(phase + 1e-6), walk.at(phase - 1e-6))
+        assert np.allclose(step / np.linalg.norm(step), walk.heading(phase), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["room", "tower"])
+def test_renderers_of_drawn_motions_share_what_stands_still_and_nothing_else(name):
+    params = {"count": 2, "supersample": 1, **SMALL}
+    scenes = [make_scene(name, {**params, "motion_seed": seed}) for seed in (1, 2)]
+    images = [scene.render("cam01", 0.4) for scene in scenes]
+    for scene, image in zip(scenes, images):
+        assert np.array_equal(scene.view(*scene.cameras["cam01"]).image(0.4), image)
+    assert not np.array_equal(*images)
+    assert scenes[0].renderer("cam01")._colour is scenes[1].renderer("cam01")._colour
+    assert make_scene(name, params).stands is None  # nothing is kept where no motion is drawn
+
+
+@pytest.mark.parametrize("name", ["room", "tower"])
+@pytest.mark.parametrize("speed", [0.05, 1.0, 8.0])
+def test_drawn_motions_stay_within_the_bounds_and_out_of_the_furniture(name, speed):
+    for seed in range(6):
+        scene = make_scene(name, {"speed_m_per_s": speed, "motion_seed": seed, **SMALL})
+        boxes = [p for p in scene.world.statics if isinstance(p.shape, Box) and p.shape.half[2] > 0.1]
+        into = [(np.linalg.inv(p.matrix), np.array(p.shape.half)) for p in boxes]
+        for mover in scene.world.movers:
+            for t in np.linspace(0, scene.period_s, 21):
+                for part, m in zip(mover.parts, mover.matrices(t)):
+                    centre, radius = part.shape.bounding_sphere()
+                    at = m[:3, :3] @ centre + m[:3, 3]
+                    assert (at + radius < scene.bounds[1]).all()
+                    assert (at[:2] - radius > scene.bounds[0][:2]).all()
+                    for inverse, half in into:
+                        assert (np.abs(inverse[:3, :3] @ at + inverse[:3, 3]) > half).any()

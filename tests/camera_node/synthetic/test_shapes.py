@@ -1,0 +1,101 @@
+"""Ray intersection against signed distances, and the cases that divide by zero."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
+from tests.camera_node.synthetic.reference import signed_distance
+
+SHAPES = [
+    Sphere(0.7),
+    Box((0.5, 0.2, 0.9)),
+    Cylinder(0.4, 0.6),
+    RoundCone(0.5, 0.2, 1.1),
+    RoundCone(0.15, 0.45, 0.8),
+    capsule(0.3, 0.9),
+]
+# The reference of the round cone is a union of 1001 balls, flat to this much.
+TOLERANCE = 3e-6
+
+
+def directions(rng: np.random.Generator, n: int) -> np.ndarray:
+    d = rng.standard_normal((3, n))
+    return d / np.linalg.norm(d, axis=0)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=repr)
+def test_hits_lie_on_the_surface_and_nothing_lies_before_them(shape):
+    rng = np.random.default_rng(1)
+    sdf = signed_distance(shape)
+    origin = np.array([[1.7], [-1.1], [0.9]])
+    # Aim near the shape so that both hits and misses are frequent.
+    aim = rng.uniform(-1.2, 1.2, (3, 400)) - origin
+    d = aim / np.linalg.norm(aim, axis=0)
+    t = nearest_hit(shape, origin, d)
+    hit = np.isfinite(t)
+    assert 40 < hit.sum() < 360
+    assert np.abs(sdf(origin + t[hit] * d[:, hit])).max() < TOLERANCE
+    for share in np.linspace(0.0, 0.999, 12):
+        assert sdf(origin + share * t[hit] * d[:, hit]).min() > -TOLERANCE
+    for distance in np.linspace(0.0, 4.0, 60):
+        assert sdf(origin + distance * d[:, ~hit]).min() > -TOLERANCE
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=repr)
+def test_from_inside_every_ray_meets_the_far_side(shape):
+    d = directions(np.random.default_rng(2), 300)
+    origin = np.array([[0.02], [0.03], [0.05]])
+    t = nearest_hit(shape, origin, d)
+    assert np.isfinite(t).all()
+    assert np.abs(signed_distance(shape)(origin + t * d)).max() < TOLERANCE
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=repr)
+def test_normals_are_the_gradient_of_the_distance(shape):
+    rng = np.random.default_rng(3)
+    origin = np.array([[0.01], [0.02], [0.03]])
+    d = directions(rng, 200)
+    p = origin + nearest_hit(shape, origin, d) * d
+    normal, uv = shape.surface(p)
+    assert np.isfinite(uv).all()
+    sdf, h = signed_distance(shape), 1e-4
+    gradient = np.stack([sdf(p + h * e[:, None]) - sdf(p - h * e[:, None]) for e in np.eye(3)]) / (2 * h)
+    cosine = (normal * gradient).sum(axis=0) / np.linalg.norm(gradient, axis=0)
+    assert np.allclose(np.linalg.norm(normal, axis=0), 1.0)
+    # Near an edge of a box or cylinder the difference straddles two faces.
+    assert np.quantile(cosine, 0.03) > 0.999
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, Quad((0.5, 0.8))], ids=repr)
+def test_bounding_sphere_holds_every_hit(shape):
+    rng = np.random.default_rng(4)
+    origin = np.array([[2.0], [1.0], [3.0]])
+    aim = rng.uniform(-1.0, 1.0, (3, 2000)) - origin
+    t = nearest_hit(shape, origin, aim)
+    p = (origin + t * aim)[:, np.isfinite(t)]
+    centre, radius = shape.bounding_sphere()
+    assert p.shape[1] > 20
+    assert np.linalg.norm(p - centre[:, None], axis=0).max() <= radius * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=repr)
+def test_distance_counts_in_lengths_of_the_direction(shape):
+    """A linear map that scales must preserve t, so directions need not be unit."""
+    d = directions(np.random.default_rng(5), 100)
+    origin = np.array([[0.05], [0.0], [0.1]])
+    assert np.allclose(nearest_hit(shape, origin, 7.0 * d) * 7.0, nearest_hit(shape, origin, d), rtol=1e-9)
+
+
+def test_quad_is_seen_from_its_front_only():
+    quad = Quad((1.0, 1.0))
+    down, up = np.array([[0.0], [0.0], [-1.0]]), np.array([[0.0], [0.0], [1.0]])
+    assert nearest_hit(quad, np.array([[0.0], [0.0], [2.0]]), down)[0] == pytest.approx(2.0)
+    assert np.isinf(nearest_hit(quad, np.array([[0.0], [0.0], [-2.0]]), up)[0])
+    assert np.isinf(nearest_hit(quad, np.array([[1.5], [0.0], [2.0]]), down)[0])
+
+
+def test_a_round_cone_that_is_only_a_ball_is_refused():
+    with pytest.raises(ValueError, match="must exceed"):
+        RoundCone(0.5, 0.1, 0.3)

@@ -1,0 +1,77 @@
+"""Textures: colours in range everywhere, edges where they belong, and no sharper than promised."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic import textures as tx
+
+RED, BLUE, WHITE = (0.9, 0.1, 0.1), (0.1, 0.2, 0.9), (1.0, 1.0, 1.0)
+ALL = [
+    tx.Plain(RED),
+    tx.Noise(tx.Plain(RED), 0.2, 0.3),
+    tx.Checker(RED, BLUE, 0.25),
+    tx.Stripes(RED, BLUE, 0.3, axis=1),
+    tx.Brick(RED, WHITE, 0.5, 0.25),
+    tx.Planks(RED, BLUE, 0.3, 1.2),
+    tx.Plaid(RED, BLUE, WHITE, 0.2, 0.3),
+    tx.Diamonds(RED, BLUE, WHITE, 0.4, 0.5),
+    tx.Books([RED, BLUE], WHITE, 0.1, 0.4),
+    tx.Gradient(RED, BLUE, -1.0, 1.0),
+    tx.Framed(tx.Plain(RED), BLUE, (0.5, 0.5), 0.1),
+    tx.Spots(tx.Plain(RED), [(0.0, 0.0, 0.2, BLUE)]),
+    tx.Bands(tx.Plain(RED), [(-0.1, 0.1, -0.1, 0.1, BLUE)]),
+]
+
+
+@pytest.mark.parametrize("texture", ALL, ids=lambda t: type(t).__name__)
+def test_colours_are_finite_and_in_range_even_far_out(texture):
+    rng = np.random.default_rng(0)
+    for reach in (1.0, 1e3, 1e9):
+        colour = texture(rng.uniform(-reach, reach, (2, 500)))
+        assert colour.shape == (3, 500)
+        assert np.isfinite(colour).all()
+        assert colour.min() >= 0.0 and colour.max() <= 1.0
+
+
+@pytest.mark.parametrize("texture", ALL, ids=lambda t: type(t).__name__)
+def test_equal_places_have_equal_colours(texture):
+    uv = np.random.default_rng(1).uniform(-2, 2, (2, 50))
+    assert np.array_equal(texture(uv), texture(uv.copy()))
+
+
+def test_checker_alternates():
+    checker = tx.Checker(RED, BLUE, 0.5, soft=0.01)
+    colours = checker(np.array([[0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5]]))
+    assert np.allclose(colours[:, 0], colours[:, 3])
+    assert np.allclose(colours[:, 1], colours[:, 2])
+    assert not np.allclose(colours[:, 0], colours[:, 1])
+
+
+@pytest.mark.parametrize(
+    "texture", [tx.Checker(RED, BLUE, 0.5, soft=0.05), tx.Stripes(RED, BLUE, 0.5, soft=0.05)]
+)
+def test_edges_are_as_soft_as_asked(texture):
+    """No step between neighbours is steeper than a smoothstep of that width (slope 1.5 / width)."""
+    u = np.linspace(-2, 2, 8001)
+    steps = np.abs(np.diff(texture(np.stack([u, np.full_like(u, 0.2)])), axis=1)).max()
+    assert steps <= 0.8 * 1.5 / 0.05 * (u[1] - u[0]) * 1.01
+
+
+def test_noise_holds_no_wavelength_below_the_one_given():
+    noise = tx.Noise(tx.Plain((0.5, 0.5, 0.5)), wavelength=0.5, amount=0.2, waves=16)
+    n, length = 1024, 64.0
+    u = np.arange(n) * length / n
+    values = noise(np.stack([u, np.zeros(n)]))[0] - 0.5
+    power = np.abs(np.fft.rfft(values * np.hanning(n))) ** 2
+    frequency = np.fft.rfftfreq(n, length / n)
+    assert power[frequency > 1.15 / 0.5].sum() < 1e-4 * power.sum()
+
+
+def test_cell_hash_is_uniform_and_without_pattern():
+    i, j = np.meshgrid(np.arange(-100.0, 100.0), np.arange(-100.0, 100.0))
+    h = tx.cell_hash(i, j)
+    counts = np.histogram(h, bins=10, range=(0, 1))[0]
+    assert np.abs(counts - h.size / 10).max() < 0.1 * h.size / 10
+    assert abs(np.corrcoef(h[:, 1:].ravel(), h[:, :-1].ravel())[0, 1]) < 0.03

@@ -1,0 +1,180 @@
+"""A live emulator between real cameras' streams and the edge's real ingest, on one event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+from collections import Counter
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import grpc.aio
+import numpy as np
+
+from channel_emu.live.frame_proxy import Proxy, ProxyOptions
+from channel_emu.model.config import channel_from_mapping
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.grpc_services import ClockService
+from edge_server.live.ingest import Ingest
+from freshfield.clock import WallClock
+from freshfield.frame import Frame, to_request
+from freshfield.geometry import Pinhole, Pose
+from freshfield.ledger import Ledger
+from freshfield.payload import encode
+from freshfield.transport import Transport
+from freshfield.v1 import clock_pb2_grpc, frames_pb2_grpc
+from freshfield.v1 import frames_pb2 as pb
+
+CAMERAS = ("cam00", "cam01", "cam02", "cam03")
+_IMAGE = encode(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8).astype(np.uint8), "jpeg")
+_LENS = Pinhole(width=64, height=48, fx=60.0, fy=60.0, cx=32.0, cy=24.0)
+_sessions = itertools.count()
+
+
+def frame_of(camera: str, session: str, sequence: int, at_ns: int, held_out: bool = False) -> Frame:
+    """A real frame: encoded, posed, with a lens."""
+    pose = Pose((1, 0, 0, 0), (0, 0, 0))
+    return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out)
+
+
+class Edge:
+    """The edge's own ingest and clock on a port of its own; ``stop`` and ``start`` make a restart."""
+
+    def __init__(self, out: Path, cameras: tuple[str, ...], held_out: tuple[str, ...], transport: Transport):
+        self._out, self._cameras, self._held_out, self._transport = out, cameras, held_out, transport
+        self.port = 0
+        self.truth: list[tuple[Frame, int]] = []
+        self.delivered: Counter[str] = Counter()
+        self.rejected: Counter[str] = Counter()
+
+    async def start(self) -> None:
+        clock = WallClock()
+        training = tuple(c for c in self._cameras if c not in self._held_out)
+        self._ledger = Ledger(self._out, "edge", "edge", clock.now_ns())
+        self._clock = clock
+        self.ingest = Ingest(
+            clock, FrameBuffer(training), self._held_out, self._ledger, lambda f, t: self.truth.append((f, t))
+        )
+        self._server = self._transport.aio_server()
+        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(self.ingest, self._server)
+        clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(clock), self._server)
+        self.port = self._transport.bind(self._server, f"127.0.0.1:{self.port}")
+        await self._server.start()
+
+    async def stop(self) -> None:
+        """As if killed: no stream is ended politely."""
+        await self._server.stop(None)
+        self._ledger.close(self._clock.now_ns())
+        self.delivered.update(self.ingest.delivered)
+        self.rejected.update(self.ingest.rejected)
+
+
+class Camera:
+    """One stream of frames to the emulator, one unanswered at a time; keeps every answer and a ledger."""
+
+    def __init__(self, name: str, port: int, transport: Transport, held_out: bool, ledger: Ledger) -> None:
+        self.name, self.held_out = name, held_out
+        self.session = f"s{next(_sessions)}"
+        self.answers: Counter[str] = Counter()
+        self.reasons: Counter[str] = Counter()
+        self.sequence = 0
+        self._clock = WallClock()
+        self._channel = transport.aio_channel(f"127.0.0.1:{port}")
+        self._metadata = transport.metadata()
+        self._call: Any = None
+        self._ledger = ledger
+
+    async def connect(self) -> None:
+        await self._channel.channel_ready()
+        self._call = frames_pb2_grpc.FrameStreamServiceStub(self._channel).Push(metadata=self._metadata)
+        await self._call.wait_for_connection()
+
+    async def push(self) -> pb.PushResponse:
+        """Send one frame and wait for its answer."""
+        if self._call is None:
+            await self.connect()
+        frame = frame_of(self.name, self.session, self.sequence, self._clock.now_ns(), self.held_out)
+        self._write(frame.sequence, "captured")
+        self._write(frame.sequence, "sent")
+        self.sequence += 1
+        await self._call.write(to_request(frame))
+        response = await self._call.read()
+        assert response.sequence == frame.sequence
+        name = pb.Outcome.Name(response.outcome).removeprefix("OUTCOME_").lower()
+        detail = f"{name}:{response.reason}" if response.reason else name
+        self._write(frame.sequence, "answered", detail)
+        self.answers[name] += 1
+        self.reasons[response.reason] += 1
+        return response
+
+    async def stream(self, frames: int, period_s: float) -> None:
+        for _ in range(frames):
+            await self.push()
+            await asyncio.sleep(period_s)
+
+    async def code(self) -> grpc.StatusCode:
+        """How the stream ended."""
+        return await self._call.code()
+
+    async def close(self) -> None:
+        await self._channel.close()
+
+    def _write(self, sequence: int, event: str, detail: str = "") -> None:
+        self._ledger.write(self._clock.now_ns(), self.name, self.session, sequence, event, detail)
+
+
+class Rig:
+    """Edge, emulator and cameras in one folder."""
+
+    def __init__(self, edge: Edge, proxy: Proxy, cameras: dict[str, Camera]) -> None:
+        self.edge, self.proxy, self.cameras = edge, proxy, cameras
+
+    async def connected(self) -> None:
+        """Until every upstream stream stands."""
+        async with asyncio.timeout(30):
+            while not all(lane.upstream and lane.upstream.connected for lane in self.proxy.lanes.values()):
+                await asyncio.sleep(0.01)
+
+    async def settled(self) -> None:
+        """Until nothing is inside the emulator any more."""
+        async with asyncio.timeout(30):
+            while any(
+                lane.link.in_flight or (lane.upstream and lane.upstream.pending)
+                for lane in self.proxy.lanes.values()
+            ):
+                await asyncio.sleep(0.01)
+
+
+@contextlib.asynccontextmanager
+async def rig(
+    out: Path,
+    section: dict,
+    *,
+    cameras: tuple[str, ...] = CAMERAS,
+    held_out: tuple[str, ...] = (),
+    seed: int = 5,
+    transport: Transport | None = None,
+    **options: Any,
+) -> AsyncIterator[Rig]:
+    transport = transport or Transport()
+    edge = Edge(out, cameras, held_out, transport)
+    await edge.start()
+    chosen = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{edge.port}", out, transport, **options)
+    proxy = Proxy(channel_from_mapping(section), cameras, seed, chosen)
+    await proxy.start()
+    ledger = Ledger(out, "node", "all", WallClock().now_ns())
+    nodes = {c: Camera(c, proxy.port, transport, c in held_out, ledger) for c in cameras}
+    made = Rig(edge, proxy, nodes)
+    await made.connected()
+    try:
+        yield made
+    finally:
+        for node in nodes.values():
+            await node.close()
+        await proxy.stop()
+        with contextlib.suppress(Exception):
+            await edge.stop()
+        ledger.close(WallClock().now_ns())

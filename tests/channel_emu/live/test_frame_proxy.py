@@ -1,0 +1,312 @@
+"""The live emulator with the edge's real ingest behind it, on the wall clock."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+
+import grpc
+import grpc.aio
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from channel_emu.live import trace
+from channel_emu.live.camera_lane import HardLimit
+from channel_emu.live.frame_proxy import Proxy, ProxyOptions
+from channel_emu.live.upstream import CREDITS
+from channel_emu.model.config import channel_from_mapping
+from edge_server.report.frame_accounting import close_books
+from freshfield.frame import to_request
+from freshfield.transport import Transport
+from freshfield.v1 import clock_pb2, clock_pb2_grpc
+from freshfield.v1 import frames_pb2 as pb
+from tests.channel_emu.live.emulator import CAMERAS, frame_of, rig
+from tests.integration.peer import Peer, silence
+
+# The thesis's channel six times faster, so that a test takes seconds.
+FAST = {
+    "preset": "ch6",
+    "arrivals": {"rate_per_ms": [1 / 20, 1 / 5]},
+    "chain": {"mu1_per_ms": 1 / 50, "mu2_per_ms": 1 / 50},
+    "service": {"mean_ms": [5.0, 10.0]},
+}
+QUICK = {"service": {"law": "exponential", "mean_ms": 4.0}}
+
+
+def run(coroutine) -> None:
+    async def limited() -> None:
+        async with asyncio.timeout(60):
+            await coroutine
+
+    asyncio.run(limited())
+
+
+def books_of(out: Path):
+    books = close_books(out)
+    assert not books.contradictions and books.total.closes
+    return books.total
+
+
+SHARED = {"service": {"law": "exponential", "mean_ms": 1.5}, "queue_limit": 6}
+SECTIONS = {
+    "ch6": FAST,
+    "ch5": {"preset": "ch5", **QUICK},
+    "fcfs": {**QUICK, "discipline": "fcfs"},
+    "ch6, one line": {**FAST, "service": {"mean_ms": [2.0, 4.0]}, "server": {"shared": True}},
+    "newest waits, round-robin": {
+        **SHARED, "discipline": "newest-waits", "server": {"shared": True, "order": "round-robin"},
+    },
+    "fcfs, oldest age": {**SHARED, "discipline": "fcfs", "server": {"shared": True, "order": "oldest-age"}},
+    "preempt, one line": {**SHARED, "discipline": "lcfs-preempt", "server": {"shared": True}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("section", SECTIONS.values(), ids=SECTIONS.keys())
+def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict) -> None:
+    """The emulator's trace, its offers decided again in virtual time: every start, due and outcome alike."""
+
+    async def live() -> None:
+        async with rig(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
+            await asyncio.gather(*(c.stream(80, 0.004) for c in r.cameras.values()))
+            await r.settled()
+
+    run(live())
+    found = trace.read(tmp_path / "t.jsonl")
+    assert trace.compare(found) == {"frames": 320, "equal": 320, "different": []}
+    account = books_of(tmp_path)
+    outcomes = [r.outcome for r in found.records]
+    assert account.sent == 320
+    assert account.delivered == outcomes.count("delivered") > 30
+    assert account.dropped_busy == outcomes.count("dropped_busy")
+    assert (account.skipped, account.superseded) == (outcomes.count("skipped"), outcomes.count("superseded"))
+    for r in found.records:
+        assert r.actual_ns is None or r.actual_ns >= r.due_ns
+    status = json.loads((tmp_path / "channel.json").read_text())
+    assert status["running"] is False and status["delay_error_ms"]["count"] == account.delivered
+    assert status["counts"]["delivered"] == account.delivered
+    assert sum(status["drawn_delay_ms"]["histogram"]["counts"]) > 0
+    if section is FAST:
+        assert status["states"] == ["low", "high"] and status["state"] in status["states"]
+        assert sum(status["state_share"].values()) == pytest.approx(1)
+        assert len(status["series"]) > 3
+
+
+def test_a_recorded_trace_is_repeated_live(tmp_path: Path) -> None:
+    recorded, repeated = tmp_path / "1", tmp_path / "2"
+
+    async def live() -> None:
+        async with rig(recorded, FAST, trace=recorded / "t.jsonl") as r:
+            await asyncio.gather(*(c.stream(50, 0.004) for c in r.cameras.values()))
+            await r.settled()
+        replay = trace.read(recorded / "t.jsonl")
+        # Another channel and seed: what happens is the recording's all the same.
+        async with rig(repeated, QUICK, seed=99, replay=replay, trace=repeated / "t.jsonl") as r:
+            await asyncio.gather(*(c.stream(50, 0.009) for c in r.cameras.values()))
+            await r.settled()
+
+    run(live())
+    first, second = (trace.read(d / "t.jsonl").by_camera() for d in (recorded, repeated))
+    for camera in CAMERAS:
+        assert [r.outcome for r in first[camera]] == [r.outcome for r in second[camera]]
+        assert [r.drawn_ns for r in first[camera]] == [r.drawn_ns for r in second[camera]]
+    books_of(repeated)
+
+
+def test_every_fault_closes_the_books(tmp_path: Path) -> None:
+    chance = {"probability": 0.2}
+    faults = {"loss": chance, "duplication": chance, "corruption": chance}
+
+    async def live() -> None:
+        async with rig(tmp_path, {**QUICK, "faults": faults}) as r:
+            await asyncio.gather(*(c.stream(60, 0.005) for c in r.cameras.values()))
+            await r.settled()
+
+    run(live())
+    account = books_of(tmp_path)
+    assert min(account.lost, account.duplicated, account.delivered) > 10
+    # The edge refuses damaged frames by their checksum, and second copies by their sequence number.
+    assert set(account.rejected) == {"crc_mismatch", "replayed_sequence"}
+    status = json.loads((tmp_path / "channel.json").read_text())
+    assert status["edge_rejected"] == dict(account.rejected)
+
+
+def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> None:
+    service = {"law": "deterministic", "mean_ms": 300.0}
+    section = {"service": service, "faults": {"reset": {"at_ms": [1500.0]}}}
+
+    async def live() -> None:
+        async with rig(tmp_path, section, cameras=("cam00",)) as r:
+            camera = r.cameras["cam00"]
+            with pytest.raises((grpc.aio.AioRpcError, asyncio.InvalidStateError)):
+                for _ in range(100):
+                    await camera.push()
+                    await asyncio.sleep(0.1)
+            # INTERNAL is what gRPC's client makes of a write that crosses the reset on the wire.
+            assert await camera.code() in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL)
+            assert r.proxy.lanes["cam00"].link.resets == 1
+            await camera.connect()
+            assert (await camera.push()).outcome == pb.OUTCOME_ACCEPTED
+            await r.settled()
+            assert r.proxy.lanes["cam00"].link.counts["broken"] == 1
+
+    run(live())
+
+
+def test_held_out_frames_pass_beside_the_channel(tmp_path: Path) -> None:
+    section = {"service": {"law": "deterministic", "mean_ms": 1e9}}
+
+    async def live() -> None:
+        async with rig(tmp_path, section, held_out=("cam03",)) as r:
+            await r.cameras["cam03"].stream(20, 0.002)
+            await r.cameras["cam00"].stream(5, 0.002)
+            async with asyncio.timeout(10):
+                while len(r.edge.truth) < 20:
+                    await asyncio.sleep(0.01)
+            assert r.cameras["cam00"].answers == {"accepted": 1, "dropped_busy": 4}
+            delays_ms = [(at - f.generated_ns) / 1e6 for f, at in r.edge.truth]
+            assert sorted(delays_ms)[10] < 100
+
+    run(live())
+    status = json.loads((tmp_path / "channel.json").read_text())
+    assert status["delay_error_ms"]["count"] == 0 and status["counts"]["held_out"] == 20
+    assert status["drawn_delay_ms"]["count"] == 1
+    assert books_of(tmp_path).in_flight == 1
+
+
+def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
+    async def live() -> None:
+        async with rig(tmp_path, QUICK) as r:
+            cameras = r.cameras.values()
+            await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))
+            await r.edge.stop()
+            await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))  # answered all the same
+            await r.edge.start()
+            await r.connected()
+            await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))
+            await r.settled()
+            assert sum(lane.broken for lane in r.proxy.lanes.values()) > 20
+            assert all(lane.upstream.connections == 2 for lane in r.proxy.lanes.values() if lane.upstream)
+            assert all(r.edge.ingest.delivered[c] > 0 for c in CAMERAS)
+
+    run(live())
+    account = books_of(tmp_path)
+    assert account.sent == 240 and account.in_flight == 0 and account.broken > 20
+
+
+def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -> None:
+    async def live() -> None:
+        edge = await Peer(respond=silence).start()
+        options = ProxyOptions("127.0.0.1:0", edge.address, tmp_path, Transport())
+        proxy = Proxy(channel_from_mapping({}), ["cam00"], 0, options)
+        await proxy.start()
+        lane = proxy.lanes["cam00"]
+        assert lane.upstream is not None
+        while not lane.upstream.connected:
+            await asyncio.sleep(0.01)
+        for n in range(200):
+            request = to_request(frame_of("cam00", "s", n, n))
+            lane.take(request.SerializeToString(), request.header)
+            await asyncio.sleep(0)
+        await edge.until(CREDITS)
+        assert lane.upstream.pending == CREDITS + 1
+        assert lane.broken == 200 - CREDITS - 1
+        await proxy.stop()
+        assert lane.broken == 200
+        await edge.stop()
+
+    run(live())
+
+
+def test_clock_health_and_reflection_pass_a_slow_channel(tmp_path: Path) -> None:
+    async def live() -> None:
+        async with rig(tmp_path, {"service": {"law": "deterministic", "mean_ms": 1e6}}) as r:
+            channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
+            clock = clock_pb2_grpc.ClockServiceStub(channel)
+            reply = await clock.Exchange(clock_pb2.ExchangeRequest(client_sent_ns=7), timeout=5)
+            assert reply.client_sent_ns == 7 and reply.server_sent_ns >= reply.server_received_ns > 0
+            health = health_pb2_grpc.HealthStub(channel)
+            for service in ("", "freshfield.v1.FrameStreamService"):
+                state = await health.Check(health_pb2.HealthCheckRequest(service=service), timeout=5)
+                assert state.status == health_pb2.HealthCheckResponse.SERVING
+            await r.edge.stop()
+            with pytest.raises(grpc.aio.AioRpcError) as gone:
+                await clock.Exchange(clock_pb2.ExchangeRequest(), timeout=10)
+            assert gone.value.code() in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED)
+            await channel.close()
+
+    run(live())
+
+
+def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
+    async def live() -> None:
+        async with rig(tmp_path, {}) as r:
+            channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
+
+            async def send(raw: bytes) -> pb.PushResponse | None:
+                call = channel.stream_stream("/freshfield.v1.FrameStreamService/Push")()
+                await call.write(raw)
+                try:
+                    return pb.PushResponse.FromString(await call.read())
+                except grpc.aio.AioRpcError as error:
+                    assert error.code() == grpc.StatusCode.INVALID_ARGUMENT
+                    return None
+
+            header = pb.FrameHeader(camera_id="cam77", session_id="s")
+            answer = await send(pb.PushRequest(header=header).SerializeToString())
+            assert answer is not None and answer.reason == "unknown_camera"
+            header = pb.FrameHeader(camera_id="cam00", session_id="two\tcolumns\n")
+            answer = await send(pb.PushRequest(header=header, payload=b"x").SerializeToString())
+            assert answer is not None and answer.reason == "bad_id"
+            good = pb.PushRequest(header=pb.FrameHeader(camera_id="cam00")).SerializeToString()
+            for raw in (b"\xff\xff\xff", b"", good[:-1], b"\x12\x05abc", b"\x0a\x02\xff\xff", b"\x0b"):
+                assert await send(raw) is None
+            # And the cameras never noticed.
+            await r.cameras["cam01"].stream(3, 0)
+            assert r.proxy.rejected == {"unknown_camera": 1, "bad_id": 1}
+            await channel.close()
+
+    run(live())
+
+
+def test_the_hard_limit_ends_the_emulator(tmp_path: Path) -> None:
+    async def live() -> None:
+        edge = await Peer().start()
+        config = channel_from_mapping({**QUICK, "hard_limit_ms": 1e-6})
+        options = ProxyOptions("127.0.0.1:0", edge.address, tmp_path, Transport())
+        proxy = Proxy(config, ["cam00"], 0, options)
+        running = asyncio.create_task(proxy.run(asyncio.Event()))
+        lane = proxy.lanes["cam00"]
+        while lane.upstream is None or not lane.upstream.connected:
+            await asyncio.sleep(0.01)
+        header = pb.FrameHeader(camera_id="cam00", session_id="s", role=pb.ROLE_TRAIN)
+        channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
+        call = channel.stream_stream("/freshfield.v1.FrameStreamService/Push")()
+        await call.write(pb.PushRequest(header=header).SerializeToString())
+        with pytest.raises(HardLimit, match=r"frame 0 of cam00 left .* ms after it was due"):
+            await running
+        await channel.close()
+        await edge.stop()
+
+    run(live())
+
+
+def test_the_token_is_demanded_and_passed_on(tmp_path: Path) -> None:
+    async def live() -> None:
+        async with rig(tmp_path, {}, transport=Transport(token="open sesame")) as r:
+            await r.cameras["cam00"].stream(5, 0.002)
+            await r.settled()
+            assert r.edge.ingest.delivered["cam00"] == 5
+            stranger = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
+            call = stranger.stream_stream("/freshfield.v1.FrameStreamService/Push")()
+            with pytest.raises(grpc.aio.AioRpcError) as refused:
+                await call.write(b"")
+                await call.read()
+                raise await_error(call)
+            assert refused.value.code() == grpc.StatusCode.UNAUTHENTICATED
+            await stranger.close()
+
+    def await_error(call) -> Exception:
+        return AssertionError("the stream was not refused")
+
+    run(live())

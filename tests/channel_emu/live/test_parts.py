@@ -1,0 +1,168 @@
+"""The small parts of the live emulator: timer, histogram, wire reader, priority."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from channel_emu.live import timer
+from channel_emu.live.histogram import Histogram
+from channel_emu.live.timer import LoopTimer
+from channel_emu.live.wire import WireError, damaged, header_of
+from channel_emu.model import ages
+from channel_emu.model.link import Transit
+from freshfield.frame import FrameRejected, from_request, to_request
+from freshfield.v1 import frames_pb2 as pb
+from tests.channel_emu.live.emulator import frame_of
+
+
+@pytest.mark.parametrize("platform", [sys.platform, "elsewhere"])
+def test_timer_fires_once_armed_and_never_early(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timer.sys, "platform", platform)
+
+    async def live() -> None:
+        fired: list[int] = []
+        woken = asyncio.Event()
+
+        def fire() -> None:
+            fired.append(time.perf_counter_ns())
+            woken.set()
+
+        subject = LoopTimer(fire)
+        for span_ns in (0, 3_000_000, 20_000_000):
+            woken.clear()
+            begun = time.perf_counter_ns()
+            subject.arm(10 * 10**9)
+            subject.arm(span_ns)  # instead of what was armed before
+            async with asyncio.timeout(5):
+                await woken.wait()
+            assert fired[-1] >= begun + span_ns
+        subject.arm(30_000_000)
+        subject.close()
+        await asyncio.sleep(0.06)
+        assert len(fired) == 3
+
+    asyncio.run(live())
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=300), st.sampled_from([1, 50, 95, 99, 100]))
+def test_histogram_percentiles_are_within_a_bin(values: list[float], percent: int) -> None:
+    histogram = Histogram()
+    for value in values:
+        histogram.add(value)
+    exact = float(np.percentile(values, percent, method="inverted_cdf"))
+    found = histogram.percentile_ms(percent)
+    assert found is not None and found <= max(values)
+    if exact < 9e4:
+        assert exact * 0.999999 <= found <= max(exact * 1.0234, 1e-4)
+    assert histogram.count == len(values) and histogram.max_ms == max(values)
+    assert histogram.mean_ms == pytest.approx(np.mean(values))
+
+
+def test_histogram_of_nothing_and_of_negatives() -> None:
+    histogram = Histogram()
+    assert histogram.percentile_ms(50) is None and histogram.mean_ms is None
+    assert histogram.linear() == ([], [])
+    histogram.add(-3.0)
+    assert histogram.max_ms == 0.0 and histogram.percentile_ms(99) == 0.0 and histogram.linear() == ([], [])
+
+
+def test_linear_bins_keep_the_count_and_the_shape() -> None:
+    histogram = Histogram()
+    values = np.random.default_rng(0).exponential(60.0, 20_000)
+    for value in values:
+        histogram.add(float(value))
+    edges, counts = histogram.linear(40)
+    exact, _ = np.histogram(values, edges)
+    assert sum(counts) == pytest.approx(0.995 * 20_000, rel=0.002)
+    # A logarithmic bin of 2.3 % is spread evenly: a few frames land next door.
+    assert np.abs(np.array(counts) - exact).max() < 0.04 * 20_000
+
+
+def test_header_is_read_without_the_payload() -> None:
+    request = to_request(frame_of("cam05", "s1", 42, 123456789, held_out=True))
+    header = header_of(request.SerializeToString())
+    assert header == request.header and header.role == pb.ROLE_HELD_OUT
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_header_or_a_wire_error(data: bytes) -> None:
+    try:
+        header_of(data)
+    except WireError:
+        return
+    # What is taken must be what protobuf takes.
+    assert pb.PushRequest.FromString(data).HasField("header")
+
+
+def test_two_headers_are_refused() -> None:
+    raw = to_request(frame_of("cam05", "s1", 42, 5)).SerializeToString()
+    with pytest.raises(WireError, match="two headers"):
+        header_of(raw + raw)
+
+
+def test_damage_changes_the_payload_and_nothing_else() -> None:
+    raw = to_request(frame_of("cam00", "s", 1, 5)).SerializeToString()
+    untouched = Transit(0, None, len(raw), 0)
+    assert damaged(raw, untouched) is raw
+    hit = Transit(0, None, len(raw), 0, flips=((0.5, 1), (0.9, 255)))
+    before, after = pb.PushRequest.FromString(raw), pb.PushRequest.FromString(damaged(raw, hit))
+    assert after.header == before.header and after.crc32c == before.crc32c
+    assert sum(a != b for a, b in zip(before.payload, after.payload)) == 2
+    with pytest.raises(FrameRejected, match="damaged") as refused:
+        from_request(after)
+    assert refused.value.reason == "crc_mismatch"
+
+
+def test_priority_says_what_it_reached_and_never_fails() -> None:
+    """In a process of its own, so that the tests keep theirs."""
+    code = "from channel_emu.live.priority import raise_priority; print(raise_priority())"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() in ("realtime", "short-slice", "nice", "normal")
+
+
+def test_the_emulator_needs_neither_torch_nor_the_other_packages() -> None:
+    code = """
+import sys
+import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.virtual.simulate, channel_emu.live.trace
+wrong = [m for m in sys.modules if m.split('.')[0] in ('torch', 'numba', 'camera_node', 'edge_server')]
+print(','.join(wrong))
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == ""
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**9)), max_size=30), st.integers(0, 10**9))
+def test_running_ages_are_those_of_the_whole_sawtooth(steps: list[tuple[int, int]], after: int) -> None:
+    """Deliveries in order of time, of frames of any age, out of order and doubled."""
+    running, at_ns = ages.RunningAge(), 2 * 10**9
+    deliveries = []
+    for step, old in steps:
+        at_ns += step
+        deliveries.append((at_ns, at_ns - old))
+        running.add(at_ns, at_ns - old)
+    end_ns = at_ns + after
+    columns = np.array(deliveries, np.int64).reshape(-1, 2)
+    saw = ages.sawtooth(columns[:, 0], columns[:, 1], end_ns)
+    for found, expected in (
+        (running.peak_age_ms(), ages.peak_age_ms(saw)),
+        (running.mean_age_ms(end_ns), ages.mean_age_ms(saw)),
+    ):
+        assert found == (None if expected is None else pytest.approx(expected, rel=1e-9))
+
+
+def test_dropped_messages_hold_no_bytes() -> None:
+    from channel_emu.live.generic_flow import Flow, Message
+
+    flow = Flow(0, None, lambda: None)
+    dropped, kept = Message(b"x" * 100, flow, 0), Message(b"y", flow, 1)
+    flow.settle(dropped, False)
+    flow.settle(kept, True)
+    assert dropped.raw == b"" and kept.raw == b"y"

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import pytest
+import yaml
+
+from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.faults import NAMES
+from channel_emu.model.presets import PRESETS
+
+
+def read(text: str):
+    return channel_from_mapping(yaml.safe_load(text), "room.yaml: channel")
+
+
+def test_presets_hold_the_thesis_numbers() -> None:
+    ch5, ch6 = read("preset: ch5"), read("preset: ch6")
+    assert (ch5.arrivals.period_ms, ch5.service.law, ch5.service.mean_ms) == (30.0, "exponential", 60.0)
+    assert ch5.discipline == "drop-new" and ch5.chain is None
+    assert ch6.chain is not None and ch6.chain.scope == "shared" and ch6.state_names == ["low", "high"]
+    assert ch6.chain.mu1_per_ms == ch6.chain.mu2_per_ms == pytest.approx(1 / 30)
+    assert ch6.arrivals.rate_per_ms == pytest.approx([1 / 120, 1 / 30])
+    assert ch6.service.mean_ms == [30.0, 60.0]
+    assert (ch6.service_state, ch6.discipline) == ("at-start", "newest-waits")
+    high, low, slow = read("preset: ch6-high"), read("preset: ch6-low"), read("preset: ch6-slow")
+    assert (high.arrivals.rate_per_ms, high.service.mean_ms) == (pytest.approx(1 / 60), 60.0)
+    assert (low.arrivals.rate_per_ms, low.service.mean_ms) == (pytest.approx(1 / 120), 30.0)
+    assert slow.chain is not None and slow.chain.mu1_per_ms == pytest.approx(1 / 3000)
+    ideal = read("{}")
+    assert (ideal.preset, ideal.service.law, ideal.arrivals.process) == ("ideal", "none", "as-offered")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_reading_what_was_written_gives_the_same(name: str) -> None:
+    config = read(f"{{preset: {name}, faults: {{loss: {{probability: 0.1}}}}}}")
+    again = channel_from_mapping(config.to_mapping())
+    assert dataclasses.replace(again, preset=name) == config
+
+
+def test_keys_beside_a_preset_override_it() -> None:
+    config = read("{preset: ch5, service: {mean_ms: 90}, discipline: parallel}")
+    assert (config.service.law, config.service.mean_ms) == ("exponential", 90.0)
+    assert config.discipline == "parallel"
+    assert config.arrivals.period_ms == 30.0
+    # Another law replaces the preset's whole: an exponential's mean is no gamma's.
+    config = read("{preset: ch5, service: {law: gamma, mean_ms: 5, shape: 2}, arrivals: as-offered}")
+    assert (config.service.law, config.service.shape) == ("gamma", 2.0)
+    assert config.arrivals.process == "as-offered"
+    config = read("{preset: ch6, chain: {scope: per-camera}}")
+    assert config.chain is not None and config.chain.scope == "per-camera"
+    assert config.chain.mu1_per_ms == pytest.approx(1 / 30)
+    config = read("{preset: ch6, chain: {generator_per_ms: [[-1, 1], [2, -2]]}}")
+    assert config.chain is not None and config.chain.generator().tolist() == [[-1, 1], [2, -2]]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{delay_ms: 5}", "channel.delay_ms: unknown key"),
+        ("{preset: ch7}", "channel.preset: expected one of ideal, ch5"),
+        ("{preset: [ch5]}", "channel.preset: expected one of"),
+        ("{service: {law: exponential}}", "channel.service: mean_ms: missing"),
+        ("{service: {law: exponential, mean_ms: fast}}", "channel.service.mean_ms: expected a number"),
+        ("{service: {law: exponential, mean_ms: -1}}", "mean_ms: expected finite numbers of at least 0"),
+        ("{service: {law: exponential, mean_ms: .nan}}", "channel.service.mean_ms: expected a number"),
+        ("{service: {law: exponential, mean_s: 1}}", "did you mean 'mean_ms'?"),
+        ("{service: {law: normal, mean_ms: 1}}", "law: expected one of none, exponential"),
+        ("{service: {law: exponential, mean_ms: 1, shape: 2}}", "shape: belongs to law gamma only"),
+        ("{service: {law: exponential, mean_ms: [1, 2]}}", "there is no chain"),
+        ("{preset: ch6, service: {mean_ms: [1, 2, 3]}}", "the chain has 2 states"),
+        ("{arrivals: {process: periodic}}", "period_ms: missing"),
+        ("{arrivals: {process: periodic, period_ms: 0}}", "period_ms: expected at least"),
+        ("{arrivals: {process: poisson, rate_per_ms: 0}}", "a rate above 0"),
+        ("{chain: {mu1_per_ms: 1}}", "expected mu1_per_ms and mu2_per_ms, or generator_per_ms"),
+        ("{chain: {mu1_per_ms: -1, mu2_per_ms: 1}}", "mu1_per_ms and mu2_per_ms: expected finite numbers"),
+        ("{chain: {mu1_per_ms: 0, mu2_per_ms: 0}}", "initial: the chain ends in different states"),
+        ("{chain: {generator_per_ms: [[-1, 1], [1]]}}", "expected a square matrix"),
+        ("{chain: {generator_per_ms: [[-1, 2], [1, -1]]}}", "rows sum to zero"),
+        ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, scope: mine}}", "scope: expected one of shared, per-camera"),
+        ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, initial: up}}", "initial: expected one of s1, s2"),
+        ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, sampled: slots}}", "slot_ms: missing (sampled slots needs"),
+        ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, slot_ms: 1}}", "slot_ms: belongs to sampled slots only"),
+        ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, sampled: slots, slot_ms: 0}}", "slot_ms: expected 0.001"),
+        ("{chain: {mu1_per_ms: 1, mu2_per_ms: 1, sampled: now}}", "sampled: expected one of continuous"),
+        ("{discipline: D/G/1/0}", "discipline: expected one of drop-new"),
+        ("{service_state: sometimes}", "service_state: expected one of at-start, modulated"),
+        ("{queue_limit: 0}", "queue_limit: expected 1"),
+        ("{queue_limit: 1.5}", "queue_limit: expected a whole number"),
+        ("{hard_limit_ms: 0}", "hard_limit_ms: expected more than 0"),
+        ("{faults: {rain: {}}}", "channel.faults.rain: unknown fault; expected one of loss"),
+        ("{faults: {loss: {probability: 2}}}", "channel.faults.loss: probability: expected a probability"),
+        ("{faults: {loss: {}}}", "channel.faults.loss.probability: missing"),
+        ("{faults: {blackout: {windows_ms: [[5, 3]]}}}", "channel.faults.blackout: windows_ms"),
+        ("{faults: {bandwidth: {megabits_per_s: 0}}}", "channel.faults.bandwidth: megabits_per_s"),
+        ("{faults: [loss]}", "channel.faults: expected a mapping"),
+        ("ch5", "channel: expected a mapping, got 'ch5'"),
+        ("{preset: ch6, arrivals: {rate_per_ms: [0, 1.0e-8]}}", "more than 100000 times"),
+    ],
+)
+def test_one_line_names_the_key_and_what_was_expected(text: str, expected: str) -> None:
+    with pytest.raises(ValueError) as refused:
+        read(text)
+    assert str(refused.value).startswith("room.yaml: channel")
+    assert expected in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_only_listed_faults_are_imported() -> None:
+    names = [f"channel_emu.model.faults.{name}" for name in NAMES]
+    kept = {name: sys.modules.pop(name) for name in names if name in sys.modules}
+    try:
+        from channel_emu.model.channel import Channel
+
+        Channel(read("preset: ch5"), 0).link("a")
+        assert not [name for name in names if name in sys.modules]
+        Channel(read("faults: {loss: {probability: 0.5}}"), 0).link("a")
+        assert [name for name in names if name in sys.modules] == ["channel_emu.model.faults.loss"]
+    finally:
+        sys.modules.update(kept)

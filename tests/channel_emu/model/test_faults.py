@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from channel_emu.model.channel import Channel
+from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.faults.corruption import damage
+from channel_emu.model.link import Kind, Link
+
+MS = 10**6
+
+
+def link(faults: dict, delay_ms: float = 1.0, camera: str = "cam00", discipline: str = "drop-new") -> Link:
+    service = {"law": "deterministic", "mean_ms": delay_ms}
+    section = {"service": service, "faults": faults, "discipline": discipline}
+    return Channel(channel_from_mapping(section), 11).link(camera)
+
+
+def offer_many(subject: Link, count: int, size: int = 1000) -> list:
+    transits = [subject.offer(i * 10 * MS, None, size)[0] for i in range(count)]
+    subject.advance(count * 10 * MS)
+    return transits
+
+
+def test_loss_takes_its_share_and_its_time() -> None:
+    transits = offer_many(link({"loss": {"probability": 0.2}}), 4000)
+    lost = [t for t in transits if t.outcome is Kind.LOST]
+    assert len(lost) == pytest.approx(800, abs=4 * (4000 * 0.16) ** 0.5)
+    assert all(t.ended_ns == t.offered_ns + MS for t in lost)
+
+
+def test_cameras_lose_independently() -> None:
+    lost = [[t.outcome is Kind.LOST for t in offer_many(link({"loss": {"probability": 0.5}}, camera=c), 2000)]
+            for c in ("cam00", "cam01")]  # fmt: skip
+    assert abs(np.corrcoef(lost)[0, 1]) < 5 / 2000**0.5
+
+
+def test_duplication_is_an_event_beside_the_delivery() -> None:
+    subject = link({"duplication": {"probability": 1.0}})
+    events = subject.offer(0)[1] + subject.advance(5 * MS)
+    assert [e.kind for e in events] == [Kind.STARTED, Kind.DELIVERED, Kind.DUPLICATED]
+    assert subject.counts == {"delivered": 1, "duplicated": 1}
+
+
+def test_corruption_flips_the_bytes_it_says() -> None:
+    transits = offer_many(link({"corruption": {"probability": 0.3, "count": 3}}), 2000)
+    hit = [t for t in transits if t.flips]
+    assert len(hit) == pytest.approx(600, abs=4 * (2000 * 0.21) ** 0.5)
+    payload = bytes(range(256)) * 4
+    for t in hit[:50]:
+        damaged = damage(payload, t.flips)
+        changed = sum(a != b for a, b in zip(payload, damaged))
+        assert len(t.flips) == 3 and len(damaged) == len(payload) and 1 <= changed <= 3
+    assert damage(b"", hit[0].flips) == b""
+
+
+def test_blackout_loses_what_is_on_the_way_during_a_window() -> None:
+    subject = link({"blackout": {"windows_ms": [[100, 200]]}}, delay_ms=20)
+    fates = {at: subject.offer(at * MS)[0] for at in (0, 79, 100, 150, 190, 220)}
+    subject.advance(1000 * MS)
+    lost = [at for at, t in fates.items() if t.outcome is Kind.LOST]
+    assert lost == [100, 150, 190]  # 79 arrives at 99; 100 and later overlap the window; 220 starts after it
+    subject = link({"blackout": {"every_ms": 100, "for_ms": 10}}, delay_ms=20)
+    fates = {at: subject.offer(at * MS)[0] for at in (0, 69, 95, 160, 185, 350)}
+    subject.advance(1000 * MS)
+    assert [at for at, t in fates.items() if t.outcome is Kind.LOST] == [95, 185]
+
+
+def test_resets_break_what_is_inside_at_their_instants() -> None:
+    subject = link({"reset": {"at_ms": [50, 55]}}, delay_ms=20, discipline="fcfs")
+    fates = [subject.offer(at * MS)[0] for at in (0, 35, 45, 60)]
+    subject.advance(100 * MS)
+    assert [str(t.outcome) for t in fates] == ["delivered", "broken", "broken", "delivered"]
+    assert subject.resets == 2 and fates[1].ended_ns == 50 * MS
+    subject = link({"reset": {"mean_interval_ms": 100.0}})
+    subject.advance(100_000 * MS)
+    assert subject.resets == pytest.approx(1000, abs=4 * 1000**0.5)
+
+
+def test_bandwidth_adds_the_time_of_the_bytes() -> None:
+    subject = link({"bandwidth": {"megabits_per_s": 8.0}})  # 1000 bytes a ms
+    transit, _ = subject.offer(0, None, 20_000)
+    assert transit.due_ns == (1 + 20) * MS
+
+
+def test_an_unlisted_fault_changes_no_draw() -> None:
+    """The same delays with and without faults: their numbers come from streams of their own."""
+    section = {"service": {"law": "exponential", "mean_ms": 3.0}, "discipline": "parallel"}
+    plain = Channel(channel_from_mapping(section), 4).link("a")
+    section["faults"] = {"loss": {"probability": 0.5}}
+    lossy = Channel(channel_from_mapping(section), 4).link("a")
+    assert [t.due_ns for t in offer_many(plain, 200)] == [t.due_ns for t in offer_many(lossy, 200)]

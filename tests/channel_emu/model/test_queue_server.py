@@ -1,0 +1,230 @@
+"""One line for several cameras: by example, by property, and kernel against link."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from channel_emu.model.channel import Channel
+from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.link import DISCIPLINES, Event, Kind, Link
+from channel_emu.model.queue_server import ORDERS
+from channel_emu.virtual.simulate import OUTCOMES, simulate
+from tests.channel_emu.virtual.test_simulate import same
+
+MS = 10**6
+WAITING = ("newest-waits", "fcfs")
+
+
+def shared(discipline: str, delays_ms: list[float], order: str = "fcfs", **more: object) -> dict[str, Link]:
+    section = {"service": {"law": "trace", "delays_ms": delays_ms}, "discipline": discipline,
+               "server": {"shared": True, "order": order}, **more}  # fmt: skip
+    channel = Channel(channel_from_mapping(section), 0)
+    return {camera: channel.link(camera) for camera in "cab"}  # joined in any order
+
+
+def play(links: dict[str, Link], offers: list[tuple[str, float]], until_ms: float = 1000) -> list[str]:
+    """What happened to whom, in order: "a0 delivered 10" is camera a's frame 0 at 10 ms."""
+    told: list[tuple[int, bool, str]] = []
+
+    def note(camera: str, events: list[Event]) -> None:
+        for e in events:  # at one instant what ends comes before what starts in its place
+            line = f"{camera}{e.transit.number} {e.kind} {e.at_ns / MS:g}"
+            told.append((e.at_ns, e.kind is Kind.STARTED, line))
+
+    for camera, at_ms in offers:
+        note(camera, links[camera].offer(round(at_ms * MS))[1])
+        for other, link in links.items():
+            if link.next_event_ns <= at_ms * MS:
+                note(other, link.advance(round(at_ms * MS)))
+    for camera, link in links.items():
+        note(camera, link.advance(round(until_ms * MS)))
+    return [line for _, _, line in sorted(told)]
+
+
+def started(lines: list[str]) -> list[str]:
+    return [line.split()[0] for line in lines if " started " in line]
+
+
+def test_drop_new_discards_whoever_finds_the_line_busy() -> None:
+    lines = play(shared("drop-new", [10]), [("a", 0), ("b", 4), ("a", 5), ("b", 10)])
+    assert lines == ["a0 started 0", "b0 dropped_busy 4", "a1 dropped_busy 5", "a0 delivered 10",
+                     "b1 started 10", "b1 delivered 20"]  # fmt: skip
+
+
+def test_a_new_frame_of_any_camera_preempts() -> None:
+    lines = play(shared("lcfs-preempt", [10]), [("a", 0), ("b", 4)])
+    assert lines == ["a0 started 0", "a0 superseded 4", "b0 started 4", "b0 delivered 14"]
+
+
+def test_parallel_counts_all_cameras_frames() -> None:
+    lines = play(shared("parallel", [10], queue_limit=2), [("a", 0), ("b", 1), ("c", 2)])
+    assert "c0 dropped_busy 2" in lines and started(lines) == ["a0", "b0"]
+
+
+OFFERS = [("a", 0), ("a", 1), ("c", 2), ("b", 3), ("c", 4), ("a", 5)]
+
+
+@pytest.mark.parametrize(
+    ("discipline", "order", "served"),
+    [
+        # c waits since 2 (c1 replaces c0 and keeps its turn), a since 1.
+        ("newest-waits", "fcfs", ["a0", "a2", "c1", "b0"]),
+        ("newest-waits", "newest-first", ["a0", "a2", "c1", "b0"]),
+        ("newest-waits", "round-robin", ["a0", "b0", "c1", "a2"]),
+        # b and c were never served and go first, by name; then a.
+        ("newest-waits", "oldest-age", ["a0", "b0", "c1", "a2"]),
+        ("fcfs", "fcfs", ["a0", "a1", "c0", "b0", "c1", "a2"]),
+        ("fcfs", "newest-first", ["a0", "b0", "c0", "c1", "a1", "a2"]),
+        ("fcfs", "round-robin", ["a0", "b0", "c0", "a1", "c1", "a2"]),
+        # After b0 (offered at 3) and c0 (at 2) a is oldest (0), then still a (1), then c.
+        ("fcfs", "oldest-age", ["a0", "b0", "c0", "a1", "a2", "c1"]),
+    ],
+)
+def test_order_of_service(discipline: str, order: str, served: list[str]) -> None:
+    assert started(play(shared(discipline, [10], order), OFFERS)) == served
+
+
+def test_a_limit_on_waiting_frames_counts_all_cameras() -> None:
+    lines = play(shared("fcfs", [10], queue_limit=2), [("a", 0), ("b", 1), ("c", 2), ("b", 3)])
+    assert "b1 dropped_busy 3" in lines and started(lines) == ["a0", "b0", "c0"]
+
+
+def test_what_others_cause_is_told_at_once() -> None:
+    """b waits behind a. Whoever asks for time first, b learns of its start with its own next question."""
+    links = shared("newest-waits", [10, 7])
+    links["a"].offer(0)
+    assert links["b"].offer(2 * MS)[1] == [] and links["b"].next_event_ns == NEVER_NS
+    assert [e.kind for e in links["a"].advance(12 * MS)] == [Kind.DELIVERED]
+    assert links["b"].next_event_ns == 10 * MS  # in the past: there is news
+    assert [(e.kind, e.at_ns) for e in links["b"].advance(12 * MS)] == [(Kind.STARTED, 10 * MS)]
+    assert links["b"].next_event_ns == 20 * MS
+    # One clock for all: c cannot offer before what was decided already.
+    assert links["c"].offer(5 * MS)[0].offered_ns == 12 * MS and links["c"].clock_backwards == 1
+
+
+def test_a_reset_breaks_one_camera_and_frees_the_line() -> None:
+    links = shared("fcfs", [50], faults={"reset": {"mean_interval_ms": 1e9}})
+    links["a"]._reset_ns = 20 * MS  # at an instant of our choice
+    links["a"]._reckon()
+    lines = play(links, [("a", 0), ("b", 1), ("a", 2)])
+    assert lines == ["a0 started 0", "a0 broken 20", "a1 broken 20", "b0 started 20", "b0 delivered 70"]
+    assert links["a"].resets == 1 and links["b"].resets == 0
+
+
+def test_a_camera_has_one_link() -> None:
+    channel = Channel(channel_from_mapping({"server": {"shared": True}}), 0)
+    channel.link("a")
+    with pytest.raises(ValueError, match="a has a link to this server already"):
+        channel.link("a")
+
+
+SECTIONS = [
+    {"discipline": discipline, "server": {"shared": True, "order": order}}
+    for discipline in DISCIPLINES for order in (ORDERS if discipline in WAITING else ("fcfs",))
+]  # fmt: skip
+
+
+def kernel_and_link(section: dict, cameras: list[str], seconds: float, period_ms: float | None) -> None:
+    config = channel_from_mapping(section)
+    python = simulate(config, cameras, seconds, 7, engine="python", frame_period_ms=period_ms)
+    kernel = simulate(config, cameras, seconds, 7, engine="kernel", frame_period_ms=period_ms)
+    for a, b in zip(python.runs, kernel.runs):
+        assert a.camera == b.camera and len(a.offered_ns) > 20
+        same(a, b)
+    counts = kernel.summary()
+    assert counts["offered"] == sum(counts[name] for name in OUTCOMES)
+
+
+@pytest.mark.parametrize("section", SECTIONS, ids=lambda s: f"{s['discipline']} {s['server']['order']}")
+def test_kernel_and_link_decide_alike(section: dict) -> None:
+    """Names out of order, few waiting places, cameras that fire at one instant and Poisson ones; service by
+    the shared chain, by chains of the cameras' own, at the start and modulated."""
+    pytest.importorskip("numba")
+    cameras = ["d", "b", "a", "c"]
+    section = {"preset": "ch6", "queue_limit": 5, **section, "service": {"mean_ms": [8.0, 25.0]}}
+    for more, period_ms in (
+        ({}, None),
+        ({"chain": {"scope": "per-camera"}, "service_state": "modulated"}, 33.0),
+        ({"arrivals": {"process": "periodic", "period_ms": 30.0, "spread": True}}, None),
+        ({"service": {"mean_ms": [1e300, 0.0]}}, None),  # stuck, or through at once
+        ({"arrivals": {"process": "periodic", "period_ms": 30.0}, "service": {"law": "deterministic",
+                                                                             "mean_ms": 10.0}}, None),
+    ):  # fmt: skip
+        kernel_and_link({**section, **more}, cameras, 5, period_ms)
+
+
+@pytest.mark.parametrize("discipline", DISCIPLINES)
+def test_a_shared_line_for_one_camera_is_a_line_of_its_own(discipline: str) -> None:
+    pytest.importorskip("numba")
+    own = channel_from_mapping({"preset": "ch6", "discipline": discipline})
+    alone = channel_from_mapping({"preset": "ch6", "discipline": discipline, "server": {"shared": True}})
+    for engine in ("python", "kernel"):
+        a, b = (simulate(config, 1, 20, 3, engine=engine).runs[0] for config in (own, alone))
+        same(a, b)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.sampled_from(SECTIONS),
+    st.lists(st.sampled_from([0.0, 1.0, 7.5, 1e12]), min_size=1, max_size=4),
+    st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from([0, 1, 5, 33])), min_size=1, max_size=40),
+    st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 200)), max_size=6),
+    st.booleans(),
+)
+def test_every_frame_ends_once_and_looking_changes_nothing(
+    section: dict,
+    delays_ms: list[float],
+    gaps: list[tuple[str, int]],
+    looks: list[tuple[str, int]],
+    faults: bool,
+) -> None:
+    chance = {"loss": {"probability": 0.3}, "reset": {"mean_interval_ms": 40.0}}
+    section = {"service": {"law": "trace", "delays_ms": delays_ms}, "queue_limit": 3,
+               "faults": chance if faults else {}, **section}  # fmt: skip
+    fates = []
+    for extra in ([], looks):
+        channel = Channel(channel_from_mapping(section), 1)
+        links = {camera: channel.link(camera) for camera in "abc"}
+        steps = [(sum(gap for _, gap in gaps[: i + 1]), 1, i) for i in range(len(gaps))]
+        steps += [(at, 0, k) for k, (_, at) in enumerate(extra)]
+        transits, ends = [], Counter()
+        for at_ms, is_offer, i in sorted(steps):
+            if is_offer:
+                transit, events = links[gaps[i][0]].offer(at_ms * MS)
+                transits.append(transit)
+            else:
+                events = links[extra[i][0]].advance(at_ms * MS)
+            ends.update(id(e.transit) for e in events if e.kind is not Kind.STARTED)
+        for link in links.values():
+            events = link.advance(2000 * MS)
+            ends.update(id(e.transit) for e in events if e.kind is not Kind.STARTED)
+        assert max(ends.values(), default=0) <= 1
+        assert len(transits) == len(ends) + sum(link.in_flight for link in links.values())
+        server = links["a"].server
+        assert server.busy <= (3 if section["discipline"] == "parallel" else 1)
+        assert server.waiting == sum(len(link.waiting) for link in links.values())
+        assert server.busy or not server.waiting
+        fates.append([(t.offered_ns, t.started_ns, t.due_ns, t.outcome, t.ended_ns) for t in transits])
+    assert fates[0] == fates[1]
+
+
+@pytest.mark.parametrize(
+    ("section", "why"),
+    [
+        ({"server": {"order": "round-robin"}}, "order: belongs to a shared server only"),
+        ({"server": {"shared": True, "order": "lifo"}}, "order: expected one of fcfs, newest-first"),
+        (
+            {"server": {"shared": True, "order": "round-robin"}},
+            "nothing waits its turn under discipline drop-new",
+        ),
+        ({"arrivals": {"process": "poisson", "rate_per_ms": 1, "spread": True}}, "spread: belongs to"),
+    ],
+)
+def test_mistakes_are_named(section: dict, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        channel_from_mapping(section)

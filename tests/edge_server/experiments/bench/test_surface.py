@@ -1,0 +1,38 @@
+"""``edge-server bench surface`` measures, prints and goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from edge_server.cli import main as edge_server
+from edge_server.experiments.bench import surface
+from edge_server.experiments.bench.surface import Effort
+
+
+@pytest.mark.slow
+def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
+    monkeypatch.setattr(surface, "QUICK", Effort(40, (2.0,), (8.0,), ("splat",)))
+    words = ["bench", "surface", "--quick", "--json", str(tmp_path / "s.json")]
+    assert edge_server(words) == 0
+    found = json.loads((tmp_path / "s.json").read_text())["surface"]
+    (exact,) = found["exact"]["meshes"]
+    assert exact["chamfer_mm"] < 3.0 and exact["complete"] > 0.8
+    (fit,) = found["cases"]["splat"]["fits"]
+    assert {(m["depth"], m["method"]) for m in fit["meshes"]} == {
+        ("of the field", "tsdf"), ("sharpened", "tsdf"), ("sharpened", "sdf"), ("carved", "tsdf"),
+    }  # fmt: skip
+    # What the pictures agree on is nearer to the truth than what the field made of them.
+    assert fit["sharpened"]["median_mm"] < fit["of the field"]["median_mm"]
+    carved, sharpened = (
+        next(m for m in fit["meshes"] if (m["depth"], m["method"]) == (depth, "tsdf"))
+        for depth in ("carved", "sharpened")
+    )
+    assert carved["complete"] > sharpened["complete"]
+    assert fit["carved"]["carve_s"] > 0.0 and "carve_s" not in fit["sharpened"]
+    assert "| exact |  | exact | tsdf | 8 |" in capsys.readouterr().out
+    assert edge_server([*words, "--resume"]) == 0
+    again = json.loads((tmp_path / "s.json").read_text())["surface"]
+    assert again["cases"] == found["cases"]

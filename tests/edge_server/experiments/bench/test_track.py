@@ -1,0 +1,201 @@
+"""``bench track``: what follows is compared with what is fitted afresh; all that is measured is kept."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.cli import main as edge_server
+from edge_server.experiments.bench import track
+from edge_server.experiments.bench.track import Plan, gaps
+from edge_server.fields import Budget, FitReport, Rendering
+from tests.edge_server.experiments.sets import SMALL_WORDS, write_recording
+
+TINY = Plan(updates=3, samples=2, cameras=5, size=24)
+
+
+class Flat:
+    """Shows mid-grey whatever it is given. interrupt: the fit, of all fields', that Ctrl-C falls into."""
+
+    fits = 0
+    interrupt: int | None = None
+
+    def fit(self, views: Any, budget: Budget) -> FitReport:
+        Flat.fits += 1
+        if Flat.fits == Flat.interrupt:
+            raise KeyboardInterrupt
+        return FitReport(budget.steps or 7, budget.seconds or 0.1, 0.0, 1, 1)
+
+    def render(self, pose: Any, lens: Any) -> Rendering:
+        shape = (lens.height, lens.width)
+        return Rendering(np.full((*shape, 3), 0.5, np.float32), np.zeros(shape), np.zeros(shape))
+
+    def warm_up(self) -> float:
+        return 0.0
+
+    def state(self) -> dict[str, Any]:
+        return {}
+
+    def load_state(self, state: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def flat(monkeypatch: pytest.MonkeyPatch) -> type[Flat]:
+    monkeypatch.setattr(track, "make_field", lambda name, options=None, seed=0: Flat())
+    monkeypatch.setattr(track, "QUICK", TINY)
+    monkeypatch.setattr(Flat, "fits", 0)
+    monkeypatch.setattr(Flat, "interrupt", None)
+    return Flat
+
+
+def bench(path: Path, *words: str) -> int:
+    return edge_server(["bench", "track", "--quick", "--json", str(path), "--scene", "room", *words])
+
+
+def test_a_follower_is_compared_with_fresh_fits_and_everything_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(track, "QUICK", TINY)
+    runs = []
+    for name in ("a", "b"):
+        path = tmp_path / name / "bench.json"
+        assert bench(path, "--field", "ngp", "--steps", "2", *SMALL_WORDS) == 0
+        runs.append(json.loads(path.read_text())["track"]["room"])
+    found, again = (run["ngp"] for run in runs)
+    run = found["2_steps"]
+    assert run["series"]["frame"] == [1, 2, 3] and run["series"]["steps"] == [2, 2, 2]
+    assert sorted(found["fresh"]) == ["0", "3"] and found["fresh"]["3"]["steps"] == 30
+    # Steps repeat bit for bit, whatever the machine does meanwhile.
+    for metric in ("psnr_db", "psnr_moving_db"):
+        assert run["series"][metric] == again["2_steps"]["series"][metric]
+        assert len(set(run["series"][metric])) == 3  # every update was scored on its own
+    assert run["whole"]["mean_db"] == pytest.approx(np.mean(run["series"]["psnr_db"]))
+
+    path = tmp_path / "a" / "bench.json"
+    assert (path.parent / "track.png").read_bytes()[:4] == b"\x89PNG"
+    text = path.with_suffix(".md").read_text()
+    assert "![track](track.png)" in text
+    row = next(line for line in text.splitlines() if line.startswith("| room | ngp |"))
+    cells = [cell.strip() for cell in row.split("|")[1:-1]]
+    whole, moving = run["whole"], run["moving"]
+    assert cells[2:5] == ["2 steps", "3", f"{whole['mean_db']:.2f} ({moving['mean_db']:.2f})"]
+    assert cells[5] == f"{whole['fresh_mean_db']:.2f} ({moving['fresh_mean_db']:.2f})"
+    assert cells[7] == f"{100 * whole['share_near']:.0f} % ({100 * moving['share_near']:.0f} %)"
+    assert cells[8] == f"{whole['median_db']:.2f} ({moving['median_db']:.2f})"
+    assert row in capsys.readouterr().out
+
+
+def test_a_field_that_learns_nothing_is_as_good_as_fresh(tmp_path, flat):
+    """Interpolation is exact at the sampled frames, and every frame is sampled here."""
+    assert bench(tmp_path / "bench.json", "--field", "ngp", "--updates", "4", "--samples", "5") == 0
+    found = json.loads((tmp_path / "bench.json").read_text())["track"]["room"]["ngp"]
+    assert set(found) >= {"fresh", "1_s", "0.25_s"}
+    for kind in ("whole", "moving"):
+        figures = found["1_s"][kind]
+        assert figures["share_near"] == 1.0
+        assert figures["median_db"] == pytest.approx(0.0, abs=1e-12)
+        assert figures["drift_db"] == pytest.approx(0.0, abs=1e-12)
+    fresh = found["fresh"]["4"]
+    assert fresh["psnr_db"] == fresh["not_updated_psnr_db"] and fresh["fitted_s"] == 15.0
+
+
+def test_drift_is_the_same_at_length_and_kept_apart(tmp_path, flat):
+    path = tmp_path / "bench.json"
+    assert bench(path, "--field", "ngp", "--updates", "4") == 0
+    words = ["bench", "drift", "--quick", "--resume", "--json", str(path), "--field", "ngp"]
+    assert edge_server(words) == 0
+    found = json.loads(path.read_text())
+    assert found["track"]["room"]["ngp"]["1_s"]["updates"] == 4
+    assert list(found["drift"]) == ["room"] and found["drift"]["room"]["ngp"]["0.25_s"]["updates"] == 32
+    assert "![drift](drift.png)" in path.with_suffix(".md").read_text()
+    assert edge_server([*words, "--updates", "5"]) == 0
+    assert json.loads(path.read_text())["drift"]["room"]["ngp"]["0.25_s"]["updates"] == 5
+
+
+def test_gaps_are_against_the_interpolated_fresh_fits():
+    frames = list(range(1, 21))
+    # Fresh falls from 30 to 20 dB; the follower starts with it and loses 0.1 dB more at every frame.
+    fresh = {0: 30.0, 20: 20.0}
+    tracked: list[float | None] = [30.0 - 0.5 * f - 0.1 * f for f in frames]
+    found = gaps(frames, tracked, fresh)
+    assert found["share_near"] == pytest.approx(5 / 20)
+    assert found["median_db"] == pytest.approx(1.05)
+    assert found["first_tenth_db"] == pytest.approx(0.15)
+    assert found["last_tenth_db"] == pytest.approx(1.95)
+    assert found["drift_db"] == pytest.approx(1.8)
+    assert found["fresh_mean_db"] == pytest.approx(np.mean([30.0 - 0.5 * f for f in frames]))
+    # Frames without a score (nothing moved) have no vote.
+    some = [v if f % 2 else None for f, v in zip(frames, tracked)]
+    assert gaps(frames, some, fresh)["share_near"] == pytest.approx(3 / 10)
+    assert gaps(frames, [None] * 20, fresh)["median_db"] is None
+    assert gaps(frames, tracked, {})["share_near"] is None
+
+
+def test_an_interrupted_bench_keeps_what_it_has_and_goes_on(tmp_path, flat, capsys):
+    path = tmp_path / "bench.json"
+    words = ("--field", "ngp", "--field", "tensorf")
+    flat.interrupt = 2 + 2 * 3 + 2 + 2  # the second update of tensorf's first run
+    assert bench(path, *words) == 130
+    assert "--resume goes on" in capsys.readouterr().out
+    rows = json.loads(path.read_text())["track"]["room"]
+    assert "interrupted" not in rows["ngp"] and rows["tensorf"]["interrupted"] is True
+    assert rows["tensorf"]["1_s"]["series"]["frame"] == [1] and "0.25_s" not in rows["tensorf"]
+    assert "| room | tensorf | 1 s (7 steps) | 1 |" in path.with_suffix(".md").read_text()
+    assert (tmp_path / "track.png").is_file()
+
+    flat.interrupt, flat.fits = None, 0
+    assert bench(path, *words, "--resume") == 0
+    assert flat.fits == 2 + 2 * 3  # tensorf's alone
+    whole = json.loads(path.read_text())["track"]["room"]
+    assert whole["ngp"] == rows["ngp"] and "interrupted" not in whole["tensorf"]
+    assert whole["tensorf"]["0.25_s"]["series"]["frame"] == [1, 2, 3]
+
+    # Other settings are other figures.
+    assert bench(path, *words, "--resume", "--updates", "2") == 0
+    assert json.loads(path.read_text())["track"]["room"]["ngp"]["1_s"]["updates"] == 2
+
+
+def test_resume_refuses_what_was_measured_otherwise(tmp_path, flat, capsys):
+    path = tmp_path / "bench.json"
+    assert bench(path, "--field", "ngp") == 0
+    for words in (["--json", str(path)], []):
+        with pytest.raises(SystemExit):
+            edge_server(["bench", "track", "--resume", *words])
+    told = capsys.readouterr().err
+    assert "was measured with --quick" in told and "--resume needs --json" in told
+    path.write_text("[]")
+    with pytest.raises(SystemExit):
+        bench(path, "--resume")
+    assert "is not what bench writes" in capsys.readouterr().err
+
+
+def test_recordings_are_followed_too_or_said_to_be_missing(tmp_path, flat, monkeypatch, capsys):
+    write_recording(tmp_path / "blender_kitchen", cameras=5, instants=4, size=24)
+    monkeypatch.setenv("FRESHFIELD_DATA", str(tmp_path))
+    words = ["bench", "track", "--quick", "--field", "ngp", "--scene", "kitchen", "--json"]
+    assert edge_server([*words, str(tmp_path / "bench.json")]) == 0
+    found = json.loads((tmp_path / "bench.json").read_text())["track"]["kitchen"]
+    assert found["scene"] == "kitchen: 4 views of 24 x 24" and found["ngp"]["1_s"]["updates"] == 3
+    assert found["baseline"]["mean_colour_db"] > 0.0
+    monkeypatch.delenv("FRESHFIELD_DATA")
+    assert edge_server([*words, str(tmp_path / "none.json")]) == 1
+    assert "kitchen: set FRESHFIELD_DATA" in capsys.readouterr().err
+
+
+def test_flags_that_mean_nothing_to_the_parts_asked_for_are_refused(capsys):
+    with pytest.raises(SystemExit):
+        edge_server(["bench", "field", "--scene", "room"])
+    assert "--scene is for track, drift; asked for: field" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        edge_server(["bench", "track", "--field", "voxel,ngp", "--option", "sizes=64"])
+    assert "voxel: sizes must be a list like [32, 64], not 64" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--updates", "0"], ["--update-s", "1,x"], ["--scene", "attic"]])
+def test_wrong_words_are_refused(words, flat, capsys):
+    with pytest.raises(SystemExit):
+        edge_server(["bench", "track", "--quick", *words])
+    assert words[0] in capsys.readouterr().err

@@ -1,0 +1,162 @@
+"""``edge-server fit`` end to end on small sets: what it writes, going on, stopping, refusing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+
+import pytest
+
+from edge_server.cli import main as edge_server
+from edge_server.experiments.fitting.evaluate import fit_in_slices, marks_s
+from edge_server.fields import FitReport, checkpoint
+from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos, write_recording
+
+
+def fit(data, out, *words: str) -> int:
+    return edge_server(["fit", str(data), "--out", str(out), *SMALL_WORDS, *words])
+
+
+def report_of(out):
+    return json.loads((out / "report.json").read_text())
+
+
+def test_it_learns_and_leaves_report_pictures_and_checkpoint(tmp_path, capsys):
+    write_photos(tmp_path / "set", 9)
+    out = tmp_path / "out"
+    assert fit(tmp_path / "set", out, "--seconds", "2.5", "--seed", "3") == 0
+    report = report_of(out)
+    assert report["seed"] == 3 and report["field"] == "ngp"
+    assert report["frames"] is None, "no frame passed a network"
+    series = report["fidelity"]["series"]
+    assert series[0]["t_s"] < series[-1]["t_s"] == pytest.approx(2.5, rel=0.2)
+    assert series[-1]["psnr_db"] > report["fidelity"]["baseline"]["mean_colour_db"] + 1.0
+    for name in ("report.html", "truth.png", "rendered.png", "figure-comparison.png", "figure-fidelity.png"):
+        assert (out / name).stat().st_size > 100, name
+    state, about = checkpoint.load(out / "field")
+    assert state and about["seconds"] == series[-1]["t_s"]
+    assert "PSNR" in capsys.readouterr().out
+
+
+def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["fit", "tower", *SMALL_WORDS, "--seconds", "1", "--scale", "4", "--frame", "6"]
+    assert edge_server(words) == 0
+    printed = capsys.readouterr().out
+    assert "tower: 18 views of 32 x 32, at 0.4 s, 1 held out" in printed
+    report = report_of(tmp_path / "runs" / "fit-tower")
+    series = report["fidelity"]["series"]
+    assert series[-1]["psnr_db"] > 10.0
+    # A folder of that name is the user's own.
+    write_photos(tmp_path / "tower", 9)
+    assert edge_server(words) == 0
+    assert "at 0.4 s" not in capsys.readouterr().out
+
+
+def test_resume_goes_on_where_it_stopped(tmp_path, capsys):
+    write_photos(tmp_path / "set", 5)
+    out = tmp_path / "out"
+    assert fit(tmp_path / "set", out, "--seconds", "1") == 0
+    before = report_of(out)["fidelity"]["series"]
+    assert fit(tmp_path / "set", out, "--seconds", "2", "--resume") == 0
+    after = report_of(out)["fidelity"]["series"]
+    assert after[: len(before)] == before
+    assert before[-1]["t_s"] < after[-1]["t_s"] == pytest.approx(2.0, rel=0.25)
+    assert fit(tmp_path / "set", out, "--seconds", "2", "--resume") == 2
+    assert "give more --seconds" in capsys.readouterr().err
+
+
+def test_ctrl_c_where_python_cannot_raise_it_is_not_lost():
+    class Deaf:
+        """A field whose fits swallow it, as a callback of the garbage collector does."""
+
+        fits = 0
+
+        def fit(self, views, budget):
+            self.fits += 1
+            with suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.2)
+            return FitReport(1, 0.2, 0.0, 1, 1)
+
+    field, scored, before = Deaf(), [], signal.getsignal(signal.SIGINT)
+    score = object()
+    assert fit_in_slices(field, [], lambda: score, (1.0, 2.0, 9.0), scored.append) is False
+    assert field.fits == len(scored) == 1 and scored[0].score is score
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_ends_early_with_the_report_written(tmp_path, capsys):
+    write_photos(tmp_path / "set", 5)
+    out = tmp_path / "out"
+    main, ended = threading.main_thread().ident, threading.Event()
+
+    def interrupt_once_it_fits() -> None:
+        while not ended.wait(0.05):
+            frame = sys._current_frames().get(main)
+            while frame is not None and frame.f_code is not fit_in_slices.__code__:
+                frame = frame.f_back
+            if frame is not None and not ended.wait(1.5):
+                os.kill(os.getpid(), signal.SIGINT)
+                return
+
+    watcher = threading.Thread(target=interrupt_once_it_fits)
+    watcher.start()
+    try:
+        assert fit(tmp_path / "set", out, "--seconds", "60") == 0
+    finally:
+        ended.set()
+        watcher.join()
+    assert "stopped early" in capsys.readouterr().out
+    assert 0.5 < report_of(out)["seconds"] < 30.0
+    assert fit(tmp_path / "set", out, "--seconds", "0.5", "--resume") == 2, "it has been fitted for longer"
+
+
+def test_transparent_images_are_scored_on_the_background_asked_for(tmp_path):
+    write_photos(tmp_path / "set", 5, alpha=True)
+    baselines = []
+    for background in ("white", "black"):
+        out = tmp_path / background
+        assert fit(tmp_path / "set", out, "--seconds", "0.5", "--background", background) == 0
+        baselines.append(report_of(out)["fidelity"]["baseline"]["mean_colour_db"])
+    assert baselines[0] != baselines[1]
+
+
+def test_an_instant_of_a_recording_and_scores_on_training_views(tmp_path):
+    write_recording(tmp_path / "set")
+    out = tmp_path / "out"
+    assert fit(tmp_path / "set", out, "--seconds", "0.5", "--holdout", "0", "--frame", "1") == 0
+    assert report_of(out)["fidelity"]["scored_on"] == ["selected"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--option", "levels"], "expected KEY=VALUE"),
+        (["--option", "colour=1"], "no option colour"),
+        (["--field", "nothing"], "no field is called 'nothing'"),
+        (["--seconds", "0"], "--seconds 0"),
+        (["--holdout", "x"], "no image or camera 'x'"),
+        (["--scale", "0.5"], "scale is 0.5"),
+        (["--resume"], "no fit to go on from"),
+    ],
+)
+def test_what_cannot_work_is_refused_in_one_line(tmp_path, capsys, words, message):
+    write_photos(tmp_path / "set", 3)
+    assert fit(tmp_path / "set", tmp_path / "out", *words) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+
+
+def test_marks_end_with_the_whole_and_leave_a_long_last_slice():
+    assert marks_s(60.0) == [1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0]
+    assert marks_s(0.5) == [0.5]
+    for total in (1.0, 7.0, 45.0, 200.0, 1000.0):
+        marks = marks_s(total)
+        assert marks == sorted(set(marks)) and marks[-1] == total
+        assert len(marks) == 1 or marks[-1] - marks[-2] >= 0.4 * total - 1e-9

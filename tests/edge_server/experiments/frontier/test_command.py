@@ -1,0 +1,226 @@
+"""``edge-server frontier``: repeatable, resumable, and its tables and figures say what was measured."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.cli import main as edge_server
+from edge_server.experiments.frontier import command, effort_sweep
+from edge_server.experiments.frontier.output import conclusion
+from edge_server.experiments.frontier.update_time import Moving, Stage, charges, mean_over_seeds, steps_for
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.virtual.virtual_deployment import Compute
+from edge_server.fields.voxel import settings
+from edge_server.live.update_budget import read_points
+from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
+
+TINY = Moving(cameras=4, size=32)
+COMPUTE = Compute(ms_per_step=30.0, ms_per_update=10.0)
+
+
+def test_an_update_time_point_is_the_same_bit_for_bit():
+    points = []
+    for _ in range(2):
+        stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
+        points.append(stage.run(3, COMPUTE, seconds=1.0))
+    assert points[0] == points[1]
+    assert points[0]["update_s"] == 0.1 and 5 <= points[0]["updates"] <= 9
+    assert points[0]["psnr_db"] is not None and points[0]["psnr_moving_db"] is not None
+
+
+def test_updates_are_charged_what_they_take_where_everything_is_new(monkeypatch):
+    """A field that takes 60 ms for new pictures, 30 for a snapshot and 5 a step, by a clock of its own."""
+    seen, clock = [], [0.0]
+
+    class Slow:
+        def warm_up(self):
+            clock[0] += 9.0
+
+        def state(self):
+            return {}
+
+        def fit(self, views, budget):
+            seen.append(views)
+            clock[0] += 0.060 + 0.005 * budget.steps
+
+        def snapshot(self):
+            clock[0] += 0.030
+
+    monkeypatch.setattr("edge_server.fields.registry.make_field", lambda *args, **more: Slow())
+    monkeypatch.setattr("edge_server.experiments.frontier.update_time.time.perf_counter", lambda: clock[0])
+    found = charges(TINY, 1.0, "ngp", {}, warm_steps=5)
+    assert found.ms_per_step == pytest.approx(5.0) and found.ms_per_update == pytest.approx(90.0)
+    stamps = [{v.generated_ns for v in views} for views in seen]
+    assert all(len(s) == 1 for s in stamps) and len(set().union(*stamps)) == len(seen)
+    assert not np.array_equal(seen[1][0].image, seen[-1][0].image), "nothing moved: nothing was new"
+
+
+def test_every_point_of_a_stage_starts_from_the_same_warm_field():
+    stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
+    first = stage.run(3, COMPUTE, seconds=0.6)
+    stage.run(9, COMPUTE, seconds=0.6)
+    assert stage.run(3, COMPUTE, seconds=0.6) == first
+
+
+def test_longer_updates_show_older_views():
+    stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=2)
+    short, long = (stage.run(steps, COMPUTE, seconds=1.5) for steps in (1, 12))
+    assert long["aaoi_ms"] - short["aaoi_ms"] == pytest.approx(11 * 30.0, abs=60.0)
+
+
+def test_the_front_is_what_nothing_beats_in_both():
+    rows = [
+        {"planned_s": 1.0, "psnr_db": 20.0},
+        {"planned_s": 2.0, "psnr_db": 19.0},
+        {"planned_s": 2.0, "psnr_db": 25.0},
+        {"planned_s": 3.0, "psnr_db": 25.0},
+        {"planned_s": 4.0, "psnr_db": 26.0},
+    ]
+    effort_sweep.mark_front(rows)
+    assert [row["on_front"] for row in rows] == [True, False, True, False, True]
+
+
+def test_steps_that_fit_into_an_update():
+    assert steps_for(1.0, COMPUTE) == 33
+    assert steps_for(0.001, COMPUTE) == 1
+
+
+def test_seeds_are_averaged_with_their_standard_error():
+    base = {
+        "speed_m_per_s": 1.0, "planned_update_s": 0.5, "update_s": 0.5, "steps": 4, "updates": 2, "scored": 2,
+        "aaoi_ms": 100.0, "psnr_moving_db": None, "ssim": 0.5, "lpips": None, "seen_psnr_db": 20.0,
+        "seen_psnr_moving_db": None, "field": "ngp", "effort": "low",
+        "options": {"effort": "low"},
+    }  # fmt: skip
+    (row,) = mean_over_seeds([{**base, "psnr_db": 20.0}, {**base, "psnr_db": 22.0}])
+    assert row["psnr_db"] == 21.0 and row["psnr_db_error"] == pytest.approx(1.0)
+    assert row["psnr_moving_db"] is None and row["psnr_moving_db_error"] is None and row["seeds"] == 2
+
+
+def test_the_conclusion_names_the_best_time_of_each_speed():
+    def row(speed, update_s, whole, moving):
+        return {
+            "field": "ngp", "effort": "low", "speed_m_per_s": speed, "update_s": update_s, "psnr_db": whole,
+            "psnr_moving_db": moving,
+        }  # fmt: skip
+
+    said = conclusion(
+        [row(1.0, 0.1, 20, 18), row(1.0, 2.0, 22, 15), row(3.0, 0.1, 20, 17), row(3.0, 2.0, 19, 14)]
+    )
+    assert "at 1 m/s 2.00 s (ngp low) for the whole image and 0.10 s (ngp low) where it moves (2.0 s" in said
+    assert "at 3 m/s 0.10 s (ngp low) for the whole image" in said
+
+
+def test_images_of_half_the_size_keep_what_a_camera_sees():
+    still = synthetic("tile", cameras=3, size=32)
+    (small, *_) = effort_sweep.shrunk(still.training, 2.0)
+    view = still.training[0]
+    assert small.image.shape == (16, 16, 3) and small.intrinsics.fx == view.intrinsics.fx / 2
+    assert np.allclose(small.image, view.image.reshape(16, 2, 16, 2, 3).mean(axis=(1, 3)), atol=1.0)
+    see_through = np.zeros((4, 4, 4), np.uint8)
+    see_through[:2, :, :] = (200, 100, 50, 255)
+    see_through[2:, :, :3] = 255  # what a transparent pixel is coloured must not bleed
+    lens = view.intrinsics.scaled(4 / 32)
+    (small,) = effort_sweep.shrunk([replace(view, image=see_through, intrinsics=lens)], 4.0)
+    assert small.image.tolist() == [[[200, 100, 50, 128]]]
+    assert effort_sweep.shrunk(still.training, 1.0) == still.training
+
+
+@pytest.fixture
+def tiny_plan(monkeypatch):
+    plan = replace(
+        command.QUICK, planned_s=(0.2, 0.4), speeds=(1.0,), update_s=(0.1, 0.4), run_s=0.8, warm_steps=3,
+        size=32, moving=TINY,
+    )  # fmt: skip
+    monkeypatch.setattr(command, "QUICK", plan)
+    return plan
+
+
+def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
+    words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
+    assert edge_server(words) == 0
+    first = capsys.readouterr().out
+    assert "(known)" not in first and "Best time to spend on an update: at 1 m/s" in first
+    for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
+        assert (tmp_path / name).stat().st_size > 100, name
+    data = json.loads((tmp_path / "frontier.json").read_text())
+    assert set(data["ms_per_step"]) == {e.label for e in effort_sweep.efforts("ngp", {}, knobs=False)}
+    assert all(ms > 0 for ms in data["ms_per_step"].values())
+    with (tmp_path / "updates.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 4  # two efforts, two update times
+    assert {p.effort for p in read_points(tmp_path / "frontier.json", "ngp")} == {"low", "medium"}
+
+    # As after Ctrl-C: what is finished is not measured again, the rest is, and nothing else has changed.
+    points = data["points"]
+    gone = next(key for key, point in points.items() if point["settings"]["figure"] == 2)
+    lost = points.pop(gone)
+    (tmp_path / "frontier.json").write_text(json.dumps(data))
+    assert edge_server(words) == 0
+    again = json.loads((tmp_path / "frontier.json").read_text())["points"]
+    assert capsys.readouterr().out.count("(known)") == len(points)
+    assert again[gone] == lost, "virtual time gives the same point again"
+
+
+def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch):
+    still, (effort, *_) = (
+        synthetic("tile", cameras=3, size=16),
+        effort_sweep.efforts("voxel", {}, knobs=False),
+    )
+    plan = replace(command.QUICK, planned_s=(0.5,))
+    measured = []
+
+    def fit(*args):
+        measured.append(args)
+        return {"steps": 1, "psnr_db": 20.0}
+
+    monkeypatch.setattr(effort_sweep, "fit_from_scratch", fit)
+    for _ in range(2):
+        store = command.Store(tmp_path / "frontier.json")
+        command.Frontier(
+            tmp_path, store, plan, still, "tile", ("voxel",), [effort], None, "none", 0
+        )._from_scratch()
+    assert len(measured) == 1
+    monkeypatch.setitem(settings.EFFORTS, effort.name, {"rays": 77})
+    command.Frontier(
+        tmp_path, store, plan, still, "tile", ("voxel",), [effort], None, "none", 0
+    )._from_scratch()
+    assert len(measured) == 2
+
+
+def test_what_is_shipped_charges_steps_for_the_views_they_are_made_with():
+    """By several seeds, and from below the shortest deadline worth setting."""
+    plan, still = command.SHIPPED, synthetic("room", size=command.SHIPPED.size)
+    assert len(still.training) == plan.moving.cameras - len(still.held_out)
+    assert still.training[0].image.shape[:2] == (plan.moving.size, plan.moving.size)
+    assert plan.seeds >= 3 and plan.update_s[0] <= 0.05
+
+
+def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_plan):
+    write_photos(tmp_path / "set", 5)
+    words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]
+    assert edge_server([*words, *SMALL_WORDS]) == 0
+    assert "figure 2 left out" in capsys.readouterr().out
+    assert (tmp_path / "out" / "frontier.png").exists() and not (tmp_path / "out" / "updates.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--policy", "best"], "policy 'best' is not known"),
+        (["--scene", "nowhere"], "no such file or folder"),
+        (["--seeds", "0"], "--seeds 0"),
+        (["--field", "splot"], "no field is called splot; there are: ngp"),
+        (["--option", "x"], "expected KEY=VALUE"),
+        (["--option", "levels=99"], "levels must be in 1..24"),
+        (["--option", "exposure=maybe"], "exposure must be true or false"),
+        (["--policy", "threshold:soon"], "'soon' is not a number"),
+    ],
+)
+def test_what_cannot_work_is_refused(tmp_path, capsys, words, message):
+    assert edge_server(["frontier", "--quick", "--out", str(tmp_path), *words]) == 2
+    assert message in capsys.readouterr().err

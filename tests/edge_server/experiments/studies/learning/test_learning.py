@@ -1,0 +1,355 @@
+"""Studies of what learns, run whole on a small world: tables, figures, verdicts, resuming."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.studies import command
+from edge_server.experiments.studies.command import LEARNING, STUDIES, make_study
+from edge_server.experiments.studies.learning import (
+    channel_drift,
+    ppo_select,
+    ppo_wait,
+    reward_cost,
+    reward_weights,
+    semantics,
+    setup,
+    state_ablation,
+    transfer,
+)
+from edge_server.experiments.studies.learning.setup import better, no_worse
+from edge_server.experiments.studies.study import DOES_NOT_HOLD, HOLDS, UNDECIDED, Ask, Verdict
+from edge_server.experiments.studies.trial import Folders
+from edge_server.experiments.training.scheduler.choices import named
+from edge_server.experiments.training.scheduler.episode import Outcome
+from edge_server.experiments.training.scheduler.evaluation import Contest, hold
+from edge_server.experiments.training.scheduler.report import percent
+from edge_server.experiments.training.scheduler.setting import seeds
+from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.scheduler.learned.rewards import Reward, make_reward
+from tests.edge_server.experiments.training.scheduler.small import FIELD, reported
+
+SMALL = {"steps": 3, "decisions": 1, "lead_ms": 1000.0, "span_ms": 400.0}
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Every setting small, every training short; what is asked of them stays as it is."""
+    usual = setup.room
+
+    def room(*args, **more):
+        return usual(*args, **{**more, **SMALL})
+
+    monkeypatch.setattr(setup, "SIZE", 24)
+    monkeypatch.setitem(setup.RUNS, True, 2)
+    monkeypatch.setattr(setup, "FIELD_OPTIONS", FIELD)
+    for name in LEARNING:
+        module = f"edge_server.experiments.studies.{STUDIES[name][0]}"
+        if name != "semantics":
+            monkeypatch.setattr(f"{module}.room", room)
+        monkeypatch.setattr(f"{module}.EPISODES", {True: 3, False: 3})
+    monkeypatch.setattr("edge_server.experiments.studies.learning.workshop.room", room)
+    monkeypatch.setattr(
+        "edge_server.experiments.studies.learning.reward_cost.EPISODES_BY_DIM", {True: 3, False: 3}
+    )
+    monkeypatch.setattr("edge_server.experiments.studies.learning.channel_drift.BEFORE", 2)
+    monkeypatch.setattr("edge_server.experiments.studies.learning.channel_drift.AFTER", 22)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LEARNING)
+def test_a_study_runs_to_its_verdicts_and_goes_on_from_what_it_has(name, small, tmp_path: Path, capsys):
+    ask = Ask(True, tmp_path, Folders(), seeds=2)
+    study = make_study(name)
+    assert study.points(ask) == []
+    first = study.report(ask, None)
+    assert first and all(v.line() for v in first)
+    rows = list(csv.DictReader((tmp_path / f"{name}.csv").open()))
+    assert rows and all(row["reward"] for row in rows)
+    assert list(tmp_path.glob(f"{name}*.png"))
+    lines = (tmp_path / "training/evaluations.jsonl").read_text().count("\n")
+    again = make_study(name).report(ask, None)
+    assert [(v.about, v.claim, v.verdict) for v in again] == [(v.about, v.claim, v.verdict) for v in first]
+    assert (tmp_path / "training/evaluations.jsonl").read_text().count("\n") == lines
+    capsys.readouterr()
+
+
+@pytest.mark.slow
+def test_one_case_of_a_study_is_run_with_as_many_episodes_as_asked_for(small, tmp_path: Path):
+    ask = Ask(True, tmp_path, Folders(), seeds=2, cases=("ch6, age -0.003",), episodes=4)
+    verdicts = make_study("ppo-wait").report(ask, None)
+    assert all(v.about.startswith("room, ch6, age -0.003/ms") for v in verdicts)
+    logs = list((tmp_path / "training").glob("ppo-wait-ch6-0.003-*/training.jsonl"))
+    assert len(logs) == 4 and all(
+        json.loads(log.read_text().splitlines()[-1])["episodes"] == 4 for log in logs
+    )
+
+
+def test_a_case_that_there_is_not_is_refused_with_those_there_are(tmp_path: Path, capsys):
+    words = ["ppo-wait", "--quick", "--out", str(tmp_path), "--case", "ch7"]
+    assert command.main(words) == 2
+    told = capsys.readouterr().err
+    assert "none has 'ch7' in its name" in told and "ch6-slow, age -0.015/ms" in told
+    assert command.main(["mat", "--quick", "--out", str(tmp_path), "--case", "room"]) == 2
+    assert "--case is for ppo-select" in capsys.readouterr().err
+    assert command.main(["mat", "--quick", "--out", str(tmp_path), "--episodes", "3"]) == 2
+    assert "--episodes is for ppo-select" in capsys.readouterr().err
+    assert command.main(["ppo-wait", "--quick", "--out", str(tmp_path), "--episodes", "0"]) == 2
+    assert "--episodes: expected 1" in capsys.readouterr().err
+
+
+def contest_of(levels: dict[str, float], seeds: int = 12) -> Contest:
+    """Every policy earns its level at every decision, but for what the seed does to all and a little luck."""
+    rng = np.random.default_rng(1)
+    asked = [(seed, n) for seed in range(seeds) for n in range(2)]
+    shared = {seed: rng.normal() for seed in range(seeds)}
+    found = Contest(Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0))
+    for into in (found.outcomes, found.again):
+        for name, level in levels.items():
+            psnr = {at: level + shared[at[0]] + 0.01 * rng.normal() for at in asked}
+            into[name] = {at: Outcome(v, None, None, None, None, 50.0, 3.0, 0.0) for at, v in psnr.items()}
+    return found
+
+
+def runs(name: str, level: float, count: int = 3) -> dict[str, float]:
+    return {f"{name}-{run}": level + 0.01 * run for run in range(count)}
+
+
+FIXED = {"random": 0.0, "all": 0.5, "threshold:40": 0.4, "threshold:80": 0.6, "wait:0": 0.4, "wait:60": 0.6}
+
+
+def answers(verdicts: Sequence[Verdict], *words: str) -> set[str]:
+    """What the verdicts say whose claim has one of the words; of all without words."""
+    found = {v.verdict for v in verdicts if not words or any(word in v.claim for word in words)}
+    assert found
+    return found
+
+
+WON = "differs between decisions"  # nothing does, here: levels do not depend on decisions
+
+
+@pytest.mark.parametrize(("level", "said"), [(3.0, HOLDS), (-3.0, DOES_NOT_HOLD)])
+def test_select_holds_if_and_only_if_what_was_learnt_is_better(level, said):
+    found = contest_of({**FIXED, "nearest:6": 0.3, "mask": 0.2, **runs("learnt", level)})
+    verdicts = ppo_select.judge("here", found)
+    assert answers([v for v in verdicts if WON not in v.claim]) == {said}
+    assert answers(verdicts, WON).isdisjoint({HOLDS})
+    assert answers(ppo_select._as_rewarded("here", found)) == {said}
+    assert any("not over trainings" in v.found for v in verdicts)
+
+
+@pytest.mark.parametrize("channel", ["swing", "ch6"])
+@pytest.mark.parametrize(("level", "said"), [(3.0, HOLDS), (-3.0, DOES_NOT_HOLD)])
+def test_wait_holds_if_and_only_if_what_was_learnt_is_better(channel, level, said):
+    both = {**runs("learnt-wait", level + 0.2), **runs("learnt-threshold", level)}
+    verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **both}))
+    assert answers(verdicts, "best fixed omega", "uniformly random") == {said}
+    assert answers(verdicts, "waiting beats thresholds") == {HOLDS}
+    assert answers(verdicts, WON).isdisjoint({HOLDS})
+    turned = {**runs("learnt-wait", level), **runs("learnt-threshold", level + 0.2)}
+    verdicts = ppo_wait.judge(channel, channel, contest_of({**FIXED, **turned}))
+    assert answers(verdicts, "waiting beats thresholds") == {DOES_NOT_HOLD}
+
+
+def test_cases_of_waiting_are_told_apart_by_their_names():
+    names = [ppo_wait.named(*case) for case in ppo_wait.CASES]
+    assert len(set(names)) == len(names)
+    assert [n for n in names if n.startswith("swing, age -0.003")] == ["swing, age -0.003/ms"]
+    assert "swing, where it moves, age -0.003/ms" in names
+
+
+@pytest.mark.parametrize(("step", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_ablation_holds_if_and_only_if_more_of_the_state_is_better(step, said):
+    levels: dict[str, float] = dict(FIXED)
+    for k, name in enumerate(state_ablation.VARIANTS):
+        levels |= runs(f"learnt {name}", 3.0 + step * k)
+    verdicts = state_ablation.judge(contest_of(levels), list(state_ablation.VARIANTS))
+    assert answers(verdicts, "best fixed threshold") == {HOLDS}
+    assert answers(verdicts, "age alone", "semantics add") == {said}
+    levels |= runs("learnt age", -3.0)
+    verdicts = state_ablation.judge(contest_of(levels), list(state_ablation.VARIANTS))
+    assert [v.verdict for v in verdicts if "best fixed" in v.claim] == [DOES_NOT_HOLD, HOLDS, HOLDS, HOLDS]
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_semantics_hold_if_and_only_if_who_looks_does_better(gap, said):
+    found = contest_of({**FIXED, **runs("with", 3.0 + gap), **runs("without", 3.0)})
+    for moves in (True, False):
+        helps, *fixed = semantics.judge("x", found, moves)
+        assert helps.verdict == said and answers(fixed) == {HOLDS}
+    low = contest_of({**FIXED, "freshest-k:6": 9.0, **runs("with", 3.0 + gap), **runs("without", 3.0)})
+    assert answers(semantics.judge("x", low, True)[1:]) == {DOES_NOT_HOLD}
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_why_semantics_do_not_help_is_told_apart(gap, said):
+    found = contest_of({**FIXED, "sees:1": 0.0, "sees:2": 3.0 + gap, **runs("without", 3.0)})
+    tells, useful = semantics.why("x", found, (0.9, 0.8))
+    assert tells.verdict == HOLDS and useful.verdict == said and "sees:2" in useful.found
+    assert semantics.why("x", found, (0.7, 0.8))[0].verdict == DOES_NOT_HOLD
+
+
+@pytest.mark.parametrize(("gap", "said"), [(1.0, HOLDS), (-1.0, DOES_NOT_HOLD)])
+def test_weights_matter_if_and_only_if_other_weights_teach_worse(gap, said):
+    levels = {**FIXED, **runs("learnt a", 3.0), **runs("learnt b", 3.0 - gap)}
+    better_than_fixed, matters = reward_weights.judge(contest_of(levels), "a", ["a", "b"])
+    assert (better_than_fixed.verdict, matters.verdict) == (HOLDS, said)
+    low = contest_of({**FIXED, **runs("learnt a", -3.0), **runs("learnt b", 0.0)})
+    assert reward_weights.judge(low, "a", ["a", "b"])[0].verdict == DOES_NOT_HOLD
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.1, HOLDS), (-0.6, DOES_NOT_HOLD)])
+def test_what_is_learnt_transfers_if_and_only_if_it_loses_little(gap, said):
+    levels = {**FIXED, **runs("learnt at home", 3.0 + gap), **runs("learnt here", 3.0)}
+    verdicts = transfer.judge("elsewhere", contest_of(levels))
+    assert [v.verdict for v in verdicts] == [HOLDS, said]
+    low = contest_of({**FIXED, **runs("learnt at home", -3.0), **runs("learnt here", -6.0)})
+    assert transfer.judge(transfer.HOME, low)[0].verdict == DOES_NOT_HOLD
+
+
+@pytest.mark.parametrize(("gap", "said"), [(1.0, HOLDS), (-1.0, DOES_NOT_HOLD)])
+def test_a_cheap_reward_wins_if_and_only_if_it_taught_more_in_the_same_time(gap, said):
+    levels = dict(FIXED)
+    for stage in (1, 10):
+        levels |= runs(f"10 steps, {stage} batches", 3.0 + gap)
+        levels |= runs(f"50 steps, {stage} batches", 3.0 + (0.0 if stage == 1 else 2.0 * gap))
+    number, time = reward_cost.judge(contest_of(levels), (1, 10), {10: [2.0, 20.0], 50: [30.0, 300.0]})
+    # Of the same number of decisions the dear one taught more; in the time that they take it had not begun.
+    assert number.verdict == (DOES_NOT_HOLD if gap > 0 else HOLDS) and time.verdict == said
+    assert "after 20.0 and 30.0 s" in time.found
+    # What happens to the dear one after the cheap one has ended does not count.
+    (_, time) = reward_cost.judge(contest_of(levels), (1, 10), {10: [2.0, 20.0], 50: [15.0, 21.0]})
+    assert time.verdict == said and "after 20.0 and 15.0 s" in time.found
+    (dim,) = reward_cost.judge_dims(
+        {f"d = {d}": contest_of({"random": 0.0, **runs(f"d = {d}", d * gap)}) for d in (0, 4)}
+    )
+    assert dim.verdict == said
+
+
+def test_fits_that_were_known_cost_what_they_cost():
+    logs = [[{"processor_seconds": 2.0, "carried_out": 0}, {"processor_seconds": 4.0, "carried_out": 8}]] * 3
+    assert (reward_cost.spent_s(logs, 1), reward_cost.spent_s(logs, 2)) == (2.0, 6.0)
+    assert reward_cost.stages(60) == (3, 6, 15, 30, 60) and reward_cost.stages(1) == (1,)
+
+
+def drifting(still: float, there: float, count: int = 3) -> list[list[dict[str, list[float]]]]:
+    """Runs of trainings in which the learnt policy earns 1 before the change and 0 after it."""
+    rng = np.random.default_rng(2)
+    before, after = channel_drift.BEFORE * 4, channel_drift.AFTER * 4
+    late = {"fixed": 0.1, "learnt": 0.0, "still learning": still, "learnt afterwards": there}
+
+    def run() -> dict[str, list[float]]:
+        return {
+            name: [*(1.0 + 0.01 * rng.normal(size=before)), *(level + 0.01 * rng.normal(size=after))]
+            for name, level in late.items()
+        }  # fmt: skip
+
+    return [[run() for _ in range(count)] for _ in range(3)]
+
+
+@pytest.mark.parametrize(("still", "said"), [(0.5, HOLDS), (-0.5, DOES_NOT_HOLD)])
+def test_drift_holds_if_and_only_if_learning_on_is_better(still, said):
+    found = channel_drift.judge("here", drifting(still, 1.0))
+    assert [v.verdict for v in found] == [said, said, HOLDS]
+    assert channel_drift.judge("here", drifting(still, -1.0))[2].verdict == DOES_NOT_HOLD
+
+
+def test_recovery_tells_that_nothing_was_lost_from_that_it_was_not_made_up():
+    ((recovered,),) = [[channel_drift.recovery(r) for r in of] for of in drifting(0.9, 1.0, 1)[:1]]
+    assert isinstance(recovered, int) and recovered >= 20
+    assert channel_drift.recovery(drifting(0.0, 1.0)[0][0]) == channel_drift.NOT_WITHIN
+    assert channel_drift.recovery(drifting(0.0, -1.0)[0][0]) == channel_drift.NOTHING_LOST
+
+
+def test_where_a_camera_dies_the_policy_learnt_afterwards_is_another_one():
+    for name, change in channel_drift.changes().items():
+        before, after = change.settings()
+        assert before.key != after.key, name
+        assert change.gone is None or (change.gone in after.silent and change.gone in after.scenario.training)
+
+
+def test_what_is_learnt_of_a_change_is_a_set_of_views_where_they_cost_something(tmp_path: Path):
+    with setup.School(Ask(True, tmp_path, Folders())) as school:
+        courses = {name: change.course(school, 7, 2) for name, change in channel_drift.changes().items()}
+    priced = [name for name, course in courses.items() if course.reward.views < 0]
+    assert [courses[name].spec.action for name in priced] == ["select"]
+    assert {course.spec.action for name, course in courses.items() if name not in priced} == {"threshold"}
+    assert {(course.episodes, course.seed) for course in courses.values()} == {(7, 2)}
+
+
+def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
+    usual = setup.room()
+    assert usual.report == setup.REPORT and set(usual.report).isdisjoint(usual.rewarding)
+    assert set(usual.report).isdisjoint(usual.scenario.training)
+    assert set(setup.FOUR_VIEWPOINTS).isdisjoint(setup.REPORT)
+    reward, everybody = make_reward("set", distance=0.0), {"all": named("all"), "random": named("random")}
+    with setup.School(Ask(True, tmp_path, Folders())) as school:
+        found = school.contest(reported(), everybody, reward, 2)
+        same = school.contest_as_rewarded(reported(), everybody, reward, 2)
+    with Crew(Folders()) as crew:
+        expected = hold(reported().judged, crew, seeds(0, "test", 2), everybody, reward)
+    assert found.outcomes == expected.outcomes and found.again == expected.again
+    assert found.outcomes["all"] != same.outcomes["all"]
+
+
+def test_how_differently_the_same_lesson_is_learnt_is_part_of_an_interval():
+    base = {s: 0.01 * (s % 3) for s in range(40)}
+    alike = [{s: v + 0.2 + 0.01 * (-1) ** (s + r) for s, v in base.items()} for r in range(3)]
+    unlike = [{s: v + level for s, v in base.items()} for level in (0.7, 0.2, -0.3)]
+    assert better("a", "b", alike, base).verdict == HOLDS
+    # The mean is the same 0.2, and hardly differs between seeds; another training may come to anything.
+    assert better("a", "b", unlike, base).verdict == UNDECIDED
+    assert better("a", "b", setup.mean_of(unlike), base).verdict == HOLDS
+    assert "3 trainings and 40 seeds" in better("a", "b", alike, base).found
+    assert "of a single training" in better("a", "b", alike[0], base).found
+    assert setup.over(unlike, unlike).mean == 0.0
+    assert setup.RUNS[False] >= 3
+
+
+def test_verdicts_follow_from_the_paired_differences():
+    base = {s: 1.0 + 0.1 * s for s in range(8)}
+    up, down = ({s: v + d + 0.001 * (s % 3) for s, v in base.items()} for d in (0.2, -0.2))
+    same = {s: v + 0.001 * (-1) ** s for s, v in base.items()}
+    assert [better("a", "b", x, base).verdict for x in (up, down, same)] == [
+        "holds", "does not hold", "undecided"
+    ]  # fmt: skip
+    contest = contest_of({"random": 0.5, "all": 1.5})
+    assert [no_worse("a", "b", x, base, contest).verdict for x in (up, down, same)] == [
+        "holds", "does not hold", "holds"
+    ]  # fmt: skip
+    assert "-20 % of the way from random to hindsight" in no_worse("a", "b", down, base, contest).found
+    # A hundredth of next to nothing is no limit.
+    near_zero = {s: 0.01 * (-1) ** s for s in base}
+    found = no_worse("a", "b", near_zero, near_zero, contest)
+    assert found.verdict == UNDECIDED and "too near zero" in found.found
+    # Who does the same at every decision is no better, and that is known.
+    alike = better("a", "b", [base, base], base)
+    assert alike.verdict == DOES_NOT_HOLD and "the very same" in alike.found
+    assert better("a", "b", {}, base).verdict == UNDECIDED
+
+
+@pytest.mark.parametrize(
+    ("mine", "base", "told"),
+    [
+        (1.2, 1.0, "+20.0 %"),
+        (-0.8, -1.0, "+20.0 %"),
+        (0.5, 0.001, "no percentage"),  # whose own interval has the zero in it
+        (0.1, -1.7, "no percentage"),
+    ],
+)
+def test_a_percentage_is_told_only_where_the_rewards_zero_is_far_away(mine, base, told):
+    values = {s: base + 0.01 * (-1) ** s for s in range(10)}
+    assert percent(dict.fromkeys(values, mine), values).startswith(told)
+
+
+@pytest.mark.parametrize(("jobs", "said"), [(1, UNDECIDED), (2, HOLDS), (8, UNDECIDED)])
+def test_only_two_processes_tell_how_long_two_cores_take(jobs, said, tmp_path: Path):
+    rows = [{"fits": 100, "carried_out": 100, "decisions": 50}]
+    found = ppo_select._time("x", [setup.Learnt(None, None, rows, 10.0, jobs, tmp_path)])  # type: ignore[arg-type]
+    assert found.verdict == said

@@ -1,0 +1,151 @@
+"""Trials: the same figures whoever runs them, in whatever order; kept by content; resumed after a stop."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from edge_server.experiments.studies import engine as engine_module
+from edge_server.experiments.studies.engine import Engine, StudyError, content_key, run_task
+from edge_server.experiments.studies.trial import Folders, Trial, picture, run_trial
+from freshfield.scenario import ScenarioError
+
+TINY = {"gaussians": 256, "start": 256}
+TRIAL = Trial(
+    "room",
+    1,
+    {"preset": "ch5"},
+    "threshold",
+    120.0,
+    size=24,
+    cameras=5,
+    field_options=TINY,
+    steps=4,
+    lpips=False,
+)
+NO_DATA = Folders()
+
+
+def quiet(_: str) -> None:
+    pass
+
+
+def trials() -> list[Trial]:
+    found = [replace(TRIAL, seed=s, value=g) for s in (1, 2) for g in (40.0, 400.0)]
+    return [
+        *found,
+        replace(TRIAL, policy="wait-flush", value=90.0),
+        replace(TRIAL, channel={"preset": "ideal"}),
+    ]
+
+
+def test_a_trial_repeats_bit_for_bit_whatever_ran_before_it():
+    first = run_trial(TRIAL, NO_DATA)
+    run_trial(replace(TRIAL, seed=5, policy="wait", value=60.0), NO_DATA)
+    assert run_trial(TRIAL, NO_DATA) == first
+    assert first["decisions"] == 1 and first["psnr_db"] > 5.0
+
+
+def test_policies_decide_at_the_same_instants_on_the_same_deliveries():
+    ages = [run_trial(replace(TRIAL, value=g), NO_DATA)["age_sum_ms"] for g in (30.0, 400.0)]
+    assert ages[0] == ages[1] > 0.0
+    assert run_trial(replace(TRIAL, seed=2), NO_DATA)["age_sum_ms"] != ages[0]
+
+
+def test_nothing_is_old_where_nothing_is_delayed_and_flushing_frees_the_links():
+    ideal = run_trial(replace(TRIAL, channel={"preset": "ideal"}), NO_DATA)
+    assert ideal["aaoi_ms"] < 30.0 and ideal["views"] == 4.0
+    slow = {"preset": "ch5", "service": {"law": "deterministic", "mean_ms": 200.0}}
+    waits = [
+        run_trial(replace(TRIAL, channel=slow, policy=p, value=240.0, seed=4), NO_DATA)
+        for p in ("wait", "wait-flush")
+    ]
+    # Frames that were on their way block the links for up to 200 ms: none of their successors is in time, and
+    # the wait goes on until the first is. Broken off, the cameras' next frames are there when it ends.
+    assert waits[1]["views"] == 4.0 and waits[1]["wait_ms"] == pytest.approx(240.0)
+    assert waits[0]["wait_ms"] > 300.0
+
+
+def test_a_warm_field_goes_on_and_computing_ages_the_scene():
+    warm = replace(TRIAL, scratch=False, first_steps=20, decisions=2, settle=1)
+    charged = replace(warm, compute={"ms_per_step": 10.0})
+    free, late = run_trial(warm, NO_DATA), run_trial(charged, NO_DATA)
+    assert free["decisions"] == 2 and late["wait_ms"] == pytest.approx(40.0)
+    assert late["age_sum_ms"] != free["age_sum_ms"]
+    assert run_trial(replace(warm, scratch=True, first_steps=0), NO_DATA)["psnr_db"] != free["psnr_db"]
+
+
+def test_processes_give_what_one_process_gives(tmp_path: Path):
+    alone = Engine(tmp_path / "a", jobs=1, say=quiet).run(trials())
+    beside = Engine(tmp_path / "b", jobs=2, say=quiet).run(trials())
+    assert alone == beside
+    assert len({r["psnr_db"] for r in alone}) == len(alone)
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_ray_gives_what_one_process_gives(tmp_path: Path):
+    ray = pytest.importorskip("ray", reason="Ray is not installed (pip install 'freshfield[cluster]')")
+    alone = Engine(tmp_path / "a", jobs=1, say=quiet).run(trials())
+    try:
+        assert Engine(tmp_path / "b", ray="local", say=quiet).run(trials()) == alone
+    finally:
+        ray.shutdown()
+
+
+def test_what_is_known_is_not_run_again_and_a_stop_loses_only_what_runs(tmp_path: Path, monkeypatch):
+    ran: list[int] = []
+
+    def counting(task, folders):
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        ran.append(len(task))
+        return run_task(task, folders)
+
+    monkeypatch.setattr(engine_module, "run_task", counting)
+    monkeypatch.setattr(engine_module, "_TRIALS_A_TASK", 1)
+    with pytest.raises(KeyboardInterrupt):
+        Engine(tmp_path, say=quiet).run(trials())
+    monkeypatch.setattr(engine_module, "run_task", run_task)
+    said: list[str] = []
+    results = Engine(tmp_path, say=said.append).run(trials())
+    assert said[0] == f"study: {len(trials()) - 2} trials to run, 2 known"
+    monkeypatch.setattr(engine_module, "run_task", counting)
+    assert Engine(tmp_path, say=quiet).run(trials()) == results, "nothing left to run"
+
+
+def test_a_torn_result_is_run_again(tmp_path: Path):
+    engine = Engine(tmp_path, say=quiet)
+    expected = engine.run([TRIAL])
+    (path,) = tmp_path.rglob("*.json")
+    assert json.loads(path.read_text())["trial"]["seed"] == 1
+    path.write_text(path.read_text()[:40])
+    assert Engine(tmp_path, say=quiet).run([TRIAL]) == expected
+
+
+def test_the_key_is_of_all_that_decides(tmp_path: Path):
+    keys = {content_key(t, NO_DATA) for t in (*trials(), replace(TRIAL, steps=5), replace(TRIAL, size=32))}
+    assert len(keys) == len(trials()) + 2
+    assert content_key(TRIAL, NO_DATA) == content_key(replace(TRIAL), NO_DATA)
+
+
+def test_pictures_are_of_the_trial(tmp_path: Path):
+    truth, shown, row = picture(TRIAL, NO_DATA)
+    assert truth.shape == shown.shape == (24, 24, 3)
+    assert row["psnr_db"] == run_trial(TRIAL, NO_DATA)["psnr_db"]
+
+
+def test_errors_say_what_to_do(tmp_path: Path, monkeypatch):
+    with pytest.raises(ScenarioError, match="policy"):
+        run_trial(replace(TRIAL, policy="hope"), NO_DATA)
+    with pytest.raises(ScenarioError, match="FRESHFIELD_DATA"):
+        monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
+        run_trial(replace(TRIAL, scene="kitchen"), NO_DATA)
+    import sys
+
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(StudyError, match="pip install"):
+        Engine(tmp_path, ray="auto", say=quiet).run([TRIAL])

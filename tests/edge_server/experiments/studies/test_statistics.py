@@ -1,0 +1,111 @@
+"""What the seeds tell: intervals that cover, optima that are not flattered, shares of a gap."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.studies.statistics import (
+    Interval,
+    crossed,
+    interval,
+    negated,
+    optimum,
+    paired,
+    share_closed,
+)
+
+
+def test_an_interval_covers_the_mean_in_95_of_100():
+    rng = np.random.default_rng(1)
+    covered = 0
+    for _ in range(2000):
+        found = interval(list(rng.normal(3.0, 2.0, 6)))
+        covered += found.low <= 3.0 <= found.high
+    assert 0.935 < covered / 2000 < 0.965
+
+
+def test_too_few_values_have_no_interval():
+    assert interval([None, 2.0]).count == 1 and math.isnan(interval([2.0]).low)
+    assert interval([]).count == 0 and interval([2.0]).above(1.0) is None
+    assert Interval(1.0, 0.5, 1.5, 9).above(0.4) is True
+    assert Interval(1.0, 0.5, 1.5, 9).above(1.6) is False
+    assert Interval(1.0, 0.5, 1.5, 9).above(1.0) is None
+    assert negated(None) is None and negated(True) is False
+
+
+def test_pairing_takes_out_what_seeds_have_in_common():
+    rng = np.random.default_rng(2)
+    common = rng.normal(0, 10, 20)
+    a = {s: float(common[s] + 1.0 + 0.1 * rng.normal()) for s in range(20)}
+    b = {s: float(common[s]) for s in range(20)} | {99: 5.0}
+    found = paired(a, b)
+    assert found.count == 20 and 0.9 < found.low < 1.0 < found.high < 1.1
+
+
+def curve_of(shape, seeds=24, noise=0.5, seed=0):
+    rng = np.random.default_rng(seed)
+    xs = [10.0, 20.0, 40.0, 80.0, 160.0]
+    return {x: {s: shape(x) + noise * rng.normal() for s in range(seeds)} for x in xs}
+
+
+def test_an_optimum_inside_is_found_and_one_at_the_end_is_not_called_inside():
+    inside = optimum(curve_of(lambda x: -abs(math.log(x / 40.0))))
+    assert inside.x == 40.0 and inside.low <= 40.0 <= inside.high and inside.interior(0.1) is True
+    assert optimum(curve_of(lambda x: abs(math.log(x / 40.0))), lower_is_better=True).x == 40.0
+    rising = optimum(curve_of(lambda x: math.log(x)))
+    assert rising.x == 160.0 and rising.interior(0.1) is False
+
+
+def test_a_flat_curve_is_not_given_an_optimum():
+    """The best of five equal points, measured on the seeds that chose it, would look better than the ends."""
+    claimed = sum(optimum(curve_of(lambda x: 0.0, seed=s)).interior() is True for s in range(60))
+    assert claimed <= 6
+
+
+def test_seeds_that_lack_a_point_are_left_out():
+    curve = curve_of(lambda x: -abs(math.log(x / 40.0)))
+    curve[10.0][3] = None
+    assert optimum(curve).over_last.count == 23
+    with pytest.raises(ValueError, match="no seed"):
+        optimum({1.0: {0: None}, 2.0: {0: 1.0}})
+
+
+def test_the_share_of_a_gap():
+    rng = np.random.default_rng(4)
+    base = {s: float(rng.normal(20, 1)) for s in range(30)}
+    limit = {s: v + 4.0 for s, v in base.items()}
+    half = {s: v + 2.0 + 0.1 * float(rng.normal()) for s, v in base.items()}
+    found = share_closed(half, base, limit)
+    assert 0.45 < found.low < 0.5 < found.high < 0.55
+    assert math.isnan(share_closed(half, limit, base).mean), "nothing to close where the limit is no better"
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0])
+def test_an_interval_over_runs_and_seeds_covers_what_it_says(spread):
+    """Three trainings that differ by ``spread``, tried on the same 60 seeds, whose mean is nought."""
+    rng = np.random.default_rng(3)
+    covered = by_seeds = 0
+    for _ in range(400):
+        table = spread * rng.normal(size=(3, 1)) + rng.normal(size=(1, 60)) + rng.normal(size=(3, 60))
+        found = crossed([dict(enumerate(run)) for run in table.tolist()])
+        alone = interval(table.mean(axis=0).tolist())
+        assert found.mean == pytest.approx(alone.mean)
+        covered += found.low <= 0.0 <= found.high
+        by_seeds += alone.low <= 0.0 <= alone.high
+    assert covered >= 0.92 * 400
+    if spread == 1.0:  # the interval that leaves the trainings out
+        assert by_seeds < 0.5 * 400
+
+
+def test_runs_and_seeds_where_there_are_few_of_either():
+    assert crossed([]).count == 0
+    one = {0: 1.0, 1: 2.0, 2: 4.0}
+    assert crossed([one]) == interval(list(one.values()))
+    with_gap = crossed([one, {0: 2.0, 1: None, 2: 5.0}])
+    assert with_gap.count == 2 and with_gap.mean == 3.0
+    assert math.isnan(crossed([{0: 1.0}, {0: 2.0}]).low)
+    level = crossed([{0: 1.0, 1: 1.0}, {0: 1.0, 1: 1.0}])
+    assert (level.low, level.mean, level.high) == (1.0, 1.0, 1.0)

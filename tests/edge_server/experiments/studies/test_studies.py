@@ -1,0 +1,256 @@
+"""The studies: their points are sound, their verdicts follow from the figures and can come out either way."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge_server.experiments.studies.command import LEARNING, STUDIES, main, make_study
+from edge_server.experiments.studies.engine import Engine
+from edge_server.experiments.studies.study import Ask, Point, Table, objective, run_study
+from edge_server.experiments.studies.trial import Folders
+from edge_server.scheduler import make_policy
+
+NAMES = [n for n in STUDIES if n not in ("metrics", *LEARNING)]
+
+
+def ask(tmp_path: Path, **more: Any) -> Ask:
+    return Ask(True, tmp_path, Folders(), **more)
+
+
+class Invented(Engine):
+    """Results by a rule instead of by running: what the verdicts make of figures that are known."""
+
+    rule: Any = None
+
+    def run(self, trials, name="study"):
+        return [self.rule(t) for t in trials]
+
+
+def invented(tmp_path: Path, rule) -> Invented:
+    engine = Invented(tmp_path)
+    engine.rule = rule
+    return engine
+
+
+def figures(quality: float, age: float, views: float = 9.0) -> dict[str, Any]:
+    return {
+        "psnr_db": 20.0 + quality, "psnr_moving_db": 18.0 + quality, "ssim": 0.8 + quality / 50,
+        "lpips": 0.2 - quality / 50, "views": views, "aaoi_ms": age, "age_sum_ms": 18 * age, "wait_ms": 0.0,
+        "decisions": 1,
+    }  # fmt: skip
+
+
+def noise(seed: int, value: float | None) -> float:
+    return 0.05 * math.sin(12.9898 * seed + 78.233 * (value or 0.0))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("quick", [True, False])
+def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tmp_path: Path):
+    study = make_study(name)
+    points = study.points(Ask(quick, tmp_path, Folders(), seeds=1))
+    assert points and len({(json.dumps(p.labels, sort_keys=True), p.trial.seed) for p in points}) == len(
+        points
+    )
+    for point in points:
+        scenario = point.trial.scenario()
+        assert len(scenario.training) == 18 and scenario.held_out
+        make_policy(point.trial.policy, point.trial.value, scenario.rng("policy"))
+
+
+def peak(at: float):
+    """Best at ``at`` ms of omega, the limit at the peak's own height."""
+
+    def rule(trial):
+        if trial.channel.get("preset") == "ideal":
+            return figures(3.0 + noise(trial.seed, 0.0), 15.0, 18.0)
+        value = trial.value if trial.value is not None else 1000.0
+        return figures(2.0 - abs(math.log(value / at)) + noise(trial.seed, value), value / 2)
+
+    return rule
+
+
+def verdicts(name: str, tmp_path: Path, rule, **more: Any) -> dict[str, str]:
+    found = run_study(
+        make_study(name), ask(tmp_path, seeds=6, scenes=("room",), **more), invented(tmp_path, rule)
+    )
+    # Of two verdicts on one thing, the first.
+    return {v.about: v.verdict for v in reversed(found)}
+
+
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch):
+    """Pictures are trials that are run; here only the figures are invented."""
+    for module, cls in (("age.max_age", "Mat"), ("age.omega", "Omega")):
+        monkeypatch.setattr(f"edge_server.experiments.studies.{module}.{cls}._pictures", lambda *a: None)
+
+
+def test_mat_finds_an_optimum_and_its_absence(tmp_path: Path):
+    found = verdicts("mat", tmp_path, peak(80.0))
+    assert set(found.values()) == {"holds"}
+    assert set(verdicts("mat", tmp_path, peak(4000.0)).values()) == {"does not hold"}
+    assert (tmp_path / "mat-room.png").stat().st_size > 10_000
+    rows = list(csv.DictReader((tmp_path / "mat.csv").open()))
+    assert {r["policy"] for r in rows} == {"all", "threshold", "no delay"} and rows[0]["seed"] == "0"
+
+
+def at_delay(peak_of):
+    """A rule whose best threshold follows the mean delay as ``peak_of`` says."""
+
+    def rule(trial):
+        return peak(peak_of(trial.channel.get("service", {"mean_ms": 60.0})["mean_ms"]))(trial)
+
+    return rule
+
+
+def test_mat_delay_finds_a_rising_best_threshold_and_no_other(tmp_path: Path):
+    rising = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 60.0 + 1.5 * delay))
+    assert set(rising.values()) == {"holds"}
+    falling = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 400.0 - 1.5 * delay))
+    assert set(falling.values()) == {"does not hold"}
+    same = verdicts("mat-delay", tmp_path, at_delay(lambda delay: 150.0))
+    assert "holds" not in same.values()
+
+
+@pytest.mark.parametrize("only", [lambda x: math.log(x), lambda x: -math.log(x), lambda x: 0.0])
+def test_mat_delay_claims_nothing_where_no_threshold_is_best(tmp_path: Path, only):
+    """Rising, falling and flat: a grid that grew with the delay would show a best that grows with it."""
+
+    def rule(trial):
+        value = trial.value or 1000.0
+        return figures(only(value) + noise(trial.seed, value), value)
+
+    assert set(verdicts("mat-delay", tmp_path, rule).values()) == {"undecided"}
+
+
+def test_one_seed_decides_nothing(tmp_path: Path):
+    for name in ("mat", "mat-delay", "lambda", "omega", "images", "phase"):
+        found = run_study(
+            make_study(name), ask(tmp_path, seeds=1, scenes=("room",)), invented(tmp_path, peak(90.0))
+        )
+        assert {v.verdict for v in found} == {"undecided"}, name
+
+
+def test_lambda_moves_the_best_threshold_only_where_it_counts_used_views(tmp_path: Path):
+    def rule(trial):
+        row = peak(200.0)(trial)
+        return {**row, "age_sum_ms": 2000.0} if trial.policy == "threshold" else row
+
+    found = verdicts("lambda", tmp_path, rule)
+    for where in ("whole image", "where it moves"):
+        assert found[f"room, threshold, {where}, ages of all cameras (5.8)"] == "does not hold"
+        assert found[f"room, threshold, {where}, ages of used views (6.35)"] == "holds"
+        assert found[f"room, wait, {where}, ages of all cameras (5.8)"] == "holds"
+
+
+def test_lambda_leaves_noise_undecided(tmp_path: Path):
+    def rule(trial):
+        return figures(
+            4.0 * noise(trial.seed, trial.value), 100.0 + 2000.0 * noise(trial.seed + 9, trial.value)
+        )
+
+    assert "holds" not in verdicts("lambda", tmp_path, rule).values()
+
+
+def test_omega_tells_a_plateau_from_a_peak(tmp_path: Path):
+    def rule(trial):
+        if trial.policy == "wait":
+            value = trial.value
+            return figures(2.0 * (1 - math.exp(-value / 40.0)) + noise(trial.seed, value), value)
+        return peak(60.0)(trial)
+
+    found = verdicts("omega", tmp_path, rule)
+    assert found["room, high traffic, threshold, PSNR (dB)"] == "holds"
+    assert found["room, high traffic, wait, PSNR (dB)"] == "holds"
+    assert found["room, high traffic, wait-flush, PSNR (dB)"] == "does not hold"
+    assert found["room, high traffic, wait, F_w (6.37)"] == "does not hold", "age outweighs all else"
+
+
+def test_images_judges_both_directions(tmp_path: Path):
+    def rule(trial):
+        count = trial.value or 18.0
+        return figures(math.log(count) + noise(trial.seed, count), 10.0 * count)
+
+    assert set(verdicts("images", tmp_path, rule).values()) == {"holds"}
+
+    def wrong(trial):
+        count = trial.value or 18.0
+        return figures(-math.log(count) + noise(trial.seed, count), 100.0 / count)
+
+    assert set(verdicts("images", tmp_path, wrong).values()) == {"does not hold"}
+
+
+def test_representations_asks_all_of_them(tmp_path: Path):
+    def rule(trial):
+        return peak(75.0 if trial.field == "splat" else 9000.0)(trial)
+
+    found = verdicts("representations", tmp_path, rule)
+    assert found["room, threshold, PSNR (dB)"] == "does not hold"
+    assert verdicts("representations", tmp_path, peak(80.0))["room, wait, PSNR (dB)"] == "holds"
+
+
+def test_phase_says_what_can_be_won_and_by_whom(tmp_path: Path):
+    gains = {"all": 0.0, "threshold": 0.8, "wait": -0.5, "mask": 1.0, "freshen": 1.5}
+
+    def rule(trial):
+        gain = 2.0 if trial.channel.get("preset") == "ideal" else gains[trial.policy]
+        return figures(gain + noise(trial.seed, trial.value), 50.0)
+
+    study = make_study("phase")
+    found = run_study(study, ask(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
+    trade, mask, freshen = (found[i::3] for i in range(3))
+    assert {v.verdict for v in (*trade, *freshen, *mask)} == {"holds"}
+    assert "75 % [7" in freshen[0].found and "no delay is 2.00" in trade[0].found
+    gains |= {"threshold": -1.0, "mask": -1.5, "freshen": 2.1}
+    found = run_study(study, ask(tmp_path, seeds=6, scenes=("room",)), invented(tmp_path, rule))
+    trade, mask, freshen = ({v.verdict for v in found[i::3]} for i in range(3))
+    assert (trade, mask, freshen) == ({"does not hold"}, {"does not hold"}, {"holds"})
+    assert (tmp_path / "phase-room.png").exists()
+
+
+def test_f_w_with_the_thesis_weights():
+    """-.02 * 30 + .2 * .8 + .3 * .25 + .015 * 40, and none where LPIPS is missing."""
+    row = {"psnr_db": 30.0, "ssim": 0.8, "lpips": 0.25, "aaoi_ms": 40.0}
+    assert objective(row) == pytest.approx(0.235)
+    assert objective(row, w_s=-0.2) == pytest.approx(-0.085)
+    assert objective({**row, "lpips": None}) is None
+
+
+def test_a_table_selects_by_labels():
+    from edge_server.experiments.studies.trial import Trial
+
+    points = [
+        Point({"policy": p, "x": x}, Trial("room", s, {})) for p in "ab" for x in (1, 2) for s in (0, 1)
+    ]
+    table = Table(points, [figures(i, i) for i in range(8)])
+    assert table.curve("x", "aaoi_ms", policy="b") == {1.0: {0: 4, 1: 5}, 2.0: {0: 6, 1: 7}}
+    assert table.distinct("policy") == ["a", "b"] and table.values("aaoi_ms", policy="a", x=2) == {0: 2, 1: 3}
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["mat", "--seeds", "0"], "--seeds"),
+        (["mat", "--scene", "moon"], "moon"),
+        (["mat", "--jobs", "0"], "--jobs"),
+        (["ppo-wait", "--scene", "tower"], "scenes of their own"),
+        (["learning", "--ray", "local"], "scenes of their own"),
+    ],
+)
+def test_bad_requests_get_one_line(words: list[str], why: str, tmp_path: Path, capsys):
+    assert main([*words, "--quick", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert why in error and error.count("\n") == 1
+
+
+def test_metrics_runs_whole(tmp_path: Path, capsys):
+    assert main(["metrics", "--quick", "--seeds", "2", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert found["verdicts"] and all(v["verdict"] for v in found["verdicts"])
+    assert (tmp_path / "metrics.png").exists() and "SSIM" in (tmp_path / "metrics.md").read_text()

@@ -1,0 +1,158 @@
+"""Drawn decisions: the buffer as the deployment has it, choices carried out as the deployment would."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.training.scheduler.choices import choices, choose, named, of_action
+from edge_server.experiments.training.scheduler.episode import Choice, Ground
+from edge_server.experiments.training.scheduler.setting import GRID_MS, PURPOSES, seeds
+from edge_server.experiments.virtual.from_scenario import deploy
+from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, VirtualDeployment
+from edge_server.fields.registry import make_field
+from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.state import StateLayout
+from freshfield.scenario import ScenarioError
+from tests.edge_server.experiments.training.scheduler.small import FIELD, NOTHING, scenario, setting
+
+FAULTS = {"preset": "ch6", "faults": {"loss": {"probability": 0.1}, "duplication": {"probability": 0.3}}}
+
+
+@pytest.fixture(scope="module")
+def ground() -> Ground:
+    return Ground(setting(), NOTHING)
+
+
+def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) -> VirtualDeployment:
+    """The same deployment with its own edge, which decides first at an instant."""
+    what = scenario(**more)
+    edge = {**what.edge, "policy": {"name": policy, "value": value}}
+    terms = Terms(steps=4, epoch_ms=60_000.0, first_ms=at_ns / 1e6, scratch=True, compute=Compute(5.0))
+    field = make_field("splat", FIELD, seed=setting().field_seed(seed))
+    return deploy(dataclasses.replace(what, edge=edge, seed=seed), terms, field=field)
+
+
+@pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
+def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
+    ground = Ground(setting(channel), NOTHING)
+    for moment in ground.episode(11).moments:
+        for wait_ms in (0, 35, 180):
+            at_ns = moment.now_ns + wait_ms * 10**6
+            live = deployed("all", None, 11, 10**13, channel=channel)
+            live.updates.buffer.keep_earlier(True)
+            live.run(at_ns / 1e9)
+            newest, earlier = live.updates.buffer.newest_and_earlier()
+            assert newest
+            for found, expected in ((moment.newest(at_ns), newest), (moment.earlier(at_ns), earlier)):
+                assert {c: (a.generated_ns, a.received_ns) for c, a in found.items()} == {
+                    c: (b.generated_ns, b.received_ns) for c, b in expected.items()
+                }
+
+
+@pytest.mark.parametrize(
+    "policy", ["all", "threshold:70", "wait:60", "freshest-k:2", "freshen", "periodic:400", "bandit:"]
+)
+def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
+    if policy.startswith("bandit:"):
+        learner = Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), seed=4)
+        learner.save(tmp_path / "policy.npz")
+        policy = f"bandit:{tmp_path / 'policy.npz'}"
+    ground = Ground(setting(compute=Compute(5.0)), NOTHING)
+    moment = ground.episode(5).moments[0]
+    choice = choose(named(policy)(np.random.default_rng(0)), moment)
+    found = ground.episode(5).evaluate(0, choice)
+    name, _, value = (policy, "", "") if policy.startswith("bandit:") else policy.partition(":")
+    live = deployed(name, float(value) if value else None, 5, moment.now_ns)
+    live.run(moment.now_ns / 1e9 + 1.0)
+    expected = live.publications[0]
+    assert set(expected.selected) == set(choice.cameras)
+    assert (found.psnr_db, found.psnr_moving_db, found.ssim) == (
+        expected.psnr_db, expected.psnr_moving_db, expected.ssim
+    )  # fmt: skip
+    assert found.aaoi_ms == expected.aaoi_ms and found.views == len(expected.selected)
+    assert moment.now_ns + round(found.wait_ms * 1e6) == expected.published_ns
+
+
+@pytest.mark.parametrize("scratch", [True, False])
+def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(scratch):
+    ground = Ground(setting(scratch=scratch), NOTHING)
+    episode = ground.episode(2)
+    asked = [(k, Choice(moment.cameras[:n], moment.now_ns)) for k, moment in enumerate(episode.moments)
+             for n in (1, 2, 4)]  # fmt: skip
+    forwards = [episode.evaluate(*a) for a in asked]
+    fresh = Ground(setting(scratch=scratch), NOTHING).episode(2)
+    backwards = [fresh.evaluate(*a) for a in reversed(asked)][::-1]
+    assert forwards == backwards
+    assert len({o.psnr_db for o in forwards}) == len(forwards)
+
+
+def test_a_warm_field_remembers_what_a_new_one_cannot_know():
+    one = Choice(("cam01",), 0)
+    found = {}
+    for scratch in (True, False):
+        ground = Ground(setting(scratch=scratch, warm_steps=60, steps=2), NOTHING)
+        for seed in range(3):
+            for moment in ground.episode(seed).moments:
+                choice = dataclasses.replace(one, at_ns=moment.now_ns)
+                outcome = ground.episode(seed).evaluate(moment.number, choice)
+                found.setdefault(scratch, []).append(outcome.psnr_db)
+    assert np.mean(found[False]) > np.mean(found[True]) + 1.0
+
+
+def test_instants_lie_on_the_grid_within_the_span_and_differ_between_seeds(ground):
+    of = {seed: ground.episode(seed).instants_ns for seed in range(6)}
+    for instants in of.values():
+        assert all(ns % (GRID_MS * 10**6) == 0 and 0.8 <= ns / 1e9 < 1.4 for ns in instants)
+        assert instants == sorted(instants)
+    assert len({tuple(v) for v in of.values()}) == 6
+
+
+def test_a_state_has_ages_and_poses_of_who_reported(ground):
+    moment = ground.episode(0).moments[1]
+    newest = moment.newest(moment.now_ns)
+    assert list(moment.state.reported) == [c in newest for c in moment.cameras]
+    for row, camera in enumerate(moment.cameras):
+        if camera in newest:
+            assert moment.state.ages_ms[row] == (moment.now_ns - newest[camera].generated_ns) / 1e6
+    poses = moment.state.poses[moment.state.reported]
+    assert np.isfinite(poses).all() and len(np.unique(poses, axis=0)) == len(poses)
+    assert moment.state.embeddings is None
+
+
+def test_actions_of_a_learner_mean_what_the_live_policies_do(ground):
+    moment = ground.episode(4).moments[0]
+    spec = Spec("threshold", omegas_ms=(40.0, 90.0))
+    assert of_action(spec, 1, moment) == choose(named("threshold:90")(np.random.default_rng(0)), moment)
+    wait = of_action(Spec("wait", omegas_ms=(0.0, 50.0)), 1, moment)
+    assert wait.at_ns >= moment.now_ns + 50 * 10**6
+    picked = of_action(Spec("select"), np.array([True, False, True, False]), moment)
+    assert picked.cameras == (moment.cameras[0], moment.cameras[2]) and picked.at_ns == moment.now_ns
+
+
+def test_where_nothing_arrives_all_there_is_is_used_at_the_end(ground):
+    moment = ground.episode(4).moments[0]
+    late = choose(make_policy("wait", 1e6, np.random.default_rng(0)), moment)
+    assert late.at_ns == moment.until_ns and late.cameras
+
+
+def test_a_policy_starts_afresh_in_every_episode(ground):
+    first, second = (choices(named("random"), ground.episode(1).moments) for _ in range(2))
+    assert first == second
+    assert first != choices(named("random"), ground.episode(1).moments, purpose=1)
+
+
+def test_seeds_of_two_purposes_or_runs_never_meet():
+    ranges = [set(seeds(run, purpose, 500)) for run in (0, 1, 2) for purpose in PURPOSES]
+    assert len(set.union(*ranges)) == sum(map(len, ranges))
+    with pytest.raises(ValueError, match="at most 1000000"):
+        seeds(0, "train", 1, first=10**6)
+
+
+def test_a_setting_without_a_held_out_camera_is_refused():
+    with pytest.raises(ScenarioError, match="held_out"):
+        dataclasses.replace(setting(), scenario=scenario(cameras={"count": 5}))

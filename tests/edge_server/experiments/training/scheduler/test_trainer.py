@@ -1,0 +1,407 @@
+"""Training: who evaluates does not matter, a stopped course goes on bit for bit, and it learns."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from edge_server.experiments.training.scheduler.choices import choices, named
+from edge_server.experiments.training.scheduler.command import main, reward_of
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, hold, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.fit_problem import KEPT, FitProblem
+from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
+from edge_server.experiments.training.scheduler.setting import seeds
+from edge_server.experiments.training.scheduler.trainer import (
+    Course,
+    TrainingError,
+    compared,
+    read_log,
+    stage_file,
+    train,
+)
+from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.problem import collect
+from edge_server.scheduler.learned.rewards import Reward, make_reward
+from edge_server.scheduler.learned.state import StateLayout
+from edge_server.scheduler.online.online_trainer import reward_for
+from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
+
+REWARD = make_reward("set", distance=0.0)
+COURSE = Course(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2,
+                checkpoint_every=1)  # fmt: skip
+
+
+def weights(learner: Learner) -> dict[str, np.ndarray]:
+    return learner.actor.weights
+
+
+def same(a: Learner, b: Learner) -> bool:
+    return all(np.array_equal(w, weights(b)[name]) for name, w in weights(a).items())
+
+
+def quiet(line: str) -> None:
+    del line
+
+
+def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path):
+    with Crew(NOTHING) as one, Crew(NOTHING, jobs=2) as two:
+        alone = train(setting(), COURSE, one, tmp_path / "one", quiet)
+        both = train(setting(), COURSE, two, tmp_path / "two", quiet)
+    assert same(alone, both) and not same(alone, Learner(COURSE.spec, COURSE.seed))
+    timeless = [[{k: v for k, v in row.items() if "seconds" not in k} for row in read_log(tmp_path / name)]
+                for name in ("one", "two")]  # fmt: skip
+    assert timeless[0] == timeless[1]
+    with Crew(NOTHING) as crew:
+        other = train(setting(), dataclasses.replace(COURSE, seed=1), crew, tmp_path / "other", quiet)
+    assert not same(alone, other)
+
+
+def test_a_stopped_course_goes_on_bit_for_bit(tmp_path: Path):
+    def stop(line: str) -> None:
+        if line.startswith("4/6"):
+            raise KeyboardInterrupt
+
+    with Crew(NOTHING) as crew:
+        whole = train(setting(), COURSE, crew, tmp_path / "whole", quiet)
+    with Crew(NOTHING) as crew, pytest.raises(KeyboardInterrupt):
+        train(setting(), COURSE, crew, tmp_path / "parts", stop)
+    assert len(read_log(tmp_path / "parts")) == 2 and not (tmp_path / "parts/policy.npz").exists()
+    with Crew(NOTHING) as crew:
+        parts = train(setting(), COURSE, crew, tmp_path / "parts", quiet)
+    assert same(whole, parts) and (tmp_path / "parts/policy.npz").exists()
+    assert len(list((tmp_path / "parts").glob("weights-*.npz"))) == 1
+    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match="other settings"):
+        train(setting(steps=5), COURSE, crew, tmp_path / "parts", quiet)
+
+
+@pytest.mark.parametrize("damage", ["weights-*.npz", "training.jsonl"])
+@pytest.mark.parametrize("what", ["gone", "half"])
+def test_a_course_whose_files_are_damaged_is_refused_in_one_line(damage: str, what: str, tmp_path: Path):
+    with Crew(NOTHING) as crew:
+        train(setting(), COURSE, crew, tmp_path, quiet)
+    (path,) = tmp_path.glob(damage)
+    if what == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match="choose another --out, or delete it"):
+        train(setting(), COURSE, crew, tmp_path, quiet)
+
+
+def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
+    omegas = (30.0, 100.0, 400.0)
+    spec = Spec("threshold", StateLayout(("age",)), omegas, hidden=16, learning_rate=1e-2)
+    course = Course(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
+    with Crew(NOTHING) as crew:
+        learner = train(setting(steps=1), course, crew, tmp_path, quiet)
+        everybody = {**rivals(omegas, ["threshold"]), "learnt": learner.actor}
+        contest = hold(setting(steps=1), crew, seeds(0, "test", 6), everybody, course.reward)
+    assert contest.term("learnt", "aaoi_ms").mean < contest.term("threshold:100", "aaoi_ms").mean
+    assert contest.against("learnt", contest.rewards("random")).low > 0.0
+    found = read_log(tmp_path)
+    assert found[-1]["omega_ms"] < 60.0 < found[0]["omega_ms"]
+
+
+def test_evaluations_are_kept_in_a_file_and_a_torn_line_costs_only_itself(tmp_path: Path):
+    known = tmp_path / "known.jsonl"
+    with Crew(NOTHING, known=known) as crew:
+        moments = crew.draw(setting(), [7])[0]
+        asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
+        first = crew.evaluate(setting(), asked * 2)
+        assert crew.evaluated == len(asked) and first[: len(asked)] == first[len(asked) :]
+        assert crew.evaluate(setting(steps=5), asked) != first[: len(asked)]
+    text = known.read_text()
+    known.write_text(text + text.splitlines()[0][:20])
+    with Crew(NOTHING, known=known) as crew:
+        assert crew.evaluate(setting(), asked) == first[: len(asked)] and crew.evaluated == 0
+
+
+def test_tries_are_compared_with_the_others_of_their_decision():
+    found = compared(np.array([1.0, 2.0, 6.0, 5.0, np.nan, 1.0]), 3)
+    assert np.allclose(found, [1 - 4, 2 - 3.5, 6 - 1.5, 4.0, np.nan, -4.0], equal_nan=True)
+    alone = compared(np.array([3.0, np.nan]), 2)
+    assert np.isnan(alone).all()  # nothing to compare with
+    assert compared(np.array([3.0, 4.0]), 1).tolist() == [3.0, 4.0]
+
+
+@pytest.fixture(scope="module")
+def contest(tmp_path_factory):
+    names = rivals((40.0, 120.0), ["threshold"], ("random", "all", "freshen"))
+    with Crew(NOTHING) as crew:
+        actor = Learner(COURSE.spec, 0).actor
+        return hold(setting(), crew, seeds(0, "test", 6), {**names, "learnt": actor}, REWARD)
+
+
+def test_hindsight_and_the_best_fixed_are_measured_where_they_were_not_chosen(contest):
+    best = contest.rewards(HINDSIGHT)
+    values, name = contest.best_fixed("threshold")
+    assert name in contest.outcomes
+    for seed, value in values.items():
+        assert value in (contest.rewards("threshold:40")[seed], contest.rewards("threshold:120")[seed])
+    assert contest.share(contest.rewards("random")).mean == 0.0
+    assert contest.share(best).mean == 1.0
+    for at in contest.outcomes["all"]:
+        first, second = ({n: contest.value(found[n][at]) for n in contest.outcomes}
+                         for found in (contest.outcomes, contest.again))  # fmt: skip
+        crossed = (second[max(first, key=first.get)] + first[max(second, key=second.get)]) / 2
+        assert contest._top(list(contest.outcomes))[0][at] == pytest.approx(crossed)
+    assert set(best) == {seed for seed, _ in contest.outcomes["all"]}
+
+
+def test_a_contest_is_told_in_a_table_and_in_words(contest, tmp_path: Path):
+    write_rows(tmp_path / "contest.csv", rows(contest))
+    found = {row["policy"]: row for row in csv.DictReader((tmp_path / "contest.csv").open())}
+    assert found.keys() == {*contest.outcomes, HINDSIGHT}
+    assert float(found["all"]["views"]) >= 3.0 and float(found["random"]["share"]) == 0.0
+    told = " ".join(lines(contest, "learnt", "threshold"))
+    assert "over random" in told and "threshold:" in told
+    kept = json.loads(json.dumps(summary(contest, "learnt", "threshold")))
+    assert kept["seeds"] == 6 and len(kept["over_best_fixed"]) == 3
+
+
+def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
+    course = [{"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
+            for k in range(5)]  # fmt: skip
+    draw_curve(tmp_path / "curve.png", course, {"random": 0.1})
+    assert (tmp_path / "curve.png").stat().st_size > 5_000
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nowhere"], "shipped scenarios"),
+        (["room", "--parts", "age,smell"], "no smell"),
+        (["room", "--jobs", "0"], "--jobs"),
+        (["room", "--episodes", "0"], "episodes"),
+        (["lego", "--jobs", "1"], "lego"),
+        (["room", "--field", "nope"], "--field: expected one of ngp"),
+        (["room", "--omegas", "20,60"], "--kind select chooses cameras"),
+        (["room", "--kind", "wait", "--omegas", "20,soon"], "expected milliseconds such as"),
+        (["room", "--report", "cam77"], "cam77 is not one of"),
+        (["room", "--report", "cam00"], "left to reward"),
+        (["room", "--network", "flat"], "--report none"),
+        (["room", "--price", "-1"], "--price: expected 0 or more"),
+        (["room", "--fit-steps", "0"], "expected at least 1"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys):
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert said in told and told.count("\n") == 1
+
+
+def test_other_learners_see_the_same_decisions_as_a_problem():
+    with Crew(NOTHING) as crew:
+        problem = FitProblem(setting(), COURSE.spec, REWARD, crew)
+        moments = crew.draw(setting(), [4])[0]
+        decision = problem.draw(4 * setting().decisions + 1)
+        assert decision.moment == moments[1] and decision.state is moments[1].state
+        action = np.array([True, False, True, True])
+        reward, terms = decision.reward(action)
+        assert decision.reward(action) == (reward, terms) and set(terms) == {"psnr", "ssim"}
+        assert reward == pytest.approx(sum(terms.values()))
+        batch = collect(Learner(COURSE.spec, 0), problem, range(6))
+        assert len(batch) == 6 and np.isfinite(batch.rewards).all()
+
+
+def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, capsys):
+    file, out = tmp_path / "small.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump(RAW))
+    words = [str(file), "--kind", "threshold", "--omegas", "50,200", "--episodes", "2", "--batch", "1",
+             "--decisions", "1", "--fit-steps", "2", "--size", "24", "--test", "2", "--jobs", "1",
+             "--out", str(out)]  # fmt: skip
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "2/2 episodes" in told and "over random" in told and "bandit:" in told
+    assert "rewarded from cam00; judged from cam03" in told
+    kept = json.loads((out / "summary.json").read_text())
+    assert kept["reward_name"] == "corrected" and kept["best_fixed"].startswith("threshold:")
+    assert (kept["rewarded_from"], kept["judged_from"], kept["motions"]) == (["cam00"], ["cam03"], True)
+    # The scenario asks for no LPIPS, so that the reward has no such term, wherever weights lie about.
+    learner = Learner.load(out / "policy.npz")
+    assert learner.taught_by["name"] == "corrected" and learner.taught_by["distance"] == 0.0
+    for name in ("training.csv", "training.png", "contest.csv", "policy.npz"):
+        assert (out / name).stat().st_size > 0
+    policy = make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))
+    with Crew(NOTHING) as crew:
+        chosen = choices(lambda rng: policy, crew.draw(setting(), [1])[0])
+    assert all(choice.cameras for choice in chosen)
+    lines_before = (out / "evaluations.jsonl").read_text()
+    assert main(words) == 0  # finished: nothing is left to be evaluated
+    assert (out / "evaluations.jsonl").read_text() == lines_before
+    # What the training took is what it took in all, not what its last session did.
+    assert json.loads((out / "summary.json").read_text())["seconds"] == kept["seconds"] > 0.0
+    # What is refused costs nothing that was there.
+    assert main([*words[:3], *words[5:]]) == 2 and "other settings" in capsys.readouterr().err
+    assert json.loads((out / "summary.json").read_text())["best_fixed"] == kept["best_fixed"]
+    assert (out / "contest.csv").exists() and (out / "policy.npz").exists()
+    assert main([*words[:-3], "1", "--test", "0", "--out", str(out)]) == 0
+    assert not (out / "summary.json").exists() and not (out / "contest.csv").exists()
+
+
+def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Path):
+    Learner(COURSE.spec, 77).save(tmp_path / "policy.npz")
+
+    def stop(line: str) -> None:
+        raise KeyboardInterrupt
+
+    with Crew(NOTHING) as crew:
+        with pytest.raises(KeyboardInterrupt):
+            train(setting(), COURSE, crew, tmp_path, stop)
+        assert not (tmp_path / "policy.npz").exists()
+        Learner(COURSE.spec, 77).save(tmp_path / "policy.npz")
+        learner = train(setting(), COURSE, crew, tmp_path, quiet)
+    assert same(Learner.load(tmp_path / "policy.npz"), learner)
+
+
+@pytest.mark.parametrize(
+    ("reward", "missing"),
+    [
+        (make_reward("set"), "lpips.*--distance none"),
+        (make_reward("set", distance_is="perceptual"), "edge.metrics"),
+    ],
+)
+def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(reward, missing, tmp_path: Path):
+    course = dataclasses.replace(COURSE, reward=reward)
+    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match=missing):
+        train(setting(), course, crew, tmp_path, quiet)
+    assert not (tmp_path / "training.json").exists()
+
+
+def test_the_distance_of_a_reward_follows_from_the_scenario_and_from_what_is_asked(tmp_path: Path):
+    weights = {"alex": ("alexnet_features.npz", "lin_alex_v0.1.npz")}
+    for names in weights.values():
+        for name in names:
+            (tmp_path / name).write_bytes(b"no weights")
+    reward, missing = reward_of("set", "whole", tmp_path, "none")
+    assert reward.distance == 0.0 and "edge.lpips is none" in missing
+    reward, missing = reward_of("set", "whole", tmp_path, "squeeze")
+    assert reward.distance == 0.0 and "squeeze" in missing
+    assert reward_of("set", "whole", None, "alex", "none") == (make_reward("set", distance=0.0), None)
+    stand_in, missing = reward_of("set", "moving", None, "alex", "perceptual")
+    assert missing is None and stand_in == make_reward("set", "moving", "perceptual")
+
+
+def test_a_stand_in_distance_is_measured_learnt_from_and_kept_for_live_use(tmp_path: Path, capsys):
+    file, out = tmp_path / "small.yaml", tmp_path / "out"
+    file.write_text(yaml.safe_dump(RAW))
+    words = [str(file), "--distance", "perceptual", "--episodes", "1", "--batch", "1", "--decisions", "1",
+             "--fit-steps", "2", "--size", "24", "--test", "0", "--jobs", "1", "--same-motion", "--scratch",
+             "--out", str(out)]  # fmt: skip
+    assert main(words) == 0
+    assert "teaches to ignore how old views are" in " ".join(capsys.readouterr().out.split())
+    (row,) = read_log(out)
+    assert row["term_perceptual"] == pytest.approx(-row["perceptual"])
+    known = Learner.load(out / "policy.npz").taught_by
+    by = reward_for("select", "", out / "policy.npz", "no weights", known)
+    assert by == make_reward("set", distance_is="perceptual")
+    with pytest.raises(ValueError, match="its reward"):
+        reward_for("select", "", out / "policy.npz", None, {"name": "set", "sweets": 1.0})
+
+
+def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: Path):
+    known, seen = tmp_path / "known.jsonl", []
+
+    def stop(done: int, count: int) -> None:
+        seen.append((done, count))
+        raise KeyboardInterrupt
+
+    with Crew(NOTHING, known=known) as crew:
+        moments = [m for e in crew.draw(setting(), range(12)) for m in e]
+        asked = [(m.seed, m.number, c) for m in moments for c in choices(named("all"), [m])]
+        with pytest.raises(KeyboardInterrupt):
+            crew.evaluate(setting(), asked, stop)
+    ((done, count),) = seen
+    assert count == len(asked) == 24 and 0 < done <= 8
+    assert len(known.read_text().splitlines()) == done
+    with Crew(NOTHING, known=known) as crew:
+        crew.evaluate(setting(), asked)
+        assert crew.evaluated == count - done
+
+
+def test_progress_is_told_before_the_first_batch_is_over(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("edge_server.experiments.training.scheduler.trainer._TELL_EVERY_S", 0.0)
+    told: list[str] = []
+    course = dataclasses.replace(COURSE, episodes=6, batch=6)
+    with Crew(NOTHING) as crew:
+        train(setting(), course, crew, tmp_path, told.append)
+    assert len(told) >= 3 and told[0].endswith("fits of batch 1") and told[-1].startswith("6/6 episodes")
+
+
+def test_the_time_of_evaluations_is_that_of_when_they_were_carried_out(tmp_path: Path):
+    known = tmp_path / "known.jsonl"
+    with Crew(NOTHING, known=known) as crew:
+        moments = crew.draw(setting(), [7])[0]
+        asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
+        crew.evaluate(setting(), asked)
+        spent = crew.cost_s(setting(), asked)
+    assert spent > 0.0
+    with Crew(NOTHING, known=known) as crew:
+        crew.evaluate(setting(), asked)
+        assert crew.evaluated == 0 and crew.cost_s(setting(), asked * 2) == spent
+    # What an older version kept has no time, so that it is carried out again.
+    rows = [json.loads(line) for line in known.read_text().splitlines()]
+    known.write_text("".join(json.dumps({k: v for k, v in r.items() if k != "cost_ms"}) + "\n" for r in rows))
+    with Crew(NOTHING, known=known) as crew:
+        crew.evaluate(setting(), asked)
+        assert crew.evaluated == len(asked)
+
+
+def test_what_had_been_learnt_on_the_way_is_kept_at_the_stages(tmp_path: Path):
+    course = dataclasses.replace(COURSE, stages=(1, 3))
+    with Crew(NOTHING) as crew:
+        learner = train(setting(), course, crew, tmp_path / "a", quiet)
+        shorter = dataclasses.replace(COURSE, episodes=2)
+        first = train(setting(), shorter, crew, tmp_path / "b", quiet)
+    assert same(Learner.load(stage_file(tmp_path / "a", 1)), first)
+    assert same(Learner.load(stage_file(tmp_path / "a", 3)), learner) and not same(first, learner)
+    with pytest.raises(TrainingError, match="stages"):
+        dataclasses.replace(COURSE, stages=(4,))
+
+
+def test_other_learners_are_never_given_an_episode_that_policies_are_tested_on():
+    problem = FitProblem(setting(), COURSE.spec, REWARD, None)
+    drawn = []
+    problem = dataclasses.replace(problem, crew=SeenSeeds(drawn))
+    for seed in (0, 5, 2**31 - 1, 2 * 10**6 * 2 + 1, 123_456_789):
+        problem.draw(seed)
+    tested = {s // 10**6 for s in (seeds(0, "test", 1)[0], seeds(0, "choose", 1)[0])}
+    assert not {s // 10**6 for s in drawn} & tested and set(s // 10**6 for s in drawn) == {0}
+    assert drawn[2] == (2**31 - 1) // 2 % 10**6
+    other = dataclasses.replace(problem, run=3)
+    other.draw(8)
+    assert drawn[-1] == seeds(3, "train", 1, 4)[0]
+
+
+class SeenSeeds:
+    """Notes which episodes are drawn, and draws nothing."""
+
+    def __init__(self, drawn: list[int]) -> None:
+        self.drawn = drawn
+        self.forgotten: list[int] = []
+
+    def draw(self, setting, seeds):
+        self.drawn += seeds
+        return [(None,) * setting.decisions]
+
+    def forget(self, setting, seeds):
+        self.forgotten += seeds
+
+
+def test_other_learners_do_not_fill_the_memory_with_episodes():
+    crew = SeenSeeds([])
+    problem = FitProblem(setting(), COURSE.spec, REWARD, crew)
+    for number in (*range(2 * (KEPT + 3)), 0):
+        problem.draw(number)
+    kept = [seed for seed in dict.fromkeys(crew.drawn) if seed not in crew.forgotten]
+    assert len(dict.fromkeys(crew.drawn)) == KEPT + 3 and len(crew.forgotten) == 4 and len(kept) == KEPT - 1
+    assert seeds(0, "train", 1, 0)[0] == crew.drawn[-1] == crew.forgotten[0], "drawn, forgotten, drawn again"

@@ -1,0 +1,120 @@
+"""``edge-server simulate``: one seed, one digest; what the scenario charges; errors for people."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from edge_server.config import ComputeConfig, read_config
+from edge_server.experiments.virtual.from_scenario import training_cameras
+from edge_server.experiments.virtual.simulate import main
+from edge_server.scheduler.learned.decision_record import read_decision
+from edge_server.scheduler.learned.explain_command import main as explain
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.state import StateLayout
+from freshfield.scenario import ScenarioError, load, parse
+from tests.edge_server.experiments.sets import SMALL
+
+
+def write(tmp_path: Path, **edge: Any) -> Path:
+    section = {
+        "name": "small",
+        "seed": 5,
+        "cameras": {"count": 5, "held_out": ["cam00"]},
+        "source": {"kind": "world", "scene": "room", "width": 24, "height": 24, "params": {"supersample": 1}},
+        "channel": {"preset": "ch5", "faults": {"loss": {"probability": 0.1}}},
+        "edge": {"field": "ngp", "field_options": SMALL, "steps": 2, **edge},
+    }
+    path = tmp_path / "small.yaml"
+    path.write_text(yaml.safe_dump(section))
+    return path
+
+
+def run(path: Path, capsys, *words: str) -> dict[str, Any]:
+    assert main([str(path), "--seconds", "1.5", "--json", *words]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_one_seed_one_digest(tmp_path: Path, capsys):
+    path = write(tmp_path)
+    first = run(path, capsys)
+    assert run(path, capsys) == first
+    assert run(path, capsys, "--seed", "6")["digest"] != first["digest"]
+    assert first["frames"]["lost"] > 0 and first["updates"] >= 4
+
+
+def test_the_charge_is_the_scenarios_or_the_commands(tmp_path: Path, capsys):
+    path = write(tmp_path, compute={"ms_per_step": 40.0, "ms_per_update": 20.0})
+    assert run(path, capsys)["update_ms"] == pytest.approx(100.0)
+    assert run(path, capsys, "--compute", "zero")["update_ms"] == 0.0
+    assert run(path, capsys, "--compute", "5:1", "--steps", "4")["update_ms"] == pytest.approx(21.0)
+    assert run(path, capsys, "--policy", "wait-flush:60")["policy"] == "wait-flush"
+
+
+def test_a_deadline_is_said_to_choose_nothing_where_steps_are_counted(tmp_path: Path, capsys):
+    assert main([str(write(tmp_path, deadline_ms=300.0)), "--seconds", "0.5"]) == 0
+    assert "edge.deadline_ms: virtual time counts steps" in capsys.readouterr().err
+
+
+def test_what_a_learnt_policy_decided_can_be_explained_as_of_a_live_run(tmp_path: Path, capsys):
+    Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
+    out, file = tmp_path / "out", write(tmp_path, learn={})
+    words = ["--seconds", "1.5", "--out", str(out), "--policy", f"bandit:{tmp_path / 'policy.npz'}"]
+    assert main([str(file), *words]) == 0
+    assert "in virtual time nobody learns" in capsys.readouterr().err
+    lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    for number in (0, lines[-1]["number"]):
+        decided = read_decision(out, number).decided
+        used = [c for c, chosen in zip(decided.state.cameras, decided.action) if chosen]
+        assert lines[number]["selected"] == used
+    assert explain([str(out)]) == 0
+    assert f"decision {lines[-1]['number']}: " in capsys.readouterr().out
+    assert main([str(file), "--seconds", "1.5", "--out", str(tmp_path / "fixed"), "--policy", "all"]) == 0
+    assert not (tmp_path / "fixed" / "decisions").exists()
+
+
+def test_files_are_written_as_a_live_run_has_them(tmp_path: Path, capsys):
+    out = tmp_path / "out"
+    assert main([str(write(tmp_path)), "--seconds", "1.5", "--out", str(out)]) == 0
+    assert "digest" in capsys.readouterr().out
+    lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    found = json.loads((out / "simulation.json").read_text())
+    assert len(lines) == found["updates"] and lines[0]["number"] == 0 and lines[-1]["psnr_db"] > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--compute", "x"], "--compute x"),
+        (["--policy", "hope"], "hope"),
+        (["--policy", "threshold:soon"], "soon"),
+        (["--seconds", "0"], "--seconds"),
+        (["--compute=-1:0"], "--compute"),
+    ],
+)
+def test_bad_requests_get_one_line(tmp_path: Path, capsys, words: list[str], why: str):
+    assert main([str(write(tmp_path)), *words]) == 2
+    error = capsys.readouterr().err
+    assert why in error and error.count("\n") == 1
+
+
+def test_the_scenario_says_zero_or_milliseconds():
+    def config(compute: Any):
+        data = {"name": "x", "cameras": {"count": 2}, "edge": {"compute": compute}}
+        return read_config(parse(data, Path("x.yaml"))).compute
+
+    assert config("zero") == ComputeConfig() and ComputeConfig().charge_ns(1000) == 0
+    assert config({"ms_per_step": 2.0}).charge_ns(10) == 20_000_000
+    for wrong in ("free", {"ms_per_step": -1.0}, {"seconds": 1}):
+        with pytest.raises(ScenarioError, match="compute"):
+            config(wrong)
+
+
+def test_an_arm_keeps_real_time():
+    with pytest.raises(ScenarioError, match=r"cell.yaml: source: .* cannot be run in virtual time"):
+        training_cameras(load("cell"))

@@ -1,0 +1,243 @@
+"""A deployment in virtual time: repeatable bit for bit, books that close, time charged as said."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from camera_node.synthetic.effects import NAMES
+from channel_emu.model.config import channel_from_mapping
+from channel_emu.virtual.simulate import simulate
+from edge_server.experiments.virtual.from_scenario import deploy
+from edge_server.experiments.virtual.truth import ExactTruth
+from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, VirtualDeployment
+from freshfield.scenario import Scenario, parse
+from tests.conftest import data_dir
+from tests.edge_server.experiments.sets import SMALL, write_recording
+
+TERMS = Terms(steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0))
+
+
+def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any) -> Scenario:
+    data = {
+        "name": "virtual",
+        "seed": seed,
+        "cameras": {"count": 5, "held_out": ["cam00"]},
+        "source": {
+            "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
+            "params": {"supersample": 1},
+        },
+        "channel": {"preset": "ch5"} if channel is None else channel,
+        "edge": {"field": "ngp", "field_options": SMALL},
+    }  # fmt: skip
+    return parse({**data, **other}, Path("virtual.yaml"))
+
+
+def run(what: Scenario, terms: Terms = TERMS, seconds: float = 1.0) -> VirtualDeployment:
+    deployment = deploy(what, terms)
+    deployment.run(seconds)
+    return deployment
+
+
+def closes(frames: dict[str, Any]) -> bool:
+    ends = ("skipped", "dropped_busy", "superseded", "lost", "broken", "delivered", "in_flight")
+    out = sum(frames[name] for name in ends) + sum(frames["rejected"].values())
+    sent = frames["captured"] - frames["replaced"] - frames["waiting"]
+    return sent == frames["sent"] and frames["sent"] + frames["duplicated"] == out
+
+
+FAULTS = {
+    "preset": "ch6",
+    "faults": {
+        "loss": {"probability": 0.1},
+        "corruption": {"probability": 0.2},
+        "duplication": {"probability": 0.2},
+        "reset": {"at_ms": [400.0]},
+        "bandwidth": {"megabits_per_s": 2.0},
+    },
+}
+
+
+@pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
+def test_one_seed_gives_the_same_run_bit_for_bit(channel):
+    first, second = (run(scenario(channel)) for _ in range(2))
+    assert first.publications and first.publications == second.publications
+    assert first.frames() == second.frames()
+    a, b = (d.updates.field.state() for d in (first, second))
+    assert a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
+    other = run(scenario(channel, seed=4))
+    assert [p.ages_ms for p in other.publications] != [p.ages_ms for p in first.publications]
+
+
+@pytest.mark.parametrize("policy", ["mask", "freshest-k+mask", "freshen", "wait+freshen"])
+@pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
+def test_treated_views_are_the_same_in_every_run(policy, channel):
+    small = {"gaussians": 300, "start": 200, "seed_cells": 12}
+    edge = {"field": "splat", "field_options": small, "policy": {"name": policy}}
+    source = {
+        "kind": "world", "scene": "room", "width": 64, "height": 64, "fps": 15, "speed_m_per_s": 3.0,
+        "params": {"supersample": 1},
+    }  # fmt: skip
+    first, second = (run(scenario(channel, edge=edge, source=source), seconds=1.5) for _ in range(2))
+    assert first.publications and first.publications == second.publications
+    a, b = (d.updates.field.state() for d in (first, second))
+    assert all(np.array_equal(a[name], b[name]) for name in a)
+    untreated = {**edge, "policy": {"name": "all" if policy in ("mask", "freshen") else policy.split("+")[0]}}
+    plain = run(scenario(channel, edge=untreated, source=source), seconds=1.5)
+    assert [p.selected for p in plain.publications] == [p.selected for p in first.publications]
+    assert [p.ages_ms for p in plain.publications] == [p.ages_ms for p in first.publications]
+    assert not np.array_equal(plain.updates.field.state()["params"], a["params"]), "they are treated"
+    assert first.updates.treatment_cost.views >= sum(len(p.selected) for p in first.publications)
+    assert plain.updates.treatment_cost.views == 0 and plain.updates.treatment_cost.ms_per_view is None
+
+
+def test_going_on_is_the_same_as_running_through():
+    through = run(scenario(), seconds=1.2)
+    parts = deploy(scenario(), TERMS)
+    found = parts.run(0.5) + parts.run(0.3) + parts.run(0.4)
+    assert found == through.publications and parts.frames() == through.frames()
+
+
+def test_the_books_close_with_every_fault_and_damage_is_refused():
+    deployment = run(scenario(FAULTS), seconds=2.0)
+    frames = deployment.frames()
+    assert closes(frames), frames
+    assert frames["rejected"]["crc_mismatch"] > 0 and frames["rejected"]["replayed_sequence"] > 0
+    assert frames["lost"] > 0 and frames["broken"] > 0 and frames["skipped"] > 0
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [{"preset": "ch5"},
+     {"preset": "ch5", "discipline": "newest-waits", "server": {"shared": True, "order": "round-robin"}}],
+    ids=["own lines", "one line"],
+)  # fmt: skip
+def test_the_links_decide_as_the_simulation_does(channel):
+    what = scenario(channel)
+    deployment = run(what, Terms(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
+    config = channel_from_mapping(what.channel)
+    alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15, engine="python")
+    expected = {r.camera: r.count("delivered") for r in alone.runs}
+    assert dict(deployment.delivered) == expected
+
+
+def test_the_present_is_when_the_charge_is_over():
+    deployment = run(scenario())
+    assert {p.update_ms for p in deployment.publications} == {100.0}
+    ends = [p.published_ns for p in deployment.publications]
+    assert {b - a for a, b in pairwise(ends)} == {100_000_000}, "the next update starts at once"
+    assert all(p.psnr_db is not None and p.truth_gap_ms == 0.0 for p in deployment.publications)
+
+
+def test_free_compute_publishes_at_the_decision_and_never_spins():
+    free = run(scenario({}), Terms(steps=1, compute=Compute()), seconds=0.5)
+    assert {p.update_ms for p in free.publications} == {0.0}
+    assert len(free.publications) == 8, "once an arrival instant: ticks 0 to 7 of 15 a second"
+    epochs = run(scenario({}), Terms(steps=1, epoch_ms=200.0), seconds=1.0)
+    times = [p.published_ns for p in epochs.publications]
+    assert np.diff(times).tolist() == [200_000_000] * (len(times) - 1)
+
+
+def test_ideal_channel_delivers_everything_at_no_age():
+    deployment = run(scenario({}), Terms(steps=1), seconds=1.0)
+    frames = deployment.frames()
+    assert frames["delivered"] == frames["captured"] == 4 * 16 and closes(frames)
+    assert {age for p in deployment.publications for age in p.ages_ms} == {0.0}
+
+
+def test_wait_uses_only_what_was_generated_after_the_decision():
+    edge = {"field": "ngp", "field_options": SMALL, "policy": {"name": "wait", "value": 150.0}}
+    deployment = run(scenario(edge=edge), Terms(steps=1, compute=Compute(ms_per_update=10.0)), seconds=2.0)
+    assert len(deployment.publications) > 3
+    for p in deployment.publications:
+        assert p.update_ms >= 10.0 and max(p.ages_ms) <= 150.0 + 10.0 + 200.0
+        assert p.omega_ms == 150.0
+
+
+def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
+    channel = {"service": {"law": "deterministic", "mean_ms": 700.0}}
+    terms = Terms(steps=1, grace_ms=0.0)
+    deployment = run(scenario(channel), terms, seconds=1.5)
+    assert deployment.publications[0].published_ns == 700_000_000
+
+
+def test_node_clocks_may_be_wrong_and_ages_are_still_true():
+    source = {
+        "kind": "world", "scene": "room", "width": 32, "height": 32, "fps": 15,
+        "effects": {"clock_drift": {"offset_ms": 80.0, "drift_ppm": 200.0}},
+    }  # fmt: skip
+    wrong, right = run(scenario(source=source)), run(scenario())
+    assert [p.ages_ms for p in wrong.publications] == [p.ages_ms for p in right.publications]
+
+
+def test_a_recording_is_scored_against_its_nearest_capture(tmp_path):
+    write_recording(tmp_path, cameras=5, instants=6)
+    source = {"kind": "transforms", "data": str(tmp_path), "fps": 10, "codec": "png"}
+    deployment = run(scenario(source=source))
+    gaps = [p.truth_gap_ms for p in deployment.publications]
+    assert gaps and all(gap is not None and abs(gap) <= 50.0 for gap in gaps)
+    assert any(p.psnr_moving_db is not None for p in deployment.publications)
+
+
+def test_the_kitchen_in_virtual_time():
+    data = str(data_dir("blender_kitchen") / "transforms.json")
+    what = scenario(
+        cameras={"ids": ["cam00", "cam01", "cam07", "cam13", "cam18"], "held_out": ["cam00"]},
+        source={"kind": "transforms", "data": data, "scale": 4},
+    )
+    deployment = run(what)
+    assert deployment.publications and closes(deployment.frames())
+
+
+def test_compute_refuses_what_is_no_time():
+    with pytest.raises(ValueError, match="not negative"):
+        Compute(ms_per_step=-1.0)
+    with pytest.raises(ValueError, match="not negative"):
+        Compute(ms_per_update=float("nan"))
+
+
+def world_with(effects: dict[str, Any], scene: str = "tower", **source: Any) -> dict[str, Any]:
+    size = {"kind": "world", "scene": scene, "width": 32, "height": 32, "fps": 15}
+    return {**size, "params": {"supersample": 1}, "effects": effects, **source}
+
+
+def test_every_effect_at_once_repeats_bit_for_bit():
+    listed = {**dict.fromkeys(NAMES), "rolling_shutter": {"rows_at_once": 16}, "motion_blur": {"samples": 2}}
+    what = world_with(listed, speed_m_per_s=8.0)
+    first, second = (run(scenario(source=what)) for _ in range(2))
+    assert len(first.publications) > 5 and first.publications == second.publications
+    a, b = (d.updates.field.state() for d in (first, second))
+    assert all(np.array_equal(a[name], b[name]) for name in a)
+    plain = run(scenario(source=world_with({}, speed_m_per_s=8.0)))
+    # Ages are the channel's; what is seen is not.
+    assert [p.ages_ms for p in first.publications] == [p.ages_ms for p in plain.publications]
+    assert [p.psnr_db for p in first.publications] != [p.psnr_db for p in plain.publications]
+
+
+def test_the_exact_truth_is_seen_through_what_is_listed_to_be_in_it():
+    def truth(effects: dict[str, Any]) -> np.ndarray:
+        found = deploy(scenario(source=world_with(effects)), TERMS).truth
+        assert isinstance(found, ExactTruth)
+        return found.image("cam00", 0.4)
+
+    plain = truth({})
+    assert np.array_equal(truth({"vignetting": {}, "fog": {}, "lens_distortion": {}}), plain)
+    # The field is asked for what is claimed of the lens.
+    for calibrated, distortion in ((True, -0.05), (False, 0.0)):
+        lens = {"k1": -0.05, "k2": 0.0, "p1": 0.0, "p2": 0.0, "calibrated": calibrated, "in_truth": True}
+        found = deploy(scenario(source=world_with({"lens_distortion": lens})), TERMS).truth
+        assert isinstance(found, ExactTruth) and found.cameras["cam00"][0].distortion[0] == distortion
+    for name in ("vignetting", "fog", "lens_distortion"):
+        assert not np.array_equal(truth({name: {"in_truth": True}}), plain), name
+
+
+def test_wrong_poses_reach_the_field_and_wrong_lenses_are_believed():
+    plain = run(scenario(source=world_with({})))
+    for effects in ({"pose_noise": {"rotation_deg": 5.0}}, {"lens_distortion": {"calibrated": False}}):
+        wrong = run(scenario(source=world_with(effects)))
+        assert [p.ages_ms for p in wrong.publications] == [p.ages_ms for p in plain.publications]
+        assert [p.psnr_db for p in wrong.publications] != [p.psnr_db for p in plain.publications]

@@ -1,0 +1,136 @@
+"""Hash encoding: forward and table gradient against plain torch, and against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edge_server.fields.common.kernels.hash_grid import SEGMENT, Grid, encode, scatter, smooth_grid
+from edge_server.fields.common.model_layout import make_grid
+from edge_server.fields.ngp import torch_model
+from edge_server.fields.ngp.settings import NgpSettings
+
+SETTINGS = NgpSettings(levels=5, log2_table=10, base_resolution=4, finest_resolution=60)
+
+
+def _case(points: int, chunks: int = 2):
+    rng = np.random.default_rng(1)
+    grid = make_grid(SETTINGS, None, rng)
+    grid.table[:] = rng.normal(size=grid.table.shape)
+    x = rng.random((chunks, 3, points), dtype=np.float32)
+    x[0, :, 0], x[0, :, 1] = 0.0, np.float32(1.0)  # both ends of the cube
+    return grid, x, rng
+
+
+def test_some_levels_are_dense_and_some_are_hashed() -> None:
+    grid, _, _ = _case(4)
+    assert grid.dense.any() and not grid.dense.all()
+    assert (np.diff(grid.first) % SEGMENT == 0).all()
+
+
+@pytest.mark.parametrize("levels", [5, 3])
+def test_features_equal_the_oracle(levels: int) -> None:
+    grid, x, _ = _case(300)
+    features = np.full((12, 300), np.nan, np.float32)
+    encode(grid, levels, x[0], 0, 300, features)
+    expected = torch_model.encode(torch_model.to_torch(grid), levels, torch.as_tensor(x[0].T))
+    np.testing.assert_allclose(features[:10].T, expected.numpy(), atol=2e-5)
+    assert np.isnan(features[10:]).all(), "rows that are not the grid's were written"
+
+
+def test_a_range_leaves_the_other_samples_alone() -> None:
+    grid, x, _ = _case(64)
+    features = np.full((10, 64), 7.0, np.float32)
+    encode(grid, 5, x[0], 10, 20, features)
+    assert (features[:, :10] == 7.0).all() and (features[:, 20:] == 7.0).all()
+    assert not (features[:, 10:20] == 7.0).any()
+
+
+def test_table_gradient_equals_the_oracle() -> None:
+    grid, x, rng = _case(200)
+    counts = np.array([200, 150])
+    d_features = rng.normal(size=(2, 12, 200)).astype(np.float32)
+    gradient = np.zeros_like(grid.table)
+    dirty = np.zeros(len(grid.table) // SEGMENT, np.bool_)
+    scatter(np.zeros(1, np.int64), 0, grid, 4, x, d_features, counts, gradient, dirty)
+    oracle = torch_model.to_torch(grid)
+    oracle.table.requires_grad_(True)
+    for c in range(2):
+        features = torch_model.encode(oracle, 4, torch.as_tensor(x[c].T[: counts[c]]))
+        (features * torch.as_tensor(d_features[c, :10, : counts[c]].T)).sum().backward()
+    assert oracle.table.grad is not None
+    np.testing.assert_allclose(gradient, oracle.table.grad.numpy(), atol=1e-4)
+    touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)
+    assert (dirty >= touched).all() and not dirty.all()
+
+
+def test_table_gradient_equals_finite_differences() -> None:
+    """In float64, by the oracle: that its own gradient is the derivative of its own output."""
+    grid, x, rng = _case(20)
+    oracle = torch_model.to_torch(grid, dtype=torch.float64)
+    points = torch.as_tensor(x[0].T, dtype=torch.float64)
+    wanted = torch.as_tensor(rng.normal(size=(20, 10)))
+    table = oracle.table.clone().requires_grad_(True)
+
+    def loss(t: torch.Tensor) -> torch.Tensor:
+        moved = torch_model.TorchGrid(oracle.resolution, oracle.first, oracle.dense, t)
+        return (torch_model.encode(moved, 5, points) * wanted).sum()
+
+    loss(table).backward()
+    assert table.grad is not None
+    for row in torch.nonzero(table.grad[:, 0])[::37, 0].tolist():
+        step = torch.zeros_like(table)
+        step[row, 0] = 1e-4
+        slope = (loss(table + step) - loss(table - step)).item() / 2e-4
+        assert slope == pytest.approx(table.grad[row, 0].item(), rel=1e-5, abs=1e-8)
+
+
+def _variation(grid: Grid, levels: int, table: Tensor) -> Tensor:
+    """Half the squared differences between neighbouring vertices of the levels that are stored densely."""
+    total = table.sum() * 0.0
+    for l in range(levels):
+        side = int(grid.resolution[l]) + 1
+        if grid.dense[l]:
+            first = int(grid.first[l])
+            cube = table[first : first + side**3].view(side, side, side, 2)
+            for axis in range(3):
+                total = total + 0.5 * cube.diff(dim=axis).square().sum()
+    return total
+
+
+def _smoothed(grid: Grid, levels: int, dirty: NDArray[np.bool_]) -> NDArray[np.float32]:
+    gradient = np.zeros_like(grid.table)
+    smooth_grid(np.zeros(1, np.int64), 0, grid, levels, np.float32(0.3), gradient, dirty)
+    return gradient
+
+
+def test_gradient_of_the_variation_equals_the_oracle_and_finite_differences() -> None:
+    grid, _, _ = _case(2)
+    everywhere = np.ones(len(grid.table) // SEGMENT, np.bool_)
+    gradient = _smoothed(grid, 4, everywhere)
+    table = torch.as_tensor(grid.table, dtype=torch.float64).requires_grad_(True)
+    (0.3 * _variation(grid, 4, table)).backward()
+    assert table.grad is not None
+    np.testing.assert_allclose(gradient, table.grad.numpy(), atol=1e-5)
+    for row in (0, 7, int(grid.first[1]) + 3):
+        both = []
+        for sign in (1.0, -1.0):
+            moved = table.detach().clone()
+            moved[row, 1] += sign * 1e-5
+            both.append(0.3 * _variation(grid, 4, moved).item())
+        assert gradient[row, 1] == pytest.approx((both[0] - both[1]) / 2e-5, rel=1e-3, abs=1e-5)
+    assert not gradient[grid.first[np.flatnonzero(~grid.dense)[0]] :].any(), "a hashed level was smoothed"
+    assert not _smoothed(grid, 1, everywhere)[grid.first[1] :].any(), "a level that is off was smoothed"
+
+
+def test_variation_is_smoothed_only_where_something_is_learnt() -> None:
+    grid, _, _ = _case(2)
+    dirty = np.zeros(len(grid.table) // SEGMENT, np.bool_)
+    dirty[2] = True
+    gradient = _smoothed(grid, 4, dirty)
+    rows = np.flatnonzero(gradient.any(axis=1))
+    assert rows.min() == 2 * SEGMENT and rows.max() < 3 * SEGMENT
+    np.testing.assert_array_equal(gradient[rows], _smoothed(grid, 4, ~dirty | dirty)[rows])

@@ -1,0 +1,115 @@
+"""Pixel to ray, and ray to samples: against ``freshfield.geometry`` and a plain march in torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numba import njit
+
+from edge_server.fields.common.kernels.rays import NEVER, Space, interval, march, pixel_direction
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.ngp.torch_field import TorchModel
+from edge_server.fields.ngp.torch_model import TorchGrid
+from freshfield.geometry import Pinhole, look_at
+
+_direction = njit(lambda lens, rotation, u, v: pixel_direction(lens, rotation, u, v))
+_interval = njit(lambda space, o, d: interval(space, o[0], o[1], o[2], d[0], d[1], d[2]))
+
+CELLS = 16
+
+
+def _space(contracted: bool, filled: float, near: float = 0.1) -> Space:
+    rng = np.random.default_rng(5)
+    occupied = (rng.random(CELLS**3) < filled).astype(np.uint8)
+    blocks = occupied.reshape([4, 4, 4, 4, 4, 4]).max(axis=(1, 3, 5)).reshape(-1)
+    density = np.full(CELLS**3, 1.5, np.float32)
+    return Space(occupied, blocks, density, CELLS, contracted, np.float32(2 * 3**0.5 / 32), np.float32(near))
+
+
+def _march(space: Space, o, d, jitter: float = 0.0):
+    x, ts, dts = np.zeros((3, 500), np.float32), np.zeros(500, np.float32), np.zeros(500, np.float32)
+    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
+    enter, leave = np.float32(enter + np.float32(jitter) * space.step), np.float32(leave)
+    way = (np.float32(v) for v in (*o, *d, enter, leave))
+    n, t, _ = march(space, *way, x, ts, dts, 0, 500, NEVER)
+    return x[:, :n], ts[:n], dts[:n], (t, leave)
+
+
+@pytest.mark.parametrize("distortion", [(0, 0, 0, 0), (0.06, -0.08, -0.001, 0.0002)])
+def test_directions_are_those_of_the_pinhole_camera(distortion: tuple) -> None:
+    camera = Pinhole(40, 30, 35.0, 36.0, 19.0, 16.0, distortion)
+    pose = look_at((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+    expected = camera.rays() @ pose[:3, :3].T
+    lens, rotation = np.array(lens_row(camera)), np.ascontiguousarray(pose[:3, :3])
+    for u, v in ((0, 0), (39, 29), (11, 23)):
+        got = _direction(lens, rotation, u + 0.5, v + 0.5)
+        np.testing.assert_allclose(got, expected[v, u], atol=2e-7)
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("filled", [1.0, 0.02])
+def test_samples_equal_the_oracle(contracted: bool, filled: float) -> None:
+    space = _space(contracted, filled)
+    settings = NgpSettings(cells=CELLS, samples=32)
+    none = torch.zeros(0)
+    box = SceneBox((0, 0, 0), 1.0, 0.1, contracted, 3.0, 0.1)
+    model = TorchModel(
+        settings, box, TorchGrid([], [], [], none), 0, [], none,
+        torch.as_tensor(space.occupied).view(CELLS, CELLS, CELLS), none, float(space.step),
+    )  # fmt: skip
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        o = rng.normal(size=3) * 1.5
+        d = rng.uniform(-0.6, 0.6, 3) - o
+        d /= np.linalg.norm(d)
+        x, ts, dts, _ = _march(space, o, d, 0.3)
+        rays = (torch.as_tensor(a[None], dtype=torch.float32) for a in (o, d, np.array(0.3)))
+        t, delta, u, inside = (a[0] for a in model.march(*rays))
+        # Both add up distances in float32, in another order: borders of cells may fall either way.
+        got, wanted = set(np.round(ts, 3)), set(np.round(t[inside].numpy(), 3))
+        assert len(got ^ wanted) <= max(2, 0.1 * len(wanted))
+        same = np.isin(np.round(ts, 3), list(wanted))
+        rows = [int((t - ts[k]).abs().argmin()) for k in np.flatnonzero(same)]
+        np.testing.assert_allclose(x[:, same].T, u[rows].numpy(), atol=2e-4)
+        np.testing.assert_allclose(dts[same], delta[rows].numpy(), rtol=2e-3)
+
+
+def test_a_ray_that_misses_the_box_has_no_samples() -> None:
+    space = _space(False, 1.0)
+    x, _, _, (t, leave) = _march(space, np.array([3.0, 0, 0]), np.array([0, 1.0, 0]))
+    assert x.size == 0 and t >= leave
+    x, _, _, _ = _march(space, np.array([3.0, 0, 0]), np.array([1.0, 0, 0]))  # looking away
+    assert x.size == 0
+
+
+def test_empty_space_is_skipped_and_room_is_respected() -> None:
+    o, d = np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])
+    assert _march(_space(False, 0.0), o, d)[0].size == 0
+    space = _space(False, 1.0)
+    whole = _march(space, o, d)[1]
+    x, ts, dts = np.zeros((3, 9), np.float32), np.zeros(9, np.float32), np.zeros(9, np.float32)
+    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
+    way = (np.float32(v) for v in (*o, *d, enter, leave))
+    n, t, _ = march(space, *way, x, ts, dts, 4, 9, NEVER)
+    assert n == 9 and t < leave and (x[:, :4] == 0).all()
+    np.testing.assert_array_equal(ts[4:], whole[:5])
+
+
+def test_no_sample_lies_nearer_than_near() -> None:
+    o, d = np.zeros(3), np.array([0.6, 0.0, 0.8])
+    assert _march(_space(True, 1.0, near=0.4), o, d)[1].min() >= 0.4
+
+
+def test_a_ray_ends_where_the_known_density_makes_it_opaque() -> None:
+    space = _space(False, 1.0)
+    o, d = np.array([-3.0, 0.1, 0.1]), np.array([1.0, 0.0, 0.0])
+    whole = _march(space, o, d)[1]
+    enter, leave = _interval(space, o.astype(np.float32), d.astype(np.float32))
+    x, ts, dts = np.zeros((3, 99), np.float32), np.zeros(99, np.float32), np.zeros(99, np.float32)
+    way = [np.float32(v) for v in (*o, *d, enter, leave)]
+    n, t, depth = march(space, *way, x, ts, dts, 0, 99, np.float32(1.0))
+    assert n == int(np.ceil(1.0 / (1.5 * space.step))) and depth > 1.0 and t < leave
+    np.testing.assert_array_equal(ts[:n], whole[:n])

@@ -1,0 +1,157 @@
+"""A whole chunk of rays, from weighted pixels to the network's gradient, against plain torch."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edge_server.fields import Budget
+from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.kernels.thread_pool import CallerPool
+from edge_server.fields.common.kernels.train import Recipe, train_chunks
+from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, Weights
+from edge_server.fields.common.supervision import pack_views
+from edge_server.fields.common.training_schedule import step_length
+from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.ngp.torch_model import encode, mlp, ray_losses, shade, to_torch
+from tests.edge_server.fields.scenes import ring
+
+SETTINGS = NgpSettings(
+    levels=4, log2_table=10, finest_resolution=32, hidden=16, rays=64, batch_samples=2048, samples=48,
+    cells=16, samples_start=48, threads=1,
+)  # fmt: skip
+VIEWS = ring(5, size=24)
+DISTORTION, SPARSITY = 0.2, 0.03
+
+
+@pytest.fixture(scope="module")
+def field() -> NgpField:
+    made = NgpField(SETTINGS, CallerPool())
+    made.fit(VIEWS, Budget(steps=10))
+    return made
+
+
+def _weights() -> list[NDArray[np.float32]]:
+    rng = np.random.default_rng(2)
+    return [rng.choice(np.array([0.0, 0.3, 1.0], np.float32), v.image.shape[:2]) for v in VIEWS]
+
+
+def _packed(field: NgpField, weights: list[NDArray[np.float32]] | None) -> Views:
+    assert field.rig.box is not None
+    return pack_views(VIEWS, field.rig.box, field.rig.memory, weights)
+
+
+def _train(
+    field: NgpField, data: Views, rays: int = SETTINGS.rays, over: float = 1.0
+) -> tuple[float, NDArray[np.float32], int]:
+    """Loss, the network's gradient and number of rays of one chunk of at most ``rays``; the occupancy grid
+    takes everything to be ``over`` times as dense as it knows."""
+    recipe = Recipe(
+        key=np.uint64(7), chunk_rays=rays, levels=SETTINGS.levels, harmonics=1,
+        changed_share=np.float32(0.5), background=np.full(3, 0.5, np.float32), random_background=False,
+    )  # fmt: skip
+    space = field._occupancy.space(step_length(SETTINGS, field.step))
+    space = space._replace(density=space.density * np.float32(over))
+    weights = Weights(np.float32(DISTORTION), np.float32(SPARSITY), np.float32(0.0))
+    batch, scratch = field._batch, field._scratch
+    field.pool.run(train_chunks, data, recipe, space, field._grid, field._net, weights, batch, scratch)
+    return float(batch.loss[0]), batch.d_params[0].copy(), int(batch.rays[0])
+
+
+def _oracle(field: NgpField, rays: int, weight: NDArray[np.float32], params: Tensor) -> tuple[Tensor, Tensor]:
+    """Colour error and loss of the samples that the last chunk took, for the network ``params``."""
+    batch, scratch = field._batch, field._scratch
+    first, ray = scratch.ray_first[0], scratch.ray[0]
+    column = scratch.column[0, : first[rays]]
+    x = torch.as_tensor(batch.x[0][:, column].T.copy(), dtype=torch.float64)
+    grid = to_torch(field._grid, dtype=torch.float64)
+    sigma, color = shade(mlp(field._net.widths.tolist(), params, encode(grid, SETTINGS.levels, x)), 1, x)
+    error = loss = torch.zeros((), dtype=torch.float64)
+    for r in range(rays):
+        a, b = int(first[r]), int(first[r + 1])
+        at = column[a:b]
+        t, delta = (torch.as_tensor(scratch.line[0, k, at], dtype=torch.float64)[None] for k in (0, 1))
+        target, back = (torch.as_tensor(ray[r, k : k + 3], dtype=torch.float64)[None] for k in (3, 6))
+        of_ray = ray_losses(sigma[None, a:b], color[None, a:b], t, delta, target, back, DISTORTION, SPARSITY)
+        error, loss = error + weight[r] * of_ray[0].sum(), loss + weight[r] * of_ray[1].sum()
+    return error, loss
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_loss_and_gradient_equal_the_oracle(field: NgpField, weighted: bool) -> None:
+    loss, gradient, rays = _train(field, _packed(field, _weights() if weighted else None))
+    weight = field._scratch.ray[0, :rays, 10] if weighted else np.ones(rays, np.float32)
+    params = torch.as_tensor(field._net.params, dtype=torch.float64).requires_grad_(True)
+    error, total = _oracle(field, rays, weight, params)
+    total.backward()
+    assert rays > 20 and loss == pytest.approx(error.item(), rel=1e-4) and params.grad is not None
+    expected = params.grad.numpy()
+    np.testing.assert_allclose(gradient, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_rays_are_whole_and_in_order(field: NgpField) -> None:
+    _, _, rays = _train(field, _packed(field, None))
+    batch, scratch = field._batch, field._scratch
+    first, column = scratch.ray_first[0, : rays + 1], scratch.column[0, : batch.columns[0]]
+    assert batch.samples[0] == first[rays] <= batch.columns[0]
+    assert sorted(column) == list(range(batch.columns[0]))  # each once, those nobody uses last
+    density = scratch.laid[0, 0]
+    for a, b in pairwise(first):
+        t, length = scratch.line[0, :, column[a:b]].T
+        assert (np.diff(t) > 0).all()
+        depth = np.cumsum(density[a:b] * length)
+        assert (depth[:-1] <= OPAQUE_DEPTH).all()  # nothing behind the first opaque sample
+
+
+def test_no_ray_is_cut_off_where_the_grid_is_wrong(field: NgpField) -> None:
+    def rays_of(over: float) -> list[NDArray[np.float32]]:
+        _, _, rays = _train(field, _packed(field, None), rays=512, over=over)
+        first, column = field._scratch.ray_first[0], field._scratch.column[0]
+        return [field._scratch.line[0, 0, column[a:b]] for a, b in pairwise(first[: rays + 1])]
+
+    whole = rays_of(0.0)  # nothing to be asked about: each in one piece
+    assert sum(map(len, whole)) > 1500
+    for over in (1.0, 5.0, 30.0):
+        found = rays_of(over)
+        assert len(found) > 0.8 * len(whole)
+        for mine, other in zip(found, whole, strict=False):
+            np.testing.assert_array_equal(mine, other)
+
+
+def test_gradient_of_weighted_rays_equals_finite_differences(field: NgpField) -> None:
+    _, gradient, rays = _train(field, _packed(field, _weights()))
+    weight = field._scratch.ray[0, :rays, 10]
+    params = torch.as_tensor(field._net.params, dtype=torch.float64)
+    for k in np.argsort(-np.abs(gradient))[:6]:
+        both = []
+        for sign in (1.0, -1.0):
+            moved = params.clone()
+            moved[k] += sign * 1e-6
+            both.append(_oracle(field, rays, weight, moved)[1].item())
+        assert gradient[k] == pytest.approx((both[0] - both[1]) / 2e-6, rel=2e-3)
+
+
+def test_pixels_of_weight_zero_are_not_drawn(field: NgpField) -> None:
+    weights = _weights()
+    data = _packed(field, weights)
+    flat = np.concatenate([w.reshape(-1) for w in weights])
+    assert (flat == 0).any() and (flat[data.drawn] > 0).all() and len(data.drawn) == (flat > 0).sum()
+    _, _, rays = _train(field, data)
+    drawn = field._scratch.ray[0, :rays, 10]
+    assert set(np.unique(drawn)) == {np.float32(0.3), np.float32(1.0)}
+    target = field._scratch.ray[0, :rays, 3:6]
+    pixels = data.pixels[data.drawn].astype(np.float32) / 255.0
+    assert all(np.abs(pixels - color).max(axis=1).min() < 1e-6 for color in target)
+
+
+def test_weights_of_one_change_nothing(field: NgpField) -> None:
+    plain = _train(field, _packed(field, None))
+    ones = _train(field, _packed(field, [np.ones(v.image.shape[:2], np.float32) for v in VIEWS]))
+    assert plain[0] == ones[0] and plain[2] == ones[2]
+    np.testing.assert_array_equal(plain[1], ones[1])

@@ -1,0 +1,151 @@
+"""Volume rendering, its loss and its gradient against plain torch and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from edge_server.fields.common.kernels.volume_rendering import (
+    GUIDE_REACH,
+    OPAQUE_DEPTH,
+    RAW_HIGH,
+    Weights,
+    activate,
+    add_harmonics,
+    ray_loss,
+    seen_samples,
+    spread_harmonics,
+)
+from edge_server.fields.ngp import torch_model
+
+SAMPLES = 24
+
+
+def _ray(seed: int, density: float, harmonics: int = 1):
+    rng = np.random.default_rng(seed)
+    rows = (1 + 3 * harmonics + 3) // 4 * 4
+    raw = rng.normal(size=(rows, SAMPLES)).astype(np.float32)
+    raw[0] += np.float32(density)
+    line = np.zeros((3, SAMPLES), np.float32)
+    line[0] = 1.0 + np.arange(SAMPLES) * 0.05
+    line[1] = rng.uniform(0.02, 0.08, SAMPLES)
+    direction = rng.normal(size=3)
+    direction = (direction / np.linalg.norm(direction)).astype(np.float32)
+    ray = np.concatenate([direction, rng.random(6)]).astype(np.float32)
+    return raw, line, ray
+
+
+def _kernel(raw, line, ray, weights, harmonics, guide=0.0):
+    out, d_out = raw.copy(), np.zeros_like(raw)
+    add_harmonics(out, harmonics, 0, SAMPLES, *ray[:3])
+    activate(out, 0, SAMPLES)
+    error = ray_loss(out, d_out, line[0], line[1], line[2], 0, SAMPLES, ray[3:6], ray[6:9], np.float32(guide),
+                     weights)  # fmt: skip
+    spread_harmonics(d_out, harmonics, 0, SAMPLES, *ray[:3])
+    return error, d_out
+
+
+def _oracle(raw, line, ray, distortion, sparsity, harmonics):
+    params = torch.as_tensor(raw.T.copy(), dtype=torch.float64).requires_grad_(True)
+    direction = torch.as_tensor(ray[:3], dtype=torch.float64).expand(SAMPLES, 3)
+    sigma, color = torch_model.shade(params, harmonics, direction)
+    t, delta = (torch.as_tensor(line[k], dtype=torch.float64)[None] for k in (0, 1))
+    target, back = (torch.as_tensor(ray[a : a + 3], dtype=torch.float64)[None] for a in (3, 6))
+    error, loss = torch_model.ray_losses(
+        sigma[None], color[None], t, delta, target, back, distortion, sparsity
+    )
+    return params, error, loss
+
+
+@pytest.mark.parametrize("density", [-4.0, 0.0, 3.0, 7.0])
+@pytest.mark.parametrize("harmonics", [1, 4, 9])
+def test_loss_and_gradient_equal_the_oracle(density: float, harmonics: int) -> None:
+    raw, line, ray = _ray(3, density, harmonics)
+    weights = Weights(np.float32(0.3), np.float32(0.05), np.float32(0.0))
+    error, d_out = _kernel(raw, line, ray, weights, harmonics)
+    params, expected, loss = _oracle(raw, line, ray, 0.3, 0.05, harmonics)
+    assert error == pytest.approx(expected.item(), rel=1e-4)
+    loss.sum().backward()
+    assert params.grad is not None
+    np.testing.assert_allclose(d_out.T, params.grad.numpy(), atol=2e-5, rtol=2e-3)
+
+
+@pytest.mark.parametrize("guide", [1.4, 0.2, 50.0])
+def test_weight_away_from_a_guide_costs_what_geman_and_mcclure_say(guide: float) -> None:
+    raw, line, ray = _ray(9, 1.0)
+    weights = Weights(*np.float32([0.3, 0.05, 0.0, 0.7]))
+    error, d_out = _kernel(raw, line, ray, weights, 1, guide)
+    params, expected, loss = _oracle(raw, line, ray, 0.3, 0.05, 1)
+    assert error == pytest.approx(expected.item(), rel=1e-4)  # the guide is no colour
+    sigma, _ = torch_model.shade(params, 1, torch.zeros(SAMPLES, 3, dtype=torch.float64))
+    through = torch.exp(-torch.cumsum(sigma * torch.as_tensor(line[1], dtype=torch.float64), 0))
+    before = torch.cat([torch.ones(1, dtype=torch.float64), through[:-1]])
+    off = (torch.as_tensor(line[0], dtype=torch.float64) - guide) / (GUIDE_REACH * guide)
+    away = ((before - through) * off**2 / (1 + off**2)).sum() + through[-1]
+    (loss.sum() + 0.7 * away).backward()
+    assert params.grad is not None
+    np.testing.assert_allclose(d_out.T, params.grad.numpy(), atol=2e-5, rtol=2e-3)
+
+
+def test_a_ray_without_a_guide_is_left_alone() -> None:
+    raw, line, ray = _ray(9, 1.0)
+    none = _kernel(raw, line, ray, Weights(*np.float32([0.3, 0.05, 0.0, 0.0])), 1)[1]
+    off = _kernel(raw, line, ray, Weights(*np.float32([0.3, 0.05, 0.0, 0.7])), 1)[1]
+    np.testing.assert_array_equal(none, off)
+
+
+def test_gradient_equals_finite_differences() -> None:
+    raw, line, ray = _ray(4, 1.0)
+    weights = Weights(np.float32(0.2), np.float32(0.03), np.float32(0.0))
+    _, d_out = _kernel(raw, line, ray, weights, 1)
+    for row in range(4):
+        for s in (0, 7, SAMPLES - 1):
+            both = []
+            for sign in (1.0, -1.0):
+                moved = raw.astype(np.float64)
+                moved[row, s] += sign * 1e-5
+                _, _, loss = _oracle(moved, line, ray, 0.2, 0.03, 1)
+                both.append(loss.item())
+            assert d_out[row, s] == pytest.approx((both[0] - both[1]) / 2e-5, rel=2e-3, abs=2e-6)
+
+
+def test_nothing_behind_an_opaque_sample_has_a_gradient() -> None:
+    raw, line, ray = _ray(5, 0.0)
+    raw[0, 6] = RAW_HIGH - 1.0
+    out = raw.copy()
+    activate(out, 0, SAMPLES)
+    assert out[0, 6] * line[1, 6] > OPAQUE_DEPTH
+    assert seen_samples(out, line[1], 0, SAMPLES) == 7
+    assert seen_samples(out, line[1], 7, SAMPLES) == SAMPLES - 7
+    _, d_out = _kernel(raw, line, ray, Weights(*np.float32([0.1, 0.1, 0])), 1)
+    assert (d_out[:, 7:] == 0).all() and (d_out[1:4, 6] != 0).all()
+
+
+def test_clamped_density_has_no_gradient() -> None:
+    raw, line, ray = _ray(6, 0.0)
+    raw[0, 0], raw[0, 1] = -40.0, -11.0
+    _, d_out = _kernel(raw, line, ray, Weights(*np.float32([0, 1.0, 0])), 1)
+    assert d_out[0, 0] == 0.0 and d_out[0, 1] != 0.0
+    raw[0, 2] = 500.0  # overflows an unclamped exponential
+    error, d_out = _kernel(raw, line, ray, Weights(*np.float32([0, 1.0, 0])), 1)
+    assert np.isfinite(error) and error >= 0 and np.isfinite(d_out).all() and d_out[0, 2] == 0.0
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_a_ray_that_is_not_finite_is_refused_whole(poison: float) -> None:
+    raw, line, ray = _ray(7, 0.0)
+    raw[2, 3] = poison
+    error, d_out = _kernel(raw, line, ray, Weights(*np.float32([0.1, 0.1, 0])), 1)
+    if np.isnan(poison):
+        assert error == -1.0 and (d_out == 0).all()
+    else:  # an infinite raw colour is full colour, or refused: never silent corruption
+        assert np.isfinite(d_out).all()
+
+
+def test_gradients_fade_near_the_camera() -> None:
+    raw, line, ray = _ray(8, 0.0)
+    _, full = _kernel(raw, line, ray, Weights(*np.float32([0, 0, 0])), 1)
+    _, faded = _kernel(raw, line, ray, Weights(*np.float32([0, 0, 2.0])), 1)
+    share = np.minimum(line[0] / 2.0, 1.0) ** 2
+    np.testing.assert_allclose(faded, full * share, rtol=1e-4, atol=1e-9)

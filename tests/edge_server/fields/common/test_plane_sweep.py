@@ -1,0 +1,202 @@
+"""Depth that a plane sweep finds in the pictures, and what it is worth as a guide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.fields import Budget, View
+from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.kernels.thread_pool import shared_pool
+from edge_server.fields.common.plane_sweep import GUIDE_RAYS, guide
+from edge_server.fields.common.scene_box import SceneBox, scene_box
+from edge_server.fields.common.supervision import leave_out, pack_views
+from tests.edge_server.fields.scenes import ring, seen
+from tests.edge_server.fields.small import NGP, SEEN, cut_out, same_state, score, small
+
+GUIDED = ("ngp", "nerfacto", "tensorf")
+
+
+def _packed(views: list[View]) -> tuple[Views, SceneBox]:
+    box = scene_box(views, None, None, None, None)
+    return pack_views(views, box, {}), box
+
+
+def _guide(views: list[View], data: Views, box: SceneBox, threads: int = 2) -> np.ndarray:
+    return guide(NGP, shared_pool(threads), box, views, data)
+
+
+@pytest.mark.parametrize("size", [48, 131, 301])
+def test_depth_is_where_the_scene_is(size: int) -> None:
+    """At 131 and 301 pixels, one speaks for several; neither is a multiple of them."""
+    views = ring(12, size)
+    data, box = _packed(views)
+    assert (size > 48) == (data.first[-1] > GUIDE_RAYS)
+    found = _guide(views, data, box)
+    assert found.shape == (data.first[-1],) and found.dtype == np.float32
+    truth = np.concatenate([
+        seen(v.intrinsics, v.camera_to_world)[1].reshape(-1) for v in views
+    ]) / box.radius_m  # fmt: skip
+    told, there = found > 0, np.isfinite(truth)
+    assert told[there].mean() > 0.5, "most of what can be seen has a guide"
+    assert told[~there].mean() < 0.01, "and next to none of the plain sky"
+    wrong = np.abs(found - truth)[told & there] / truth[told & there]
+    # Before an area of one colour, every place that all see in that area agrees as well.
+    assert np.median(wrong) < 0.05 and np.mean(wrong < 0.1) > 0.6
+    middle = np.median(truth[told & there])
+    assert np.median(wrong) < 0.5 * np.median(np.abs(middle / truth[told & there] - 1.0))
+
+
+def test_depth_does_not_depend_on_threads() -> None:
+    data, box = _packed(SEEN)
+    np.testing.assert_array_equal(_guide(SEEN, data, box, 1), _guide(SEEN, data, box, 2))
+
+
+def test_transparent_sky_has_no_depth() -> None:
+    views = [cut_out(v) for v in SEEN]
+    data, box = _packed(views)
+    found = _guide(views, data, box)
+    sky = data.pixels[:, 3] < 16
+    assert (found[~sky] > 0).mean() > 0.5 and (found[sky] == 0).all()
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_pictures_of_one_colour_have_no_depth(level: int) -> None:
+    views = [replace(v, image=np.full_like(v.image, level)) for v in SEEN]
+    data, box = _packed(views)
+    assert (_guide(views, data, box) == 0).all()
+
+
+def test_two_views_have_none_and_refused_ones_no_say() -> None:
+    data, box = _packed(SEEN)
+    two, where = _packed(SEEN[:2])
+    assert _guide(SEEN[:2], two, where).size == 0
+    refused = np.ones(len(SEEN), bool)
+    refused[:2] = False
+    assert _guide(SEEN, leave_out(data, refused), box).size == 0
+    # What a refused picture shows changes nothing for the others.
+    refused[:] = False
+    refused[3] = True
+    wrong = [*SEEN[:3], replace(SEEN[3], image=255 - SEEN[3].image), *SEEN[4:]]
+    np.testing.assert_array_equal(
+        _guide(SEEN, leave_out(data, refused), box)[: data.first[3]],
+        _guide(wrong, leave_out(_packed(wrong)[0], refused), box)[: data.first[3]],
+    )
+
+
+@pytest.mark.parametrize("name", GUIDED)
+def test_it_is_worth_decibels_where_few_cameras_look(name: str) -> None:
+    """Every third of 18 cameras of ``tile``: a third of the pictures, most of the scene unseen by two."""
+    still = synthetic("tile", cameras=19, size=64)
+    few = still.training[::3]
+    gain = []
+    for seed in (0, 1, 2):
+        fields = [small(name, depth_guide=weight, seed=seed) for weight in (0.0, 0.1)]
+        for field in fields:
+            field.fit(few, Budget(steps=150))
+        without, with_one = (score(field, still.held_out[0]) for field in fields)
+        gain.append(with_one - without)
+    assert np.median(gain) > 0.5
+
+
+def test_it_is_used_where_it_is_called_for() -> None:
+    """A plain background or few cameras; elsewhere it would only take its time."""
+    sky, room = small("ngp"), small("ngp")
+    sky.fit(SEEN, Budget(steps=1))
+    assert sky._guiding() > 0.0
+    views = synthetic("room", cameras=13, size=32).training
+    room.fit(views, Budget(steps=1))
+    assert room._guiding() == 0.0
+    few = small("ngp")
+    few.fit(views[::2], Budget(steps=1))
+    assert few._guiding() > 0.0
+    never = small("ngp", depth_guide=0.0)
+    never.fit(SEEN, Budget(steps=1))
+    assert never._guiding() == 0.0
+
+
+def test_pictures_of_several_sizes() -> None:
+    """Of 48 and 96 pixels: each gets the depth of its own pixels."""
+    views = [large if k % 3 == 0 else small for k, (small, large) in enumerate(zip(ring(13), ring(13, 96)))]
+    data, box = _packed(views)
+    found = _guide(views, data, box)
+    for k in (0, 1):
+        truth = seen(views[k].intrinsics, views[k].camera_to_world)[1].reshape(-1) / box.radius_m
+        mine = found[data.first[k] : data.first[k + 1]]
+        both = (mine > 0) & np.isfinite(truth)
+        assert both.mean() > 0.1 and np.median(np.abs(mine - truth)[both] / truth[both]) < 0.08
+
+
+def test_no_sweep_where_none_is_called_for_or_the_budget_is_too_short(monkeypatch) -> None:
+    swept, clock = [], [0.0]
+
+    def slow(settings, pool, box, views, data):
+        swept.append(len(views))
+        clock[0] += 0.4
+        return np.zeros(0, np.float32)
+
+    monkeypatch.setattr("edge_server.fields.common.plane_sweep.guide", slow)
+    room = small("ngp")
+    room.fit(synthetic("room", cameras=13, size=32).training, Budget(steps=2))
+    exposed = small("ngp", exposure=True)
+    exposed.fit(SEEN, Budget(steps=1))
+    assert swept == []
+    sky = small("ngp")
+    sky.now = lambda: clock[0]
+    sky.fit(SEEN, Budget(seconds=0.2))  # who does not know how long it takes tries
+    steps = sky.step
+    for k in range(6):
+        # A new picture each time, and a clock that stands still but for the sweep and the steps.
+        fresh = [replace(v, generated_ns=1000 + k) for v in SEEN]
+        one_step, took = sky._one_step, []
+
+        def step(*args, one_step=one_step, took=took):
+            clock[0] += 0.02
+            took.append(0.02)
+            return one_step(*args)
+
+        monkeypatch.setattr(sky, "_one_step", step)
+        sky.fit(fresh, Budget(seconds=0.2))
+        monkeypatch.setattr(sky, "_one_step", one_step)
+    assert sky.step > steps + 20 and len(swept) == 1
+    sky.fit([replace(v, generated_ns=5000) for v in SEEN], Budget(steps=1))
+    assert len(swept) == 2, "steps have no clock"
+
+
+def test_the_same_pictures_are_swept_once(monkeypatch) -> None:
+    from edge_server.fields.common import plane_sweep
+
+    swept, guide_ = [], plane_sweep.guide
+    monkeypatch.setattr(plane_sweep, "guide", lambda *given: swept.append(1) or guide_(*given))
+    field = small("ngp")
+    for _ in range(3):
+        field.fit(SEEN, Budget(steps=2))
+    assert len(swept) == 1
+    field.fit([replace(v, generated_ns=9000) for v in SEEN], Budget(steps=2))
+    assert len(swept) == 2
+
+
+def test_it_falls_to_nothing() -> None:
+    field = small("ngp", guide_steps=4)
+    weights = []
+    for _ in range(6):
+        weights.append(field._guiding() if field.step else 0.1)
+        field.fit(SEEN, Budget(steps=1))
+    np.testing.assert_allclose(weights, [0.1, 0.075, 0.05, 0.025, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("name", GUIDED)
+def test_a_guided_fit_is_one_result(name: str) -> None:
+    one, two, resumed = (small(name, threads=threads) for threads in (1, 2, 2))
+    for field in (one, two):
+        for _ in range(2):
+            field.fit(SEEN, Budget(steps=5))
+    same_state(one, two)
+    resumed.fit(SEEN, Budget(steps=5))
+    other = small(name)
+    other.load_state(resumed.state())
+    other.fit(SEEN, Budget(steps=5))
+    same_state(one, other)

@@ -1,0 +1,115 @@
+"""Where the scene is, from the cameras alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.fields.common.scene_box import converging_point, plain_background, scene_box
+from freshfield.geometry import look_at
+from tests.edge_server.fields.scenes import ring
+
+RING = ring(8, size=16)
+NOISE = np.random.default_rng(0).integers(0, 256, (8, 16, 16, 3), dtype=np.uint8)
+VIEWS = [replace(view, image=image) for view, image in zip(RING, NOISE)]  # surroundings everywhere
+
+
+def test_the_box_is_where_the_axes_meet() -> None:
+    box = scene_box(VIEWS)
+    np.testing.assert_allclose(box.centre_m, [0, 0, 0.4], atol=1e-6)
+    assert box.contracted and 2.0 < box.radius_m < 3.2 and 0.0 < box.near_m < box.distance_m
+    np.testing.assert_allclose(box.normalise(np.array([0, 0, 0.4 + box.radius_m])), [0, 0, 1], atol=1e-6)
+
+
+def test_it_moves_and_scales_with_the_rig() -> None:
+    grown = []
+    for view in VIEWS:
+        pose = view.camera_to_world.copy()
+        pose[:3, 3] = 100.0 * pose[:3, 3] + [5.0, 6.0, 7.0]
+        grown.append(replace(view, camera_to_world=pose))
+    a, b = scene_box(VIEWS), scene_box(grown)
+    assert b.radius_m == pytest.approx(100 * a.radius_m) and b.near_m == pytest.approx(100 * a.near_m)
+    np.testing.assert_allclose(b.centre_m, 100 * np.array(a.centre_m) + [5, 6, 7], atol=1e-6)
+
+
+def test_transparent_pictures_show_an_object() -> None:
+    views = [replace(v, image=np.zeros((16, 16, 4), np.uint8)) for v in VIEWS]
+    box = scene_box(views)
+    assert not box.contracted and 0.5 < box.radius_m < 1.3
+
+
+def test_a_plain_background_shows_an_object_too() -> None:
+    color = plain_background(RING)
+    assert color is not None and np.abs(color - RING[0].image[0, 0] / 255.0).max() < 0.01
+    assert plain_background(VIEWS) is None
+    assert not scene_box(RING).contracted
+
+
+def test_what_is_given_is_kept() -> None:
+    box = scene_box(VIEWS, (1.0, 2.0, 3.0), 4.0, 0.5, False)
+    assert (box.centre_m, box.radius_m, box.near_m, box.contracted) == ((1.0, 2.0, 3.0), 4.0, 0.5, False)
+
+
+def test_parallel_outward_and_single_cameras_have_a_box_too() -> None:
+    pose = VIEWS[0].camera_to_world
+    assert converging_point(np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 0, 1.0]])) is None
+    one = scene_box(VIEWS[:1])
+    ahead = (np.array(one.centre_m) - pose[:3, 3]) @ pose[:3, 2]
+    assert ahead > 1.0
+    eyes = [v.camera_to_world[:3, 3] for v in VIEWS]
+    outward = [replace(v, camera_to_world=look_at(eye, 2 * eye)) for v, eye in zip(VIEWS, eyes)]
+    box = scene_box(outward)
+    assert np.linalg.norm(np.array(box.centre_m)[:2]) < 0.2 and np.isfinite(box.radius_m)
+    same = [replace(VIEWS[0], camera=str(k)) for k in range(5)]
+    assert np.isfinite(scene_box(same).radius_m) and scene_box(same).radius_m > 0
+
+
+@pytest.mark.parametrize("aside_m", [1.0, 2.0])
+def test_a_camera_that_looks_elsewhere_does_not_move_the_box(aside_m: float) -> None:
+    views = ring(9, distance_m=1.5)
+    expected = scene_box(views)
+    pose = views[2].camera_to_world.copy()
+    pose[:3, 3] += aside_m * pose[:3, 0]
+    box = scene_box([replace(v, camera_to_world=pose) if v is views[2] else v for v in views])
+    np.testing.assert_allclose(box.centre_m, expected.centre_m, atol=1e-9)
+    turned = pose[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    pose[:3, :3] = turned
+    box = scene_box([replace(v, camera_to_world=pose) if v is views[2] else v for v in views])
+    np.testing.assert_allclose(box.centre_m, expected.centre_m, atol=1e-9)
+
+
+@pytest.mark.parametrize("scene", ["tile", "room", "tower"])
+@pytest.mark.parametrize("off_m", [30.0, 1e3, 1e6])
+def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: float) -> None:
+    """Whichever it is, and in whatever direction: ahead, behind and aside of where it looks among them."""
+    views = synthetic(scene, cameras=13, size=16).training
+    expected, rng = scene_box(views), np.random.default_rng(0)
+    for k, view in enumerate(views):
+        aside = rng.normal(size=3)
+        axis = view.camera_to_world[:3, 2]
+        for direction in (aside / np.linalg.norm(aside), axis, -axis):
+            pose = view.camera_to_world.copy()
+            pose[:3, 3] += off_m * direction
+            box = scene_box([*views[:k], replace(view, camera_to_world=pose), *views[k + 1 :]])
+            moved_m = np.linalg.norm(np.subtract(box.centre_m, expected.centre_m))
+            assert moved_m < 0.15 * expected.radius_m and box.contracted == expected.contracted
+            assert box.radius_m == pytest.approx(expected.radius_m, rel=0.2)
+
+
+def test_where_many_cameras_disagree_all_are_heard() -> None:
+    """Looking outwards, or only three cameras: nothing tells who is wrong."""
+    views = ring(8)
+    poses = []
+    for k, view in enumerate(views):
+        pose = view.camera_to_world.copy()
+        if k % 2:
+            pose[:3, 3] += 2.0 * pose[:3, 0]
+        poses.append(replace(view, camera_to_world=pose))
+    origins = np.stack([v.camera_to_world[:3, 3] for v in poses])
+    axes = np.stack([v.camera_to_world[:3, 2] for v in poses])
+    expected = converging_point(origins, axes)
+    assert expected is not None
+    np.testing.assert_allclose(np.array(scene_box(poses).centre_m), expected)

@@ -1,0 +1,42 @@
+"""What is refused before it reaches a field: cameras that cannot be, told by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.fields import View
+from edge_server.fields.common.supervision import check_view
+from tests.edge_server.fields.scenes import ring
+
+VIEW = ring(1, size=16)[0]
+
+
+def _posed(rotation: np.ndarray, position_m: float = 1.0) -> View:
+    pose = VIEW.camera_to_world.copy()
+    pose[:3, :3], pose[:3, 3] = rotation, position_m
+    return replace(VIEW, camera_to_world=pose)
+
+
+@pytest.mark.parametrize(
+    ("view", "text"),
+    [
+        (_posed(np.zeros((3, 3))), "not orthonormal"),
+        (_posed(3.0 * np.eye(3)), "not orthonormal"),
+        (_posed(np.diag([-1.0, 1.0, 1.0])), "right-handed"),
+        (_posed(np.eye(3), np.nan), "finite"),
+        (_posed(np.eye(3), 1e300), "more than 1e.09 m from the origin"),
+        (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=5e-324)), "no lens for an image of 16 x 16"),
+        (replace(VIEW, intrinsics=replace(VIEW.intrinsics, fy=1e30)), "no lens"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused_by_name(view: View, text: str) -> None:
+    with pytest.raises(ValueError, match=f"camera {VIEW.camera}: .*{text}"):
+        check_view(view)
+
+
+def test_a_geographic_grid_and_a_long_lens_are_welcome() -> None:
+    check_view(_posed(np.eye(3), 6e6))
+    check_view(replace(VIEW, intrinsics=replace(VIEW.intrinsics, fx=1e4, fy=1e4)))

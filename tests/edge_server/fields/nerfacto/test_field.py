@@ -1,0 +1,113 @@
+"""What is the proposal-sampled field's own; ``test_every_representation`` has the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.fields import Budget, View
+from edge_server.fields.nerfacto.field import NerfactoField
+from edge_server.fields.nerfacto.settings import EFFORTS, NerfactoSettings, help_text, make_settings
+from edge_server.fields.registry import make_field
+from tests.edge_server.fields.common.test_camera_refinement import _displaced
+from tests.edge_server.fields.scenes import psnr
+from tests.edge_server.fields.small import HELD, SEEN, score
+from tests.edge_server.fields.small import NERFACTO as SMALL
+
+
+@pytest.fixture(scope="module")
+def trained() -> NerfactoField:
+    field = NerfactoField(SMALL)
+    field.fit(SEEN, Budget(steps=250))
+    return field
+
+
+def test_the_proposal_learns_where_surfaces_are() -> None:
+    """Fewer samples do with it than without: that is what it is for. Without a depth guide, which would tell
+    both where surfaces are."""
+    few = {"max_samples": 4}
+    scores = []
+    for interlevel in (SMALL.interlevel, 0.0):
+        field = NerfactoField(replace(SMALL, interlevel=interlevel, depth_guide=0.0))
+        field.fit(SEEN, Budget(steps=250))
+        color, _, _ = field.snapshot().render_pixels(
+            HELD.camera_to_world, HELD.intrinsics, _pixels(HELD), **few
+        )
+        scores.append(psnr(color.reshape(HELD.image.shape), HELD.image / 255.0))
+    assert scores[0] > scores[1] + 0.5
+
+
+def _pixels(view: View) -> np.ndarray:
+    v, u = np.mgrid[0 : view.intrinsics.height, 0 : view.intrinsics.width]
+    return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
+
+
+def test_a_state_of_another_shape_is_refused() -> None:
+    state = NerfactoField(SMALL).state()
+    with pytest.raises(ValueError, match="appearance = 0"):
+        NerfactoField(replace(SMALL, appearance=2)).load_state(state)
+    with pytest.raises(ValueError, match="not a state"):
+        NerfactoField(SMALL).load_state({"table": state["table"]})
+
+
+def test_it_is_registered_and_its_options_are_checked() -> None:
+    field = make_field("nerfacto", {"bins": 40, "appearance": 4}, seed=5)
+    assert isinstance(field, NerfactoField) and field.settings.bins == 40 and field.settings.seed == 5
+    with pytest.raises(ValueError, match=r"no option density_rank; it has: effort, .*bins.*nice"):
+        make_field("nerfacto", {"density_rank": 8})
+    for wrong, text in (
+        ({"bins": 4}, "bins must be in 8..1024, not 4"),
+        ({"proposal_cells": 30}, "proposal_cells must be a multiple of 4"),
+        ({"even": 1.5}, "even must be in 0.0..1.0"),
+        ({"appearance": 99}, "appearance must be in 0..16"),
+        ({"appearance": 4, "exposure": True}, "choose one"),
+        ({"device": "cuda"}, "CPUs only"),
+        ({"effort": "heroic"}, "low, medium, high"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            make_field("nerfacto", wrong)
+    assert all(len(text) > 10 for text in help_text().values())
+    low, medium, high = (make_settings({"effort": e}) for e in EFFORTS)
+    assert low.samples < medium.samples < high.samples and medium == NerfactoSettings()
+
+
+def test_appearances_take_up_what_differs_between_cameras() -> None:
+    """A room's pictures with gains of 0.7 to 1.4; scored against the picture at the mean exposure."""
+    still = synthetic("room", cameras=13, size=48)
+    gains = np.exp(np.random.default_rng(2).permutation(np.linspace(-0.35, 0.35, 12)))
+    views = [
+        replace(v, image=np.clip(v.image * g + 0.5, 0, 255).astype(np.uint8))
+        for v, g in zip(still.training, gains)
+    ]
+    scores, looks = [], None
+    for appearance in (0, 4):
+        field = NerfactoField(replace(SMALL, appearance=appearance))
+        field.fit(views, Budget(steps=300))
+        scores.append(score(field, still.held_out[0]))
+        looks = field._cameras.appearances
+    assert scores[1] > scores[0] + 1.0
+    assert looks is not None and set(looks.known) == {v.camera for v in views}
+    values = np.array([known[0] for known in looks.known.values()])
+    np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=1e-9)
+    # What is learnt is the gain: a straight line through the numbers tells it.
+    fitted = np.linalg.lstsq(values, np.log(gains), rcond=None)[0]
+    assert np.corrcoef(values @ fitted, np.log(gains))[0, 1] > 0.9
+
+
+def test_appearance_costs_nothing_where_it_is_not_asked_for() -> None:
+    field = NerfactoField(SMALL)
+    field.fit(SEEN, Budget(steps=2))
+    assert field._cameras.appearances is None and field._bins.looks.size == 0 and field._net.widths[-1] == 4
+
+
+def test_wrong_poses_are_refined() -> None:
+    """The shared trainer's refinement, through this field's own rendering."""
+    views, scores = _displaced(SEEN, 0.02, 1.5), {}
+    for on in (False, True):
+        field = NerfactoField(replace(SMALL, refine_m=0.1 * on, refine_deg=4.0 * on))
+        field.fit(views, Budget(steps=600))
+        scores[on] = score(field)
+    assert scores[True] > scores[False] + 0.5

@@ -1,0 +1,574 @@
+"""The Gaussian kernels: projection, compositing and their gradients against torch and finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from edge_server.fields import View
+from edge_server.fields.common.kernels.rays import Views
+from edge_server.fields.common.kernels.thread_pool import CallerPool, Pool
+from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.splat import buffers
+from edge_server.fields.splat.buffers import Passes, camera_rows
+from edge_server.fields.splat.kernels.optimizer_step import Moments, Rule, pull, update
+from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, TILE, Gaussians
+from edge_server.fields.splat.kernels.rasterize import (
+    Loss,
+    compare_tiles,
+    dissimilarity,
+    render_tiles,
+    train_tiles,
+)
+from edge_server.fields.splat.kernels.view_evidence import Verdicts, judge
+from edge_server.fields.splat.snapshot import SplatSnapshot
+from freshfield.geometry import Pinhole, look_at
+from tests.edge_server.fields.splat import torch_oracle
+
+BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
+LENS = Pinhole(21, 18, 22.0, 24.0, 10.0, 9.5)
+BENT = replace(LENS, distortion=(-0.12, 0.03, 0.01, -0.015))
+BACK = np.array([0.2, 0.5, 0.9], np.float32)
+
+
+def _cloud(count: int = 12, harmonics: int = 1, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    params = rng.normal(size=(count, BASE + 3 * (harmonics - 1))).astype(np.float32)
+    params[:, :3] *= 0.5
+    params[:, SCALE:QUATERNION] = np.log(rng.uniform(0.08, 0.4, (count, 3)))
+    params[:, OPACITY] = rng.uniform(-1.0, 2.0, count)
+    params[:, BASE - 3 : BASE] = rng.random((count, 3))
+    params[:, BASE:] *= 0.2
+    return params
+
+
+def _still(params: np.ndarray, harmonics: int) -> Gaussians:
+    return Gaussians(params, harmonics, np.zeros((len(params), 3), np.float32))
+
+
+def _camera(lens: Pinhole = LENS, eye: tuple[float, float, float] = (1.0, -2.5, 0.8)) -> np.ndarray:
+    return camera_rows([look_at(eye, (0.05, 0.0, 0.1))], [lens], BOX)
+
+
+def _render(params: np.ndarray, cam: np.ndarray, harmonics: int = 1, threads: int = 1) -> list[np.ndarray]:
+    passes = Passes(CallerPool() if threads == 1 else Pool(threads, 0))
+    passes.look(cam, _still(params, harmonics), [None], differentiate=False)
+    w, h = LENS.width, LENS.height
+    out = [np.full((h, w, 3), 7, np.float32), np.full((h, w), 7, np.float32), np.full((h, w), 7, np.float32)]
+    passes.pool.run(
+        render_tiles, int(passes.columns[0]), int(passes.rows[0]), w, h, passes.projected, passes.lists, BACK,
+        passes.memory, passes.kept, *out,
+    )  # fmt: skip
+    return out
+
+
+def _oracle(params: torch.Tensor, cam: np.ndarray, harmonics: int = 1) -> tuple[torch.Tensor, ...]:
+    flat = torch_oracle.flatten(torch.as_tensor(cam[0], dtype=torch.float64), params, harmonics)
+    back = torch.as_tensor(BACK, dtype=torch.float64)
+    return torch_oracle.composite(flat, LENS.width, LENS.height, back)
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+@pytest.mark.parametrize("harmonics", [1, 4, 9])
+def test_pictures_equal_the_oracle(lens: Pinhole, harmonics: int) -> None:
+    params, cam = _cloud(harmonics=harmonics), _camera(lens)
+    expected = _oracle(torch.as_tensor(params, dtype=torch.float64), cam, harmonics)
+    for mine, theirs in zip(_render(params, cam, harmonics), expected):
+        reference = theirs.detach().numpy().clip(0.0, 1.0 if mine.ndim == 3 else None)
+        np.testing.assert_allclose(mine, reference, atol=2e-4)
+
+
+def test_a_ball_appears_where_the_lens_puts_it() -> None:
+    """Against the project's own lens model, without the oracle."""
+    params = _cloud(1)
+    params[0, :3], params[0, SCALE:QUATERNION], params[0, OPACITY] = (0.5, 0.2, -0.3), np.log(0.02), 9.0
+    pose = look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))
+    _, depth, opacity = _render(params, camera_rows([pose], [BENT], BOX))
+    local = (params[0, :3] - pose[:3, 3]) @ pose[:3, :3]
+    ys, xs = np.mgrid[0 : LENS.height, 0 : LENS.width] + 0.5
+    found = np.array([(xs * opacity).sum(), (ys * opacity).sum()]) / opacity.sum()
+    np.testing.assert_allclose(found, BENT.project(local), atol=0.1)
+    assert depth[opacity > 0.3] == pytest.approx(local[2], abs=1e-3)
+
+
+def _views(target: np.ndarray, weight: np.ndarray | None = None) -> Views:
+    h, w = target.shape[:2]
+    return Views(
+        first=np.array([0, h * w]), size=np.array([[w, h]]), lens=np.zeros((1, 8)),
+        rotation=np.zeros((1, 3, 3)), origin=np.zeros((1, 3)), pixels=target.reshape(h * w, -1),
+        changed=np.zeros(0, np.int64),
+        weight=np.zeros(0, np.float32) if weight is None else weight.reshape(-1),
+    )  # fmt: skip
+
+
+def _gradient(
+    params: np.ndarray, cam: np.ndarray, target: np.ndarray, harmonics: int = 1, absolute: bool = False,
+    dssim: float = 0.0, weight: np.ndarray | None = None,
+) -> tuple[float, np.ndarray]:  # fmt: skip
+    """Loss and its gradient: Adam's first moment after one step with beta1 = 0."""
+    pool = CallerPool()
+    passes = Passes(pool)
+    gaussians = _still(params.copy(), harmonics)
+    passes.look(cam, gaussians, [None])
+    total = int(passes.columns[0] * passes.rows[0])
+    tasks = np.array([(0, t) for t in range(total)], np.int32)
+    losses = np.zeros((total, 3))
+    loss = Loss(absolute, np.float32(dssim), BACK, False, np.uint64(1))
+    pool.run(
+        train_tiles, _views(target, weight), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
+        passes.lists, loss, passes.memory, passes.kept, passes.sums, losses,
+    )  # fmt: skip
+    n = len(params)
+    flat = [np.zeros(n, np.float32) for _ in range(3)]
+    moments = Moments(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
+    rule = Rule(
+        np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32),
+        *(np.float32(v) for v in (0.0, 0.9, 1e-8, 0.0, 4.0, 5.0)),
+    )  # fmt: skip
+    dropped = np.zeros(n, np.int64)
+    pool.run(
+        update, cam, gaussians, n, passes.projected, passes.lists.own_first, passes.lists.own_count,
+        passes.sums, moments, rule, dropped,
+    )  # fmt: skip
+    assert losses[:, 2].sum() == 0 and dropped.sum() == 0
+    return float(losses[:, 0].sum()), moments.m
+
+
+def _target(channels: int = 3) -> np.ndarray:
+    return np.random.default_rng(5).integers(0, 256, (LENS.height, LENS.width, channels), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+@pytest.mark.parametrize("harmonics", [1, 4, 9])
+@pytest.mark.parametrize("absolute", [False, True])
+def test_gradients_equal_the_oracle(lens: Pinhole, harmonics: int, absolute: bool) -> None:
+    params, cam, target = _cloud(harmonics=harmonics, seed=3), _camera(lens), _target(4)
+    value, gradient = _gradient(params, cam, target, harmonics, absolute)
+    theirs = torch.as_tensor(params, dtype=torch.float64).requires_grad_(True)
+    color, _, _ = _oracle(theirs, cam, harmonics)
+    alpha = torch.as_tensor(target[..., 3:] / 255.0)
+    wanted = torch.as_tensor(target[..., :3] / 255.0) * alpha + (1 - alpha) * torch.as_tensor(BACK)
+    error = color - wanted
+    loss = error.abs().sum() if absolute else error.square().sum()
+    loss.backward()
+    assert theirs.grad is not None
+    assert value == pytest.approx(loss.item(), rel=1e-4)
+    expected = theirs.grad.numpy()
+    scale = np.abs(expected).max(axis=0, keepdims=True)
+    np.testing.assert_allclose(gradient / scale, expected / scale, atol=3e-3)
+
+
+def _weights() -> np.ndarray:
+    """Some of none, a whole tile of none, the others unequal."""
+    rng = np.random.default_rng(6)
+    weight = rng.random((LENS.height, LENS.width)).astype(np.float32)
+    weight[rng.random(weight.shape) < 0.3] = 0.0
+    weight[:TILE, TILE : 2 * TILE] = 0.0
+    return weight
+
+
+def _tile_dissimilarity(color: torch.Tensor, wanted: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """(1 - SSIM) / 2 of each tile and channel, times the sum of its weights; pixels of none left out."""
+    total = torch.zeros(()).to(color)
+    for y in range(0, LENS.height, TILE):
+        for x in range(0, LENS.width, TILE):
+            counts = weight[y : y + TILE, x : x + TILE] > 0
+            for a, b in zip(*(p[y : y + TILE, x : x + TILE][counts].T for p in (color, wanted))):
+                if counts.any():
+                    ma, mb, va, vb = a.mean(), b.mean(), a.var(correction=0), b.var(correction=0)
+                    both = ((a - ma) * (b - mb)).mean()
+                    c1, c2 = 0.01**2, 0.03**2
+                    ssim = (2 * ma * mb + c1) * (2 * both + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2))
+                    total = total + weight[y : y + TILE, x : x + TILE].sum() * (1 - ssim) / 2
+    return total
+
+
+@pytest.mark.parametrize(("absolute", "dssim"), [(False, 0.0), (True, 0.0), (False, 3.0), (True, 3.0)])
+def test_weighed_gradients_equal_the_oracle(absolute: bool, dssim: float) -> None:
+    params, cam, target, weight = _cloud(seed=3), _camera(BENT), _target(), _weights()
+    value, gradient = _gradient(params, cam, target, absolute=absolute, dssim=dssim, weight=weight)
+    theirs = torch.as_tensor(params, dtype=torch.float64).requires_grad_(True)
+    color, wanted = _oracle(theirs, cam)[0], torch.as_tensor(target / 255.0)
+    share, error = torch.as_tensor(weight, dtype=torch.float64), color - wanted
+    loss = (share[..., None] * (error.abs() if absolute else error.square())).sum()
+    loss = loss + dssim * _tile_dissimilarity(color, wanted, share)
+    loss.backward()
+    assert theirs.grad is not None and value == pytest.approx(loss.item(), rel=1e-4)
+    expected = theirs.grad.numpy()
+    scale = np.abs(expected).max(axis=0, keepdims=True)
+    np.testing.assert_allclose(gradient / scale, expected / scale, atol=3e-3)
+
+
+@pytest.mark.parametrize("dssim", [0.0, 3.0])
+def test_pixels_without_weight_do_not_matter(dssim: float) -> None:
+    params, cam, target, weight = _cloud(seed=3), _camera(), _target(), _weights()
+    other = target.copy()
+    other[weight == 0] = 255 - other[weight == 0]
+    one, two = (_gradient(params, cam, t, dssim=dssim, weight=weight) for t in (target, other))
+    assert one[0] == two[0] > 0
+    np.testing.assert_array_equal(one[1], two[1])
+    nothing, gradient = _gradient(params, cam, target, dssim=dssim, weight=np.zeros_like(weight))
+    assert nothing == 0.0 and (gradient == 0).all()
+
+
+@pytest.mark.parametrize("dssim", [0.0, 3.0])
+def test_equal_weights_scale_the_gradient(dssim: float) -> None:
+    params, cam, target = _cloud(seed=3), _camera(), _target()
+    value, gradient = _gradient(params, cam, target, dssim=dssim)
+    half = np.full(target.shape[:2], 0.5, np.float32)
+    halved, weighed = _gradient(params, cam, target, dssim=dssim, weight=half)
+    assert halved == pytest.approx(0.5 * value, rel=1e-5)
+    np.testing.assert_allclose(weighed, 0.5 * gradient, rtol=1e-4, atol=1e-4 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("dssim", [0.0, 3.0])
+def test_gradients_equal_finite_differences(dssim: float) -> None:
+    params, cam, target = _cloud(5, seed=8), _camera(BENT), _target()
+    _, gradient = _gradient(params, cam, target, dssim=dssim)
+    # The tolerance is for the rim: where a Gaussian adds less than 1/255 it ends, and a step that moves the
+    # rim makes a jump that no gradient knows.
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        # Uphill, so that contributions do not cancel out and rounding does not decide.
+        way = (np.sign(gradient) * rng.random(params.shape) * 2e-3).astype(np.float32)
+        up, _ = _gradient(params + way, cam, target, dssim=dssim)
+        down, _ = _gradient(params - way, cam, target, dssim=dssim)
+        assert (up - down) / 2.0 == pytest.approx(float((gradient * way).sum()), rel=0.2)
+
+
+def test_dissimilarity_equals_its_definition() -> None:
+    rng = np.random.default_rng(2)
+    memory, target = rng.random(11 * 64).astype(np.float32), rng.random(64).astype(np.float32)
+    target[56:] = -1.0  # outside the picture
+    x = torch.as_tensor(memory[192 : 192 + 56], dtype=torch.float64).requires_grad_(True)
+    y = torch.as_tensor(target[:56], dtype=torch.float64)
+    mx, my = x.mean(), y.mean()
+    xx, yy, xy = ((x - mx) ** 2).mean(), ((y - my) ** 2).mean(), ((x - mx) * (y - my)).mean()
+    c1, c2 = 0.01**2, 0.03**2
+    ssim = (2 * mx * my + c1) * (2 * xy + c2) / ((mx**2 + my**2 + c1) * (xx + yy + c2))
+    loss = 0.7 * 56 * (1 - ssim) / 2
+    loss.backward()
+    memory[448:512] = 0.0
+    value = dissimilarity(memory, 192, 448, target, 56, np.float32(0.7))
+    assert value == pytest.approx(loss.item(), rel=1e-4) and x.grad is not None
+    np.testing.assert_allclose(memory[448 : 448 + 56], x.grad.numpy(), atol=1e-4)
+    assert (memory[448 + 56 : 512] == 0).all()
+
+
+def test_what_is_clamped_has_no_gradient() -> None:
+    """An opaque Gaussian in one pixel's middle: its alpha is cut to .99 there, and nothing pulls at it."""
+    params, cam = _cloud(1), _camera()
+    params[0, :3], params[0, SCALE:QUATERNION], params[0, OPACITY] = (0.0, 0.0, 0.0), 3.9, 8.9
+    _, _, opacity = _render(params, cam)
+    assert opacity.max() == pytest.approx(0.99, abs=1e-6) and (opacity > 0.9899).mean() > 0.99
+    _, gradient = _gradient(params, cam, _target())
+    assert (gradient[0, :OPACITY] == 0).all() and np.abs(gradient[0, OPACITY + 1 :]).min() > 0
+
+
+def test_opacity_nought_and_one() -> None:
+    cam = _camera()
+    params = _cloud(3)
+    params[:, OPACITY] = -50.0
+    color, depth, opacity = _render(params, cam)
+    np.testing.assert_array_equal(color, np.broadcast_to(BACK, color.shape))
+    assert (depth == 0).all() and (opacity == 0).all()
+    _, gradient = _gradient(params, cam, _target())
+    assert (gradient == 0).all()
+    params[:, OPACITY] = 50.0
+    _, _, opacity = _render(params, cam)
+    assert 0.99 <= opacity.max() <= 1.0
+    _, gradient = _gradient(params, cam, _target())
+    assert np.isfinite(gradient).all() and (gradient[:, OPACITY] == 0).all()
+
+
+def test_a_quaternion_without_direction_is_no_rotation() -> None:
+    cam, params = _camera(), _cloud(2)
+    params[:, QUATERNION:OPACITY] = 0.0
+    plain = params.copy()
+    plain[:, QUATERNION] = 1.0
+    np.testing.assert_array_equal(_render(params, cam)[0], _render(plain, cam)[0])
+    _, gradient = _gradient(params, cam, _target())
+    assert np.isfinite(gradient).all() and (gradient[:, QUATERNION:OPACITY] == 0).all()
+
+
+@pytest.mark.parametrize("log_scales", [(-30.0, -30.0, -30.0), (3.0, -12.0, -12.0), (-12.0, 4.0, 4.0)])
+def test_covariances_near_singular_stay_finite(log_scales: tuple[float, float, float]) -> None:
+    cam, params = _camera(), _cloud(4)
+    params[:, SCALE:QUATERNION] = log_scales
+    for part in _render(params, cam):
+        assert np.isfinite(part).all()
+    _, gradient = _gradient(params, cam, _target())
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e-40])
+def test_no_parameter_poisons_the_picture(value: float) -> None:
+    cam = _camera()
+    for column in range(BASE):
+        params = _cloud(6)
+        params[2, column] = value
+        for part in _render(params, cam):
+            assert np.isfinite(part).all(), f"column {column}"
+
+
+def test_behind_the_camera_and_none_at_all() -> None:
+    params = _cloud(5)
+    params[:, :3] = (5.0, -12.0, 3.0)  # behind it
+    for cloud in (params, params[:0]):
+        color, _, opacity = _render(cloud, _camera())
+        np.testing.assert_array_equal(color, np.broadcast_to(BACK, color.shape))
+        assert (opacity == 0).all()
+
+
+def test_a_huge_one_far_to_the_side_does_not_fold_back() -> None:
+    """The lens's polynomial turns around beyond the field of view; what stands there must not appear."""
+    params = _cloud(1)
+    eye = np.array([1.0, -2.5, 0.8])
+    pose = look_at(eye, (0.05, 0.0, 0.1))
+    params[0, :3] = pose[:3, 3] + pose[:3, :3] @ np.array([6.0, 0.0, 0.4])
+    params[0, SCALE:QUATERNION], params[0, OPACITY] = np.log(0.05), 8.0
+    bent = replace(LENS, distortion=(-0.25, 0.0, 0.0, 0.0))
+    _, _, opacity = _render(params, camera_rows([pose], [bent], BOX))
+    assert (opacity == 0).all()
+
+
+def test_lists_are_front_to_back_whatever_the_thread_count() -> None:
+    params, cam = _cloud(200, seed=4), np.concatenate([_camera(), _camera(BENT, (-2.0, 1.5, 0.5))])
+    found = []
+    for pool in (CallerPool(), Pool(3, 0)):
+        passes = Passes(pool)
+        passes.look(cam, _still(params, 1), [None, None])
+        found.append(passes)
+    for b in range(2):
+        lists = found[0].lists
+        for t in range(int(found[0].columns[b] * found[0].rows[b])):
+            mine = lists.pair[b, lists.first[b, t] : lists.first[b, t + 1]]
+            other = found[1].lists
+            np.testing.assert_array_equal(mine, other.pair[b, other.first[b, t] : other.first[b, t + 1]])
+            owners = lists.owner[b, mine]
+            depth = found[0].projected[b, owners, 9]
+            assert (np.diff(depth) > -1e-4).all() and len(set(owners)) == len(owners)
+    one, many = _render(params, cam[:1]), _render(params, cam[:1], threads=3)
+    for a, c in zip(one, many):
+        np.testing.assert_array_equal(a, c)
+
+
+@pytest.mark.parametrize("longest", [0.08, 3.0])
+def test_a_tile_lists_the_gaussians_that_have_a_pixel_in_it_and_hardly_another(longest: float) -> None:
+    """Needles in every direction, also such that the first 64 tiles of their box are not all of them."""
+    lens = Pinhole(150, 110, 160.0, 160.0, 74.0, 57.0)
+    params = _cloud(300, seed=6)
+    params[:, SCALE:QUATERNION] = np.log([0.01, 0.02, longest])
+    passes = Passes(CallerPool())
+    passes.look(_camera(lens), _still(params, 1), [None])
+    lists, columns = passes.lists, int(passes.columns[0])
+    total = columns * int(passes.rows[0])
+    listed = np.zeros((len(params), total), bool)
+    for t in range(total):
+        listed[lists.owner[0, lists.pair[0, lists.first[0, t] : lists.first[0, t + 1]]], t] = True
+    x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    tile = (y // TILE).astype(int) * columns + (x // TILE).astype(int)
+    touched, over_64 = np.zeros_like(listed), np.zeros(len(params), bool)
+    for i in np.flatnonzero(passes.tiles[0, : len(params), 1] > 0):
+        mx, my, a, b, c, alpha = passes.projected[0, i, :6].astype(np.float64)
+        power = -0.5 * (a * (x - mx) ** 2 + c * (y - my) ** 2) - b * (x - mx) * (y - my)
+        touched[i, np.unique(tile[alpha * np.exp(power) >= 1.0 / 255.0])] = True
+        x0, x1, y0, y1 = passes.tiles[0, i, :4]
+        over_64[i] = (x1 - x0) * (y1 - y0) > 64
+    assert touched.sum() > 1000 and not (touched & ~listed).any()
+    assert over_64.any() == (longest > 1.0)
+    beside = listed & ~touched
+    assert beside[~over_64].sum() < 0.03 * touched.sum()
+
+
+@pytest.mark.parametrize("count", [0, 1, 300])
+@pytest.mark.parametrize("share", [1.0, 0.3])
+@pytest.mark.parametrize("longest", [0.08, 3.0])
+def test_lists_do_not_depend_on_how_many_bands_there_are(longest: float, share: float, count: int) -> None:
+    """Bands without a row among them, and every pair dealt to one tile, those of a Gaussian side by side. Two
+    cameras, the picture of one smaller than a tile."""
+    lenses = (Pinhole(150, 50, 160.0, 160.0, 74.0, 27.0), Pinhole(5, 3, 6.0, 6.0, 2.0, 1.0))
+    params = _cloud(300, seed=6)[:count].copy()
+    params[:, SCALE:QUATERNION] = np.log([0.01, 0.02, longest])
+    total = [-(-lens.width // TILE) * -(-lens.height // TILE) for lens in lenses]
+    wanted = (np.random.default_rng(2).random(total[0]) < share).astype(np.uint8)
+    found = []
+    for threads in (1, 2, 3, 5, 9):
+        passes = Passes(Pool(threads, 0))
+        cams = np.concatenate([_camera(lens) for lens in lenses])
+        passes.look(cams, _still(params, 1), [wanted if share < 1.0 else None, None])
+        lists, made = passes.lists, []
+        for b, tiles in enumerate(total):
+            first, pairs = lists.first[b, : tiles + 1], int(lists.needed[b])
+            own_first, own_count = lists.own_first[b, :count], lists.own_count[b, :count]
+            assert first[0] == 0 and first[-1] == pairs == own_count.sum()
+            assert np.diff(first).max() == lists.longest[b].max()
+            assert (np.sort(lists.pair[b, :pairs]) == np.arange(pairs)).all()
+            assert (lists.owner[b, :pairs] == np.repeat(np.arange(count), own_count)).all()
+            assert (own_first[own_count > 0] == (np.cumsum(own_count) - own_count)[own_count > 0]).all()
+            made += [first.copy(), lists.pair[b, :pairs].copy()]
+        assert share == 1.0 or not np.diff(made[0])[wanted == 0].any()
+        found.append(made)
+    assert count < 300 or (found[0][0][-1] > 400 and found[0][2][-1] > 0)
+    for other in found[1:]:
+        assert all((a == b).all() for a, b in zip(found[0], other))
+
+
+def test_gaussians_beyond_what_memory_is_for_are_left_out_and_nothing_else(monkeypatch) -> None:
+    params = _cloud(600, seed=6)
+    params[:, SCALE:QUATERNION] = np.log(0.3)
+    total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
+    everything = Passes(CallerPool())
+    everything.look(_camera(), _still(params, 1), [None])
+    whole = everything.lists.own_count[0, :600].astype(np.int64)
+    monkeypatch.setattr(buffers, "PAIRS_MOST", 2500)
+    for threads in (1, 3):
+        passes = Passes(Pool(threads, 0))
+        passes.look(_camera(), _still(params, 1), [None])
+        lists, made = passes.lists, 0
+        room, listed = lists.pair.shape[1], int(lists.first[0, total])
+        assert lists.needed[0] == whole.sum() > room >= listed == lists.own_count[0, :600].sum() > 2000
+        for i, pairs in enumerate(whole):
+            fits = made + pairs <= room
+            assert lists.own_count[0, i] == (pairs if fits else 0)
+            made += pairs * fits
+        assert (np.sort(lists.pair[0, :listed]) == np.arange(listed)).all()
+
+
+def test_tiles_that_are_not_wanted_get_no_pairs() -> None:
+    passes, cam = Passes(CallerPool()), _camera()
+    total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
+    wanted = np.zeros(total, np.uint8)
+    wanted[4] = 1
+    passes.look(cam, _still(_cloud(50), 1), [wanted])
+    lengths = np.diff(passes.lists.first[0, : total + 1])
+    assert lengths[4] > 0 and lengths.sum() == lengths[4] == passes.lists.needed[0]
+
+
+def test_a_camera_sees_what_moves_where_it_was_when_its_picture_was_taken() -> None:
+    params, velocity = _cloud(5), np.random.default_rng(1).normal(size=(5, 3)).astype(np.float32)
+    late = camera_rows([look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))], [LENS], BOX, [-0.25])
+    there = params.copy()
+    there[:, :3] -= np.float32(0.25) * velocity
+    passes = [Passes(CallerPool()) for _ in range(2)]
+    passes[0].look(late, Gaussians(params, 1, velocity), [None])
+    passes[1].look(_camera(), _still(there, 1), [None])
+    np.testing.assert_allclose(passes[0].projected, passes[1].projected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_pull_on_a_place_is_the_gradient_by_position() -> None:
+    params, cam, target = _cloud(9, seed=2), _camera(), _target()
+    _, gradient = _gradient(params, cam, target)
+    passes, some = Passes(CallerPool()), np.array([7, 1, 4], np.int64)
+    gaussians = _still(params, 1)
+    passes.look(cam, gaussians, [None])
+    tasks = np.array([(0, t) for t in range(int(passes.columns[0] * passes.rows[0]))], np.int32)
+    passes.pool.run(
+        train_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
+        passes.lists, Loss(False, np.float32(0), BACK, False, np.uint64(1)), passes.memory, passes.kept,
+        passes.sums, np.zeros((len(tasks), 3)),
+    )  # fmt: skip
+    slope = np.full((3, 3), 7, np.float32)
+    passes.pool.run(
+        pull, cam, gaussians, some, passes.projected, passes.lists.own_first, passes.lists.own_count,
+        passes.sums, slope,
+    )  # fmt: skip
+    np.testing.assert_allclose(slope, gradient[some, :3], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+def test_single_pixels_are_rendered_as_their_picture_is(lens: Pinhole) -> None:
+    params, pose = _cloud(40, harmonics=4, seed=4), look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))
+    snapshot = SplatSnapshot(BOX, _still(params, 4), BACK, (), CallerPool(), 0)
+    views = [
+        View("a", np.zeros((lens.height, lens.width, 3), np.uint8), pose, lens),
+        View(
+            "b", np.zeros((LENS.height, LENS.width, 3), np.uint8), look_at((2.0, 1.5, 1.0), (0, 0, 0)), LENS
+        ),
+    ]
+    rng, points = np.random.default_rng(1), []
+    for view, count in zip(views, (40, 7)):
+        size = (view.intrinsics.width, view.intrinsics.height)
+        points.append(rng.integers(0, size, (count, 2)) + 0.5)
+    for view, where, color in zip(views, points, snapshot.colors_at(views, points)):
+        whole = snapshot.render(view.camera_to_world, view.intrinsics)
+        x, y = where.astype(int).T
+        np.testing.assert_allclose(color, whole.color[y, x], atol=1e-5)
+        assert np.ptp(color) > 0.2
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e-40])
+def test_no_parameter_poisons_single_pixels(value: float) -> None:
+    pixels, pose = np.array([[0.5, 0.5], [10.5, 9.5], [20.5, 17.5]]), look_at((1.0, -2.5, 0.8), (0, 0, 0.1))
+    for column in range(BASE):
+        params = _cloud(6)
+        params[2, column] = value
+        snapshot = SplatSnapshot(BOX, _still(params, 1), BACK, (), CallerPool(), 0)
+        view = View("a", np.zeros((LENS.height, LENS.width, 3), np.uint8), pose, LENS)
+        assert np.isfinite(snapshot.colors_at([view], [pixels])[0]).all()
+
+
+def test_compared_pixels_are_as_far_off_as_the_rendering_is() -> None:
+    params, cam, target = _cloud(20, seed=4), _camera(), _target()
+    color = _render(params, cam)[0]
+    passes = Passes(CallerPool())
+    columns = -(-LENS.width // TILE)
+    passes.look(cam, _still(params, 1), [None], differentiate=False)
+    tasks = np.array([(0, 0), (0, columns + 1)], np.int32)
+    error = np.full(LENS.width * LENS.height, -1, np.float32)
+    passes.pool.run(
+        compare_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
+        passes.lists, BACK, passes.memory, passes.kept, error,
+    )  # fmt: skip
+    error = error.reshape(LENS.height, LENS.width)
+    wanted = np.abs(color - target / 255.0).max(axis=2)
+    for y, x in ((0, 0), (TILE, TILE)):
+        np.testing.assert_allclose(
+            error[y : y + TILE, x : x + TILE], wanted[y : y + TILE, x : x + TILE], atol=1e-5
+        )
+    assert (error[:TILE, TILE:] == -1).all()
+
+
+@pytest.mark.parametrize("lens", [LENS, BENT])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_verdicts_are_what_pixel_after_pixel_says(lens: Pinhole, channels: int) -> None:
+    rng = np.random.default_rng(channels)
+    eyes = [(1.0, -2.5, 0.8), (2.0, 1.5, 1.0), (0.3, 0.2, 0.1)]  # the last among the Gaussians
+    poses = [look_at(eye, (0.05, 0.0, 0.1)) for eye in eyes]
+    lenses = [lens, LENS, lens]
+    cams = camera_rows(poses, lenses, BOX, [0.0, -0.2, -0.5])
+    sizes = np.array([[q.width, q.height] for q in lenses])
+    first = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
+    pixels = rng.integers(0, 256, (first[-1], channels), dtype=np.uint8)
+    marks = (rng.random(first[-1]) < 0.5).astype(np.uint8)
+    weight = (rng.random(first[-1]) < 0.8).astype(np.float32)
+    data = _views(pixels.reshape(1, -1, channels), weight)._replace(first=first, size=sizes)
+    params, velocity = _cloud(200, seed=3), rng.normal(size=(200, 3)).astype(np.float32)
+    params[7, 0], params[8, BASE - 1] = np.nan, np.inf
+    allowed = rng.uniform(0.1, 0.9, 200).astype(np.float32)
+    found = Verdicts.room(200)
+    CallerPool().run(judge, cams, data, marks, Gaussians(params, 1, velocity), allowed, found)
+    for i in range(200):
+        sees = marked = wrong = 0
+        off = []
+        for k, (pose, q, t) in enumerate(zip(poses, lenses, (0.0, -0.2, -0.5))):
+            local = (params[i, :3] + t * velocity[i] - pose[:3, 3]) @ pose[:3, :3]
+            if not local[2] > 0.05:
+                continue
+            u, v = q.project(local)
+            if not (0 <= u < q.width and 0 <= v < q.height):
+                continue
+            pixel = first[k] + int(v) * q.width + int(u)
+            if weight[pixel] > 0:
+                apart = np.abs(pixels[pixel, :3] / 255.0 - params[i, BASE - 3 : BASE]).max()
+                sees, off = sees + 1, [*off, min(apart, 0.5)]
+                marked += marks[pixel]
+                cut = channels == 4 and pixels[pixel, 3] < 128
+                wrong += marks[pixel] * (apart > allowed[i] or cut)
+        said = (found.sees[i], found.marked[i], found.wrong[i])
+        assert said == (sees, marked, wrong), f"Gaussian {i}"
+        assert found.off[i] == pytest.approx(np.mean(off) if off else 0.0, abs=1e-5)
+    assert found.sees.max() == 3 and 0 < found.wrong.sum() < found.marked.sum() < found.sees.sum()

@@ -1,0 +1,121 @@
+"""Gaussian splatting in plain torch, line by line as the equations are written (Kerbl et al. 2023).
+
+The tests compare the kernels and their gradients with this, in float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
+from edge_server.fields.splat.kernels.project import (
+    ALPHA_LEAST,
+    COLOR,
+    LENS,
+    LIMITS,
+    LOW_PASS,
+    NEAR,
+    OPACITY,
+    ORIGIN,
+    QUATERNION,
+    RAW_OPACITY,
+    SCALE,
+    SCALE_HIGH,
+    SCALE_LOW,
+)
+from edge_server.fields.splat.kernels.rasterize import ALPHA_MOST, STOP
+
+
+@dataclass(frozen=True)
+class Flat:
+    """Projected Gaussians: mean (N, 2) in pixels, covariance (N, 2, 2), alpha (N,), color (N, 3), depth
+    (N,), seen (N,): in front of the near plane."""
+
+    mean: Tensor
+    covariance: Tensor
+    alpha: Tensor
+    color: Tensor
+    depth: Tensor
+    seen: Tensor
+
+
+def rotations(quaternion: Tensor) -> Tensor:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length; the identity for one of none."""
+    norm = quaternion.norm(dim=-1, keepdim=True)
+    none = norm < 1e-10
+    unit = torch.where(none, torch.tensor([1.0, 0, 0, 0]).to(quaternion), quaternion / norm.clamp(min=1e-10))
+    w, x, y, z = unit.unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).view(-1, 3, 3)
+
+
+def distort(lens: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """``Pinhole``'s distortion of normalised coordinates; lens (8,)."""
+    k1, k2, p1, p2 = lens[4:8]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * k2)
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return u, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+def flatten(cam: Tensor, params: Tensor, harmonics: int) -> Flat:
+    """Project Gaussians (N, P) into camera row ``cam`` (see ``kernels.splat_project``)."""
+    view, origin, lens = cam[:ORIGIN].view(3, 3), cam[ORIGIN:LENS], cam[LENS:LIMITS]
+    x, y, z = ((params[:, :3] - origin) @ view.T).unbind(-1)
+    seen = z > cam[NEAR]
+    z = torch.where(seen, z, torch.ones_like(z))
+    a, b = x / z, y / z
+    ta, tb = (
+        a.clamp(float(cam[LIMITS]), float(cam[LIMITS + 1])),
+        b.clamp(float(cam[LIMITS + 2]), float(cam[LIMITS + 3])),
+    )
+    with torch.enable_grad():  # the lens's Jacobian by differentiation, so that the kernel's is checked
+        pa, pb = (ta, tb) if ta.requires_grad else (ta.requires_grad_(True), tb.requires_grad_(True))
+        u, v = distort(lens, pa, pb)
+        dxx, dxy = torch.autograd.grad(u.sum(), (pa, pb), create_graph=True)
+        _, dyy = torch.autograd.grad(v.sum(), (pa, pb), create_graph=True)
+    fx, fy, cx, cy = lens[:4]
+    mean = torch.stack(
+        [fx * (u + dxx * (a - ta) + dxy * (b - tb)) + cx, fy * (v + dxy * (a - ta) + dyy * (b - tb)) + cy], -1
+    )
+    bent = torch.stack([fx * dxx, fx * dxy, fy * dxy, fy * dyy], dim=-1).view(-1, 2, 2)
+    one, none = 1 / z, torch.zeros_like(z)
+    plane = torch.stack([one, none, -ta / z, none, one, -tb / z], dim=-1).view(-1, 2, 3)
+    scale = params[:, SCALE:QUATERNION].clamp(SCALE_LOW, SCALE_HIGH).exp()
+    half = bent @ plane @ view @ rotations(params[:, QUATERNION:OPACITY]) * scale[:, None, :]
+    covariance = half @ half.mT + LOW_PASS * torch.eye(2).to(half)
+    direction = params[:, :3] - origin
+    direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+    shares = params[:, COLOR + 3 :].view(len(params), harmonics - 1, 3)
+    color = params[:, COLOR : COLOR + 3] + (shares * harmonics_of(harmonics, direction)[..., None]).sum(1)
+    alpha = params[:, OPACITY].clamp(-RAW_OPACITY, RAW_OPACITY).sigmoid()
+    return Flat(mean, covariance, alpha, color, z, seen)
+
+
+def composite(flat: Flat, width: int, height: int, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour (H, W, 3), depth (H, W) and opacity (H, W), front to back."""
+    ys, xs = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixel = torch.stack([xs, ys], dim=-1).to(flat.mean) + 0.5
+    light = torch.ones(height, width).to(flat.mean)
+    color, depth = torch.zeros(height, width, 3).to(light), torch.zeros(height, width).to(light)
+    inverse = torch.linalg.inv(flat.covariance)
+    for i in torch.argsort(flat.depth.detach(), stable=True).tolist():
+        if not flat.seen[i]:
+            continue
+        offset = pixel - flat.mean[i]
+        power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, inverse[i], offset)
+        alpha = (flat.alpha[i] * power.exp()).clamp(max=ALPHA_MOST)
+        alpha = torch.where((alpha >= ALPHA_LEAST) & (light >= STOP), alpha, torch.zeros_like(alpha))
+        weight = alpha * light
+        color = color + weight[..., None] * flat.color[i]
+        depth = depth + weight * flat.depth[i]
+        light = light - weight
+    seen = 1 - light
+    return color + light[..., None] * background, depth / seen.clamp(min=1e-3), seen

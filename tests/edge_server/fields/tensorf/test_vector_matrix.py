@@ -1,0 +1,152 @@
+"""Vector-matrix factors: forward and gradients against plain torch and against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from edge_server.fields.tensorf.field import TensorfField, finer
+from edge_server.fields.tensorf.kernels.vector_matrix import (
+    CHANNELS,
+    ROWS,
+    Planes,
+    components,
+    density,
+    regularise,
+    scatter_planes,
+)
+from edge_server.fields.tensorf.settings import TensorfSettings
+
+SETTINGS = TensorfSettings(density_rank=8, color_rank=16, resolution_start=9, resolution=17, first=1.0)
+AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # the plane's two axes and the line's
+
+
+def _planes() -> Planes:
+    planes: Planes = TensorfField(SETTINGS)._encoding
+    return planes
+
+
+def _points(count: int, chunks: int = 2):
+    rng = np.random.default_rng(1)
+    x = rng.random((chunks, 3, count), dtype=np.float32)
+    x[0, :, 0], x[0, :, 1] = 0.0, np.float32(1.0)  # both ends of the cube
+    return x, rng
+
+
+def _oracle(planes: Planes, table: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """Points (N, 3) -> all groups' components (N, groups, 8), by torch's own interpolation."""
+    n, out = planes.size, []
+    at = 2.0 * x - 1.0
+    for g in range(planes.groups):
+        rows = table[g * planes.rows : g * planes.rows + n * (n + 1)]
+        u, v, w = AXES[g % 3]
+        plane = rows[: n * n].reshape(n, n, CHANNELS).permute(2, 0, 1)[None]
+        line = rows[n * n :].T.reshape(1, CHANNELS, n, 1)
+        sample = torch.nn.functional.grid_sample
+        on_plane = sample(plane, at[:, [u, v]][None, :, None], align_corners=True, padding_mode="border")
+        along = torch.stack([torch.zeros_like(at[:, w]), at[:, w]], dim=-1)
+        on_line = sample(line, along[None, :, None], align_corners=True, padding_mode="border")
+        out.append((on_plane * on_line)[0, :, :, 0].T)
+    return torch.stack(out, dim=1)
+
+
+def test_density_and_components_equal_the_oracle() -> None:
+    planes, (x, _) = _planes(), _points(300)
+    raw, acts = np.full(300, np.nan, np.float32), np.full((60, 300), np.nan, np.float32)
+    density(planes, x[0], 0, 300, raw)
+    components(planes, x[0], 0, 300, acts)
+    expected = _oracle(planes, torch.as_tensor(planes.table), torch.as_tensor(x[0].T)).numpy()
+    summed = planes.bias + expected[:, : planes.density_groups].sum(axis=(1, 2))
+    np.testing.assert_allclose(raw, summed, atol=1e-3)
+    rest = expected[:, planes.density_groups :].reshape(300, -1)
+    np.testing.assert_allclose(acts[: rest.shape[1]].T, rest, atol=3e-4)
+    assert np.isnan(acts[rest.shape[1] :]).all(), "rows that are not the factors' were written"
+
+
+def test_a_range_leaves_the_other_samples_alone() -> None:
+    planes, (x, _) = _planes(), _points(64)
+    raw, acts = np.full(64, 7.0, np.float32), np.full((60, 64), 7.0, np.float32)
+    density(planes, x[0], 10, 31, raw)
+    components(planes, x[0], 10, 31, acts)
+    for row in (raw, *acts[:48]):
+        assert (row[:10] == 7.0).all() and (row[31:] == 7.0).all() and not (row[10:31] == 7.0).any()
+
+
+def _gradient(planes: Planes, x, d, counts):
+    gradient = np.zeros_like(planes.table)
+    dirty = np.zeros(len(planes.table) // ROWS, np.bool_)
+    scatter_planes(np.zeros(1, np.int64), 0, planes, x, d, counts, gradient, dirty)
+    return gradient, dirty
+
+
+def _loss(planes: Planes, table: torch.Tensor, x, d, counts) -> torch.Tensor:
+    total = torch.zeros((), dtype=table.dtype)
+    colors = (planes.groups - planes.density_groups) * CHANNELS
+    for c, n in enumerate(counts):
+        found = _oracle(planes, table, torch.as_tensor(x[c, :, :n].T, dtype=table.dtype))
+        wanted = torch.as_tensor(d[c, :, :n].T, dtype=table.dtype)
+        total = total + (found[:, planes.density_groups :].reshape(n, colors) * wanted[:, :colors]).sum()
+        total = total + (found[:, : planes.density_groups].sum(dim=(1, 2)) * wanted[:, colors]).sum()
+    return total
+
+
+def test_gradient_equals_the_oracle() -> None:
+    planes, (x, rng) = _planes(), _points(100)
+    d = rng.normal(size=(2, 49, 100)).astype(np.float32)
+    d[:, :, 5:9] = 0.0  # samples that nothing depends on
+    x *= np.float32(0.4)  # most of space is left alone
+    counts = np.array([100, 37])
+    gradient, dirty = _gradient(planes, x, d, counts)
+    table = torch.as_tensor(planes.table).requires_grad_(True)
+    _loss(planes, table, x, d, counts).backward()
+    assert table.grad is not None
+    np.testing.assert_allclose(gradient, table.grad.numpy(), atol=2e-3)
+    touched = (gradient.reshape(len(dirty), -1) != 0).any(axis=1)
+    assert (dirty >= touched).all() and not dirty.all()
+
+
+def test_gradient_equals_finite_differences() -> None:
+    planes, (x, rng) = _planes(), _points(20)
+    d, counts = rng.normal(size=(2, 49, 20)).astype(np.float32), np.array([20, 20])
+    gradient, _ = _gradient(planes, x, d, counts)
+    table = torch.as_tensor(planes.table, dtype=torch.float64)
+    for row, column in [tuple(at) for at in np.argwhere(gradient != 0)[::97]]:
+        step = torch.zeros_like(table)
+        step[row, column] = 1e-4
+        slope = _loss(planes, table + step, x, d, counts) - _loss(planes, table - step, x, d, counts)
+        assert slope.item() / 2e-4 == pytest.approx(gradient[row, column], rel=1e-3, abs=1e-4)
+
+
+def test_regularisers_equal_the_oracle_where_something_is_dirty() -> None:
+    planes = _planes()
+    table = torch.as_tensor(planes.table).requires_grad_(True)
+    n, total = planes.size, torch.zeros(())
+    for g in range(planes.groups):
+        rows = table[g * planes.rows : g * planes.rows + n * (n + 1)]
+        plane = rows[: n * n].reshape(n, n, CHANNELS)
+        total = total + 0.05 * (plane.diff(dim=0).square().sum() + plane.diff(dim=1).square().sum())
+        if g < planes.density_groups:
+            total = total + 0.03 * rows.abs().sum()
+    total.backward()
+    assert table.grad is not None
+    gradient, dirty = np.zeros_like(planes.table), np.zeros(len(planes.table) // ROWS, np.bool_)
+    dirty[::3] = True
+    regularise(np.zeros(1, np.int64), 0, planes, np.float32(0.1), np.float32(0.03), gradient, dirty)
+    expected = np.where(np.repeat(dirty, ROWS)[:, None], table.grad.numpy(), 0.0)
+    np.testing.assert_allclose(gradient, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("new", [17, 31])
+def test_finer_planes_say_the_same(new: int) -> None:
+    """Exactly at 2 n - 1 vertices a side; nearly, otherwise."""
+    planes, (x, _) = _planes(), _points(200)
+    table = finer(planes.table, planes.groups, planes.size, new)
+    fine = planes._replace(size=new, rows=len(table) // planes.groups, table=table)
+    points = torch.as_tensor(x[0].T)
+    before = _oracle(planes, torch.as_tensor(planes.table), points).numpy()
+    after = _oracle(fine, torch.as_tensor(table), points).numpy()
+    if new == 17:
+        np.testing.assert_allclose(after, before, atol=1e-4)
+    else:
+        assert np.corrcoef(before.ravel(), after.ravel())[0, 1] > 0.95

@@ -1,0 +1,117 @@
+"""What is the voxel field's own; ``test_every_representation`` has the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget, View
+from edge_server.fields.registry import make_field
+from edge_server.fields.voxel.field import VoxelField
+from edge_server.fields.voxel.settings import EFFORTS, help_text, make_settings
+from tests.edge_server.fields.scenes import mean_psnr, psnr
+from tests.edge_server.fields.small import HELD, SEEN, same_state
+from tests.edge_server.fields.small import VOXEL as SMALL
+
+
+def test_a_long_fit_is_no_worse_than_a_short_one() -> None:
+    few, others = SEEN[::2], SEEN[1::2]  # few views are soon known by heart
+    gains = []
+    for settle in (SMALL.settle, 0.0):
+        short, long = (VoxelField(replace(SMALL, settle=settle, diffuse=0.0)) for _ in range(2))
+        short.fit(few, Budget(steps=150))
+        long.fit(few, Budget(steps=1200))
+        gains.append(mean_psnr(long, others) - mean_psnr(short, others))
+    assert gains[0] > -0.25 and gains[1] < -0.5
+
+
+def test_a_diffused_grid_repeats_itself_and_shows_better_what_it_has_not_seen() -> None:
+    few, others = SEEN[::2], SEEN[1::2]
+    fields = [VoxelField(replace(SMALL, threads=n, diffuse=s)) for n, s in ((1, 1.0), (3, 1.0), (2, 0.0))]
+    for field in fields:
+        field.fit(few, Budget(steps=400))
+    same_state(fields[0], fields[1])
+    assert mean_psnr(fields[0], others) > mean_psnr(fields[2], others) + 0.3
+
+
+def test_diffusion_counts_the_less_the_more_places_were_seen_from() -> None:
+    def fitted(views: list[View], **changed: Any) -> VoxelField:
+        field = VoxelField(replace(SMALL, **changed))
+        field.fit(views, Budget(steps=40))
+        return field
+
+    same_state(fitted(SEEN, diffuse_views=len(SEEN) // 2), fitted(SEEN, diffuse=0.5))
+    twice = [*SEEN, *(replace(view, camera=f"{view.camera}, beside itself") for view in SEEN)]
+    assert len(twice) == 24 and len({tuple(view.camera_to_world[:3, 3]) for view in twice}) == 12
+    same_state(fitted(twice, diffuse_views=12), fitted(twice, diffuse_views=1000))
+    with pytest.raises(AssertionError):
+        same_state(fitted(SEEN, diffuse_views=11), fitted(SEEN))
+
+
+def test_upsampling_hardly_changes_the_picture() -> None:
+    field = VoxelField(replace(SMALL, sizes=(32, 48), refine_at=(60,)))
+    field.fit(SEEN, Budget(steps=60))
+    before, table = field.render(HELD.camera_to_world, HELD.intrinsics).color, field._voxels.table
+    field._grow(60)
+    field._snapshot = None
+    after = field.render(HELD.camera_to_world, HELD.intrinsics).color
+    assert field._voxels.size == 48 and len(field._voxels.table) > len(table)
+    assert psnr(before, after) > 26.0
+
+
+def test_a_state_of_another_shape_is_refused() -> None:
+    state = VoxelField(SMALL).state()
+    with pytest.raises(ValueError, match=r"sizes = \[16, 32, 48\]"):
+        VoxelField(replace(SMALL, sizes=(16, 32, 64))).load_state(state)
+    with pytest.raises(ValueError, match="not a state"):
+        VoxelField(SMALL).load_state({"table": state["table"]})
+
+
+def test_the_grid_is_as_fine_as_pixels_where_no_size_is_set() -> None:
+    field = VoxelField(replace(SMALL, sizes=None, refine_at=(3, 6)))
+    field.fit(SEEN, Budget(steps=8))
+    assert field.rig.box is not None
+    last = np.clip(field.rig.box.pixels_across, 64, 192)
+    assert 0 <= field._voxels.size - last < 32 and field._sizes[0] < field._sizes[1] < field._sizes[2]
+    other = VoxelField(field.settings)
+    other.load_state(field.state())
+    same_state(field, other)
+
+
+def test_a_plain_background_is_known_to_be_empty_in_spite_of_noise() -> None:
+    rng = np.random.default_rng(0)
+    noise = [np.rint(rng.normal(0.0, 1.5, v.image.shape)) for v in SEEN]
+    noisy = [replace(v, image=np.clip(v.image + n, 0, 255).astype(np.uint8)) for v, n in zip(SEEN, noise)]
+    field = VoxelField(SMALL)
+    field.fit(noisy, Budget(steps=2))
+    assert field._outlines is not None
+    alpha = field._outlines[1].pixels[:, 3]
+    sky = np.concatenate([(v.image == v.image[0, 0]).all(axis=-1).ravel() for v in SEEN])
+    assert alpha[sky].mean() < 1.0 and alpha[~sky].mean() > 250.0
+    without = VoxelField(replace(SMALL, outline=0.0))
+    without.fit(noisy, Budget(steps=2))
+    assert without._outlines is not None and without._outlines[1].pixels.shape[1] == 3
+
+
+def test_it_is_registered_and_its_options_are_checked() -> None:
+    field = make_field("voxel", {"sizes": [16, 24], "refine_at": [10]}, seed=5)
+    assert isinstance(field, VoxelField) and field.settings.sizes == (16, 24) and field.settings.seed == 5
+    for wrong, text in (
+        ({"levels": 3}, r"no option levels; it has: effort, sizes, .*nice"),
+        ({"hidden": 16}, "no option hidden; it has"),
+        ({"sizes": [32, 16]}, "sizes must be rising"),
+        ({"sizes": [32, 48], "refine_at": [9, 12]}, "refine_at must be 1 rising"),
+        ({"refine_at": [9, 9]}, "refine_at must be rising"),
+        ({"parts": 0}, "parts must be in 1..64, not 0"),
+        ({"device": "cuda"}, "CPUs only"),
+        ({"effort": "heroic"}, "low, medium, high"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            make_field("voxel", wrong)
+    assert all(len(text) > 10 for text in help_text().values())
+    assert make_settings({"effort": "low"}).sizes == EFFORTS["low"]["sizes"]
+    for effort in EFFORTS:
+        make_settings({"effort": effort})

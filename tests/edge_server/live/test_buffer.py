@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import threading
+
+from edge_server.live.buffer import FrameBuffer
+from tests.edge_server.frames import frame
+
+MS = 1_000_000
+
+
+def test_age_is_now_minus_generation_on_the_edges_clock():
+    buffer = FrameBuffer(["cam01", "cam02"])
+    buffer.put(frame(generated_ns=100 * MS, clock_offset_ns=-20 * MS), received_ns=150 * MS)
+    assert buffer.ages_ms(200 * MS) == {"cam01": 120.0, "cam02": None}
+
+
+def test_a_late_older_frame_never_becomes_newest():
+    buffer = FrameBuffer(["cam01"])
+    buffer.put(frame(sequence=2, generated_ns=60 * MS), 70 * MS)
+    buffer.put(frame(sequence=1, generated_ns=30 * MS), 90 * MS)
+    assert buffer.newest()["cam01"].frame.sequence == 2
+    assert (buffer.stale_on_arrival, buffer.arrivals) == (1, 2)
+
+
+def test_a_frame_from_the_future_gives_way_to_any():
+    buffer = FrameBuffer(["cam01"])
+    buffer.put(frame(sequence=1, generated_ns=1300 * MS), 100 * MS)
+    assert buffer.ages_ms(100 * MS) == {"cam01": -1200.0}
+    buffer.put(frame(sequence=2, generated_ns=120 * MS), 150 * MS)
+    assert buffer.newest()["cam01"].frame.sequence == 2
+    assert buffer.ages_ms(150 * MS) == {"cam01": 30.0} and buffer.stale_on_arrival == 0
+
+
+def test_a_frame_ahead_within_the_tolerance_is_still_the_newest():
+    buffer = FrameBuffer(["cam01"])
+    buffer.put(frame(sequence=2, generated_ns=400 * MS), 150 * MS)
+    buffer.put(frame(sequence=1, generated_ns=120 * MS), 150 * MS)
+    assert buffer.newest()["cam01"].frame.sequence == 2 and buffer.stale_on_arrival == 1
+
+
+def test_memory_is_one_frame_a_camera():
+    buffer = FrameBuffer(["cam01", "cam02"])
+    for i in range(1000):
+        buffer.put(frame(sequence=i, generated_ns=i * MS), i * MS)
+    assert len(buffer.newest()) == 1
+    assert buffer.newest()["cam01"].frame.sequence == 999
+
+
+def test_the_frame_before_is_kept_only_where_it_is_asked_for():
+    buffer = FrameBuffer(["cam01", "cam02"])
+    buffer.put(frame(sequence=0, generated_ns=0), 0)
+    buffer.put(frame(sequence=1, generated_ns=30 * MS), 40 * MS)
+    assert buffer.newest_and_earlier() == (buffer.newest(), {})
+    buffer.keep_earlier(True)
+    assert buffer.newest_and_earlier()[1] == {}, "what was not kept is gone"
+    for i in range(2, 500):
+        buffer.put(frame(sequence=i, generated_ns=30 * i * MS), 30 * i * MS)
+    newest, earlier = buffer.newest_and_earlier()
+    assert newest["cam01"].frame.sequence == 499 and earlier["cam01"].frame.sequence == 498
+    assert len(earlier) == 1
+    buffer.keep_earlier(False)
+    assert buffer.newest_and_earlier()[1] == {}
+
+
+def test_a_frame_that_was_overtaken_is_the_one_before():
+    buffer = FrameBuffer(["cam01"])
+    buffer.keep_earlier(True)
+    for sequence, generated_ms in ((1, 30), (3, 90), (2, 60), (0, 0), (2, 60), (3, 90)):
+        buffer.put(frame(sequence=sequence, generated_ns=generated_ms * MS), 100 * MS)
+    newest, earlier = buffer.newest_and_earlier()
+    assert (newest["cam01"].frame.sequence, earlier["cam01"].frame.sequence) == (3, 2)
+
+
+def test_a_frame_from_the_future_is_no_frame_before():
+    buffer = FrameBuffer(["cam01"])
+    buffer.keep_earlier(True)
+    buffer.put(frame(sequence=1, generated_ns=1300 * MS), 100 * MS)
+    buffer.put(frame(sequence=2, generated_ns=120 * MS), 150 * MS)
+    assert buffer.newest_and_earlier()[1] == {}
+    buffer.put(frame(sequence=3, generated_ns=150 * MS), 180 * MS)
+    assert buffer.newest_and_earlier()[1]["cam01"].frame.sequence == 2
+
+
+def test_order_is_the_cameras_not_the_arrivals():
+    buffer = FrameBuffer(["b", "a"])
+    buffer.put(frame("a"), 0)
+    buffer.put(frame("b"), 0)
+    assert list(buffer.newest()) == ["b", "a"]
+
+
+def test_wait_returns_on_arrival_and_on_timeout():
+    buffer = FrameBuffer(["cam01"])
+    assert buffer.wait(0, 0.01) == 0
+    threading.Timer(0.05, lambda: buffer.put(frame(), 0)).start()
+    assert buffer.wait(0, 5.0) == 1

@@ -1,0 +1,135 @@
+"""Every refusal at the edge's door: named, counted, and without harm to what comes after it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.ingest import Gate, Ingest, Recent
+from freshfield.clock import VirtualClock
+from freshfield.frame import FrameRejected, to_request
+from freshfield.ledger import Ledger, read
+from freshfield.v1 import frames_pb2 as pb
+from tests.edge_server.frames import frame
+
+NOW = 10**18
+MS = 1_000_000
+
+
+@pytest.fixture
+def ingest(tmp_path):
+    clock = VirtualClock(NOW)
+    held = []
+    ledger = Ledger(tmp_path, "edge", "edge", NOW)
+    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, lambda f, t: held.append(f))
+    made.test_clock, made.test_held, made.test_ledger = clock, held, ledger
+    yield made
+    ledger.close(NOW)
+
+
+def good(sequence: int = 0, **other):
+    return frame(sequence=sequence, generated_ns=NOW - 50 * MS + sequence, **other)
+
+
+def test_an_accepted_frame_is_buffered_and_written_down(ingest):
+    answer = ingest.take(to_request(good()))
+    assert (answer.outcome, answer.sequence) == (pb.OUTCOME_ACCEPTED, 0)
+    assert ingest._buffer.ages_ms(NOW)["cam01"] == pytest.approx(50.0)
+    (event,) = read(ingest.test_ledger.path).events
+    assert (event.event, event.camera, event.sequence) == ("delivered", "cam01", 0)
+
+
+def test_held_out_frames_never_reach_the_training_buffer(ingest):
+    answer = ingest.take(to_request(good(camera="cam00", held_out=True)))
+    assert answer.outcome == pb.OUTCOME_ACCEPTED
+    assert [f.camera for f in ingest.test_held] == ["cam00"]
+    assert ingest._buffer.newest() == {}
+
+
+def bad(kind: str) -> pb.PushRequest:
+    base = good(sequence=5)
+    if kind == "crc_mismatch":
+        request = to_request(base)
+        damaged = bytearray(request.payload)
+        damaged[len(damaged) // 2] ^= 1
+        request.payload = bytes(damaged)
+        return request
+    if kind == "bad_pose":
+        request = to_request(base)
+        request.header.pose.qw = 7.0
+        from freshfield.frame import checksum
+
+        request.crc32c = checksum(request.header, request.payload)
+        return request
+    changes = {
+        "unknown_camera": {"camera": "cam77"},
+        "wrong_role": {"held_out": True},
+        "bad_id": {"camera": "../../etc"},
+        "from_future": {"generated_ns": NOW + 3600 * 10**9},
+        "too_old": {"generated_ns": NOW - 2 * 3600 * 10**9},
+        "size_mismatch": {"intrinsics": dataclasses.replace(base.intrinsics, width=64)},
+        "bad_payload": {"payload": b"not an image"},
+        "bad_intrinsics": {"intrinsics": dataclasses.replace(base.intrinsics, fx=float("nan"))},
+    }[kind]
+    return to_request(dataclasses.replace(base, **changes))
+
+
+KINDS = ["crc_mismatch", "bad_pose", "unknown_camera", "wrong_role", "bad_id", "from_future", "too_old",
+         "size_mismatch", "bad_payload", "bad_intrinsics"]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_refusal_is_named_counted_and_loses_nothing_else(ingest, kind):
+    answer = ingest.take(bad(kind))
+    assert (answer.outcome, answer.reason) == (pb.OUTCOME_REJECTED, kind)
+    assert answer.detail
+    assert ingest.rejected == {kind: 1}
+    # The very next frame, with a sequence below the refused one's, is welcome.
+    assert ingest.take(to_request(good(sequence=1))).outcome == pb.OUTCOME_ACCEPTED
+    events = [e.event for e in read(ingest.test_ledger.path).events]
+    assert events == ["rejected", "delivered"]
+
+
+def test_replay_and_reversed_time_are_refused_within_a_session_only():
+    gate = Gate(["cam01"], [])
+    gate.admit(good(sequence=3), NOW)
+    with pytest.raises(FrameRejected) as replay:
+        gate.admit(good(sequence=3), NOW)
+    assert replay.value.reason == "replayed_sequence"
+    with pytest.raises(FrameRejected) as reversed_time:
+        gate.admit(frame(sequence=4, generated_ns=NOW - 90 * MS), NOW)
+    assert reversed_time.value.reason == "time_reversed"
+    gate.admit(good(sequence=0, session="s2"), NOW)
+
+
+def test_a_thousand_sessions_do_not_grow_the_gate():
+    gate = Gate(["cam01"], [])
+    for i in range(1000):
+        gate.admit(good(session=f"s{i}"), NOW)
+    assert len(gate._sessions["cam01"]) <= 64
+
+
+def test_an_uncertain_clock_is_given_its_uncertainty():
+    ahead = frame(generated_ns=NOW + 400 * MS, clock_uncertainty_ns=200 * MS)
+    Gate(["cam01"], []).admit(ahead, NOW)
+    with pytest.raises(FrameRejected):
+        Gate(["cam01"], []).admit(dataclasses.replace(ahead, clock_uncertainty_ns=0), NOW)
+
+
+def test_an_unknown_clock_cannot_bring_a_frame_from_tomorrow():
+    tomorrow = frame(generated_ns=NOW + 2 * 10**9, clock_uncertainty_ns=3600 * 10**9)
+    with pytest.raises(FrameRejected) as refused:
+        Gate(["cam01"], []).admit(tomorrow, NOW)
+    assert refused.value.reason == "from_future"
+
+
+def test_recent_percentiles_match_numpy_over_the_window():
+    recent = Recent(100)
+    assert recent.percentile(50) is None
+    values = np.random.default_rng(0).random(250)
+    for value in values:
+        recent.add(value)
+    assert recent.percentile(50) == pytest.approx(np.sort(values[-100:])[50])

@@ -1,0 +1,192 @@
+"""The update loop: decisions in virtual time, and the same code as a thread on the wall clock."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget
+from edge_server.live.buffer import FrameBuffer
+from edge_server.live.loop import Loop, Updates
+from edge_server.live.update_budget import Fixed
+from edge_server.scheduler import make_policy
+from freshfield.clock import WallClock
+from tests.edge_server.fields_for_tests import tiny_field
+from tests.edge_server.frames import frame
+
+MS = 1_000_000
+
+
+def updates(policy="all", value=None, cameras=("cam01", "cam02")) -> Updates:
+    made = make_policy(policy, value, np.random.default_rng(0))
+    return Updates(FrameBuffer(cameras), made, tiny_field(), start_ns=0)
+
+
+def test_an_update_in_virtual_time_is_charged_to_the_ages():
+    u = updates()
+    u.buffer.put(frame("cam01", generated_ns=100 * MS), 120 * MS)
+    u.buffer.put(frame("cam02", generated_ns=140 * MS), 150 * MS)
+    selection = u.select(u.plan(200 * MS), 200 * MS)
+    views, report = u.fit(selection, Budget(steps=2))
+    done = u.publication(selection, views, report, published_ns=500 * MS)
+    assert done.selected == ("cam01", "cam02")
+    # Fitting took 300 ms of virtual time, and the scene aged with it.
+    assert done.ages_ms == (400.0, 360.0)
+    assert (done.aaoi_ms, done.update_ms, done.t_s, done.steps) == (380.0, 300.0, 0.5, 2)
+    assert u.number == 1
+
+
+def test_wait_selects_nothing_before_its_horizon_and_goes_on_until_something_qualifies():
+    u = updates("wait", 60)
+    u.buffer.put(frame("cam01", generated_ns=90 * MS), 95 * MS)
+    plan = u.plan(100 * MS)
+    assert u.select(plan, 159 * MS) is None
+    assert u.select(plan, 160 * MS) is None  # the horizon is over, but nothing was generated in it
+    u.buffer.put(frame("cam01", sequence=1, generated_ns=170 * MS), 180 * MS)
+    assert [i.frame.sequence for i in u.select(plan, 180 * MS).items] == [1]
+
+
+def test_a_treatment_sees_the_frame_before_and_what_was_delivered_is_handed_on():
+    u = updates("freshen")
+    for k in range(2):
+        for camera in ("cam01", "cam02"):
+            image = frame(camera, sequence=5 * k, generated_ns=(60 * k + 1) * MS)
+            u.buffer.put(image, (60 * k + 10) * MS)
+    fed = []
+    fit = u.field.fit
+    u.field.fit = lambda views, budget: fed.extend(views) or fit(views, budget)
+    views, _ = u.fit(u.select(u.plan(120 * MS), 120 * MS), Budget(steps=1))
+    assert [v.carried_to_ns for v in views] == [None, None] and all(v.weight is None for v in views)
+    assert [v.carried_to_ns for v in fed] == [120 * MS, 120 * MS]
+    assert u.treatment_cost.views == 2 and u.treatment_cost.ms_per_view > 0
+
+
+def test_a_policy_without_treatment_gives_the_memory_back():
+    u = updates("all")
+    u.policy = make_policy("mask", None, np.random.default_rng(0))
+    for k in range(3):
+        u.buffer.put(frame("cam01", sequence=k, generated_ns=30 * k * MS), 30 * k * MS)
+        u.fit(u.select(u.plan(99 * MS), 99 * MS), Budget(steps=1))
+    assert u.buffer.newest_and_earlier()[1] and u.decoder._earlier
+    u.policy = make_policy("all", None, np.random.default_rng(0))
+    assert not u.buffer.newest_and_earlier()[1] and not u.decoder._earlier
+    assert u.select(u.plan(99 * MS), 99 * MS).earlier == ()
+
+
+def test_an_empty_buffer_selects_nothing():
+    u = updates()
+    assert u.select(u.plan(5), 5) is None
+
+
+class Running:
+    """A loop on the wall clock, with what it published and said."""
+
+    def __init__(self, u: Updates, grace_ms: float = 0.0, pacing=None) -> None:
+        self.published, self.lines, self.saved = [], [], []
+        self.clock = WallClock()
+        self.loop = Loop(
+            u, self.clock, pacing or Fixed(100.0), grace_ms,
+            lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append,
+        )  # fmt: skip
+
+    def until(self, condition, seconds: float = 60.0) -> None:
+        deadline = time.perf_counter() + seconds
+        while not condition():
+            assert time.perf_counter() < deadline, f"never happened; the loop said {self.lines[-3:]}"
+            assert self.loop.failure is None
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def running():
+    made: list[Running] = []
+
+    def start(u: Updates, **options) -> Running:
+        run = Running(u, **options)
+        made.append(run)
+        run.loop.start()
+        return run
+
+    yield start
+    for run in made:
+        run.loop.stop()
+        assert not run.loop.alive
+
+
+def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tmp_path):
+    u = updates()
+    run = running(u, grace_ms=50.0)
+    now = run.clock.now_ns()
+    u.buffer.put(frame("cam01", generated_ns=now), now)
+    run.until(lambda: len(run.published) >= 2)
+    publication, renderer = run.published[0]
+    assert publication.selected == ("cam01",)
+    shown = renderer.render(np.eye(4), frame().intrinsics)
+    assert np.isfinite(shown.color).all()
+
+    run.loop.paused = True
+    run.until(lambda: run.lines[-1] == "paused")
+    count = len(run.published)
+    time.sleep(0.4)
+    assert len(run.published) == count
+    run.loop.use_policy(make_policy("threshold", 0.0, np.random.default_rng(0)))
+    run.loop.request_reset()
+    future = run.loop.request_checkpoint(tmp_path / "field.npz")
+    run.loop.paused = False
+    assert future.result(30) == tmp_path / "field.npz"
+    assert run.saved == [tmp_path / "field.npz"]
+    run.until(lambda: len(run.published) > count)
+    assert run.published[-1][0].omega_ms == 0.0
+
+
+def test_an_update_without_time_to_learn_is_told_once_and_again_if_it_comes_back(running, caplog):
+    class Changing:
+        """No time at all, then some, then none again."""
+
+        def __init__(self):
+            self.updates = 0
+
+        def budget(self):
+            return Budget(steps=1) if self.updates == 4 else Budget(seconds=1e-6)
+
+        def done(self, budget, update_ms):
+            self.updates += 1
+
+    u = updates()
+    now = WallClock().now_ns()
+    u.buffer.put(frame("cam01", generated_ns=now), now)
+    run = running(u, pacing=Changing())
+    run.until(lambda: len(run.published) >= 8)
+    run.loop.stop()
+    assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]
+    told = [record.message for record in caplog.records if "made no step" in record.message]
+    assert len(told) == 2 and "edge.update_ms" in told[0]
+
+
+def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):
+    u = updates()
+    run = running(u, grace_ms=100.0)
+    now = run.clock.now_ns()
+    threading.Timer(0.2, lambda: u.buffer.put(frame("cam02", generated_ns=now), now)).start()
+    run.until(lambda: run.published)
+    assert run.published[0][0].selected == ("cam02",)
+    assert any("1 of 2" in line for line in run.lines)
+
+
+def test_a_failing_field_ends_the_loop_and_is_not_hidden():
+    u = updates()
+
+    def broken(views, budget):
+        raise RuntimeError("no memory")
+
+    u.field.fit = broken
+    run = Running(u)
+    now = run.clock.now_ns()
+    u.buffer.put(frame("cam01", generated_ns=now), now)
+    u.buffer.put(frame("cam02", generated_ns=now), now)
+    run.loop.start()
+    run.loop._thread.join(60)
+    assert isinstance(run.loop.failure, RuntimeError)

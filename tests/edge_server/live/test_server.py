@@ -1,0 +1,220 @@
+"""A whole edge server in one process: real gRPC, a real (small) field, real scores."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import urllib.request
+
+import grpc
+import numpy as np
+import pytest
+
+from edge_server.config import read_config
+from edge_server.fields import checkpoint
+from edge_server.live.server import EdgeServer, Options
+from freshfield import frame as wire
+from freshfield import payload, scenario
+from freshfield.geometry import Pose, look_at
+from freshfield.ledger import read_all
+from freshfield.transport import Transport
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2_grpc
+from tests.edge_server.fields_for_tests import TINY
+from tests.edge_server.frames import CAMERA
+from tests.ports import free_port
+
+
+def tiny_scenario(tmp_path, held_out=("cam00",)):
+    data = {
+        "name": "tiny",
+        "seed": 3,
+        "cameras": {"count": 3, "held_out": list(held_out)},
+        "edge": {"field_options": TINY, "update_ms": 100, "grace_ms": 500, "lpips": "none"},
+    }
+    return scenario.parse(data, tmp_path / "tiny.yaml")
+
+
+class Feed(threading.Thread):
+    """Streams real frames of every camera, one unacknowledged at a time, until stopped."""
+
+    def __init__(self, port: int, cameras, held_out, transport: Transport | None = None) -> None:
+        super().__init__(daemon=True)
+        self.cameras, self.held_out = cameras, held_out
+        self.transport = transport or Transport()
+        self.channel = self.transport.channel(f"127.0.0.1:{port}")
+        self.done = threading.Event()
+        self.answers = []
+
+    def frames(self):
+        angle = {c: 0.5 * i for i, c in enumerate(self.cameras)}
+        for sequence in range(10**6):
+            for camera in self.cameras:
+                if self.done.wait(0.01):
+                    return
+                eye = [2 * np.cos(angle[camera]), 2 * np.sin(angle[camera]), 0.5]
+                image = np.full((24, 32, 3), 90, np.uint8)
+                image[6:18, 10:22] = (200, 40 + sequence % 100, 30)
+                yield wire.to_request(
+                    wire.Frame(
+                        camera, "s", sequence, time.time_ns(), Pose.from_matrix(look_at(eye, [0, 0, 0])),
+                        CAMERA, "jpeg", payload.encode(image), held_out=camera in self.held_out,
+                    )
+                )  # fmt: skip
+
+    def run(self) -> None:
+        stub = frames_pb2_grpc.FrameStreamServiceStub(self.channel)
+        try:
+            for answer in stub.Push(self.frames(), metadata=self.transport.metadata(), wait_for_ready=True):
+                self.answers.append(answer)
+        except grpc.RpcError as error:
+            self.error = error
+
+    def stop(self) -> None:
+        self.done.set()
+        self.join(5)
+        self.channel.close()
+
+
+@pytest.fixture
+def serve(tmp_path):
+    started = []
+
+    def start(made=None, **options):
+        made = made or tiny_scenario(tmp_path)
+        port = free_port()
+        server = EdgeServer(
+            made, read_config(made), Options(f"127.0.0.1:{port}", tmp_path / "out", **options)
+        )
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        started.append((server, thread))
+        return server, port, thread
+
+    yield start
+    for server, thread in started:
+        server.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+
+
+def until(condition, seconds=60.0):
+    deadline = time.perf_counter() + seconds
+    while not condition():
+        assert time.perf_counter() < deadline, "it never happened"
+        time.sleep(0.05)
+
+
+def test_a_run_from_first_frame_to_files(serve, tmp_path):
+    server, port, thread = serve(metrics_port=(metrics := free_port()))
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    until(lambda: any(p.psnr_db is not None for p in server.state.publications()))
+    until(lambda: server.scoring.baselines)  # they come after the first score
+    with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics") as page:
+        text = page.read().decode()
+    assert 'freshfield_camera_age_seconds{camera="cam01"}' in text
+    assert "freshfield_psnr_db" in text and "freshfield_updates_total" in text
+    feed.stop()
+    server.stop()
+    thread.join(20)
+    out = tmp_path / "out"
+    series = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    scored = [s for s in series if s["psnr_db"] is not None]
+    assert scored and all(abs(s["truth_gap_ms"]) < 100 for s in scored)
+    assert {c for s in series for c in s["selected"]} == {"cam01", "cam02"}  # never the held-out one
+    status = json.loads((out / "edge.json").read_text())
+    assert status["updates"]["count"] == len(series)
+    assert status["baseline"]["mean_colour_db"] > 5
+    assert (out / "truth.png").exists() and (out / "rendered.png").exists()
+    (ledger,) = read_all(out)
+    delivered = [e for e in ledger.events if e.event == "delivered"]
+    assert ledger.closed and len(delivered) == len(feed.answers)
+
+    # And it goes on from there.
+    _, about = checkpoint.load(out / "field.npz")
+    assert about["updates"] == len(series)
+    again, _, _ = serve(resume=out / "field.npz")
+    assert again.field.step > 0 and again.updates.number == len(series)
+    fresh, _, _ = serve()
+    assert fresh.updates.number == 0
+    kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
+    assert kept[: len(series)] == series  # what the first process wrote is still there
+
+
+def test_operators_see_and_change_a_running_server(serve, tmp_path):
+    server, port, _ = serve()
+    channel = Transport().channel(f"127.0.0.1:{port}")
+    grpc.channel_ready_future(channel).result(30)
+    edge = edge_pb2_grpc.EdgeServiceStub(channel)
+    with pytest.raises(grpc.RpcError) as early:
+        edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest())
+    assert early.value.code() == grpc.StatusCode.FAILED_PRECONDITION
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    decisions = edge.WatchDecisions(edge_pb2.WatchDecisionsRequest())
+    first = next(decisions).decision
+    assert set(first.selected) <= {"cam01", "cam02"} and first.published_ns > first.decided_ns
+    status = edge.GetStatus(edge_pb2.GetStatusRequest())
+    assert [c.camera_id for c in status.cameras if c.held_out] == ["cam00"]
+    changed = edge.SetPolicy(edge_pb2.SetPolicyRequest(name="threshold", value=77.0))
+    assert (changed.name, changed.value) == ("threshold", 77.0)
+    until(lambda: server.state.publications()[-1].omega_ms == 77.0)
+    with pytest.raises(grpc.RpcError) as unknown:
+        edge.SetPolicy(edge_pb2.SetPolicyRequest(name="best"))
+    assert unknown.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert "freshest-k" in unknown.value.details()
+    path = edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path
+    assert checkpoint.load(path)[0]
+    edge.ResetField(edge_pb2.ResetFieldRequest())
+    until(lambda: not server.state.controls.reset_requested)
+    clock = clock_pb2_grpc.ClockServiceStub(channel)
+    answer = clock.Exchange(clock_pb2.ExchangeRequest(client_sent_ns=5))
+    assert answer.client_sent_ns == 5
+    assert answer.server_sent_ns >= answer.server_received_ns
+    decisions.cancel()
+    feed.stop()
+    channel.close()
+
+
+def test_without_a_held_out_camera_the_selected_views_are_scored_and_it_says_so(serve, tmp_path):
+    server, port, _ = serve(tiny_scenario(tmp_path, held_out=()))
+    feed = Feed(port, server.scenario.cameras, ())
+    feed.start()
+    until(lambda: any(p.scored_on == "selected" for p in server.state.publications()))
+    feed.stop()
+
+
+def test_a_token_is_demanded_and_honoured(serve, tmp_path):
+    server, port, _ = serve(transport=Transport(token="open sesame"))
+    refused = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    refused.start()
+    refused.join(20)
+    assert refused.error.code() == grpc.StatusCode.UNAUTHENTICATED
+    welcome = Feed(port, server.scenario.cameras, server.scenario.held_out, Transport(token="open sesame"))
+    welcome.start()
+    until(lambda: len(welcome.answers) > 3)
+    welcome.stop()
+
+
+def test_a_taken_port_is_one_clear_error(serve, tmp_path):
+    _, port, _ = serve()
+    grpc.channel_ready_future(Transport().channel(f"127.0.0.1:{port}")).result(30)
+    made = tiny_scenario(tmp_path)
+    second = EdgeServer(made, read_config(made), Options(f"127.0.0.1:{port}", tmp_path / "second"))
+    with pytest.raises(ValueError, match="cannot listen"):
+        second.run()
+
+
+def test_the_ledger_is_closed_even_if_nothing_else_can_be_written(serve, tmp_path):
+    server, port, thread = serve()
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    until(lambda: server.state.publications())
+    feed.stop()
+    (tmp_path / "out" / "field.npz").mkdir()  # the checkpoint cannot take its place
+    server.stop()
+    thread.join(20)
+    (ledger,) = read_all(tmp_path / "out")
+    assert ledger.closed
+    assert json.loads((tmp_path / "out" / "edge.json").read_text())["lines_lost"] == 0

@@ -1,0 +1,74 @@
+"""A whole edge server that decides by what was learnt: real frames, a real embedder, recorded decisions."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
+pytest.importorskip("onnx", reason="the extra embed is not installed")
+
+from edge_server.config import read_config
+from edge_server.live.server import EdgeServer, Options
+from edge_server.scheduler.learned.decision_record import read_decision
+from edge_server.scheduler.learned.explain_command import main as explain
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.state import StateLayout
+from freshfield import scenario
+from tests.edge_server.embed.graphs import CHANNELS, detector
+from tests.edge_server.fields_for_tests import TINY
+from tests.edge_server.live.test_server import Feed, until
+from tests.ports import free_port
+
+
+def server_of(tmp_path, layout, embedding=True, port=None):
+    Learner(Spec("select", layout), 1).save(tmp_path / "policy.npz")
+    detector(tmp_path / "d.onnx")
+    edge = {"field_options": TINY, "update_ms": 50, "grace_ms": 500, "lpips": "none"}
+    edge["policy"] = {"name": "bandit:policy.npz"}
+    if embedding:
+        edge["embedding"] = {"model": "d.onnx", "dim": CHANNELS, "provider": "cpu"}
+    data = {"name": "tiny", "seed": 3, "cameras": {"count": 3, "held_out": ["cam00"]}, "edge": edge}
+    made = scenario.parse(data, tmp_path / "tiny.yaml")
+    return EdgeServer(made, read_config(made), Options(f"127.0.0.1:{port or free_port()}", tmp_path / "out"))
+
+
+def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_path, capsys):
+    port = free_port()
+    server = server_of(tmp_path, StateLayout(("age", "pose", "semantics"), dim=CHANNELS), port=port)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
+    feed.start()
+    try:
+        until(lambda: server.updates.number >= 4)
+        decided = server.state.decision()
+        assert decided is not None and decided.actor.spec.layout.dim == CHANNELS
+        with pytest.raises(ValueError, match="chosen at the start"):
+            server.state.set_policy(f"bandit:{tmp_path / 'other.npz'}", None)
+        server.state.set_policy("threshold", 100.0)
+        server.state.set_policy(f"bandit:{tmp_path / 'policy.npz'}", None)
+    finally:
+        server.stop()
+        thread.join(20)
+        feed.stop()
+    found = read_decision(tmp_path / "out", 1)
+    used = [c for c, chosen in zip(found.decided.state.cameras, found.decided.action) if chosen]
+    published = next(p for p in server.state.publications() if p.number == 1)
+    assert list(published.selected) == used
+    assert np.isfinite(found.decided.state.embeddings).any()
+    assert explain([str(tmp_path / "out"), "--decision", "1"]) == 0
+    assert "in the picture of" in capsys.readouterr().out
+
+
+def test_a_scenario_that_says_nothing_has_the_usual_embedding_which_is_another(tmp_path):
+    with pytest.raises(scenario.ScenarioError, match=r"tiny\.yaml: edge"):
+        server_of(tmp_path, StateLayout(("semantics",), dim=CHANNELS), embedding=False)
+
+
+def test_with_another_width_it_does_not_start(tmp_path):
+    with pytest.raises(scenario.ScenarioError, match="of 2 numbers"):
+        server_of(tmp_path, StateLayout(("semantics",), dim=2))

@@ -1,0 +1,95 @@
+"""The command: text, figures and picture of a recorded decision, with a real embedder."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from edge_server.scheduler.learned.bandit import Decided
+from edge_server.scheduler.learned.decision_record import DecisionRecord
+from edge_server.scheduler.learned.explain_command import main
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.state import StateLayout
+from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
+from tests.edge_server.scheduler.learned.test_decision_record import decided
+
+
+def ages_only(run):
+    actor = Learner(Spec("wait", StateLayout(("age",)), OMEGAS_MS), 0).actor
+    s = state(3, np.random.default_rng(0))
+    (action,), (logp,) = actor.act([s])
+    DecisionRecord(run).write(Decided(4, 0, s, np.asarray(action), float(logp), actor))
+
+
+def test_a_decision_by_ages_is_explained(tmp_path, capsys):
+    ages_only(tmp_path)
+    assert main([str(tmp_path), "--json", str(tmp_path / "e.json")]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("decision 4: wait ")
+    assert "cam02" in said and "in the picture" not in said
+    found = json.loads((tmp_path / "e.json").read_text())
+    whole = found["logit"] - found["logit_of_average_cameras"]
+    assert sum(found["cameras"].values()) == pytest.approx(whole)
+    assert sum(found["parts"].values()) == pytest.approx(whole)
+    assert found["regions"] is None
+    assert cv2.imread(str(tmp_path / "decision-000004.png")).shape[1] > 500
+
+
+def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
+    pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
+    pytest.importorskip("onnx", reason="the extra embed is not installed")
+    from tests.edge_server.embed.graphs import detector
+
+    model = detector(tmp_path / "d.onnx")
+    embedding = {"model": str(model), "dim": 3, "provider": "cpu"}
+    DecisionRecord(tmp_path, embedding).write(decided(2))
+    asked = [str(tmp_path), "--decision", "2", "--camera", "cam01", "--json", str(tmp_path / "e.json")]
+    assert main(asked) == 0
+    assert "in the picture of cam01 most by the region in row" in capsys.readouterr().out
+    regions = np.array(json.loads((tmp_path / "e.json").read_text())["regions"])
+    assert regions.shape == (8, 8) and np.abs(regions).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("embedding", "says"),
+    [
+        ({"model": "/nowhere/d.onnx", "dim": 3, "provider": "cpu"}, "no such file"),
+        ({"model": "d.onnx", "shutter": "rolling"}, "of another version"),
+        (None, "does not say what embedded its frames"),
+    ],
+)
+def test_where_frames_cannot_be_embedded_again_the_rest_is_told(embedding, says, tmp_path, capsys):
+    pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
+    pytest.importorskip("onnx", reason="the extra embed is not installed")
+    DecisionRecord(tmp_path, embedding).write(decided(2))
+    assert main([str(tmp_path), "--json", str(tmp_path / "e.json")]) == 0
+    told = capsys.readouterr()
+    assert "by part of the state" in told.out and "in the picture" not in told.out
+    assert says in told.err and told.err.count("\n") == 1
+    assert json.loads((tmp_path / "e.json").read_text())["regions"] is None
+    # Whoever asks for a picture is refused.
+    assert main([str(tmp_path), "--camera", "cam01"]) == 2
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--decision", "9"], "decision 9 is not recorded"),
+        (["--camera", "cam01"], "this policy looks at no pictures"),
+    ],
+)
+def test_what_cannot_be_explained_is_said_in_one_line(tmp_path, capsys, words, says):
+    ages_only(tmp_path)
+    assert main([str(tmp_path), *words]) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
+
+
+def test_a_run_without_decisions_says_so(tmp_path, capsys):
+    assert main([str(tmp_path)]) == 2
+    assert "bandit:FILE" in capsys.readouterr().err

@@ -1,0 +1,330 @@
+"""A learnt policy that goes on learning: it follows a change, stays on its leash, falls back and returns."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edge_server.scheduler import Epoch, make_policy
+from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.learner_spec import Spec
+from edge_server.scheduler.learned.ppo import Learner
+from edge_server.scheduler.learned.rewards import make_reward
+from edge_server.scheduler.learned.state import StateLayout
+from edge_server.scheduler.online.online_policy import Apprentice, Exploring, Leash, divergence
+from edge_server.scheduler.online.online_trainer import Lessons, of_training, open_lessons, reward_for
+from edge_server.scheduler.online.sequential_test import LEAST
+from tests.edge_server.scheduler.learned.problems import state
+
+OMEGAS = (20.0, 80.0, 320.0)
+SPEC = Spec("threshold", StateLayout(("age",)), OMEGAS, hidden=16, learning_rate=1e-2)
+MS = 10**6
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def leash(**more) -> Leash:
+    """Judged from the first decision on."""
+    return Leash(**{"settle": 0, **more})
+
+
+def taught(worth, updates: int = 25) -> Learner:
+    """A learner of thresholds that has seen ``worth`` (omega -> reward)."""
+    learner = Learner(SPEC, 1)
+    states = [state(5, rng(k)) for k in range(64)]
+    for _ in range(updates):
+        actions, logps = learner.act(states)
+        rewards = [worth(OMEGAS[int(a)]) for a in actions]
+        learner.update(learner.batch(states, actions, logps, rewards))
+    return learner
+
+
+def epoch(number: int) -> Epoch:
+    seen = state(5, rng(1000 + number))
+    now_ns = 10**12 + number * 100 * MS
+    generated = {c: now_ns - round(a * MS) for c, a in zip(seen.cameras, seen.ages_ms)}
+    return Epoch(now_ns, number, generated, lambda parts=(): seen)
+
+
+def use(apprentice: Apprentice, worth, count: int, first: int = 0) -> list[float]:
+    """Decide ``count`` times, each rewarded by the omega that was used."""
+    used = []
+    for number in range(first, first + count):
+        at = epoch(number)
+        plan = apprentice.plan(at)
+        assert apprentice.select(at, plan)
+        used.append(plan.omega_ms)
+        if apprentice.scored(number, worth(plan.omega_ms) + 0.05 * float(rng(number).standard_normal())):
+            apprentice.learn()
+    return used
+
+
+def short(omega: float) -> float:
+    return -omega / 100.0
+
+
+def long(omega: float) -> float:
+    return omega / 100.0
+
+
+def test_it_falls_back_when_what_pays_has_changed_and_returns_once_it_has_learnt():
+    fixed = make_policy("threshold", 80.0, rng())
+    apprentice = Apprentice(taught(short), fixed, "bandit:x", rng(2), leash(share=0.3, bound=50.0))
+    before = use(apprentice, short, 150)
+    assert not apprentice.fallen_back and np.mean(before) < 60.0
+    drifted = use(apprentice, long, 250, 150)
+    assert "worse than threshold:80" in apprentice.told()
+    assert apprentice.fallen_back and np.mean(drifted[-50:]) > np.mean(before)
+    for number in range(400, 4000, 100):
+        use(apprentice, long, 100, number)
+        if not apprentice.fallen_back:
+            break
+    assert not apprentice.fallen_back
+    assert np.mean(use(apprentice, long, 100, 4000)) > 200.0
+
+
+def test_the_trust_region_holds_whatever_is_rewarded():
+    apprentice = Apprentice(
+        Learner(SPEC, 1),
+        make_policy("threshold", 80.0, rng()),
+        "bandit:x",
+        rng(2),
+        leash(bound=0.2, batch=16),
+    )
+    for first in range(0, 600, 50):
+        use(apprentice, long, 50, first)
+        assert apprentice.moved <= 0.2
+    assert apprentice.updates > 10 and apprentice.shortened > 0
+    free = Apprentice(
+        Learner(replace(SPEC, target_kl=50.0), 1),
+        make_policy("threshold", 80.0, rng()),
+        "bandit:x",
+        rng(2),
+        leash(bound=50.0, batch=16),
+    )
+    use(free, long, 600)
+    assert free.moved > 0.2 and free.shortened == 0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_one_update_moves_it_no_further_than_the_specification_says(seed: int):
+    spec = replace(SPEC, learning_rate=3e-2)
+    apprentice = Apprentice(
+        Learner(spec, seed), make_policy("threshold", 80.0, rng()), "b", rng(2), leash(bound=50.0, batch=16)
+    )
+    steps = []
+    for number in range(400):
+        at = epoch(number)
+        plan = apprentice.plan(at)
+        apprentice.select(at, plan)
+        if apprentice.scored(number, (long if number < 200 else short)(plan.omega_ms)):
+            before = apprentice._learner.actor
+            told = apprentice.learn()
+            batch = spec.layout.batch([epoch(k).state() for k in range(number + 1)])
+            steps.append(divergence(before, apprentice._learner.actor, batch))
+            assert told["step_kl"] <= spec.target_kl
+    assert len(steps) > 10 and apprentice.shortened > 0
+    assert np.mean(steps) > 0.1 * spec.target_kl, "it is held back, not held"
+
+
+@pytest.mark.parametrize(("action", "cameras"), [("select", 18), ("select", 200), ("threshold", 18)])
+def test_it_is_compared_with_what_acted_chance_included(action: str, cameras: int):
+    """In the first pass nothing has been learnt yet: a policy that is nearly sure has moved by nothing."""
+    spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, start=0.99, passes=1)
+    apprentice = Apprentice(Learner(spec, 1), make_policy("all", None, rng()), "b", rng(3), leash(batch=32))
+    for number in range(60):
+        seen = state(cameras, rng(number))
+        now_ns = 10**12 + number * 100 * MS
+        generated = {c: now_ns - round(a * MS) for c, a in zip(seen.cameras, seen.ages_ms)}
+        at = Epoch(now_ns, number, generated, lambda parts=(), seen=seen: seen)
+        apprentice.select(at, apprentice.plan(at))
+        if apprentice.scored(number, float(rng(number).standard_normal())):
+            break
+    told = apprentice.learn()
+    assert told is not None and told["kl_from_acted"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_what_was_trained_on_differences_learns_live_wherever_the_rewards_zero_lies():
+    """Training compares the actions of one decision; live there is one, and its reward is what it is."""
+
+    def trained() -> Learner:
+        learner, states = Learner(SPEC, 1), [state(5, rng(k)) for k in range(64)]
+        for number in range(2):
+            actions, logps = learner.act(states)
+            found = rng(number).normal(0.04 * (actions == 0), 0.02)
+            learner.update(learner.batch(states, actions, logps, found - found.mean()))
+        return learner
+
+    learnt = []
+    for zero in (0.0, -1.2, 30.0):
+        fixed = make_policy("threshold", 80.0, rng())
+        apprentice = Apprentice(trained(), fixed, "b", rng(2), leash(bound=50.0))
+        use(apprentice, lambda omega, zero=zero: zero + 0.3 * (omega == 320.0), 200)
+        assert apprentice.updates >= 4
+        learnt.append(apprentice._bandit.actor)
+    share = [np.bincount(a.act([state(5, rng(k)) for k in range(400)], rng(9))[0], minlength=3)[2] / 400
+             for a in (trained().actor, *learnt)]  # fmt: skip
+    assert share[1] > 1.5 * share[0] and share[2] == share[3] == share[1]
+    for other in learnt[1:]:
+        assert all(np.allclose(w, other.weights[n], atol=1e-6) for n, w in learnt[0].weights.items())
+
+
+@pytest.mark.parametrize("fallen_back", [False, True])
+def test_who_decides_is_not_changed_by_chance(fallen_back: bool):
+    """Rewards that nobody has a hand in, and that stay high or low for a while, as those of a field do."""
+    fixed = make_policy("threshold", 80.0, rng())
+    for seed in range(6):
+        apprentice = Apprentice(Learner(SPEC, 1), fixed, "b", rng(seed), leash(batch=10**6))
+        if fallen_back:
+            apprentice._change_over()
+        noise, found = rng(100 + seed), 0.0
+        for number in range(600):
+            at = epoch(number)
+            apprentice.select(at, apprentice.plan(at))
+            found = 0.8 * found + 0.6 * float(noise.standard_normal())
+            apprentice.scored(number, found)
+            assert apprentice.fallen_back is fallen_back
+
+
+def test_the_same_seed_does_the_same_and_saves_what_goes_on(tmp_path: Path):
+    made = [
+        Apprentice(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash())
+        for _ in range(2)
+    ]
+    first, second = (use(a, long, 200) for a in made)
+    assert first == second and made[0].status() == made[1].status() and made[0].updates > 0
+    made[0].save(tmp_path / "learnt.npz")
+    saved, other = (Actor.load(tmp_path / "learnt.npz").weights, made[1]._bandit.actor.weights)
+    assert all(np.array_equal(w, other[n]) for n, w in saved.items())
+
+
+def test_late_missing_and_broken_rewards_teach_nothing_and_harm_nothing():
+    apprentice = Apprentice(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash())
+    before = apprentice._bandit.actor.weights
+    for number in range(200):
+        at = epoch(number)
+        apprentice.select(at, apprentice.plan(at))
+        assert not apprentice.scored(number, (None, np.nan, np.inf)[number % 3])
+        assert not apprentice.scored(number, 1.0)  # twice
+    assert apprentice.learn() is None and not apprentice.scored(10**6, 1.0)
+    assert all(np.array_equal(w, before[n]) for n, w in apprentice._bandit.actor.weights.items())
+    assert apprentice.status()["learnt_reward"]["count"] == 0 and "not known yet" in apprentice.told()
+
+
+def test_nobody_is_judged_by_a_field_that_only_begins():
+    fixed = make_policy("threshold", 80.0, rng())
+    apprentice = Apprentice(taught(short), fixed, "b", rng(2), Leash(settle=50))
+    use(apprentice, long, 50, 1000)  # an edge that was restarted goes on counting
+    assert apprentice.status()["learnt_reward"]["count"] == apprentice.status()["fixed_reward"]["count"] == 0
+    use(apprentice, long, 30, 1050)
+    counts = [apprentice.status()[f"{who}_reward"]["count"] for who in ("learnt", "fixed")]
+    assert sum(counts) == 30
+
+
+def test_no_verdict_on_a_few_decisions():
+    apprentice = Apprentice(
+        taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash(share=0.5)
+    )
+    use(apprentice, long, LEAST)  # of both together: too few of either
+    assert not apprentice.fallen_back
+
+
+@pytest.mark.parametrize("action", ["select", "threshold"])
+def test_divergence_is_the_one_of_torch_and_finite_at_the_edges(action):
+    spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, hidden=8)
+    a, b = (Learner(spec, s).actor for s in (1, 2))
+    a, b = (Actor(spec, {n: w + 0.5 * rng(9).standard_normal(w.shape) * k for n, w in x.weights.items()})
+            for k, x in ((1, a), (-1, b)))  # fmt: skip
+    features = spec.layout.batch([state(5, rng(k), silent=k % 2) for k in range(7)])
+    p, q = (torch.tensor(x.logits(features)) for x in (a, b))
+    if action == "select":
+        kl = torch.distributions.kl_divergence(
+            torch.distributions.Bernoulli(logits=p), torch.distributions.Bernoulli(logits=q)
+        )
+        expected = float((kl * torch.tensor(features[..., -1])).sum(1).mean())
+    else:
+        expected = float(
+            torch.distributions.kl_divergence(
+                torch.distributions.Categorical(logits=p), torch.distributions.Categorical(logits=q)
+            ).mean()
+        )
+    assert divergence(a, b, features) == pytest.approx(expected, rel=1e-9) and expected > 1e-4
+    assert divergence(a, a, features) == pytest.approx(0.0, abs=1e-12)
+    far = Actor(spec, {**b.weights, "out_b": np.full_like(b.weights["out_b"], 1e4)})
+    assert np.isfinite(divergence(a, far, features))
+
+
+def test_the_reward_and_the_fall_back_are_those_of_the_training(tmp_path: Path):
+    taught(short, 1).save(tmp_path / "policy.npz")
+    summary = {"reward_name": "thesis", "on": "moving", "best_fixed": "threshold:150"}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    lessons = open_lessons(tmp_path / "policy.npz", "", "", rng(), None, tmp_path)
+    assert lessons.reward == make_reward("thesis", fidelity="moving")
+    assert (lessons.apprentice.fixed.name, lessons.apprentice.fixed.value) == ("threshold", 150.0)
+    given = open_lessons(tmp_path / "policy.npz", "set", "all", rng(), "no weights", tmp_path)
+    assert given.reward == make_reward("set", distance=0.0) and given.apprentice.fixed.name == "all"
+    assert of_training(Path("nowhere/x.npz")) == {}
+    assert reward_for("select", "", Path("nowhere/x.npz"), None).name == "set"
+    for bad, said in ((("nonsense", ""), "nonsense"), (("set", "threshold:x"), "fallback: ")):
+        with pytest.raises(ValueError, match=said):
+            open_lessons(tmp_path / "policy.npz", *bad, rng(), None, tmp_path)
+
+
+class Score:
+    psnr_db = psnr_moving_db = ssim = lpips = None
+
+    def __init__(self, aaoi_ms: float) -> None:
+        self.aaoi_ms = aaoi_ms
+
+
+def test_lessons_are_given_on_a_thread_of_their_own_and_written_down(tmp_path: Path):
+    apprentice = Apprentice(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash(batch=8))
+    reward = make_reward("corrected", psnr=0.0, ssim=0.0, distance=0.0, age=-0.01)
+    lessons = Lessons(apprentice, reward, tmp_path)
+    lessons.start()
+    for number in range(40):
+        at = epoch(number)
+        plan = apprentice.plan(at)
+        apprentice.select(at, plan)
+        lessons.scored(number, Score(plan.omega_ms))
+    for _ in range(200):
+        if apprentice.updates:
+            break
+        threading_wait()
+    lessons.stop()
+    lessons.close()
+    lines = [json.loads(line) for line in (tmp_path / "learning.jsonl").read_text().splitlines()]
+    assert lines and lines[0]["update"] == 1 and lines[0]["decisions"] == 8
+    assert Learner.load(tmp_path / "learnt.npz").updates > 25
+
+
+@pytest.mark.parametrize("action", ["select", "wait"])
+def test_chance_has_its_share_in_every_action_and_the_probability_told_is_the_true_one(action):
+    spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, hidden=8)
+    weights = dict(Learner(spec, 1).actor.weights)
+    weights["out_b"] = np.full_like(weights["out_b"], 1e3)  # as sure as can be, of cameras
+    if action == "wait":
+        weights["out_b"][1:] = 0.0
+    seen = state(4, rng(1))
+    sure, chance = Actor(spec, weights), Exploring(spec, weights, 0.2)
+    draws = np.array([chance.act([seen], rng(k))[0][0] for k in range(600)])
+    assert len({str(sure.act([seen], rng(k))[0][0]) for k in range(50)}) == 1
+    if action == "select":
+        assert np.allclose(draws.mean(axis=0), 0.9, atol=0.04)
+        return
+    assert np.allclose(np.bincount(draws, minlength=3) / 600, [1 - 0.4 / 3, 0.2 / 3, 0.2 / 3], atol=0.04)
+    told = {int(a): float(p) for k in range(60) for a, p in [np.ravel(chance.act([seen], rng(k)))]}
+    assert np.exp(told[0]) == pytest.approx(1 - 0.4 / 3) and np.exp(told[1]) == pytest.approx(0.2 / 3)
+
+
+def threading_wait() -> None:
+    import time
+
+    time.sleep(0.02)

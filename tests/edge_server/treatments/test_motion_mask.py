@@ -1,0 +1,52 @@
+"""Of stale views, what was moving counts for less, the more the older they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_server.treatments.change_detection import compare
+from edge_server.treatments.motion_mask import Mask, speed_px_per_ms
+from tests.edge_server.treatments.pictures import MS, picture, seen
+
+
+def masked(ages_ms: list[float], speed: float = 0.08):
+    """Cameras that saw the same at other times, treated at one instant."""
+    now_ms = 1000.0
+    views, earlier = [], {}
+    for k, age_ms in enumerate(ages_ms):
+        camera = f"cam{k:02d}"
+        views.append(seen(100.0, camera, px_per_ms=speed))
+        views[-1] = type(views[-1])(**{**vars(views[-1]), "generated_ns": round((now_ms - age_ms) * MS)})
+        before = seen(40.0, camera, px_per_ms=speed)
+        earlier[camera] = type(before)(
+            **{**vars(before), "generated_ns": round((now_ms - age_ms - 60.0) * MS)}
+        )
+    return views, Mask().treat(views, earlier, round(now_ms * MS))
+
+
+def test_weights_fall_with_age_and_reach_farther():
+    views, treated = masked([10.0, 60.0, 90.0])
+    assert [t is v for t, v in zip(treated, views)] == [True, False, False], "the youngest stay whole"
+    least = [1.0 if v.weight is None else float(v.weight.min()) for v in treated]
+    assert least[0] == 1.0 > least[1] > least[2] >= Mask().least_weight
+    wide = [int((v.weight < 1.0).sum()) for v in treated[1:]]
+    assert wide[1] > wide[0], "what moved is farther by now"
+    assert all(v.image is w.image and v.carried_to_ns is None for v, w in zip(treated, views))
+
+
+def test_what_changed_is_under_the_mask():
+    _views, treated = masked([0.0, 120.0])
+    moved = np.abs(picture(100.0).astype(int) - picture(220.0)).max(axis=2) > 20
+    assert (treated[1].weight[moved] < 1.0).mean() > 0.9
+    assert (treated[1].weight == 1.0).mean() > 0.5
+
+
+def test_the_speed_of_a_patch_is_found_within_a_factor_of_two():
+    before, now = seen(0.0), seen(25.0)
+    assert speed_px_per_ms(before, now, compare(before, now)) == pytest.approx(0.08, rel=1.0, abs=0.0)
+
+
+def test_nothing_moves_nothing_is_masked():
+    views, treated = masked([0.0, 50.0, 400.0], speed=0.0)
+    assert all(v is w for v, w in zip(treated, views))
