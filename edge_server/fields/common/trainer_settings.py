@@ -86,7 +86,7 @@ class TrainerSettings:
     seed: int = option(0, "seed of initial values and of all sampling")
     threads: int | None = option(None, "worker threads; results do not depend on it. None: all cores")
     nice: int = option(0, "how far workers lower their own priority (Linux); in a server 5")
-    device: str = option("auto", "cpu (numba), cuda (torch) or auto")
+    device: str = option("auto", "cpu (numba) or cuda (torch, only where asked for); auto: cpu")
 
     def __post_init__(self) -> None:
         name = self.name

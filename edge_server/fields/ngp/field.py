@@ -17,8 +17,7 @@ from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.model_layout import make_grid, make_net
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
-from edge_server.fields.ngp.cuda_driver import driver_present
-from edge_server.fields.ngp.settings import NgpSettings, make_settings
+from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings, make_settings
 
 assert SEGMENT * FEATURES == DIRTY, "scatter and adam must mean the same by a dirty flag"
 
@@ -26,11 +25,8 @@ assert SEGMENT * FEATURES == DIRTY, "scatter and adam must mean the same by a di
 class NgpField(TrainedField):
     """A multiresolution hash grid and a small network. See ``fields.Field`` for the protocol."""
 
-    name = "ngp"
-    shape = (
-        "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers",
-        "harmonics", "cells", "samples",
-    )  # fmt: skip
+    name = NgpSettings.name
+    shape = STATE_SHAPE
     settings: NgpSettings
 
     def __init__(self, settings: NgpSettings | None = None, pool: Pool | None = None) -> None:
@@ -62,17 +58,14 @@ class NgpField(TrainedField):
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``ngp_settings``), for the device they ask for; ``auto`` takes a GPU only
-    where it can do all that they ask for. ValueError where ``cuda`` is asked for and cannot."""
-    settings = make_settings(options, seed)
-    if settings.device == "cpu" or (settings.device == "auto" and not driver_present()):
-        return NgpField(settings)
-    from edge_server.fields.ngp.torch_field import (  # torch, only where it may be used
-        NgpTorchField,
-        cuda_present,
-        lacks,
-    )
+    """A field from plain options (``ngp.settings``). Only ``device: cuda`` takes a GPU.
 
-    if settings.device == "cuda" or (cuda_present() and not lacks(settings)):
-        return NgpTorchField(settings)
+    Raises ValueError for a wrong option, and for ``cuda`` where torch finds no such device or where another
+    option exists in the kernels alone.
+    """
+    settings = make_settings(options, seed)
+    if settings.device == "cuda":
+        from edge_server.fields.ngp.torch_field import NgpTorchField  # torch is imported only here
+
+        return NgpTorchField(settings, "cuda")
     return NgpField(settings)

@@ -7,6 +7,12 @@ from typing import Any
 
 from edge_server.fields.common.trainer_settings import TrainerSettings, help_of, option, settings_from
 
+STATE_SHAPE = (
+    "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers", "harmonics",
+    "cells", "samples",
+)  # fmt: skip
+"""Settings that decide the shape of a saved state: those of a loaded one must be equal."""
+
 
 @dataclass(frozen=True)
 class NgpSettings(TrainerSettings):

@@ -39,8 +39,7 @@ from edge_server.fields.common.training_schedule import (
     step_length,
 )
 from edge_server.fields.common.view_store import Arrays, Rig
-from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
 from edge_server.fields.ngp.torch_model import TorchGrid, encode, mlp, ray_losses, shade, to_torch, weights_of
 from freshfield.geometry import Pinhole
 
@@ -180,13 +179,13 @@ class NgpTorchField:
     """See ``NgpField``: the protocol and its meaning are the same. ValueError for a device that is not here,
     and for options that only the kernels have (``lacks``)."""
 
-    def __init__(self, settings: NgpSettings | None = None, device: str | None = None) -> None:
+    def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
         self.settings = settings or NgpSettings()
         if missing := lacks(self.settings):
-            raise ValueError(f"ngp: {', '.join(missing)} needs device cpu; the field in torch has it not")
-        self.device = device or ("cuda" if cuda_present() else "cpu")
+            raise ValueError(f"ngp: {', '.join(missing)} needs device cpu: the torch field lacks it")
+        self.device = device
         if self.device.startswith("cuda") and not cuda_present():
-            raise ValueError("ngp: device cuda was asked for, but torch finds none here; use cpu or auto")
+            raise ValueError("ngp: device cuda was asked for, but torch finds none here; use device cpu")
         self.pool = shared_pool(self.settings.threads, self.settings.nice)
         self._lock = threading.RLock()
         self.now = time.perf_counter  # the clock of budgets in seconds
@@ -239,11 +238,11 @@ class NgpTorchField:
         with self._lock:
             counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
             counters["needed"] = self._occupancy.needed
-            return pack(NgpField.name, self.settings, self.rig, counters, self._arrays())
+            return pack(NgpSettings.name, self.settings, self.rig, counters, self._arrays())
 
     def load_state(self, state: Arrays) -> None:
         with self._lock, all_or_nothing(self):
-            meta = unpack_meta(self.settings, state, NgpField.name, NgpField.shape)
+            meta = unpack_meta(self.settings, state, NgpSettings.name, STATE_SHAPE)
             self.rig = Rig(self.settings)
             self.rig.load(meta, state)
             self._forget_parameters()

@@ -1,7 +1,7 @@
 """``camera-node calibrate hand-eye --live --drive``: the arm goes by itself where the session wants the hand.
 
 Between two moves nobody holds the arm's controls: whoever stands by may bring the hand elsewhere with the
-pendant. Ways are tested as ``drive-arm`` tests them (``camera_node.robot.arm.roadmap``): arm, camera and floor
+pendant. Ways are tested as ``drive-arm`` tests them (``robot.arm.roadmap``): arm, camera and floor
 are known, the target, the cable and whatever else stands there are not.
 """
 
