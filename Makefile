@@ -74,7 +74,7 @@ format: .venv/.ok-test  ## ruff: apply the format and the safe fixes
 
 types: .venv/.ok-test  ## mypy
 	$(PY) -m mypy
-	MYPYPATH=proto:deploy $(PY) -m mypy deploy/up.py deploy/healthy.py deploy/check_report.py deploy/launch
+	MYPYPATH=proto:deploy $(PY) -m mypy deploy/up.py deploy/check_report.py deploy/freshfield_up
 
 bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, runs/bench-*; DATA=FOLDER BENCH=--quick
 	@mkdir -p runs

@@ -9,6 +9,8 @@ COPY proto proto
 COPY camera_node camera_node
 COPY channel_emu channel_emu
 COPY edge_server edge_server
+COPY deploy/freshfield_up deploy/freshfield_up
+COPY deploy/scenarios deploy/scenarios
 RUN python -m venv /venv \
  && /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q . \
  && /venv/bin/python -m pip uninstall --disable-pip-version-check -y -q pip setuptools
@@ -17,8 +19,6 @@ FROM docker.io/library/python:3.11-slim-bookworm
 RUN useradd --system --create-home --uid 10001 freshfield \
  && install -d -o freshfield -g freshfield /runs
 COPY --from=build /venv /venv
-COPY deploy/scenarios /app/deploy/scenarios
-COPY deploy/healthy.py /app/deploy/healthy.py
 ENV PATH=/venv/bin:$PATH PYTHONUNBUFFERED=1 \
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
 WORKDIR /app
@@ -27,5 +27,5 @@ VOLUME /runs
 # A node is healthy while it keeps its status file fresh (in a folder that several share, CAMERA names it);
 # the emulator's own check is in compose.yaml.
 HEALTHCHECK --interval=5s --timeout=3s --start-period=60s --retries=3 \
-  CMD ["python", "deploy/healthy.py", "--node", "/runs"]
+  CMD ["python", "-m", "freshfield_up.healthy", "--node", "/runs"]
 CMD ["camera-node", "--help"]

@@ -16,14 +16,14 @@ COPY proto proto
 COPY camera_node camera_node
 COPY channel_emu channel_emu
 COPY edge_server edge_server
+COPY deploy/freshfield_up deploy/freshfield_up
+COPY deploy/scenarios deploy/scenarios
 RUN /venv/bin/python -m pip install --disable-pip-version-check --no-cache-dir -q '.[edge,embed]'
 
 FROM docker.io/library/python:3.11-slim-bookworm
 RUN useradd --system --create-home --uid 10001 freshfield \
  && install -d -o freshfield -g freshfield /runs
 COPY --from=build /venv /venv
-COPY deploy/scenarios /app/deploy/scenarios
-COPY deploy/healthy.py /app/deploy/healthy.py
 # Compiled kernels are kept in the user's home: the installed packages are not theirs to write to.
 ENV PATH=/venv/bin:$PATH PYTHONUNBUFFERED=1 \
     NUMBA_CACHE_DIR=/home/freshfield/.cache/numba MPLCONFIGDIR=/home/freshfield/.cache/matplotlib
@@ -35,5 +35,5 @@ RUN python -c 'from edge_server.fields.registry import make_field; make_field("n
 VOLUME /runs
 EXPOSE 7000 8080
 HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 \
-  CMD ["python", "deploy/healthy.py", "--serving", "127.0.0.1:7000"]
+  CMD ["python", "-m", "freshfield_up.healthy", "--serving", "127.0.0.1:7000"]
 CMD ["edge-server", "--help"]

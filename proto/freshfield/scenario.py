@@ -31,7 +31,10 @@ import yaml
 from freshfield.frame import valid_id
 
 T = TypeVar("T")
-SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
+_HERE = Path(__file__).resolve()
+_CHECKOUT = _HERE.parents[2] / "deploy" / "scenarios"
+SCENARIO_FOLDER = _CHECKOUT if _CHECKOUT.is_dir() else _HERE.parent / "scenarios"
+"""The shipped scenarios: of the checkout, or those that an installed wheel carries."""
 MAX_CAMERAS = 1000
 
 

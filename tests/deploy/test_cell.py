@@ -17,36 +17,36 @@ CELL = load("cell")
 
 
 @pytest.fixture
-def plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    from launch import commands
+def process_set(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    from freshfield_up import commands
 
     monkeypatch.setattr(commands, "program", lambda name: name)
-    return lambda scenario: commands.plan(scenario, tmp_path, 8080)
+    return lambda scenario: commands.process_set(scenario, tmp_path, 8080)
 
 
-def test_a_simulated_arm_and_its_driver_belong_to_the_run(plan) -> None:
-    found = plan(CELL)
+def test_a_simulated_arm_and_its_driver_belong_to_the_run(process_set) -> None:
+    found = process_set(CELL)
     assert [child.command[1] for child in found.arms + found.drivers] == ["simulate-arm", "drive-arm"]
     assert found.arm_address == "127.0.0.2:30004"
     # Nobody sends to what is gone: driver, cameras, arm, channel, edge.
     assert [child.name for child in found.children] == ["driver", "node", "arm", "emulator", "edge"]
 
 
-def test_a_real_arm_is_neither_simulated_nor_driven(plan) -> None:
+def test_a_real_arm_is_neither_simulated_nor_driven(process_set) -> None:
     arm = {**CELL.source["arm"], "simulated": False}
     real = dataclasses.replace(CELL, source={**CELL.source, "arm": arm})
-    assert [child.name for child in plan(real).children] == ["node", "emulator", "edge"]
-    assert [child.name for child in plan(load("tile")).children] == ["node", "emulator", "edge"]
+    assert [child.name for child in process_set(real).children] == ["node", "emulator", "edge"]
+    assert [child.name for child in process_set(load("tile")).children] == ["node", "emulator", "edge"]
 
 
-def test_a_simulated_arm_without_a_path_stands_still(plan) -> None:
+def test_a_simulated_arm_without_a_path_stands_still(process_set) -> None:
     arm = {key: value for key, value in CELL.source["arm"].items() if key != "path"}
     still = dataclasses.replace(CELL, source={**CELL.source, "arm": arm})
-    assert plan(still).arms and not plan(still).drivers
+    assert process_set(still).arms and not process_set(still).drivers
 
 
 def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: Path) -> None:
-    from launch import commands, mesh
+    from freshfield_up import commands, mesh
 
     monkeypatch.setattr(mesh, "program", lambda name: name)
     asked = mesh.child(CELL, tmp_path)
@@ -65,7 +65,7 @@ def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: P
     [('{"updates": {"count": 3}}', True), ('{"updates": {"count": 0}}', False), ("", False)],
 )
 def test_there_is_a_mesh_from_the_first_update_on(tmp_path: Path, status: str, possible: bool) -> None:
-    from launch import mesh
+    from freshfield_up import mesh
 
     (tmp_path / "edge.json").write_text(status)
     assert mesh.possible(tmp_path) == possible

@@ -56,9 +56,9 @@ def test_only_the_page_is_published_and_only_on_this_machine() -> None:
 def test_every_service_has_a_health_check_and_no_privileges() -> None:
     for name, service in SERVICES.items():
         check = service["healthcheck"]["test"]  # images in the OCI format carry none
-        assert check[:3] == ["CMD", "python", "deploy/healthy.py"]
+        assert check[:4] == ["CMD", "python", "-m", "freshfield_up.healthy"]
         port = re.search(r"--listen \S+:(\d+)", service["command"])
-        assert check[3:] == (["--serving", f"127.0.0.1:{port[1]}"] if port else ["--node", "/runs"]), name
+        assert check[4:] == (["--serving", f"127.0.0.1:{port[1]}"] if port else ["--node", "/runs"]), name
         assert not {"privileged", "cap_add", "user", "pid"} & set(service)
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from launch.display import LiveTable, draw
-from launch.resources import Use
-from launch.status import read_status
+from freshfield_up.display import LiveTable, draw
+from freshfield_up.resources import Use
+from freshfield_up.status import read_status
 
 CAMERAS = tuple(f"cam{i:02d}" for i in range(13))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from launch.folder import MARKER, FolderError, prepare
+from freshfield_up.folder import MARKER, FolderError, prepare
 
 
 def test_a_new_folder_gets_a_marker(tmp_path: Path) -> None:

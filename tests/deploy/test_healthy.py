@@ -12,11 +12,9 @@ from pathlib import Path
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
-from tests.conftest import ROOT
-
 
 def healthy(*words: str, **environment: str) -> bool:
-    command = [sys.executable, str(ROOT / "deploy" / "healthy.py"), *words]
+    command = [sys.executable, "-m", "freshfield_up.healthy", *words]
     plain = {k: v for k, v in os.environ.items() if k != "CAMERA"}
     done = subprocess.run(command, env={**plain, **environment}, capture_output=True, timeout=30)
     assert done.returncode in (0, 1) and not done.stderr, done.stderr.decode()

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from launch import processes
-from launch.processes import Child
+from freshfield_up import processes
+from freshfield_up.processes import Child
 
 
 def python(tmp_path: Path, code: str, name: str = "one") -> Child:
@@ -31,7 +31,7 @@ def test_an_obituary_names_the_exit_code_and_the_last_words(tmp_path: Path) -> N
     child = python(tmp_path, "print('reading'); raise SystemExit('the lens cap is on')")
     child.start()
     wait_for(lambda: not child.running)
-    text = child.obituary()
+    text = child.exit_summary()
     assert "process one ended by itself with exit code 1" in text
     assert "| the lens cap is on" in text and "| reading" in text
     assert str(child.log) in text
@@ -42,8 +42,8 @@ def test_an_obituary_names_the_signal(tmp_path: Path) -> None:
     child.start()
     os.kill(child.pid, signal.SIGKILL)
     wait_for(lambda: not child.running)
-    assert "killed by SIGKILL" in child.obituary()
-    assert "wrote nothing" in child.obituary()
+    assert "killed by SIGKILL" in child.exit_summary()
+    assert "wrote nothing" in child.exit_summary()
 
 
 def test_stop_is_gentle_first_and_firm_afterwards(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_no_child_outlives_a_launcher_that_was_killed_outright(tmp_path: Path) -
     launcher = """
 import sys, time
 from pathlib import Path
-from launch.processes import Child
+from freshfield_up.processes import Child
 child = Child("c", "c", [sys.executable, "-c", "import time; time.sleep(60)"], Path(sys.argv[1]))
 child.start()
 print(child.pid, flush=True)
@@ -105,7 +105,7 @@ def test_starting_a_process_is_no_business_of_grpc(tmp_path: Path) -> None:
     code = """
         import subprocess, sys
         from concurrent import futures
-        from launch import net
+        from freshfield_up import net
         import grpc
         server = grpc.server(futures.ThreadPoolExecutor(1))
         port = server.add_insecure_port("127.0.0.1:0")

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from launch.summary import summarise
+from freshfield_up.summary import summarise
 
 
 @pytest.mark.parametrize("closes, said", [(True, "the books close"), (False, "the books DO NOT CLOSE")])

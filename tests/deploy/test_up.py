@@ -237,7 +237,7 @@ def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     "text, seconds", [("60", 60.0), ("60s", 60.0), ("1.5m", 90.0), ("2h", 7200.0), ("0", 0.0)]
 )
 def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
-    import up as script
+    from freshfield_up import cli as script
 
     assert script.seconds(text) == seconds
 
@@ -254,13 +254,13 @@ def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
 def test_who_decides_and_whether_it_learns_is_passed_on_to_the_edge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], expected: list[str]
 ) -> None:
-    import up as script
     from freshfield.scenario import load
-    from launch import commands
+    from freshfield_up import cli as script
+    from freshfield_up import commands
 
     monkeypatch.setattr(commands, "program", lambda name: name)
     asked = script._edge_options(script._parser().parse_args(["room", *words]))
-    found = commands.plan(load("room"), tmp_path, 8080, edge_options=asked)
+    found = commands.process_set(load("room"), tmp_path, 8080, edge_options=asked)
     assert [w for w in found.edge.command if w.startswith(("--policy", "--learn", "--fallback"))] == expected
     others = [word for child in (found.emulator, *found.nodes) for word in child.command]
     assert not set(expected) & set(others)

@@ -11,7 +11,7 @@ from edge_server.config import ExportConfig
 from edge_server.report import build_report
 from edge_server.report.report import METRICS, SERIES, assemble, fidelity, updates
 from edge_server.report.run_files import read_records
-from launch.summary import summarise
+from freshfield_up.summary import summarise
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from freshfield.scenario import Scenario
-from launch.net import LOOPBACK, free_ports
-from launch.processes import Child
+from freshfield_up.net import LOOPBACK, free_ports
+from freshfield_up.processes import Child
 
 # Libraries start a thread for each core unless told otherwise. Nodes and emulator have none to gain, and
 # the field brings its own pool: the others' threads would only take turns with it.
@@ -35,7 +35,7 @@ class MissingCommand(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Plan:
+class ProcessSet:
     """The processes of one scenario. ``nodes`` is never empty; ``arms`` and ``drivers`` hold one each where
     the scenario has a simulated arm and a path for it."""
 
@@ -59,7 +59,7 @@ class Plan:
         return [self.drivers, self.nodes, self.arms, [self.emulator], [self.edge]]
 
 
-def plan(
+def process_set(
     scenario: Scenario,
     out: Path,
     page_port: int,
@@ -67,7 +67,7 @@ def plan(
     seed: int | None = None,
     process_per_camera: bool = False,
     edge_options: Sequence[str] = (),
-) -> Plan:
+) -> ProcessSet:
     """Commands, addresses and log files of a run into ``out``. edge_options: further words for the edge
     server."""
     edge_port, emulator_port = free_ports(2)
@@ -107,7 +107,7 @@ def plan(
         nodes.append(Child(name, role, command, out / f"log-{name}.txt", one))
     arm = scenario.source.get("arm")
     if not isinstance(arm, dict) or not arm.get("simulated"):
-        return Plan(edge, emulator, nodes, edge_address, emulator_address)
+        return ProcessSet(edge, emulator, nodes, edge_address, emulator_address)
     arms, drivers = [
         [Child(name, role, [program("camera-node"), command, file], out / f"log-{name}.txt", one)]
         for name, role, command in (
@@ -118,7 +118,7 @@ def plan(
     arm_address = f"{arm.get('host')}:{_ARM_PORT}"
     if not arm.get("path"):
         drivers = []
-    return Plan(edge, emulator, nodes, edge_address, emulator_address, arms, arm_address, drivers)
+    return ProcessSet(edge, emulator, nodes, edge_address, emulator_address, arms, arm_address, drivers)
 
 
 def program(name: str) -> str:

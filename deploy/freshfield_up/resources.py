@@ -13,7 +13,7 @@ from pathlib import Path
 
 import psutil
 
-from launch.processes import Child
+from freshfield_up.processes import Child
 
 PERIOD_S = 2.0
 

@@ -1,8 +1,8 @@
 """Health check of the containers: exit code 0 if the process beside it does its work.
 
-python healthy.py --serving HOST:PORT     the gRPC health service there says SERVING
-python healthy.py --node DIR              a node's status file there is younger than ten seconds: the
-                                          file of the camera named by $CAMERA, or of any node
+python -m freshfield_up.healthy --serving HOST:PORT   the gRPC health service there says SERVING
+python -m freshfield_up.healthy --node DIR            a node's status file there is younger than ten seconds:
+                                                      the file of the camera $CAMERA, or of any node
 """
 
 from __future__ import annotations

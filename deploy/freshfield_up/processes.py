@@ -60,7 +60,7 @@ class Child:
     def pid(self) -> int | None:
         return self.process.pid if self.process is not None else None
 
-    def obituary(self) -> str:
+    def exit_summary(self) -> str:
         """How it ended and the last lines of its log, for a person. Only for a process that has ended."""
         assert self.process is not None and self.process.returncode is not None
         age_s = time.monotonic() - self.started_s

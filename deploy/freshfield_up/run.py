@@ -11,13 +11,13 @@ from pathlib import Path
 from types import FrameType
 
 from freshfield.scenario import Scenario
-from launch import folder, mesh, net, processes
-from launch.commands import Plan, plan, program
-from launch.display import Display, make_display
-from launch.processes import Child
-from launch.resources import Resources
-from launch.status import read_json, read_status
-from launch.summary import summarise
+from freshfield_up import folder, mesh, net
+from freshfield_up.commands import ProcessSet, process_set, program
+from freshfield_up.display import Display, make_display
+from freshfield_up.processes import GRACE_S, Child, kill, stop
+from freshfield_up.resources import Resources
+from freshfield_up.status import read_json, read_status
+from freshfield_up.summary import summarise
 
 TICK_S = 0.25
 READY_WITHIN_S = 600.0
@@ -51,21 +51,21 @@ class Run:
     def __init__(self, scenario: Scenario, options: Options) -> None:
         self.scenario = scenario
         self.options = options
-        self.plan: Plan
+        self.processes: ProcessSet
         self._display: Display
         self._signals: list[str] = []
         self._asked = threading.Event()
         self._began_s = time.monotonic()
         self._ready_s: float | None = None
         self._page_told = False
-        self._dead: list[str] = []
+        self._failures: list[str] = []
         self._restart_at: dict[str, float] = {}
 
     def main(self) -> int:
         """Run to the end; 0 if it ended as asked. Raises FolderError or MissingCommand before any start."""
         options = self.options
         mesh.check(self.scenario)
-        self.plan = plan(
+        self.processes = process_set(
             self.scenario,
             options.out,
             options.port,
@@ -91,7 +91,7 @@ class Run:
             self._report()
         finally:
             lock.close()
-        return 1 if self._dead else 0
+        return 1 if self._failures else 0
 
     def _introduce(self) -> None:
         cameras = f"{len(self.scenario.training)} cameras"
@@ -104,10 +104,10 @@ class Run:
         """Start, then look around every tick until there is a reason to stop."""
         # The nodes render ahead while the edge loads its libraries. The emulator opens its door last: no
         # frame is offered before there is somebody to take it, and none is lost to the start.
-        self.plan.edge.start()
-        for arm in self.plan.arms:
+        self.processes.edge.start()
+        for arm in self.processes.arms:
             arm.start()
-        if not self.plan.arms:
+        if not self.processes.arms:
             self._start_nodes()
         resources = Resources(self.options.out / "processes.jsonl")
         while not self._asked.wait(TICK_S):
@@ -116,9 +116,9 @@ class Run:
                 return
             if self._ready_s is None:
                 self._get_ready(now_s)
-                if self._dead:
+                if self._failures:
                     return
-            resources.sample(now_s - self._began_s, self.plan.children)
+            resources.sample(now_s - self._began_s, self.processes.children)
             self._display.show(
                 read_status(self.options.out, self.scenario.cameras), self._headline(now_s), resources.latest
             )
@@ -126,16 +126,16 @@ class Run:
                 return
 
     def _start_nodes(self) -> None:
-        for child in self.plan.nodes:
+        for child in self.processes.nodes:
             child.start()
 
     def _get_ready(self, now_s: float) -> None:
         """One step of the start: nodes once an arm they need is there, emulator once the edge serves, and the
         address once the page answers."""
-        emulator = self.plan.emulator
-        if self.plan.nodes[0].process is None and net.accepts(self.plan.arm_address):
+        emulator = self.processes.emulator
+        if self.processes.nodes[0].process is None and net.accepts(self.processes.arm_address):
             self._start_nodes()
-        if emulator.process is None and net.is_serving(self.plan.edge_address):
+        if emulator.process is None and net.is_serving(self.processes.edge_address):
             emulator.start()
         if not self._page_told and net.page_answers(self.options.port):
             self._page_told = True
@@ -147,48 +147,48 @@ class Run:
         waited_for = self._not_ready()
         if waited_for is None:
             self._ready_s = now_s
-            for driver in self.plan.drivers:
+            for driver in self.processes.drivers:
                 driver.start()  # before, the arm would make its tour for a field that cannot learn yet
         elif now_s - self._began_s > READY_WITHIN_S:
-            self._mourn(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
+            self._fail(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
 
     def _not_ready(self) -> Child | None:
         """Whoever is being waited for."""
-        if self.plan.emulator.process is None or not self._page_told:
-            return self.plan.edge
-        if not net.is_serving(self.plan.emulator_address):
-            return self.plan.emulator
+        if self.processes.emulator.process is None or not self._page_told:
+            return self.processes.edge
+        if not net.is_serving(self.processes.emulator_address):
+            return self.processes.emulator
         phases = [read_json(file).get("phase") for file in self.options.out.glob("node-*.json")]
-        if phases.count("streaming") < len(self.plan.nodes):
-            return self.plan.nodes[0]
+        if phases.count("streaming") < len(self.processes.nodes):
+            return self.processes.nodes[0]
         doing = str(read_json(self.options.out / "edge.json").get("doing") or _COMPILING)
-        return self.plan.edge if doing.startswith(_COMPILING) else None
+        return self.processes.edge if doing.startswith(_COMPILING) else None
 
     def _all_alive(self, now_s: float) -> bool:
         """Look for the dead; with --restart, start them again after a second. False if the run is over."""
-        for child in self.plan.children:
+        for child in self.processes.children:
             if child.process is None or child.running:
                 continue
             due_s = self._restart_at.get(child.name)
             if due_s is None:
                 if not self.options.restart or child.restarts >= MAX_RESTARTS:
-                    self._mourn(child.obituary())
+                    self._fail(child.exit_summary())
                     continue
-                self._display.say(f"{child.obituary()}\nIt is started again in a second (--restart).")
+                self._display.say(f"{child.exit_summary()}\nIt is started again in a second (--restart).")
                 self._restart_at[child.name] = now_s + 1.0
             elif now_s >= due_s:
                 del self._restart_at[child.name]
                 child.restarts += 1
                 child.start()
-        return not self._dead
+        return not self._failures
 
-    def _mourn(self, text: str) -> None:
-        self._dead.append(text)
+    def _fail(self, text: str) -> None:
+        self._failures.append(text)
         self._display.say(text)
 
     def _headline(self, now_s: float) -> str:
         if self._ready_s is None:
-            if self.plan.emulator.process is None:
+            if self.processes.emulator.process is None:
                 return "starting: the edge server loads, the cameras prepare their frames"
             return "starting: the cameras prepare their frames, the field its kernels"
         elapsed = int(now_s - self._ready_s)
@@ -205,8 +205,8 @@ class Run:
         why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
         self._display.say(f"stopping{reason}: cameras, channel, edge")
-        for group in self.plan.groups:
-            processes.stop(group, 0.0 if len(self._signals) > 1 else processes.GRACE_S)
+        for group in self.processes.groups:
+            stop(group, 0.0 if len(self._signals) > 1 else GRACE_S)
             for child in group:
                 if child.killed:
                     self._display.say(f"{child.role} did not end in time and was killed; see {child.log}")
@@ -215,7 +215,7 @@ class Run:
         """Make what the scenario asks for besides the report. A signal, the second one of a run that was
         stopped by one, breaks it off."""
         export = mesh.child(self.scenario, self.options.out)
-        if export is None or self._dead:
+        if export is None or self._failures:
             return
         if not mesh.possible(self.options.out):
             self._display.say("no mesh: nothing to export yet, the field has made no update")
@@ -226,16 +226,16 @@ class Run:
         while export.running:
             time.sleep(TICK_S)
             if len(self._signals) > signals:
-                processes.kill(export)
+                kill(export)
                 self._display.say("no mesh: broken off")
                 return
             if time.monotonic() - begin_s > EXPORT_WITHIN_S:
-                processes.kill(export)
-                self._mourn(f"the mesh was not ready after {EXPORT_WITHIN_S:.0f} s; see {export.log}")
+                kill(export)
+                self._fail(f"the mesh was not ready after {EXPORT_WITHIN_S:.0f} s; see {export.log}")
                 return
         assert export.process is not None
         if export.process.returncode != 0:
-            self._mourn(export.obituary())
+            self._fail(export.exit_summary())
 
     def _report(self) -> None:
         """Join the books and write the report, whatever happened before."""
@@ -251,10 +251,10 @@ class Run:
         try:
             code = report.process.wait(REPORT_WITHIN_S)
         except subprocess.TimeoutExpired:
-            processes.kill(report)
-            self._mourn(f"the report was not ready after {REPORT_WITHIN_S:.0f} s; see {report.log}")
+            kill(report)
+            self._fail(f"the report was not ready after {REPORT_WITHIN_S:.0f} s; see {report.log}")
             return
         if code != 0:
-            self._mourn(report.obituary())
+            self._fail(report.exit_summary())
             return
         self._display.say(summarise(out))

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from freshfield.scenario import Scenario
-from launch.commands import MissingCommand, program
-from launch.processes import Child
-from launch.status import number, read_json
+from freshfield_up.commands import MissingCommand, program
+from freshfield_up.processes import Child
+from freshfield_up.status import number, read_json
 
 FIGURES = "mesh.json"
 

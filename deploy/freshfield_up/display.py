@@ -14,8 +14,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from launch.resources import Use
-from launch.status import RunStatus, Words, number
+from freshfield_up.resources import Use
+from freshfield_up.status import RunStatus, Words, number
 
 LINE_EVERY_S = 5.0
 _COLUMNS_FROM = 12

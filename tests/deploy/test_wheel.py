@@ -1,0 +1,105 @@
+"""An installed wheel does what a checkout does: it is built, installed and run from an empty folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+from tests.ports import free_port
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    (found,) = folder.glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def machine(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bin folder of a new environment that holds the wheel and sees this one's third-party packages."""
+    home = tmp_path_factory.mktemp("machine") / "venv"
+    subprocess.run([sys.executable, "-m", "venv", str(home)], check=True, timeout=120)
+    python = home / "bin" / "python"
+    (site,) = (home / "lib").glob("python*/site-packages")
+    # A .pth file in a folder named by a .pth file is not read: the checkout itself stays out of sight.
+    here = [path for path in sys.path if path.endswith("site-packages")]
+    (site / "third-party.pth").write_text("\n".join(here))
+    install = [str(python), "-m", "pip", "install", "-q", "--no-deps", "--force-reinstall", str(wheel)]
+    subprocess.run(install, check=True, capture_output=True, timeout=300)
+    return home / "bin"
+
+
+def run(command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command, cwd=cwd, env=_environment(), capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def _environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator:
+    """Starts a command in the background; all of them are stopped at the end, the first started last."""
+    running: list[subprocess.Popen] = []
+
+    def start(*command: str) -> subprocess.Popen:
+        log = (tmp_path / f"log-{len(running)}.txt").open("wb")
+        running.append(
+            subprocess.Popen(command, cwd=tmp_path, env=_environment(), stdout=log, stderr=subprocess.STDOUT)
+        )
+        return running[-1]
+
+    yield start
+    for process in reversed(running):
+        process.terminate()
+        process.wait(30)
+
+
+def test_the_wheel_carries_scenarios_models_and_launcher(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    shipped = {f"freshfield/scenarios/{path.name}" for path in (ROOT / "deploy/scenarios").glob("*.yaml")}
+    models = {f"edge_server/embed/models/{p.name}" for p in (ROOT / "edge_server/embed/models").iterdir()}
+    assert shipped <= names and models <= names
+    assert {"freshfield_up/cli.py", "edge_server/frontier.json"} <= names
+    assert not [name for name in names if name.startswith(("tests/", "deploy/", "docs/"))]
+
+
+def test_several_machines_start_from_an_empty_folder(machine: Path, started, tmp_path: Path) -> None:
+    where = run([str(machine / "python"), "-c", "import freshfield; print(freshfield.__file__)"], tmp_path)
+    assert str(machine.parent) in where.stdout, "the checkout was imported, not the wheel"
+    edge, emulator = (f"127.0.0.1:{free_port()}" for _ in range(2))
+    started(str(machine / "edge-server"), "run", "compose", "--listen", edge, "--out", "runs/edge")
+    started(str(machine / "channel-emu"), "run", "compose", "--listen", emulator, "--to", edge,
+            "--out", "runs/emulator")  # fmt: skip
+    for camera in ("cam00", "cam01", "cam02"):
+        started(str(machine / "camera-node"), "run", "compose", "--camera", camera, "--to", emulator,
+                "--out", f"runs/{camera}")  # fmt: skip
+    status, end_s = tmp_path / "runs/edge/edge.json", time.monotonic() + 180
+    while not (status.exists() and json.loads(status.read_text())["updates"]["count"] >= 3):
+        logs = "\n".join(log.read_text()[-1500:] for log in sorted(tmp_path.glob("log-*.txt")))
+        assert time.monotonic() < end_s, f"no three updates in time:\n{logs}"
+        time.sleep(0.5)
+
+
+def test_the_launcher_runs_a_shipped_scenario_by_name(machine: Path, tmp_path: Path) -> None:
+    words = ["compose", "--for", "5s", "--out", "runs/up", "--port", str(free_port()), "--no-table"]
+    done = run([str(machine / "freshfield-up"), *words], tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((tmp_path / "runs/up/report.json").read_text())
+    assert report["frames"]["closes"] and report["frames"]["delivered"] > 0
