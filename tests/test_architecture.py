@@ -1,0 +1,115 @@
+"""The rules of the house that imports can break: arrows point one way, no circles, rooms stay small."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+SOURCES = {"freshfield": ROOT / "proto", "camera_node": ROOT, "channel_emu": ROOT, "edge_server": ROOT}
+# importer -> what it may never import, in the order of the data
+FORBIDDEN = {
+    "freshfield": ("camera_node", "channel_emu", "edge_server"),
+    "camera_node": ("channel_emu", "edge_server", "torch"),
+    "channel_emu": ("camera_node", "edge_server", "torch"),
+    "channel_emu.model": ("channel_emu.live", "channel_emu.virtual", "channel_emu.estimate"),
+    "channel_emu.live": ("channel_emu.virtual", "channel_emu.estimate"),
+    "channel_emu.virtual": ("channel_emu.live", "channel_emu.estimate"),
+    "edge_server.fields": (
+        "edge_server.live", "edge_server.scheduler", "edge_server.fidelity", "edge_server.page",
+        "edge_server.report", "edge_server.surface",
+    ),
+    "edge_server.fields.common": tuple(
+        f"edge_server.fields.{name}" for name in ("splat", "ngp", "nerfacto", "tensorf", "voxel")
+    ),
+    "edge_server.embed": ("edge_server.live", "edge_server.fields", "edge_server.page"),
+    "edge_server.scheduler": ("edge_server.live", "edge_server.page"),
+    "edge_server.fidelity": ("edge_server.live", "edge_server.page"),
+    "edge_server.report": ("edge_server.live", "edge_server.page"),
+}  # fmt: skip
+FILES_A_LEVEL = 16  # fifteen and an __init__
+
+
+@cache
+def imports() -> dict[str, frozenset[str]]:
+    """Module -> every module that it imports anywhere, lazily and for type checkers too."""
+    files = {
+        ".".join(path.relative_to(base).with_suffix("").parts).removesuffix(".__init__"): path
+        for package, base in SOURCES.items()
+        for path in (base / package).rglob("*.py")
+        if not path.stem.endswith(("_pb2", "_pb2_grpc"))
+    }
+    graph = {}
+    for module, path in files.items():
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names = {f"{node.module}.{alias.name}" for alias in node.names}
+                found |= {name if name in files else node.module for name in names}
+        graph[module] = frozenset(found)
+    return graph
+
+
+def within(module: str, room: str) -> bool:
+    return module == room or module.startswith(f"{room}.")
+
+
+@pytest.mark.parametrize("room", FORBIDDEN)
+def test_arrows_point_one_way(room: str) -> None:
+    wrong = [
+        f"{module} -> {target}"
+        for module, targets in imports().items()
+        if within(module, room)
+        for target in targets
+        if any(within(target, other) for other in FORBIDDEN[room])
+    ]
+    assert not wrong
+
+
+def test_only_experiments_compose_the_packages_and_nothing_imports_experiments() -> None:
+    room = "edge_server.experiments"
+    wrong = [
+        f"{module} -> {target}"
+        for module, targets in imports().items()
+        if within(module, "edge_server") and not within(module, room)
+        for target in targets
+        if any(within(target, other) for other in (room, "camera_node", "channel_emu"))
+    ]
+    assert not wrong
+
+
+def test_imports_form_no_circle() -> None:
+    """At the top of a file or in a function alike. A package's __init__ may open its own files by name."""
+    graph = {m: {t for t in targets if not within(t, m)} for m, targets in imports().items()}
+    done, stack, circles = set(), [], []
+
+    def visit(module: str) -> None:
+        stack.append(module)
+        for target in sorted(graph[module] & graph.keys()):
+            if target in stack:
+                circles.append(" -> ".join([*stack[stack.index(target) :], target]))
+            elif target not in done:
+                visit(target)
+        stack.pop()
+        done.add(module)
+
+    for module in sorted(graph):
+        if module not in done:
+            visit(module)
+    assert not circles
+
+
+def test_a_level_holds_about_fifteen_files() -> None:
+    levels = Counter(
+        path.parent.relative_to(ROOT)
+        for package, base in SOURCES.items()
+        for path in Path(base / package).rglob("*.py")
+    )
+    assert not {str(level): count for level, count in levels.items() if count > FILES_A_LEVEL}
