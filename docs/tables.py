@@ -9,6 +9,7 @@ replaced. tests/deploy/test_docs.py fails while a page says something else than 
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -69,7 +70,8 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A Markdown table; numbers of a row are shown with one decimal."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(
-        "| " + " | ".join(f"{c:.1f}" if isinstance(c, float) else str(c) for c in line) + " |" for line in lines
+        "| " + " | ".join(f"{c:.1f}" if isinstance(c, float) else str(c) for c in line) + " |"
+        for line in lines
     )
 
 
@@ -90,10 +92,18 @@ def representations() -> str:
         start, tile = found["start"][name], found["tile"][name]
         rows.append([
             f"`{name}`", what, tile["render_128_ms"], tile["render_256_ms"], start["jit_cold_s"],
-            f"{start['jit_cached_s']:.2f}", f"{start['peak_rss_mb']:.0f}",
+            f"{start['jit_cached_s']:.2f}", math.floor(start["peak_rss_mb"] + 0.5),
         ])  # fmt: skip
     return table(
-        ["`field:`", "what it is", "render 128², ms", "render 256², ms", "compile, s", "from cache, s", "peak MB"],
+        [
+            "`field:`",
+            "what it is",
+            "render 128², ms",
+            "render 256², ms",
+            "compile, s",
+            "from cache, s",
+            "peak MB",
+        ],
         rows,
     )
 
@@ -122,7 +132,9 @@ def best_updates() -> str:
             whole = max(row, key=lambda p: p["psnr_db"])
             moving = max(row, key=lambda p: p["psnr_moving_db"])
             rows.append([
-                f"{speed:g}", f"`{field}`, {effort}", f"{whole['psnr_db']:.1f} at {whole['planned_update_s']:g} s",
+                f"{speed:g}",
+                f"`{field}`, {effort}",
+                f"{whole['psnr_db']:.1f} at {whole['planned_update_s']:g} s",
                 f"{moving['psnr_moving_db']:.1f} at {moving['planned_update_s']:g} s",
                 f"{row[-1]['psnr_db']:.1f} / {row[-1]['psnr_moving_db']:.1f}",
             ])  # fmt: skip

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import importlib.util
+import io
 import re
 import shlex
 from functools import cache
@@ -62,9 +65,6 @@ def test_every_page_is_linked_from_the_index_and_the_readme_is_short() -> None:
 @cache
 def help_of(program: str, *words: str) -> str | None:
     """What ``program words --help`` prints; None where there is no such command."""
-    import contextlib
-    import io
-
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()):
         try:
             PROGRAMS[program]([*words, "--help"])
@@ -91,8 +91,12 @@ def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
 def test_files_and_modules_that_are_named_exist(page: Path) -> None:
     for code in code_of(page.read_text()):
         for path in re.findall(rf"(?<![\w/.-])((?:{'|'.join(TOP)})/[\w./-]*)", code):
-            assert (ROOT / path.rstrip(".")).exists() or path.startswith("docs/results/"), f"{name(page)}: {path}"
-        for module in re.findall(r"python -m ([\w.]+)|((?:camera_node|channel_emu|edge_server)\.[\w.]+)", code):
+            assert (ROOT / path.rstrip(".")).exists() or path.startswith("docs/results/"), (
+                f"{name(page)}: {path}"
+            )
+        for module in re.findall(
+            r"python -m ([\w.]+)|((?:camera_node|channel_emu|edge_server)\.[\w.]+)", code
+        ):
             found = (module[0] or module[1]).rstrip(".")
             parent, _, last = found.rpartition(".")
             spec = importlib.util.find_spec(parent)
@@ -106,4 +110,6 @@ def test_tables_say_what_the_measured_files_say() -> None:
     tables = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tables)
     for page in (ROOT / "docs").rglob("*.md"):
-        assert tables.renewed(page.read_text()) == page.read_text(), f"{name(page)}: run `python docs/tables.py`"
+        assert tables.renewed(page.read_text()) == page.read_text(), (
+            f"{name(page)}: run `python docs/tables.py`"
+        )
