@@ -1,0 +1,284 @@
+"""Writes the tables of docs/ that come from measured files.
+
+    python docs/tables.py            after `make bench` or `edge-server frontier --shipped`
+
+A table stands between the lines ``<!-- table NAME -->`` and ``<!-- end -->``; what stands between them is
+replaced. tests/deploy/test_docs.py fails while a page says something else than the files.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parent
+FIELDS = {
+    "splat": "3D Gaussians",
+    "voxel": "voxel grid, no network",
+    "ngp": "hash grid, small network (default)",
+    "nerfacto": "hash grid, proposal sampling",
+    "tensorf": "vector-matrix factors",
+}
+# title, option as `bench options --only` knows it, and the cases (field, scene) with and without a need of it
+OPTIONS: tuple[tuple[str, tuple[tuple[str, str], ...], tuple[tuple[str, str], ...]], ...] = (
+    ("contraction", (("ngp", "room"), ("splat", "room")), (("ngp", "tile"), ("splat", "tile"))),
+    ("exposure", (("ngp", "room, gains"),), (("ngp", "room"),)),
+    ("pose refinement", (("ngp", "room, poses"),), (("ngp", "room"),)),
+    ("distortion loss", (("ngp", "room"),), (("ngp", "tile"),)),
+    (
+        "depth guide",
+        (("ngp", "tile"), ("ngp", "tile, six"), ("ngp", "kitchen, six"), ("ngp", "lego")),
+        (("ngp", "room"),),
+    ),
+    ("appearance", (("nerfacto", "room, gains"),), (("nerfacto", "room"),)),
+    (
+        "view-dependent colour",
+        (("ngp", "lego"), ("ngp", "kitchen"), ("splat", "lego"), ("splat", "kitchen")),
+        (("ngp", "tile"), ("ngp", "room"), ("splat", "tile"), ("splat", "room")),
+    ),
+    ("random background", (("ngp", "lego"), ("splat", "lego")), (("ngp", "tile"), ("splat", "tile"))),
+    ("outlines", (("voxel", "tile"),), (("voxel", "room"),)),
+    ("diffusion", (("voxel", "room"), ("voxel", "kitchen"), ("voxel", "tile")), (("voxel", "lego"),)),
+    ("no density seen by few", (), (("ngp", "tile"), ("ngp", "room"), ("splat", "tile"), ("splat", "room"))),
+    ("near fade", (), (("ngp", "tile"), ("ngp", "room"))),
+    ("smoothness", (), (("ngp", "tile"), ("ngp", "room"))),
+)
+UPDATE_OPTIONS = (
+    ("changed pixels first", "room, moving"),
+    ("changed pixels first", "kitchen, moving"),
+    ("stale pixels masked", "room, late"),
+    ("stale pixels masked", "room, moving"),
+    ("weighed by age", "room, late"),
+    ("weighed by age", "room, moving"),
+    ("movement followed", "room, late"),
+    ("movement followed", "room, moving"),
+    ("wrong views refused", "room, moving"),
+    ("wrong views refused", "kitchen, moving"),
+)
+
+
+def measured(name: str) -> Any:
+    """A file of figures, by its path from the repository's root."""
+    return json.loads((DOCS.parent / name).read_text())
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table; numbers of a row are shown with one decimal."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(
+        "| " + " | ".join(f"{c:.1f}" if isinstance(c, float) else str(c) for c in line) + " |"
+        for line in lines
+    )
+
+
+def from_scratch(scene: str, seconds: Sequence[float]) -> str:
+    """PSNR after so many seconds of fitting, a row a representation."""
+    found = measured("docs/results/field.json")["field"][scene]
+    head = ["representation", *(f"{s:g} s" for s in seconds)]
+    return table(
+        head, ([f"`{f}`", *(found[f]["series"][f"{s:g}_s"]["psnr_db"] for s in seconds)] for f in FIELDS)
+    )
+
+
+def representations() -> str:
+    """What each representation is, and what it takes: rendering, compiling, memory."""
+    found = measured("docs/results/field.json")["field"]
+    rows = []
+    for name, what in FIELDS.items():
+        start, tile = found["start"][name], found["tile"][name]
+        rows.append([
+            f"`{name}`", what, tile["render_128_ms"], tile["render_256_ms"], start["jit_cold_s"],
+            f"{start['jit_cached_s']:.2f}", math.floor(start["peak_rss_mb"] + 0.5),
+        ])  # fmt: skip
+    return table(
+        [
+            "`field:`",
+            "what it is",
+            "render 128², ms",
+            "render 256², ms",
+            "compile, s",
+            "from cache, s",
+            "peak MB",
+        ],
+        rows,
+    )
+
+
+def baselines() -> str:
+    """How far held-out cameras stand off, and what doing without a field would score."""
+    found = measured("docs/results/field.json")["field"]
+    rows = []
+    for scene in ("tile", "room", "kitchen", "lego", "fox"):
+        part = found[scene]
+        known = part["baseline"]
+        rows.append([part["scene"], part["angle_deg"], known["mean_colour_db"], known["nearest_view_db"]])
+    return table(
+        ["scene", "held-out view to nearest other, degrees", "mean color, dB", "nearest view, dB"], rows
+    )
+
+
+def best_updates() -> str:
+    """The best time of an update, by what is scored; `splat` at two efforts, the others at one."""
+    points = measured("edge_server/frontier.json")["updates"]
+    longest = max(p["planned_update_s"] for p in points)
+    rows = []
+    for speed in sorted({p["speed_m_per_s"] for p in points}):
+        for field, effort in (("splat", "low"), *((field, "medium") for field in FIELDS)):
+            row = _line(points, speed, field, effort)
+            whole = max(row, key=lambda p: p["psnr_db"])
+            moving = max(row, key=lambda p: p["psnr_moving_db"])
+            rows.append([
+                f"{speed:g}",
+                f"`{field}`, {effort}",
+                f"{whole['psnr_db']:.1f} at {whole['planned_update_s']:g} s",
+                f"{moving['psnr_moving_db']:.1f} at {moving['planned_update_s']:g} s",
+                f"{row[-1]['psnr_db']:.1f} / {row[-1]['psnr_moving_db']:.1f}",
+            ])  # fmt: skip
+    return table(
+        [
+            "person, m/s", "representation, effort", "best dB, whole image", "best dB, moving pixels",
+            f"at {longest:g} s, whole / moving",
+        ],
+        rows,
+    )  # fmt: skip
+
+
+def all_updates() -> str:
+    """Every point of the shipped frontier: whole image / moving pixels."""
+    points = measured("edge_server/frontier.json")["updates"]
+    times = sorted({p["planned_update_s"] for p in points})
+    rows = []
+    for speed in sorted({p["speed_m_per_s"] for p in points}):
+        for field in FIELDS:
+            for effort in ("low", "medium"):
+                cells = [
+                    f"{p['psnr_db']:.1f} / {p['psnr_moving_db']:.1f}"
+                    for p in _line(points, speed, field, effort)
+                ]
+                rows.append([f"{speed:g}", f"`{field}`, {effort}", *cells])
+    return table(["person, m/s", "representation, effort", *(f"{s:g} s" for s in times)], rows)
+
+
+def _line(points: Sequence[Any], speed: float, field: str, effort: str) -> list[Any]:
+    found = [p for p in points if (p["speed_m_per_s"], p["field"], p["effort"]) == (speed, field, effort)]
+    return sorted(found, key=lambda p: p["planned_update_s"])
+
+
+def options() -> str:
+    """Gain of each optional part after four seconds (and step for step), where it is called for or not."""
+    found = {(r["option"], r["field"], r["scene"]): r["gain_psnr_db"] for r in _option_rows()}
+
+    def cell(name: str, cases: Sequence[tuple[str, str]]) -> str:
+        parts = []
+        for field, scene in cases:
+            gain = found[name, field, scene]
+            parts.append(f"`{field}`, {scene}: {signed(gain['4_s'])} ({signed(gain['400_steps'])})")
+        return "<br>".join(parts) or "none of ours"
+
+    return table(
+        ["option", "scenes that call for it, gain dB", "scenes that do not, gain dB"],
+        ([name, cell(name, yes), cell(name, no)] for name, yes, no in OPTIONS),
+    )
+
+
+def update_options() -> str:
+    """The same for updates of a quarter of a second while the scene moves: whole image, moving pixels."""
+    found = {(r["option"], r["field"], r["scene"]): r for r in _option_rows()}
+    rows = []
+    for name, scene in UPDATE_OPTIONS:
+        cells = []
+        for field in ("ngp", "splat"):
+            row = found.get((name, field, scene))
+            cells.append(
+                f"{signed(row['gain_psnr_db']['0.25_s'])} / {signed(row['gain_psnr_moving_db']['0.25_s'])}"
+                if row
+                else "has none"
+            )
+        rows.append([name, scene, *cells])
+    return table(["option", "scene", "`ngp`, whole / moving, dB", "`splat`, whole / moving, dB"], rows)
+
+
+def _option_rows() -> list[Any]:
+    rows: list[Any] = measured("docs/results/field.json")["options"]["rows"]
+    return rows
+
+
+def signed(value: float) -> str:
+    """With its sign and one decimal; 0 has none."""
+    text = f"{value:+.1f}"
+    return "0" if float(text) == 0 else text
+
+
+def limits() -> str:
+    """What the machine's own limits explain of each kernel's time."""
+    rows = [row for row in _rows("limits", r"\w+ on ") if row[4] not in ("-", "")]
+    return table(
+        ["field, scene", "kernel", "share of a step", "explained by the machine's limits"],
+        ([row[0], f"`{row[1]}`", row[3], row[4]] for row in rows),
+    )
+
+
+def following(part: str) -> str:
+    """Tables of track and drift: how far updates stay behind a fresh fit."""
+    found = _rows(part, "(room|kitchen) ")
+    found.sort(key=lambda row: (("room", "kitchen").index(row[0]), list(FIELDS).index(row[1])))
+    last = 10 if part == "drift" else 9
+    rows = [[r[0], f"`{r[1]}`", r[2], *map(_one_decimal, r[4:last])] for r in found]
+    head = ["scene", "`field:`", "update", "updated, dB", "fresh fit, dB", "never updated, dB"]
+    head += ["within 0.5 dB of fresh", "median gap, dB", "gap in first, last tenth, dB"]
+    return table(head[: len(rows[0])], rows)
+
+
+def _one_decimal(text: str) -> str:
+    return re.sub(r"-?\d+\.\d+", lambda number: re.sub(r"^-(?=0\.0$)", "", f"{float(number[0]):.1f}"), text)
+
+
+def _rows(part: str, begins: str) -> list[list[str]]:
+    """Rows of field.md's tables of a part, those whose first cell begins so, as cells."""
+    text = (DOCS / "results" / "field.md").read_text().partition(f"## {part}\n")[2].partition("\n## ")[0]
+    lines = [line for line in text.splitlines() if re.match(rf"\| {begins}", line)]
+    return [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "representations": representations,
+    "tile": lambda: from_scratch("tile", (0.25, 0.5, 0.8, 1, 2.5, 15)),
+    "room": lambda: from_scratch("room", (0.25, 0.5, 1, 2.5, 4, 15)),
+    "kitchen": lambda: from_scratch("kitchen", (2, 5, 15, 60)),
+    "lego": lambda: from_scratch("lego", (2, 5, 15, 60)),
+    "fox": lambda: from_scratch("fox", (2, 5, 15, 60)),
+    "baselines": baselines,
+    "best-updates": best_updates,
+    "all-updates": all_updates,
+    "options": options,
+    "update-options": update_options,
+    "track": lambda: following("track"),
+    "drift": lambda: following("drift"),
+    "limits": limits,
+}
+
+
+def renewed(text: str) -> str:
+    """A page with its tables made anew. KeyError: a page names a table that there is not."""
+    return re.sub(
+        r"<!-- table ([\w-]+) -->\n.*?<!-- end -->",
+        lambda found: f"<!-- table {found[1]} -->\n{TABLES[found[1]]()}\n<!-- end -->",
+        text,
+        flags=re.S,
+    )
+
+
+def main() -> None:
+    for page in sorted(DOCS.rglob("*.md")):
+        text = page.read_text()
+        if (new := renewed(text)) != text:
+            page.write_text(new)
+            print(page.relative_to(DOCS.parent))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""The documentation: links resolve, commands and files exist, tables say what the measured files say."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import io
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from camera_node.cli import main as camera_node
+from channel_emu.cli import main as channel_emu
+from edge_server.cli import main as edge_server
+from tests.conftest import ROOT
+
+PROGRAMS = {"camera-node": camera_node, "channel-emu": channel_emu, "edge-server": edge_server}
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").rglob("*.md")), ROOT / "deploy" / "lab" / "README.md"]
+# Folders of the repository that a page may name a path in.
+TOP = ("camera_node", "channel_emu", "edge_server", "proto", "deploy", "docs", "tests")
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def code_of(text: str) -> list[str]:
+    """Code spans and lines of code blocks. A span may go over a line's end."""
+    blocks = re.findall(r"(?:^|\n)(?:```\w*\n(.*?)\n```|((?: {4}[^\n]*\n)+))", text, re.S)
+    lines = [line.strip() for pair in blocks for block in pair for line in block.splitlines()]
+    return lines + [" ".join(span.split()) for span in re.findall(r"(?<!`)`([^`]+)`(?!`)", text)]
+
+
+def anchors(text: str) -> set[str]:
+    """Names that GitHub gives the headings of a page."""
+    heads = re.findall(r"^#+ (.*)$", text, re.M)
+    return {re.sub(r"[^\w -]", "", head.lower()).strip().replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_relative_links_resolve(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{name(page)}: {link}"
+        if anchor:
+            assert anchor in anchors(target.read_text()), f"{name(page)}: {link}"
+
+
+def test_every_page_is_linked_from_the_index_and_the_readme_is_short() -> None:
+    words, lines = len(README.read_text().split()), len(README.read_text().splitlines())
+    assert words <= 1500 and lines <= 160
+    index = (ROOT / "docs" / "README.md").read_text()
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name == "README.md" or f"({page.name})" in index
+
+
+@cache
+def help_of(program: str, *words: str) -> str | None:
+    """What ``program words --help`` prints; None where there is no such command."""
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()):
+        try:
+            PROGRAMS[program]([*words, "--help"])
+        except SystemExit as end:
+            return None if end.code else out.getvalue()
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_exist_with_the_options_they_are_given(page: Path) -> None:
+    for code in code_of(page.read_text()):
+        for program, rest in re.findall(rf"\b({'|'.join(PROGRAMS)}) ([^|;&`]+)", re.sub(r"\s#.*", "", code)):
+            words = shlex.split(rest.replace("'", ""))
+            if not words or not re.fullmatch(r"[a-z][a-z-]*", words[0]):
+                continue  # a name in a sentence
+            command = tuple(words[: 2 if words[0] == "calibrate" else 1])
+            known = help_of(program, *command)
+            assert known is not None, f"{name(page)}: {program} {' '.join(command)}"
+            given = {word.partition("=")[0] for word in words if re.match(r"--[a-z]", word)}
+            assert given <= set(re.findall(r"--[a-z-]+", known)), f"{name(page)}: {code}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_files_and_modules_that_are_named_exist(page: Path) -> None:
+    for code in code_of(page.read_text()):
+        for path in re.findall(rf"(?<![\w/.-])((?:{'|'.join(TOP)})/[\w./-]*)", code):
+            assert (ROOT / path.rstrip(".")).exists() or path.startswith("docs/results/"), (
+                f"{name(page)}: {path}"
+            )
+        for module in re.findall(
+            r"python -m ([\w.]+)|((?:camera_node|channel_emu|edge_server)\.[\w.]+)", code
+        ):
+            found = (module[0] or module[1]).rstrip(".")
+            parent, _, last = found.rpartition(".")
+            spec = importlib.util.find_spec(parent)
+            assert spec is not None, f"{name(page)}: {found}"
+            assert importlib.util.find_spec(found) or hasattr(importlib.import_module(parent), last)
+
+
+def test_tables_say_what_the_measured_files_say() -> None:
+    spec = importlib.util.spec_from_file_location("docs_tables", ROOT / "docs" / "tables.py")
+    assert spec is not None and spec.loader is not None
+    tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    for page in (ROOT / "docs").rglob("*.md"):
+        assert tables.renewed(page.read_text()) == page.read_text(), (
+            f"{name(page)}: run `python docs/tables.py`"
+        )
