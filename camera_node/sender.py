@@ -16,6 +16,7 @@ from camera_node.outbox import Outbox
 from freshfield.clock import Offset
 from freshfield.frame import Frame, to_request
 from freshfield.payload import MAX_PAST_NS
+from freshfield.transport import backoff_s
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc as rpc
 
@@ -80,7 +81,7 @@ class Sender:
 
     async def run(self) -> None:
         """Until cancelled."""
-        backoff = FIRST_BACKOFF_S
+        failures = 0
         while True:
             answered = self.outbox.counts["sent"] - self.outbox.counts["broken"]
             try:
@@ -102,9 +103,9 @@ class Sender:
             finally:
                 self.connected = False
             if self.outbox.counts["sent"] - self.outbox.counts["broken"] > answered:
-                backoff = FIRST_BACKOFF_S  # it worked for a while
-            await asyncio.sleep(backoff * self._jitter.uniform(0.5, 1.0))
-            backoff = min(backoff * 2.0, MAX_BACKOFF_S)
+                failures = 0  # it worked for a while
+            await asyncio.sleep(backoff_s(failures, FIRST_BACKOFF_S, MAX_BACKOFF_S, self._jitter))
+            failures += 1
 
     async def _session(self) -> None:
         """One stream, from the moment the peer can be reached until it fails."""
