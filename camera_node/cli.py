@@ -61,6 +61,11 @@ def main(arguments: list[str] | None = None) -> int:
     commands.add_parser("sources", help="list kinds of sources and the keys they take")
     commands.add_parser("effects", help="list effects and their parameters")
     arm_cli.add_commands(commands)
+    _add_doctor(commands.add_parser(
+        "doctor", help="examine this machine's part of a set-up: what is wrong, and what to do about it",
+        description="Tests, one after the other, the packages, cameras, arm, clock, network, disk and files "
+        "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
+    ))  # fmt: skip
     args = parser.parse_args(arguments)
     try:
         if args.command == "run":
@@ -71,6 +76,10 @@ def main(arguments: list[str] | None = None) -> int:
             return arm_cli.run(args)
         if args.command == "calibrate":
             return calibrate.run(args)
+        if args.command == "doctor":
+            from camera_node import doctor
+
+            return doctor.run(args)
         from camera_node import listing
 
         print(listing.sources() if args.command == "sources" else listing.effects())
@@ -104,6 +113,16 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     run.add_argument("-q", "--quiet", action="store_true", help="only warnings")
     transport.add_arguments(run)
+
+
+def _add_doctor(doctor: argparse.ArgumentParser) -> None:
+    doctor.add_argument("scenario", nargs="?", help="without one, only what every scenario needs is tested")
+    doctor.add_argument("--to", metavar="HOST:PORT", help="the channel emulator or edge server to reach")
+    doctor.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    doctor.add_argument(
+        "--out", type=Path, default=Path("runs"), metavar="DIR", help="where runs will be written"
+    )
+    doctor.add_argument("--json", action="store_true", help="one JSON object for scripts")
 
 
 def _open(args: argparse.Namespace, cache_mb: float) -> tuple[scenario.Scenario, list[Camera]]:

@@ -14,9 +14,6 @@ from typing import Any
 from freshfield.payload import CODECS, MAX_IMAGE_SIDE
 from freshfield.scenario import Scenario, ScenarioError, read_section
 
-KINDS = (
-    "world", "transforms", "video", "dynerf", "zju", "eyeful", "colmap", "mcap", "camera", "oak", "realsense",
-)  # fmt: skip
 LOOPS = ("back-and-forth", "restart")
 REPLAYS = ("once", "restart")
 PAIRINGS = ("nearest", "interpolated")
@@ -339,18 +336,19 @@ class McapConfig(SourceConfig):
             raise ValueError("effects: a recording is replayed as it was; leave them out")
 
 
+# kind -> its keys
 MODELS: dict[str, type[SourceConfig]] = {
     "world": WorldConfig,
     "transforms": TransformsConfig,
     "video": VideoConfig,
-    "camera": CameraConfig,
-    "oak": OakConfig,
-    "realsense": RealsenseConfig,
     "dynerf": DynerfConfig,
     "zju": ZjuConfig,
     "eyeful": EyefulConfig,
     "colmap": ColmapConfig,
     "mcap": McapConfig,
+    "camera": CameraConfig,
+    "oak": OakConfig,
+    "realsense": RealsenseConfig,
 }
 
 
@@ -366,7 +364,7 @@ def source_config(scenario: Scenario) -> SourceConfig:
     where = f"{scenario.path}: source"
     kind = scenario.source.get("kind")
     if kind not in MODELS:
-        raise ScenarioError(f"{where}.kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+        raise ScenarioError(f"{where}.kind: expected one of {', '.join(MODELS)}, got {kind!r}")
     return read_section(MODELS[kind], scenario.source, where)
 
 
