@@ -20,10 +20,13 @@ from camera_node.sources.datasets.records import (
     PosedImage,
     camera_to_world,
     errors_at,
+    find_files,
 )
 from freshfield.geometry import quaternion_to_matrix
 
-PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")
+_PLACES = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
+# Binary ones are preferred, as COLMAP does.
+FILES = tuple(f"{place}cameras{ending}" for place in _PLACES for ending in (".bin", ".txt"))
 # COLMAP's number and name of each model with the number of its parameters; those it has beside them are
 # refused.
 _MODELS = {
@@ -50,12 +53,6 @@ def describes(file: Path) -> bool:
     return file.suffix in (".bin", ".txt")
 
 
-def find(folder: Path) -> list[Path]:
-    """See ``formats.Reader``: the files of cameras; binary ones come first, as COLMAP prefers them."""
-    files = [folder / place / f"cameras{ending}" for place in PLACES for ending in (".bin", ".txt")]
-    return [file for file in files if _complete(file)][:1]
-
-
 def from_config(path: Path, config: ColmapConfig) -> Dataset:
     """See ``formats.Reader``."""
     return load_dataset(path, ImageOptions(config.scale, config.background), config.images)
@@ -70,13 +67,12 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
 
     Images without a file are left out and counted. Raises DatasetError.
     """
-    beside = path.with_name(f"cameras{path.suffix}")
-    files = find(path) if path.is_dir() else [beside] if _complete(beside) else []
-    if not files:
+    files = find_files(path, FILES) if path.is_dir() else [path.with_name(f"cameras{path.suffix}")]
+    file = next((f for f in files if f.is_file() and f.with_stem("images").is_file()), None)
+    if file is None:
         raise DatasetError(
             f"{path}: no COLMAP model: expected cameras and images, .bin or .txt, in it or in sparse/0"
         )
-    file = files[0]
     lenses, entries = (_binary if file.suffix == ".bin" else _text)(file)
     folder = _images(path if path.is_dir() else path.parent, file, images)
     sized: dict[int, Lens] = {}
@@ -101,10 +97,6 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     if not found:
         raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
     return Dataset(tuple(found), missing)
-
-
-def _complete(cameras: Path) -> bool:
-    return cameras.is_file() and cameras.with_stem("images").is_file()
 
 
 def _images(given: Path, model: Path, images: str | None) -> Path:

@@ -21,6 +21,7 @@ from camera_node.sources.rig_calibration import CalibratedCamera
 from freshfield.geometry import Pinhole, Pose
 
 POSES = "poses_bounds.npy"
+FILES = (POSES,)
 # Of a video's shape against that of the images its focal length was found on: both are rounded to pixels.
 _SAME_SHAPE = 0.02
 
@@ -28,11 +29,6 @@ _SAME_SHAPE = 0.02
 def describes(file: Path) -> bool:
     """See ``formats.Reader``."""
     return file.name == POSES
-
-
-def find(folder: Path) -> list[Path]:
-    """See ``formats.Reader``."""
-    return sorted(folder.glob(POSES))
 
 
 def from_config(path: Path, config: DynerfConfig) -> VideoRig:

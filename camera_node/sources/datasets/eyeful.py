@@ -24,9 +24,17 @@ import numpy as np
 from camera_node.config import EyefulConfig
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
-from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, errors_at, read_json
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    PosedImage,
+    errors_at,
+    find_files,
+    read_json,
+)
 from freshfield.geometry import se3_inverse
 
+FILES = ("cameras.json", "cameras.xml")
 # Smallest first: more pixels than a field learns in a second are of no use.
 FOLDERS = ("images-jpeg-1k", "images-jpeg-2k", "images-jpeg-4k", "images-jpeg")
 # (x, y up, z) -> (z, x, y): their height becomes our z.
@@ -48,11 +56,6 @@ def describes(file: Path) -> bool:
     return file.suffix == ".xml" or (isinstance(data, dict) and "KRT" in data)
 
 
-def find(folder: Path) -> list[Path]:
-    """See ``formats.Reader``."""
-    return [folder / name for name in ("cameras.json", "cameras.xml") if (folder / name).is_file()]
-
-
 def from_config(path: Path, config: EyefulConfig) -> Dataset:
     """See ``formats.Reader``."""
     return load_dataset(path, ImageOptions(config.scale), config.images)
@@ -68,7 +71,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | No
     time. Images without a file are left out and counted. Raises DatasetError.
     """
     folder = path if path.is_dir() else path.parent
-    file = path if path.is_file() else next(iter(find(folder)), folder / "cameras.json")
+    file = path if path.is_file() else next(iter(find_files(folder, FILES)), folder / FILES[0])
     entries = _from_xml(file) if file.suffix == ".xml" else _from_json(file)
     held_out = _held_out(folder / "splits.json")
     pictures = _images(folder, images)

@@ -12,7 +12,7 @@ from typing import Any, Protocol, cast
 
 from camera_node.config import MODELS, RecordedConfig
 from camera_node.sources.datasets.photo import ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError
+from camera_node.sources.datasets.records import Dataset, DatasetError, find_files
 from camera_node.sources.datasets.video import VideoRig
 
 # In this order: where several fit, the one that says most about its images comes first.
@@ -20,13 +20,13 @@ FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, Reco
 
 
 class Reader(Protocol):
-    """What the module of a format offers."""
+    """What the module of a format offers. FILES: patterns of the files that describe a data set in a folder;
+    the first usable one is taken."""
+
+    FILES: tuple[str, ...]
 
     def describes(self, file: Path) -> bool:
         """Whether a file describes a data set of this format. Raises DatasetError for a damaged one."""
-
-    def find(self, folder: Path) -> list[Path]:
-        """The describing files of this format in a folder, of which the first usable one is taken."""
 
     def load_dataset(self, path: Path, options: ImageOptions) -> Dataset:
         """The posed images of a folder or describing file. Raises DatasetError."""
@@ -58,7 +58,7 @@ def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tup
         raise DatasetError(f"{path}: no such file or folder")
     errors: list[str] = []
     for key in FORMATS if name is None else (name,):
-        for file in reader(key).find(path):
+        for file in find_files(path, reader(key).FILES):
             try:
                 return file, reader(key).load_dataset(file, options)
             except DatasetError as error:

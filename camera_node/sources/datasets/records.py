@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,6 +83,11 @@ class Dataset:
         """The images of one camera, in the order of time."""
         found = [image for image in self.images if image.camera == camera]
         return tuple(sorted(found, key=lambda image: 0.0 if image.time_s is None else image.time_s))
+
+
+def find_files(folder: Path, patterns: Sequence[str]) -> list[Path]:
+    """The files of a folder that match a pattern, in the order of the patterns."""
+    return list(dict.fromkeys(file for pattern in patterns for file in sorted(folder.glob(pattern))))
 
 
 @contextlib.contextmanager

@@ -18,9 +18,18 @@ import numpy as np
 from camera_node.config import BACKGROUNDS, TransformsConfig
 from camera_node.sources.datasets.imaging import composite, read_image, resize, shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage, read_json
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    Image,
+    PosedImage,
+    find_files,
+    read_json,
+)
 from freshfield.geometry import OPENGL_TO_OPENCV, GeometryError, Pinhole, Pose
 
+# First what nerfstudio and NeRF-synthetic start a training from.
+FILES = ("transforms.json", "transforms_train.json", "transforms*.json")
 _EXTENSIONS = ("", ".png", ".jpg", ".jpeg")
 _FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO")
 
@@ -31,13 +40,6 @@ def describes(file: Path) -> bool:
         return False
     data = read_json(file)
     return isinstance(data, dict) and "frames" in data
-
-
-def find(folder: Path) -> list[Path]:
-    """See ``formats.Reader``: first what nerfstudio and NeRF-synthetic start a training from."""
-    preferred = [folder / "transforms.json", folder / "transforms_train.json"]
-    others = sorted(folder.glob("transforms*.json"))
-    return [p for p in dict.fromkeys([*preferred, *others]) if p.is_file()]
 
 
 def from_config(path: Path, config: TransformsConfig) -> Dataset:
@@ -55,7 +57,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder")
     tried = []
-    for file in [path] if path.is_file() else find(path):
+    for file in [path] if path.is_file() else find_files(path, FILES):
         dataset = _load(file, options.scale, options.background)
         if dataset.images:
             return dataset

@@ -10,11 +10,12 @@ from pathlib import Path
 from camera_node.config import VideoConfig
 from camera_node.sources.datasets.imaging import shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, read_json
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, find_files, read_json
 from camera_node.sources.datasets.video_clip import Clip
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.geometry import Pinhole
 
+FILES = ("calib*.json",)
 _PLACES = ("videos/{}.mp4", "{}.mp4")
 
 
@@ -30,11 +31,6 @@ def describes(file: Path) -> bool:
     """See ``formats.Reader``."""
     data = read_json(file) if file.suffix == ".json" else None
     return isinstance(data, dict) and not {"frames", "KRT"} & set(data)
-
-
-def find(folder: Path) -> list[Path]:
-    """See ``formats.Reader``."""
-    return sorted(folder.glob("calib*.json"))
 
 
 def from_config(path: Path, config: VideoConfig) -> VideoRig:
@@ -113,7 +109,7 @@ def open_clip(rig: VideoRig, name: str) -> Clip:
 def _find_calibration(folder: Path) -> Path:
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such file or folder")
-    found = find(folder)
+    found = find_files(folder, FILES)
     if len(found) != 1:
         names = ", ".join(p.name for p in found) or "none"
         raise DatasetError(f"{folder}: expected one calib*.json, found {names}; name the file itself")

@@ -30,6 +30,7 @@ from camera_node.sources.datasets.records import (
 )
 
 ANNOTATIONS = "annots.npy"
+FILES = (ANNOTATIONS,)
 # The files do not say; what the studio's cameras are taken to run at where a scenario does not.
 FPS = 50.0
 _MM = 1e-3
@@ -38,11 +39,6 @@ _MM = 1e-3
 def describes(file: Path) -> bool:
     """See ``formats.Reader``."""
     return file.name == ANNOTATIONS
-
-
-def find(folder: Path) -> list[Path]:
-    """See ``formats.Reader``."""
-    return sorted(folder.glob(ANNOTATIONS))
 
 
 def from_config(path: Path, config: ZjuConfig) -> Dataset:
