@@ -274,8 +274,8 @@ class DynerfConfig(RecordedConfig):
 @dataclass(frozen=True)
 class ZjuConfig(RecordedConfig):
     """ZJU-MoCap. data: the folder with ``annots.npy`` and the cameras' folders of images. recorded_fps: of
-    the recording, whose files do not tell. masks: a folder of masks (``mask_cihp``) that cut the background out;
-    background: what replaces it."""
+    the recording, whose files do not tell. masks: a folder of masks (``mask_cihp``) that cut the person out;
+    background: what goes behind the person."""
 
     recorded_fps: float = 50.0
     masks: str | None = None

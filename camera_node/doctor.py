@@ -58,17 +58,17 @@ class CheckResult:
 
 def run(args: argparse.Namespace) -> int:
     """Examine and print; 1 if something is wrong."""
-    findings = []
-    for finding in run_checks(args.scenario, args.to, args.data, args.out):
-        findings.append(finding)
+    results = []
+    for result in run_checks(args.scenario, args.to, args.data, args.out):
+        results.append(result)
         if not args.json:
-            mark = {True: "ok", False: "WRONG", None: "-"}[finding.ok]
-            print(f"{mark:6} {finding.part:18} {finding.said}", flush=True)
-    wrong = sum(finding.ok is False for finding in findings)
+            mark = {True: "ok", False: "WRONG", None: "-"}[result.ok]
+            print(f"{mark:6} {result.part:18} {result.said}", flush=True)
+    wrong = sum(result.ok is False for result in results)
     if args.json:
-        print(json.dumps({"ok": not wrong, "parts": [asdict(finding) for finding in findings]}, indent=1))
+        print(json.dumps({"ok": not wrong, "parts": [asdict(result) for result in results]}, indent=1))
     else:
-        print(f"\n{wrong} of {len(findings)} parts need attention" if wrong else "\nnothing is wrong")
+        print(f"\n{wrong} of {len(results)} parts need attention" if wrong else "\nnothing is wrong")
     return 1 if wrong else 0
 
 
@@ -111,9 +111,9 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None) -> Iter
             yield _check("arm's path", lambda: checks.path(scenario, arm, path))
 
 
-def _check(part: str, examination: Callable[[], str]) -> CheckResult:
+def _check(part: str, check: Callable[[], str]) -> CheckResult:
     try:
-        return CheckResult(part, True, examination())
+        return CheckResult(part, True, check())
     except (ValueError, OSError) as error:
         return CheckResult(part, False, " ".join(str(error).split()).removeprefix(f"{part.split()[-1]}: "))
     except Exception as error:  # libraries of devices raise what they like: the other parts count too

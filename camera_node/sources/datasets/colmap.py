@@ -27,8 +27,7 @@ from freshfield.geometry import quaternion_to_matrix
 _PLACES = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
 # Binary ones are preferred, as COLMAP does.
 FILES = tuple(f"{place}cameras{ending}" for place in _PLACES for ending in (".bin", ".txt"))
-# COLMAP's number and name of each model with the number of its parameters; those it has beside them are
-# refused.
+# COLMAP's number and name of each supported model with the number of its parameters; others are refused.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),

@@ -37,7 +37,7 @@ from freshfield.geometry import se3_inverse
 FILES = ("cameras.json", "cameras.xml")
 # Smallest first: more pixels than a field learns in a second are of no use.
 FOLDERS = ("images-jpeg-1k", "images-jpeg-2k", "images-jpeg-4k", "images-jpeg")
-# (x, y up, z) -> (z, x, y): their height becomes our z.
+# (x, y up, z) -> (z, x, y): the height y becomes our z.
 _UPRIGHT = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 

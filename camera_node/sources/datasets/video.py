@@ -38,23 +38,23 @@ def from_config(path: Path, config: VideoConfig) -> VideoRig:
     return load_rig(path, config.files)
 
 
-def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
+def load_rig(path: Path, files: Mapping[str, str]) -> VideoRig:
     """The rig of a calibration JSON, or of the only one in a folder; cameras without a video are left out.
 
-    files: camera -> video, relative to the JSON. Raises DatasetError.
+    files: camera -> video, relative to the JSON, where it is at none of ``_PLACES``. Raises DatasetError.
     """
     calibration = path if path.is_file() else _find_calibration(path)
     cameras = load_calibration(calibration)
-    for name in files or {}:
+    for name in files:
         if name not in cameras:
             raise DatasetError(f"{calibration}: has no camera {name!r}, for which a video is named")
     found: dict[str, Path] = {}
     for name in cameras:
-        places = [(files or {})[name]] if name in (files or {}) else [p.format(name) for p in _PLACES]
+        places = [files[name]] if name in files else [p.format(name) for p in _PLACES]
         video = next((calibration.parent / p for p in places if (calibration.parent / p).is_file()), None)
         if video is not None:
             found[name] = video
-        elif name in (files or {}):
+        elif name in files:
             raise DatasetError(f"{calibration.parent / places[0]}: no such video (camera {name})")
     if not found:
         raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
@@ -63,7 +63,7 @@ def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     """``rig_dataset`` of a calibration JSON, or of the only one in a folder. Raises DatasetError."""
-    return rig_dataset(load_rig(path), path, options.scale)
+    return rig_dataset(load_rig(path, {}), path, options.scale)
 
 
 def rig_dataset(rig: VideoRig, path: Path, scale: float) -> Dataset:

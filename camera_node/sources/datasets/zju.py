@@ -31,7 +31,7 @@ from camera_node.sources.datasets.records import (
 
 ANNOTATIONS = "annots.npy"
 FILES = (ANNOTATIONS,)
-# The files do not say; what the studio's cameras are taken to run at where a scenario does not.
+# Assumed rate of the studio's cameras: the files do not say it.
 FPS = 50.0
 _MM = 1e-3
 

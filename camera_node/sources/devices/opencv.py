@@ -1,10 +1,10 @@
 """Any camera that OpenCV opens: USB cameras, and network cameras by address.
 
 Drivers of Linux (V4L2) stamp a frame when its transfer begins, on the machine's monotonic clock, and OpenCV
-hands that on; where the exposure was set, half of it is taken off. Other back ends give no stamp that can be
-trusted, so there the instant of arrival less ``latency_ms`` has to do. Which of the two it is, the first
-frame decides for as long as the camera is open. A thread reads without a pause, so that nothing waits in the
-driver and grows old.
+returns that stamp; where the exposure was set, half of it is subtracted. Stamps of other back ends cannot be
+trusted, so there the instant of arrival less ``latency_ms`` is used. The first frame decides which of the two
+holds for as long as the camera is open. A thread reads without a pause, so that no frame waits in the driver
+and grows old.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class OpenCvFeed(Feed):
         return captured_ns, cast(Image, np.ascontiguousarray(picture[:, :, ::-1]))
 
     def _age_ns(self) -> int | None:
-        """Of the frame that was just grabbed; None for one whose stamp is of another clock than the first
-        one's, so that nobody knows when it was."""
+        """Age of the frame that was just grabbed; None where its stamp is of another clock than the first
+        frame's, so that its instant is unknown."""
         stamp_age_ns = None
         if self._v4l2 and self.stamped_by != _BY_ARRIVAL:
             stamp_age_ns = time.monotonic_ns() - round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
