@@ -1,22 +1,22 @@
-"""Shots as they go on the wire: compressed once, kept while there is room."""
+"""Shots as they are sent: compressed once, cached while there is room."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
 
-from camera_node.capture_schedule import Pace, Paced, Ticks
-from camera_node.clocks import Drifting, NodeClock
+from camera_node.capture_schedule import CaptureSchedule, RateSchedule, ScheduledSource
+from camera_node.clocks import ClockError, NodeClock
 from camera_node.config import SourceConfig
-from camera_node.sources import Source
+from camera_node.sources.base import Source
 from freshfield import payload
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole, Pose
 
 
 @dataclass(frozen=True)
-class Encoded:
-    """A compressed shot: everything of a frame but when it was due. captured_ns: see ``Shot``."""
+class EncodedShot:
+    """A compressed shot: all of a frame but the instant it was due. captured_ns: see ``Shot``."""
 
     payload: bytes
     pose: Pose
@@ -25,23 +25,23 @@ class Encoded:
     captured_ns: int | None = None
 
 
-class EncodedCache:
-    """Compressed shots by (camera, content), up to ``max_bytes``. What is in stays in.
+class ShotCache:
+    """Compressed shots by (camera, content), up to ``max_bytes``. Nothing is evicted.
 
-    Shots come round in a fixed order, and then evicting the oldest would evict exactly what is needed
-    next: a full cache that keeps what it has still serves its share of every round.
+    Shots come round in a fixed order, so the oldest is the one that is needed next: a full cache that keeps
+    what it has still serves its share of every round.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
         self.bytes = 0
-        self._shots: dict[tuple[str, int], Encoded] = {}
+        self._shots: dict[tuple[str, int], EncodedShot] = {}
         self._lock = threading.Lock()
 
-    def get(self, camera: str, content: int) -> Encoded | None:
+    def get(self, camera: str, content: int) -> EncodedShot | None:
         return self._shots.get((camera, content))
 
-    def put(self, camera: str, content: int, shot: Encoded) -> bool:
+    def put(self, camera: str, content: int, shot: EncodedShot) -> bool:
         """Keep a shot; False if it would not fit."""
         with self._lock:
             if (camera, content) in self._shots:
@@ -60,46 +60,48 @@ class Camera:
         self,
         source: Source,
         config: SourceConfig,
-        cache: EncodedCache,
-        drift: Drifting | None = None,
+        cache: ShotCache,
+        clock_error: ClockError | None = None,
     ) -> None:
         self.name = source.camera
         self.fps = source.fps
         self.source = source
         # What is replayed has been compressed already.
-        self._codec = source.codec if isinstance(source, Paced) else config.codec
+        self.codec = source.codec if isinstance(source, ScheduledSource) else config.codec
         self._quality = config.quality
         self._cache = cache
-        self._drift = drift
+        self._clock_error = clock_error
 
     def clock(self, true: Clock) -> NodeClock:
         """The clock this camera stamps with, given the true time."""
-        return NodeClock(true, self._drift)
+        return NodeClock(true, self._clock_error)
 
-    def pace(self, start_ns: int) -> Pace:
-        """When it captures; a recording begins at ``start_ns``."""
+    def schedule(self, start_ns: int) -> CaptureSchedule:
+        """When it captures; a recording that is played once begins at ``start_ns``."""
         source = self.source
-        return source.pace(start_ns) if isinstance(source, Paced) else Ticks(self.fps)
+        return source.schedule(start_ns) if isinstance(source, ScheduledSource) else RateSchedule(self.fps)
 
-    @property
-    def codec(self) -> str:
-        return self._codec
-
-    def cached(self, tick: int) -> Encoded | None:
-        """The tick's shot if it is at hand; costs a look-up."""
+    def cached(self, tick: int) -> EncodedShot | None:
+        """The tick's shot if it is in the cache."""
         if self.source.contents is None:
             return None
         return self._cache.get(self.name, self.source.content(tick))
 
-    def capture(self, tick: int) -> Encoded:
+    def capture(self, tick: int) -> EncodedShot:
         """The tick's shot, made if need be: milliseconds, so not on the event loop.
 
         Raises ValueError if the source has no such shot or it cannot be sent, OSError if its file is gone.
         """
-        return self.cached(tick) or self._make(self.source.content(tick))
+        shot = self.cached(tick)
+        if shot is None:
+            content = self.source.content(tick)
+            shot = self._encode(content)
+            if self.source.contents is not None:
+                self._cache.put(self.name, content, shot)
+        return shot
 
     def fits(self) -> bool:
-        """Whether a whole round of shots will fit the cache, judged by the first; makes that one."""
+        """Whether all shots will fit into the cache, judged by the size of the first, which is made."""
         contents = self.source.contents
         if contents is None:
             return False
@@ -111,21 +113,15 @@ class Camera:
         return self._cache.bytes + (contents - 1) * len(shot.payload) <= self._cache.max_bytes
 
     def fill(self, content: int) -> bool:
-        """Make one shot ahead of its time; False if the cache is full. Raises as ``capture``."""
+        """Make one shot before it is due; False if the cache is full. Raises as ``capture``."""
         if self._cache.get(self.name, content) is not None:
             return True
         return self._cache.put(self.name, content, self._encode(content))
 
-    def _make(self, content: int) -> Encoded:
-        shot = self._encode(content)
-        if self.source.contents is not None:
-            self._cache.put(self.name, content, shot)
-        return shot
-
-    def _encode(self, content: int) -> Encoded:
+    def _encode(self, content: int) -> EncodedShot:
         shot = self.source.read(content)
         data = shot.image
         if not isinstance(data, bytes):
-            data = payload.encode(data, self._codec, self._quality)
-        payload.check(data, self._codec, shot.intrinsics.width, shot.intrinsics.height)
-        return Encoded(data, shot.pose, shot.intrinsics, shot.pose_gap_ns, shot.captured_ns)
+            data = payload.encode(data, self.codec, self._quality)
+        payload.check(data, self.codec, shot.intrinsics.width, shot.intrinsics.height)
+        return EncodedShot(data, shot.pose, shot.intrinsics, shot.pose_gap_ns, shot.captured_ns)

@@ -1,4 +1,4 @@
-"""The command ``camera-node``: run cameras of a scenario, list what they can look at."""
+"""The command ``camera-node``: run the cameras of a scenario, list the kinds of sources, and more."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from camera_node.robot import arm_cli
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration import command as calibrate
-from freshfield import scenario, transport
+from freshfield import transport
+from freshfield.scenario import Scenario, ScenarioError, load
 
 if TYPE_CHECKING:
     from camera_node.capture import Camera
@@ -39,7 +40,7 @@ DEFAULT_CACHE_MB = 64.0
 
 
 class UsageError(Exception):
-    """Something the person at the keyboard can put right; shown as one line."""
+    """A mistake in how the command was called; shown as one line."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -61,6 +62,11 @@ def main(arguments: list[str] | None = None) -> int:
     commands.add_parser("sources", help="list kinds of sources and the keys they take")
     commands.add_parser("effects", help="list effects and their parameters")
     arm_cli.add_commands(commands)
+    _add_doctor(commands.add_parser(
+        "doctor", help="examine this machine's part of a set-up: what is wrong, and what to do about it",
+        description="Tests, one after the other, the packages, cameras, arm, clock, network, disk and files "
+        "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
+    ))  # fmt: skip
     args = parser.parse_args(arguments)
     try:
         if args.command == "run":
@@ -71,11 +77,15 @@ def main(arguments: list[str] | None = None) -> int:
             return arm_cli.run(args)
         if args.command == "calibrate":
             return calibrate.run(args)
+        if args.command == "doctor":
+            from camera_node import doctor
+
+            return doctor.run(args)
         from camera_node import listing
 
         print(listing.sources() if args.command == "sources" else listing.effects())
         return 0
-    except (UsageError, CalibrationError, scenario.ScenarioError, transport.TransportError) as error:
+    except (UsageError, CalibrationError, ScenarioError, transport.TransportError) as error:
         print(f"camera-node: {error}", file=sys.stderr)
         return 2
 
@@ -106,7 +116,17 @@ def _add_run(run: argparse.ArgumentParser) -> None:
     transport.add_arguments(run)
 
 
-def _open(args: argparse.Namespace, cache_mb: float) -> tuple[scenario.Scenario, list[Camera]]:
+def _add_doctor(doctor: argparse.ArgumentParser) -> None:
+    doctor.add_argument("scenario", nargs="?", help="without one, only what every scenario needs is tested")
+    doctor.add_argument("--to", metavar="HOST:PORT", help="the channel emulator or edge server to reach")
+    doctor.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    doctor.add_argument(
+        "--out", type=Path, default=Path("runs"), metavar="DIR", help="where runs will be written"
+    )
+    doctor.add_argument("--json", action="store_true", help="one JSON object for scripts")
+
+
+def _open(args: argparse.Namespace, cache_mb: float) -> tuple[Scenario, list[Camera]]:
     """The scenario and the chosen cameras, opened. Raises UsageError or ScenarioError."""
     from camera_node.build import build_cameras
     from camera_node.config import source_config
@@ -115,14 +135,14 @@ def _open(args: argparse.Namespace, cache_mb: float) -> tuple[scenario.Scenario,
     logging.basicConfig(
         level=level, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
     )
-    plan = scenario.load(args.scenario, args.seed)
+    scenario = load(args.scenario, args.seed)
     try:
         cameras = build_cameras(
-            plan, source_config(plan), _chosen(plan, args), args.data, int(cache_mb * 2**20)
+            scenario, source_config(scenario), _chosen(scenario, args), args.data, int(cache_mb * 2**20)
         )
     except (ValueError, OSError) as error:
         raise UsageError(str(error)) from None
-    return plan, cameras
+    return scenario, cameras
 
 
 def _prepare(args: argparse.Namespace) -> int:
@@ -147,7 +167,7 @@ def _run(args: argparse.Namespace) -> int:
         seconds=args.seconds,
         response_timeout_s=args.response_timeout,
     )
-    plan, cameras = _open(args, args.cache_mb)
+    scenario, cameras = _open(args, args.cache_mb)
     if args.out is not None:
         try:
             args.out.mkdir(parents=True, exist_ok=True)
@@ -155,7 +175,7 @@ def _run(args: argparse.Namespace) -> int:
             raise UsageError(f"--out: {args.out}: {error.strerror}") from None
 
     async def live() -> None:
-        node = Node(plan, cameras, options)
+        node = Node(scenario, cameras, options)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, node.stop)
@@ -169,15 +189,15 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _chosen(plan: scenario.Scenario, args: argparse.Namespace) -> tuple[str, ...]:
+def _chosen(scenario: Scenario, args: argparse.Namespace) -> tuple[str, ...]:
     if args.all:
-        return plan.cameras
+        return scenario.cameras
     chosen = tuple(dict.fromkeys(c.strip() for c in args.camera.split(",") if c.strip()))
-    unknown = [c for c in chosen if c not in plan.cameras]
+    unknown = [c for c in chosen if c not in scenario.cameras]
     if unknown or not chosen:
         raise UsageError(
-            f"--camera: {plan.path} has no camera {', '.join(unknown) or 'of no name'}; "
-            f"it has {', '.join(plan.cameras)}"
+            f"--camera: {scenario.path} has no camera {', '.join(unknown) or 'of no name'}; "
+            f"it has {', '.join(scenario.cameras)}"
         )
     return chosen
 

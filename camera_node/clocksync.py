@@ -1,4 +1,4 @@
-"""Keeps the estimate of the peer's clock: one small exchange a second on the frames' own channel."""
+"""Keeps an estimate of the peer's clock: one small exchange a second on the channel of the frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from freshfield.v1 import clock_pb2 as pb
 from freshfield.v1 import clock_pb2_grpc as rpc
 
 PERIOD_S = 1.0
-# The first exchanges follow one another closely, so that early frames are well dated too.
+# The first exchanges follow one another closely, so that early frames get a good estimate too.
 _FIRST = 4
 _FIRST_PERIOD_S = 0.05
 
@@ -27,7 +27,7 @@ class ClockSync:
         self._stub = rpc.ClockServiceStub(channel)
         self._metadata = metadata
         self._clock = clock
-        self._estimator = OffsetEstimator()  # the first one is believed from its first exchange on
+        self._estimator = OffsetEstimator()  # the first one is used from its first exchange on
 
     def offset(self) -> Offset | None:
         return self._estimator.estimate(self._clock.now_ns())
@@ -55,7 +55,7 @@ class ClockSync:
                 pb.ExchangeRequest(client_sent_ns=sent), timeout=PERIOD_S, metadata=self._metadata
             )
         except (grpc.RpcError, grpc.aio.BaseError):
-            return False  # the senders say what is wrong with the peer
+            return False  # the senders log what is wrong with the peer
         if answer is None or answer.client_sent_ns != sent:
             return False
         estimator.add(sent, answer.server_received_ns, answer.server_sent_ns, self._clock.now_ns())

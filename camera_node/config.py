@@ -1,7 +1,7 @@
-"""The scenario's ``source:`` section: what the cameras look at, how fast, and how frames are compressed.
+"""The scenario's ``source:`` section: what the cameras see, their frame rate, and how frames are compressed.
 
-``kind`` chooses the model. Every key is checked here, with file and key in the message; what needs the data
-itself (does the folder hold this camera?) is checked when the source opens.
+``kind`` chooses the model in ``MODELS``. Every key is checked here, with file and key in the message. What
+needs the data itself (does the folder hold this camera?) is checked when the source opens.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ from typing import Any
 from freshfield.payload import CODECS, MAX_IMAGE_SIDE
 from freshfield.scenario import Scenario, ScenarioError, read_section
 
-KINDS = (
-    "world", "transforms", "video", "dynerf", "zju", "eyeful", "colmap", "mcap", "camera", "oak", "realsense",
-)  # fmt: skip
 LOOPS = ("back-and-forth", "restart")
 REPLAYS = ("once", "restart")
 PAIRINGS = ("nearest", "interpolated")
@@ -29,7 +26,7 @@ class SourceConfig:
     """Keys of every kind.
 
     fps: captures a second (default: the recording's own, 15 for a world, 10 for photos). codec: jpeg, png
-    or zstd. quality: of jpeg, 1 to 100; colour is not subsampled from 90 up. effects: name -> parameters;
+    or zstd. quality: of jpeg, 1 to 100; color is not subsampled from 90 up. effects: name -> parameters;
     what is not listed is not imported.
     """
 
@@ -124,10 +121,7 @@ class ArmConfig:
             )
         if not 10.0 <= self.frequency_hz <= 500.0:
             raise ValueError(f"frequency_hz is {self.frequency_hz:g}, expected 10 to 500")
-        if self.pairing not in PAIRINGS:
-            raise ValueError(f"pairing is {self.pairing!r}, expected one of {', '.join(PAIRINGS)}")
-        if self.max_gap_ms < 0:
-            raise ValueError("max_gap_ms cannot be negative")
+        _check_pairing(self.pairing, self.max_gap_ms)
 
 
 @dataclass(frozen=True)
@@ -169,17 +163,14 @@ class TrajectoryConfig:
     hand_eye: str = ""
 
     def __post_init__(self) -> None:
-        if self.pairing not in PAIRINGS:
-            raise ValueError(f"pairing is {self.pairing!r}, expected one of {', '.join(PAIRINGS)}")
-        if self.max_gap_ms < 0:
-            raise ValueError("max_gap_ms cannot be negative")
+        _check_pairing(self.pairing, self.max_gap_ms)
 
 
 @dataclass(frozen=True)
 class RecordedConfig(SourceConfig):
-    """Keys of both recorded kinds. data: folder or JSON, absolute or below the data folder. scale: images
-    are divided by it. loop: clips go back and forth, or restart. assignment: scenario camera -> the data
-    set's camera, where the names differ."""
+    """Keys of all recorded data sets. data: folder or describing file, absolute or below the data folder.
+    scale: image sizes are divided by it. loop: clips go back and forth, or restart. assignment: scenario
+    camera -> the data set's camera, where the names differ."""
 
     data: str = ""
     scale: float = 1.0
@@ -194,18 +185,19 @@ class RecordedConfig(SourceConfig):
             raise ValueError(f"scale is {self.scale:g}, expected 1 or more (2 halves the images)")
         if self.loop not in LOOPS:
             raise ValueError(f"loop is {self.loop!r}, expected one of {', '.join(LOOPS)}")
+        background = getattr(self, "background", BACKGROUNDS[0])
+        if background not in BACKGROUNDS:
+            raise ValueError(f"background is {background!r}, expected {', '.join(BACKGROUNDS)}")
+        if background == "keep" and self.codec != "png":
+            raise ValueError(f"background 'keep' sends alpha, which codec {self.codec!r} cannot; use png")
 
 
 @dataclass(frozen=True)
 class TransformsConfig(RecordedConfig):
-    """nerfstudio, instant-ngp, NeRF-synthetic. background: what RGBA images are laid on; ``keep`` sends
-    alpha and needs the codec png."""
+    """nerfstudio, instant-ngp, NeRF-synthetic. background: what goes under RGBA images;
+    ``keep`` sends alpha and needs the codec png."""
 
     background: str = "white"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_background(self.background, self.codec)
 
 
 @dataclass(frozen=True)
@@ -283,7 +275,7 @@ class DynerfConfig(RecordedConfig):
 class ZjuConfig(RecordedConfig):
     """ZJU-MoCap. data: the folder with ``annots.npy`` and the cameras' folders of images. recorded_fps: of
     the recording, whose files do not tell. masks: a folder of masks (``mask_cihp``) that cut the person out;
-    background: what the person is then laid on."""
+    background: what goes behind the person."""
 
     recorded_fps: float = 50.0
     masks: str | None = None
@@ -293,7 +285,6 @@ class ZjuConfig(RecordedConfig):
         super().__post_init__()
         if not 0.01 <= self.recorded_fps <= 1000:
             raise ValueError(f"recorded_fps is {self.recorded_fps:g}, expected 0.01 to 1000")
-        _check_background(self.background, self.codec)
 
 
 @dataclass(frozen=True)
@@ -308,14 +299,10 @@ class EyefulConfig(RecordedConfig):
 @dataclass(frozen=True)
 class ColmapConfig(RecordedConfig):
     """A COLMAP model, text or binary. data: the folder that holds it, itself or in ``sparse/0``. images:
-    folder of images (default ``images``). background: what transparent ones are laid on."""
+    folder of images (default ``images``). background: what goes under transparent ones."""
 
     images: str | None = None
     background: str = "white"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_background(self.background, self.codec)
 
 
 @dataclass(frozen=True)
@@ -339,26 +326,27 @@ class McapConfig(SourceConfig):
             raise ValueError("effects: a recording is replayed as it was; leave them out")
 
 
+# kind -> its keys
 MODELS: dict[str, type[SourceConfig]] = {
     "world": WorldConfig,
     "transforms": TransformsConfig,
     "video": VideoConfig,
-    "camera": CameraConfig,
-    "oak": OakConfig,
-    "realsense": RealsenseConfig,
     "dynerf": DynerfConfig,
     "zju": ZjuConfig,
     "eyeful": EyefulConfig,
     "colmap": ColmapConfig,
     "mcap": McapConfig,
+    "camera": CameraConfig,
+    "oak": OakConfig,
+    "realsense": RealsenseConfig,
 }
 
 
-def _check_background(background: str, codec: str) -> None:
-    if background not in BACKGROUNDS:
-        raise ValueError(f"background is {background!r}, expected {', '.join(BACKGROUNDS)}")
-    if background == "keep" and codec != "png":
-        raise ValueError(f"background 'keep' sends alpha, which codec {codec!r} cannot; use png")
+def _check_pairing(pairing: str, max_gap_ms: float) -> None:
+    if pairing not in PAIRINGS:
+        raise ValueError(f"pairing is {pairing!r}, expected one of {', '.join(PAIRINGS)}")
+    if max_gap_ms < 0:
+        raise ValueError("max_gap_ms cannot be negative")
 
 
 def source_config(scenario: Scenario) -> SourceConfig:
@@ -366,7 +354,7 @@ def source_config(scenario: Scenario) -> SourceConfig:
     where = f"{scenario.path}: source"
     kind = scenario.source.get("kind")
     if kind not in MODELS:
-        raise ScenarioError(f"{where}.kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+        raise ScenarioError(f"{where}.kind: expected one of {', '.join(MODELS)}, got {kind!r}")
     return read_section(MODELS[kind], scenario.source, where)
 
 

@@ -1,4 +1,4 @@
-"""What ``camera-node sources`` and ``camera-node effects`` print, read off the models themselves."""
+"""What ``camera-node sources`` and ``camera-node effects`` print, taken from the models themselves."""
 
 from __future__ import annotations
 

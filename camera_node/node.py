@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import secrets
@@ -15,14 +16,14 @@ from typing import Any
 
 import grpc.aio
 
-from camera_node.capture import Camera, Encoded
+from camera_node.capture import Camera, EncodedShot
 from camera_node.clocks import NodeClock
 from camera_node.clocksync import ClockSync
 from camera_node.outbox import Outbox
 from camera_node.prepare import prepare
 from camera_node.sender import Sender
-from camera_node.status import write_status
 from freshfield.clock import Clock, WallClock
+from freshfield.files import write_json
 from freshfield.frame import Frame
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario
@@ -38,10 +39,14 @@ _READY_POLL_S = 0.01
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """to: HOST:PORT of the next hop. out: folder for ledger and status, or None for neither. seconds: how
-    long to capture, or None until stopped. clock: true time, which decides when frames are taken; a camera
-    with a wrong clock sees it through that. response_timeout_s: an answer later than this means a dead
-    stream."""
+    """How a node runs.
+
+    to: HOST:PORT of the next hop.
+    clock: true time, which decides when frames are taken; a camera with a wrong clock stamps by that.
+    out: folder for ledger and status; None for neither.
+    seconds: how long to capture; None until stopped.
+    response_timeout_s: an answer that takes longer means a dead stream.
+    """
 
     to: str
     transport: Transport
@@ -93,7 +98,7 @@ class Node:
         try:
             await self._work()
         finally:
-            self._stopping.set()  # what the pool is at looks at this
+            self._stopping.set()  # the pool's work checks this
             self._pool.shutdown(wait=False, cancel_futures=True)
             await channel.close()
             self._enter("stopped")
@@ -105,9 +110,9 @@ class Node:
     ) -> ClockSync:
         """Cameras on the machine's clock share one estimate; one with a wrong clock needs its own."""
         clock = self._clocks[camera]
-        if not clock.true_to_machine:
+        if not clock.exact:
             return ClockSync(channel, metadata, clock)
-        shared = [self._syncs[c] for c in self._syncs if self._clocks[c].true_to_machine]
+        shared = [self._syncs[c] for c in self._syncs if self._clocks[c].exact]
         return shared[0] if shared else ClockSync(channel, metadata, clock)
 
     async def _work(self) -> None:
@@ -133,7 +138,7 @@ class Node:
         self._enter("preparing")
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
-        if any(camera.pace(0).whole for camera in self._cameras):
+        if any(camera.schedule(0).lossless for camera in self._cameras):
             # A recording that began before there is somebody to send it to would lose its beginning.
             self._enter("connecting")
             while not all(sender.ready for sender in self.senders.values()):
@@ -153,14 +158,14 @@ class Node:
                 raise result
 
     async def _capture(self, camera: Camera, start_ns: int) -> None:
-        """One camera's captures, as its pace has them due in true time."""
+        """One camera's captures, each when its schedule has it due in true time."""
         loop = asyncio.get_running_loop()
         outbox, trouble = self.outboxes[camera.name], self._trouble[camera.name]
-        pace = camera.pace(start_ns)
-        tick: int | None = pace.first(self._clock.now_ns())
+        schedule = camera.schedule(start_ns)
+        tick: int | None = schedule.first(self._clock.now_ns())
         sequence = 0
         while tick is not None:
-            due_ns = pace.due_ns(tick)
+            due_ns = schedule.due_ns(tick)
             await asyncio.sleep((due_ns - self._clock.now_ns()) * 1e-9)
             try:
                 shot = camera.cached(tick)
@@ -173,14 +178,14 @@ class Node:
                 # it; a real camera says itself when it exposed.
                 shown_ns = due_ns if shot.captured_ns is None else shot.captured_ns
                 generated_ns = self._clocks[camera.name].stamp_ns(shown_ns)
-                if pace.whole:
-                    await outbox.room()
+                if schedule.lossless:
+                    await outbox.wait_empty()
                 outbox.put(self._frame(camera, shot, sequence, generated_ns))
                 sequence += 1
-            tick, missed = pace.after(tick, self._clock.now_ns())
+            tick, missed = schedule.next(tick, self._clock.now_ns())
             trouble["missed"] += missed
 
-    def _frame(self, camera: Camera, shot: Encoded, sequence: int, generated_ns: int) -> Frame:
+    def _frame(self, camera: Camera, shot: EncodedShot, sequence: int, generated_ns: int) -> Frame:
         return Frame(
             camera=camera.name,
             session=self.session,
@@ -195,7 +200,7 @@ class Node:
         )
 
     def _failed(self, camera: str, error: Exception) -> None:
-        """A capture that could not be had: counted always, said once."""
+        """Count a capture that could not be made; log the first."""
         if not self._trouble[camera]["failed"]:
             log.warning("%s: no frame: %s (further ones are only counted)", camera, error)
         self._trouble[camera]["failed"] += 1
@@ -206,7 +211,7 @@ class Node:
                 while any(s.busy or (s.connected and s.outbox.waiting) for s in self.senders.values()):
                     await asyncio.sleep(0.01)
         except TimeoutError:
-            pass  # those frames are written down as broken
+            pass  # those frames are recorded as broken
 
     def _enter(self, phase: str) -> None:
         self.phase = phase
@@ -219,10 +224,19 @@ class Node:
 
     def _write_status(self) -> None:
         if self._options.out is not None:
-            write_status(self._options.out / f"node-{self.name}.json", self.status())
+            with contextlib.suppress(OSError):  # a full disk costs a status, not the node
+                write_json(self._options.out / f"node-{self.name}.json", self.status())
 
     def status(self) -> dict[str, Any]:
-        """What the terminal table shows; see ``camera_node.status``."""
+        """What the status file ``OUT/node-<name>.json`` holds, replaced as a whole about once a second.
+
+        Keys: name, pid, session, phase (starting, preparing, connecting, streaming, stopped), to, t_ns
+        (machine's clock), and for each of ``cameras``: fps, held_out, connected, connections, trouble (text
+        or null), clock_offset_ms and clock_uncertainty_ms (peer minus camera; null before the first
+        exchange), waiting, captured, replaced, sent, broken, outcomes {accepted, dropped_busy, superseded,
+        "rejected:<reason>"}, missed (ticks the machine was too slow for), failed (shots that could not be
+        made).
+        """
         return {
             "name": self.name,
             "pid": os.getpid(),

@@ -1,4 +1,4 @@
-"""The one place where a captured frame waits, and the books kept about it."""
+"""The one place where a captured frame waits to be sent, and the record of what became of every frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from freshfield.ledger import Ledger
 
 
 class Outbox:
-    """One camera's newest frame, and nothing else. Counts and writes what became of every frame.
+    """One camera's newest unsent frame. Counts what became of every frame and writes it to the ledger.
 
     counts: captured, replaced, sent, broken, and one entry for each outcome of an answer.
     """
@@ -32,20 +32,20 @@ class Outbox:
         return int(self._frame is not None)
 
     def put(self, frame: Frame) -> None:
-        """Offer a captured frame; it takes the place of one still waiting."""
+        """Offer a captured frame; it replaces one that still waits."""
         if self._frame is not None:
-            # Before ``captured``, so that at no instant of a kill two frames would count as waiting.
-            self.note(self._frame.sequence, "replaced")
+            # Before ``captured``, so that a process killed in between leaves at most one frame waiting.
+            self.record(self._frame.sequence, "replaced")
         self._frame = frame
-        self.note(frame.sequence, "captured")
+        self.record(frame.sequence, "captured")
         self._filled.set()
         self._emptied.clear()
 
-    async def room(self) -> None:
+    async def wait_empty(self) -> None:
         """Until no frame waits, so that ``put`` replaces none."""
         await self._emptied.wait()
 
-    async def wait(self) -> None:
+    async def wait_frame(self) -> None:
         """Until a frame waits."""
         await self._filled.wait()
 
@@ -57,11 +57,11 @@ class Outbox:
             raise LookupError("no frame is waiting")
         self._filled.clear()
         self._emptied.set()
-        self.note(frame.sequence, "sent")
+        self.record(frame.sequence, "sent")
         return frame
 
-    def note(self, sequence: int, event: str, detail: str = "") -> None:
-        """Count an event and write it down."""
+    def record(self, sequence: int, event: str, detail: str = "") -> None:
+        """Count an event and write it to the ledger."""
         self.counts[detail if event == "answered" else event] += 1
         if self._ledger is not None:
             self._ledger.write(self._clock.now_ns(), self.camera, self.session, sequence, event, detail)

@@ -1,4 +1,4 @@
-"""Makes the shots that will come round again before the first is due, so that streaming is cheap."""
+"""Makes the shots that repeat before the first is due, so that streaming is cheap."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ log = logging.getLogger("camera-node")
 
 
 def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:
-    """Fill the cache with every shot of each camera whose whole round fits, and let go of what made them.
+    """Fill the cache with the shots of each camera whose shots all fit, and free what made them.
 
-    A round that does not fit is left to be made as it is captured: making a part of it ahead would delay
-    the first frame and save little.
+    Shots that do not all fit are made as they are captured: making a part of them now would delay the first
+    frame and save little.
     """
     for camera in cameras:
         camera.source.prepare(stopped)

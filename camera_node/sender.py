@@ -1,4 +1,4 @@
-"""One camera's stream: a frame goes out when the last one was answered, for as long as the node lives."""
+"""One camera's stream: each frame is sent when the one before was answered, as long as the node lives."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from camera_node.outbox import Outbox
 from freshfield.clock import Offset
 from freshfield.frame import Frame, to_request
 from freshfield.payload import MAX_PAST_NS
+from freshfield.transport import backoff_s
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc as rpc
 
@@ -26,9 +27,9 @@ MAX_BACKOFF_S = 3.0
 # How long the first frame waits for the first clock exchange; a peer that has no clock costs it just once.
 OFFSET_WAIT_S = 2.0
 _OFFSET_POLL_S = 0.01
-# An offset nobody has measured may be anything; zero with no uncertainty would be a lie.
+# An offset that was never measured may be anything: zero with a small uncertainty would be wrong.
 UNKNOWN_OFFSET = Offset(0, MAX_PAST_NS)
-# A peer that hangs or speaks nonsense must not fill the books with names of its own making.
+# A peer that is broken must not fill the ledger with names that it makes up.
 _MAX_REASONS = 32
 _REASON = re.compile(r"[a-z0-9_]{1,48}")
 
@@ -40,13 +41,14 @@ _OUTCOMES = {
 
 
 class ProtocolError(RuntimeError):
-    """The peer answered something that it was not asked."""
+    """The peer sent an answer that does not belong to the frame."""
 
 
 class Sender:
     """Sends what waits in an outbox over one stream, one frame unacknowledged, and reconnects for ever.
 
-    offset: the node's present estimate of the peer's clock, put on each frame as it leaves.
+    offset: returns the current estimate of the peer's clock, which each frame carries.
+    jitter: of the pauses between attempts.
     response_timeout_s: an answer that takes longer means a dead stream.
     """
 
@@ -80,7 +82,7 @@ class Sender:
 
     async def run(self) -> None:
         """Until cancelled."""
-        backoff = FIRST_BACKOFF_S
+        failures = 0
         while True:
             answered = self.outbox.counts["sent"] - self.outbox.counts["broken"]
             try:
@@ -102,9 +104,9 @@ class Sender:
             finally:
                 self.connected = False
             if self.outbox.counts["sent"] - self.outbox.counts["broken"] > answered:
-                backoff = FIRST_BACKOFF_S  # it worked for a while
-            await asyncio.sleep(backoff * self._jitter.uniform(0.5, 1.0))
-            backoff = min(backoff * 2.0, MAX_BACKOFF_S)
+                failures = 0  # it worked for a while
+            await asyncio.sleep(backoff_s(failures, FIRST_BACKOFF_S, MAX_BACKOFF_S, self._jitter))
+            failures += 1
 
     async def _session(self) -> None:
         """One stream, from the moment the peer can be reached until it fails."""
@@ -117,7 +119,7 @@ class Sender:
             self.connections += 1
             await self._await_offset(call)
             while True:
-                await self.outbox.wait()
+                await self.outbox.wait_frame()
                 if call.done():  # before taking a frame that could only be lost
                     raise await _status(call)
                 await self._exchange(call, self.outbox.take())
@@ -125,8 +127,8 @@ class Sender:
             call.cancel()
 
     async def _await_offset(self, call: grpc.aio.StreamStreamCall) -> None:
-        """Until the peer's clock is known, for a while: frames that nobody can date are of little use. The
-        outbox goes on taking captures meanwhile, so that what leaves first is the newest."""
+        """Wait up to ``OFFSET_WAIT_S`` until the peer's clock is known: the age of earlier frames would be
+        unknown. The outbox takes captures meanwhile, so that the newest is sent first."""
         if self._offset_awaited:
             return
         try:
@@ -158,8 +160,8 @@ class Sender:
         finally:
             self.busy = False
             if not answered:
-                self.outbox.note(frame.sequence, "broken")
-        self._account(frame, response)
+                self.outbox.record(frame.sequence, "broken")
+        self._count(frame, response)
         if self.trouble:
             log.info("%s: connected again", frame.camera)
             self.trouble = ""
@@ -168,7 +170,7 @@ class Sender:
         offset = self._offset() or UNKNOWN_OFFSET
         return replace(frame, clock_offset_ns=offset.offset_ns, clock_uncertainty_ns=offset.uncertainty_ns)
 
-    def _account(self, frame: Frame, response: pb.PushResponse) -> None:
+    def _count(self, frame: Frame, response: pb.PushResponse) -> None:
         outcome = _OUTCOMES.get(response.outcome)
         if outcome is None:
             reason = response.reason if _REASON.fullmatch(response.reason) else "unspecified"
@@ -178,10 +180,10 @@ class Sender:
                 log.warning("%s: frame refused: %s (%s)", frame.camera, reason, response.detail[:200])
             self._reasons[reason] = self._reasons.get(reason, 0) + 1
             outcome = f"rejected:{reason}"
-        self.outbox.note(frame.sequence, "answered", outcome)
+        self.outbox.record(frame.sequence, "answered", outcome)
 
     def _report(self, error: Exception) -> None:
-        """Say what broke, once per kind of trouble and not once per attempt."""
+        """Log what broke, once per kind of trouble and not once per attempt."""
         if isinstance(error, grpc.aio.AioRpcError):
             text = f"{error.code().name}: {error.details()}"
         else:

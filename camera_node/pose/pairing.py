@@ -1,9 +1,9 @@
 """Pairing frames with what an arm reports (thesis 4.3.3), while both still arrive, each at its own rate.
 
-The thesis takes the sample nearest to the frame. Here a sample may also be made between the two around it: by
-a straight line and slerp, along the screw from one to the other (constant twist), or linearly in joint space.
-``camera-node calibrate accuracy`` measures what each is worth. Either way the distance to the nearest sample
-goes with the frame, and beyond a bound there is no pair.
+The thesis takes the sample nearest to the frame. The two samples around it can also be interpolated: linearly
+with slerp, along the screw from one to the other (constant twist), or linearly in joint space. ``camera-node
+calibrate accuracy`` measures the error of each. The time to the nearest sample goes with the frame, and a
+frame without a sample within a bound gets no pose.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import Paired, PoseGapError, find
+from camera_node.pose.providers import PairedPose, PoseGapError, locate
 from freshfield.geometry import Pose, se3_inverse, so3_exp, so3_log
 
 T = TypeVar("T")
-Mix = Callable[[T, T, float], T]
+Interpolate = Callable[[T, T, float], T]
 Joints = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-4
 
 
-def along_line(a: Pose, b: Pose, fraction: float) -> Pose:
+def interpolate_linear(a: Pose, b: Pose, fraction: float) -> Pose:
     """Slerp and a straight line between the two origins."""
     return a.interpolate(b, fraction)
 
 
-def along_screw(a: Pose, b: Pose, fraction: float) -> Pose:
+def interpolate_screw(a: Pose, b: Pose, fraction: float) -> Pose:
     """The SE(3) geodesic a exp(f log(a^-1 b)): a body that turns and moves at constant rates about its own
     axes, so that the origin of anything mounted on it runs along the same screw."""
     start = a.matrix()
@@ -56,17 +56,19 @@ def _left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.eye(3) + a * k + b * (k @ k)
 
 
-def between_joints(a: Joints, b: Joints, fraction: float) -> Joints:
-    """Joint angles (J,) in radians, linearly; not across a turn: a controller reports turns unwrapped."""
+def interpolate_joints(a: Joints, b: Joints, fraction: float) -> Joints:
+    """Joint angles (J,) in radians, linearly: a controller reports them unwrapped."""
     return (1.0 - fraction) * a + fraction * b
 
 
 @dataclass
-class Counts:
-    """What a buffer was given and asked. duplicates: the same stamp again (the first is kept). conflicting:
-    those of them with another sample. reordered: older than the newest but put in its place. stale: too old
-    to be of use. restarts: times the sender's clock was seen to begin anew. paired, refused: instants asked
-    for."""
+class PairingCounts:
+    """Samples and requests of a buffer.
+
+    duplicates: samples with a known stamp (the first is kept); conflicting: those of them with another value.
+    reordered: samples older than the newest, inserted at their place. stale: samples too old to be kept.
+    restarts: how often the sender's clock was seen to begin anew. paired, refused: instants asked for.
+    """
 
     samples: int = 0
     duplicates: int = 0
@@ -79,34 +81,34 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class Match(Generic[T]):
-    """A sample for an instant, and how far (ns) the nearest one it rests on is from that instant."""
+class PairedSample(Generic[T]):
+    """A sample for an instant, and the time (ns) from that instant to the nearest sample used."""
 
     sample: T
     gap_ns: int
 
 
 class SampleBuffer(Generic[T]):
-    """The last ``keep_ns`` of a stream of samples, in the order of their stamps whatever order they came in.
-    Thread-safe: one thread adds, others ask.
+    """The last ``keep_ns`` of a stream of samples, sorted by stamp. Thread-safe: one thread adds, others ask.
 
-    mix: makes a sample between two; None takes the nearest. An instant further than ``max_gap_ns`` from every
-    sample is refused and counted. A stamp older than everything kept is dropped; ``restart_after`` of them in
-    a row, each newer than the one before, mean that the sender's clock was set back or that a wild stamp had
-    emptied the buffer, and the buffer begins anew with them.
+    interpolate: makes a sample between two; None takes the nearest.
+    max_gap_ns: an instant farther than this from every sample is refused and counted.
+    keep_ns: samples this much older than the newest are dropped.
+    restart_after: so many stale samples in a row, each newer than the one before, mean that the sender's
+        clock was set back or that a wild stamp had emptied the buffer; the buffer begins anew with them.
     """
 
     def __init__(
         self,
-        mix: Mix[T] | None,
+        interpolate: Interpolate[T] | None,
         max_gap_ns: int = 50_000_000,
         keep_ns: int = 2_000_000_000,
         restart_after: int = 8,
     ) -> None:
         if max_gap_ns < 0 or keep_ns <= 0 or restart_after < 1:
             raise ValueError("max_gap_ns cannot be negative, keep_ns and restart_after must be positive")
-        self.counts = Counts()
-        self._mix = mix
+        self.counts = PairingCounts()
+        self._interpolate = interpolate
         self._max_gap_ns, self._keep_ns, self._restart_after = max_gap_ns, keep_ns, restart_after
         self._times: list[int] = []
         self._samples: list[T] = []
@@ -122,7 +124,7 @@ class SampleBuffer(Generic[T]):
             at = bisect.bisect_left(self._times, t_ns)
             if at < len(self._times) and self._times[at] == t_ns:
                 self.counts.duplicates += 1
-                self.counts.conflicting += not np.array_equal(_plain(self._samples[at]), _plain(sample))
+                self.counts.conflicting += not np.array_equal(_as_array(self._samples[at]), _as_array(sample))
                 return False
             self.counts.reordered += at < len(self._times)
             self._old.clear()
@@ -131,23 +133,22 @@ class SampleBuffer(Generic[T]):
             self._prune()
             return True
 
-    def at(self, t_ns: int) -> Match[T]:
+    def at(self, t_ns: int) -> PairedSample[T]:
         """The sample for an instant. Raises PoseGapError where none is near enough."""
         with self._lock:
             try:
-                place = find(self._times, t_ns, self._max_gap_ns)
+                place = locate(self._times, t_ns, self._max_gap_ns)
             except PoseGapError:
                 self.counts.refused += 1
                 raise
             self.counts.paired += 1
-            if self._mix is None or place.fraction is None:
-                return Match(self._samples[place.nearest], place.gap_ns)
+            if self._interpolate is None or place.fraction is None:
+                return PairedSample(self._samples[place.nearest], place.gap_ns)
             a, b = self._samples[place.before], self._samples[place.before + 1]
-        return Match(self._mix(a, b, place.fraction), place.gap_ns)
+        return PairedSample(self._interpolate(a, b, place.fraction), place.gap_ns)
 
     def ready(self, t_ns: int) -> bool:
-        """Whether a sample as new as the instant has come: before that, interpolation would only repeat the
-        newest one."""
+        """Whether a sample as new as the instant has come; until then the newest one would be repeated."""
         with self._lock:
             return bool(self._times) and self._times[-1] >= t_ns
 
@@ -171,40 +172,31 @@ class SampleBuffer(Generic[T]):
             del self._times[:first], self._samples[:first]
 
 
-class PoseBuffer:
-    """Poses of an arm as they come in, asked as any ``PoseProvider``."""
+class PoseBuffer(SampleBuffer[Pose]):
+    """Poses of an arm as they come in, as a ``PoseProvider``."""
 
     def __init__(
-        self, mix: Mix[Pose] | None = along_screw, max_gap_ns: int = 50_000_000, keep_ns: int = 2_000_000_000
+        self,
+        interpolate: Interpolate[Pose] | None = interpolate_screw,
+        max_gap_ns: int = 50_000_000,
+        keep_ns: int = 2_000_000_000,
     ) -> None:
-        self._buffer = SampleBuffer[Pose](mix, max_gap_ns, keep_ns)
+        super().__init__(interpolate, max_gap_ns, keep_ns)
 
-    @property
-    def counts(self) -> Counts:
-        return self._buffer.counts
-
-    def add(self, t_ns: int, pose: Pose) -> bool:
-        """See ``SampleBuffer.add``."""
-        return self._buffer.add(t_ns, pose)
-
-    def ready(self, t_ns: int) -> bool:
-        """See ``SampleBuffer.ready``."""
-        return self._buffer.ready(t_ns)
-
-    def at(self, t_ns: int) -> Paired:
-        match = self._buffer.at(t_ns)
-        return Paired(match.sample, match.gap_ns)
+    def at(self, t_ns: int) -> PairedPose:  # type: ignore[override]
+        found = super().at(t_ns)
+        return PairedPose(found.sample, found.gap_ns)
 
 
-def tidy(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list[T], Counts]:
-    """A recording in the order of its stamps, each once (the first that came), and what was put right."""
-    counts = Counts(samples=len(times_ns))
+def sort_samples(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list[T], PairingCounts]:
+    """A recording sorted by stamp, each stamp once (the first that came), and what was corrected."""
+    counts = PairingCounts(samples=len(times_ns))
     newest = None
     kept: dict[int, T] = {}
     for t_ns, sample in zip(times_ns, samples):
         if t_ns in kept:
             counts.duplicates += 1
-            counts.conflicting += not np.array_equal(_plain(kept[t_ns]), _plain(sample))
+            counts.conflicting += not np.array_equal(_as_array(kept[t_ns]), _as_array(sample))
             continue
         counts.reordered += newest is not None and t_ns < newest
         newest = t_ns if newest is None else max(newest, t_ns)
@@ -213,7 +205,7 @@ def tidy(times_ns: Sequence[int], samples: Sequence[T]) -> tuple[list[int], list
     return order, [kept[t] for t in order], counts
 
 
-def _plain(sample: object) -> NDArray[np.float64]:
+def _as_array(sample: object) -> NDArray[np.float64]:
     if isinstance(sample, Pose):
         return np.array([*sample.quaternion, *sample.translation_m])
     return np.asarray(sample, dtype=np.float64)

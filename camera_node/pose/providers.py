@@ -1,7 +1,7 @@
-"""Poses of cameras on a rig: fixed ones, and ones that follow a recorded trajectory.
+"""Poses of cameras: fixed ones, and ones that follow a recorded trajectory.
 
-A trajectory is a TUM file, ``t tx ty tz qx qy qz qw`` a line: seconds, metres, camera-to-world, camera axes
-as in OpenCV, the quaternion's w last (it is first everywhere else in this project).
+A trajectory is a TUM file, ``t tx ty tz qx qy qz qw`` a line: seconds, meters, camera-to-world, OpenCV camera
+axes, the quaternion's w last (it is first everywhere else in this project).
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ class PoseGapError(ValueError):
 
 
 @dataclass(frozen=True)
-class Paired:
-    """A pose for an instant, and how far (ns) the nearest sample it rests on is from that instant."""
+class PairedPose:
+    """A pose for an instant, and the time (ns) from that instant to the nearest sample used."""
 
     pose: Pose
     gap_ns: int
 
 
 class PoseProvider(Protocol):
-    def at(self, t_ns: int) -> Paired:
+    def at(self, t_ns: int) -> PairedPose:
         """Raises PoseGapError where no sample is near enough."""
         ...
 
 
 @runtime_checkable
-class Closing(Protocol):
-    """A provider that holds a connection, until ``close``."""
+class Closable(Protocol):
+    """What holds a connection or device until ``close``."""
 
     def close(self) -> None: ...
 
@@ -55,8 +55,8 @@ class FixedPose:
 
     pose: Pose
 
-    def at(self, t_ns: int) -> Paired:
-        return Paired(self.pose, 0)
+    def at(self, t_ns: int) -> PairedPose:
+        return PairedPose(self.pose, 0)
 
 
 class Trajectory:
@@ -79,12 +79,12 @@ class Trajectory:
         self._interpolate = interpolate
         self._max_gap_ns = max_gap_ns
 
-    def at(self, t_ns: int) -> Paired:
-        place = find(self._times, t_ns, self._max_gap_ns)
+    def at(self, t_ns: int) -> PairedPose:
+        place = locate(self._times, t_ns, self._max_gap_ns)
         if not self._interpolate or place.fraction is None:
-            return Paired(self._poses[place.nearest], place.gap_ns)
+            return PairedPose(self._poses[place.nearest], place.gap_ns)
         before, after = self._poses[place.before], self._poses[place.before + 1]
-        return Paired(before.interpolate(after, place.fraction), place.gap_ns)
+        return PairedPose(before.interpolate(after, place.fraction), place.gap_ns)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Place:
     fraction: float | None
 
 
-def find(times_ns: Sequence[int], t_ns: int, max_gap_ns: int) -> Place:
+def locate(times_ns: Sequence[int], t_ns: int, max_gap_ns: int) -> Place:
     """Place of an instant among increasing times. Raises PoseGapError where none is within the bound."""
     if not times_ns:
         raise PoseGapError("there is no pose yet")
@@ -117,11 +117,13 @@ def find(times_ns: Sequence[int], t_ns: int, max_gap_ns: int) -> Place:
     return Place(nearest, gap, before, (t_ns - times_ns[before]) / (times_ns[after] - times_ns[before]))
 
 
-def read_tum(path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000) -> Trajectory:
-    """Read a trajectory file. Raises TrajectoryError."""
+def read_tum(
+    path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000, start_ns: int = 0
+) -> Trajectory:
+    """Read a trajectory file. start_ns: the file's time that becomes 0. Raises TrajectoryError."""
     times, poses = read_samples(path)
     try:
-        return Trajectory(times, poses, interpolate, max_gap_ns)
+        return Trajectory([t_ns - start_ns for t_ns in times], poses, interpolate, max_gap_ns)
     except TrajectoryError as error:
         raise TrajectoryError(f"{path}: {error}") from None
 

@@ -1,4 +1,4 @@
-"""The commands of the bench: simulate an arm, drive one, examine a set-up. Imports none of what they use."""
+"""The commands that move an arm: simulate one, drive one, teleoperate one. Imports none of what they use."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from camera_node.config import ROBOTS
 
-COMMANDS = ("simulate-arm", "drive-arm", "teleop", "doctor")
+COMMANDS = ("simulate-arm", "drive-arm", "teleop")
 
 
 def add_commands(commands: Any) -> None:
@@ -56,19 +56,6 @@ def add_commands(commands: Any) -> None:
     drive.add_argument("--yes", action="store_true", help="the arm's space is clear: do not ask")
 
     _add_teleop(commands)
-
-    doctor = commands.add_parser(
-        "doctor", help="examine this machine's part of a set-up: what is wrong, and what to do about it",
-        description="Tests, one after the other, the packages, cameras, arm, clock, network, disk and files "
-        "that a scenario needs on this machine. Moves nothing. Exit code 1 if something is wrong.",
-    )  # fmt: skip
-    doctor.add_argument("scenario", nargs="?", help="without one, only what every scenario needs is tested")
-    doctor.add_argument("--to", metavar="HOST:PORT", help="the channel emulator or edge server to reach")
-    doctor.add_argument("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
-    doctor.add_argument(
-        "--out", type=Path, default=Path("runs"), metavar="DIR", help="where runs will be written"
-    )
-    doctor.add_argument("--json", action="store_true", help="one JSON object for scripts")
 
 
 TELEOP = """\
@@ -121,13 +108,9 @@ def run(args: argparse.Namespace) -> int:
             from camera_node.robot.arm import drive
 
             return drive.run(args)
-        if args.command == "teleop":
-            from camera_node.robot.teleop import command as teleop
+        from camera_node.robot.teleop import command as teleop
 
-            return teleop.run(args)
-        from camera_node import doctor
-
-        return doctor.run(args)
+        return teleop.run(args)
     except ValueError as error:  # what an arm or a file has to say, in one line
         print(f"camera-node: {error}", file=sys.stderr)
         return 2

@@ -10,19 +10,19 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.config import ArmConfig
-from camera_node.pose.providers import Closing, PoseGapError, PoseProvider
+from camera_node.pose.providers import Closable, PoseGapError, PoseProvider
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, hand_eyes
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
-from camera_node.sources import Shot, Source
+from camera_node.sources.base import Shot, Source
 from camera_node.synthetic import Scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from camera_node.synthetic.frame_cache import FrameCache
@@ -76,11 +76,8 @@ class Truth:
         self._link = None
 
 
-class HandCamera:
+class HandCamera(Source):
     """One camera on the hand. mount: flange-from-camera, base: world-from-base (4, 4), as they really are."""
-
-    contents: int | None = None
-    """Never the same picture twice."""
 
     def __init__(
         self,
@@ -101,9 +98,6 @@ class HandCamera:
         self._poses, self._truth = poses, truth
         self._arm, self._base, self._mount = arm, base, mount
 
-    def content(self, tick: int) -> int:
-        return tick
-
     def read(self, content: int) -> Shot:
         """Cast what the camera sees at the tick's instant. Raises PoseGapError."""
         t_ns = content * 10**9 * self.fps.denominator // self.fps.numerator
@@ -116,15 +110,9 @@ class HandCamera:
         pose = self._effects.claimed_pose(paired.pose, content)
         return Shot(image, pose, self.intrinsics, paired.gap_ns)
 
-    def prepare(self, stopped: Callable[[], bool]) -> None:
-        """Nothing can be cast before the arm is there."""
-
-    def release(self) -> None:
-        """Nothing is kept."""
-
     def close(self) -> None:
         """Let go of the arm."""
-        if isinstance(self._poses, Closing):
+        if isinstance(self._poses, Closable):
             self._poses.close()
         self._truth.close()
 

@@ -1,4 +1,4 @@
-"""Which camera of a data set plays which camera of the scenario."""
+"""Which camera of a data set stands for which camera of the scenario."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from collections.abc import Mapping, Sequence
 from freshfield.scenario import Scenario, ScenarioError
 
 
-def assigned(
+def assign_cameras(
     scenario: Scenario, assignment: Mapping[str, str], cameras: Sequence[str], available: Sequence[str]
 ) -> dict[str, str]:
-    """Data set camera of each of ``cameras``: as ``assignment`` says, else the one of the same name.
+    """Data set camera of each of ``cameras``.
 
-    Raises ScenarioError where that camera does not exist, or two cameras would show the same.
+    assignment: scenario camera -> data set camera; where it says nothing, the names are the same.
+    available: the data set's cameras.
+
+    Raises ScenarioError where a camera does not exist, or two cameras would show the same.
     """
     where = f"{scenario.path}: source.assignment"
     for camera in assignment:

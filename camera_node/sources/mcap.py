@@ -1,23 +1,23 @@
-"""A recorded session, replayed message by message: the bytes, poses and lenses that once arrived at an edge.
+"""A recorded session, replayed message by message: the bytes, poses and lenses that an edge once received.
 
-Frames are captured at the intervals at which they were, to the nanosecond. Where clocks differed, each
-session of a node is shifted as a whole, by the offset it knew best."""
+Frames keep their intervals to the nanosecond. Where clocks differed, each session of a node is shifted as a
+whole, by its least uncertain offset."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from camera_node.capture_schedule import Once, Pace, Round
-from camera_node.config import McapConfig, SourceConfig, find_data
-from camera_node.sources import Shot, Source
-from camera_node.sources.assignment import assigned
+from camera_node.capture_schedule import CaptureSchedule, LoopSchedule, OnceSchedule
+from camera_node.config import McapConfig, find_data
+from camera_node.sources.assignment import assign_cameras
+from camera_node.sources.base import Shot, Source
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.frame import pose_and_lens
 from freshfield.geometry import Pinhole
@@ -30,8 +30,12 @@ if TYPE_CHECKING:
 log = logging.getLogger("camera-node")
 
 
-class ReplaySource:
-    """One camera of a session. times_ns: of its frames since the session's first, strictly increasing."""
+class ReplaySource(Source):
+    """One camera of a session.
+
+    times_ns: of its frames since the session's first, strictly increasing.
+    period_ns: of a replay that loops; None plays it once.
+    """
 
     def __init__(
         self,
@@ -42,7 +46,7 @@ class ReplaySource:
         period_ns: int | None,
     ) -> None:
         self.camera = camera
-        self.contents: int | None = len(frames)
+        self.contents = len(frames)
         self.codec = CODEC_NAMES[frames[0].header.codec]
         self.intrinsics: Pinhole = pose_and_lens(frames[0].header)[1]
         usual_ns = float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 1e9
@@ -50,9 +54,11 @@ class ReplaySource:
         self._session, self._frames = session, frames
         self._times, self._period = times_ns, period_ns
 
-    def pace(self, start_ns: int) -> Pace:
+    def schedule(self, start_ns: int) -> CaptureSchedule:
         """Once from ``start_ns`` on, or over and over in step with the epoch."""
-        return Once(self._times, start_ns) if self._period is None else Round(self._times, self._period)
+        if self._period is None:
+            return OnceSchedule(self._times, start_ns)
+        return LoopSchedule(self._times, self._period)
 
     def content(self, tick: int) -> int:
         return tick % len(self._frames)
@@ -62,18 +68,11 @@ class ReplaySource:
         pose, lens = pose_and_lens(frame.header)
         return Shot(self._session.payload(frame), pose, lens, frame.header.pose_gap_ns)
 
-    def prepare(self, stopped: Callable[[], bool]) -> None:
-        """Nothing beyond the shots themselves can be made ahead."""
 
-    def release(self) -> None:
-        """Nothing is held between reads."""
-
-
-def open_sources(
-    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
+def open_replay(
+    scenario: Scenario, config: McapConfig, cameras: Sequence[str], data: Path | None
 ) -> dict[str, Source]:
-    """See ``camera_node.sources.open_sources``."""
-    config = cast(McapConfig, config)
+    """See ``camera_node.sources.registry.open_sources``."""
     path = Path(config.file).expanduser()
     if not path.is_file():
         path = find_data(config.file, scenario, data, key="file")
@@ -93,14 +92,14 @@ def open_sources(
     # From the last frame to the first of the next round: a usual interval.
     gaps = [b - a for t in times.values() for a, b in pairwise(t)]
     period = last - first + (round(float(np.median(gaps))) if gaps else 10**9)
-    names = assigned(scenario, config.assignment, cameras, list(session.frames))
+    names = assign_cameras(scenario, config.assignment, cameras, list(session.frames))
     sources: dict[str, Source] = {}
     for camera, name in names.items():
         frames, kept = _in_order(name, session.frames[name], times[name])
         if len({frame.header.codec for frame in frames}) != 1 or frames[0].header.codec not in CODEC_NAMES:
             raise DatasetError(f"{path}: {name}: its frames are not all of one known codec")
-        turn = period if config.loop == "restart" else None
-        sources[camera] = ReplaySource(camera, session, frames, [t - first for t in kept], turn)
+        loop_ns = period if config.loop == "restart" else None
+        sources[camera] = ReplaySource(camera, session, frames, [t - first for t in kept], loop_ns)
     return sources
 
 
@@ -117,7 +116,7 @@ def _times(frames: Sequence[SessionFrame]) -> list[int]:
 def _in_order(
     name: str, frames: Sequence[SessionFrame], times_ns: Sequence[int]
 ) -> tuple[list[SessionFrame], list[int]]:
-    """Frames without those that do not follow the one before: an edge would refuse them."""
+    """The frames whose time is after that of the one before: an edge would refuse the others."""
     kept: list[int] = []
     out: list[SessionFrame] = []
     for frame, t_ns in zip(frames, times_ns):

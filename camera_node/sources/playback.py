@@ -1,4 +1,4 @@
-"""Which frame of a recording a tick shows: at the recording's own pace, looping for ever."""
+"""Which frame of a recording a tick shows: at the recording's own rate, looping for ever."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ class Playback:
         position = (2 * tick * self.recorded_fps + self.fps) // (2 * self.fps)  # rounds half up, exactly
         if not self.back_and_forth:
             return int(position % self.count)
-        turn = max(1, 2 * (self.count - 1))
-        place = int(position % turn)
-        return place if place < self.count else turn - place
+        period = max(1, 2 * (self.count - 1))
+        place = int(position % period)
+        return place if place < self.count else period - place

@@ -1,4 +1,4 @@
-"""A recorded camera with effects on each of its frames: on images, as sensor noise, or on their poses."""
+"""A camera's effects, and sources whose images or poses they change."""
 
 from __future__ import annotations
 
@@ -6,23 +6,48 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from camera_node.sources import Shot, Source
+from camera_node.config import SourceConfig
+from camera_node.sources.base import Shot, Source
 from freshfield import payload
+from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
     from camera_node.synthetic.effects import Effects
 
 
-class AffectedSource:
-    """Another source's shots, each changed by the effects of its own tick, so that none repeats; a pose that
-    is wrong by the same in every frame changes them once."""
+def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Effects | None:
+    """The effects of one camera. None where the scenario lists none: then nothing of them is imported. Raises
+    ScenarioError."""
+    if not config.effects:
+        return None
+    from camera_node.synthetic.effects import EffectError, load_effects
+
+    try:
+        effects = load_effects(
+            config.effect_parameters,
+            lambda name: scenario.rng(f"effect {name}", camera),
+            held_out=camera in scenario.held_out,
+        )
+    except EffectError as error:
+        raise ScenarioError(f"{scenario.path}: source.effects: {error}") from None
+    if config.kind != "world" and (effects.world or effects.lens or effects.exposure):
+        raise ScenarioError(
+            f"{scenario.path}: source.effects: effects of the kinds world, lens and exposure need "
+            "source kind world"
+        )
+    return effects
+
+
+class AffectedSource(Source):
+    """Another source's shots, each changed by the effects of its own tick, so that none repeats. A pose error
+    that is the same in every frame leaves them repeating."""
 
     def __init__(self, source: Source, effects: Effects, codec: str) -> None:
         self.camera = source.camera
         self.fps = source.fps
         self.intrinsics = source.intrinsics
         self._each_differs = bool(effects.image) or effects.pose_varies
-        self.contents: int | None = None if self._each_differs else source.contents
+        self.contents = None if self._each_differs else source.contents
         self._source = source
         self._effects = effects
         self._codec = codec

@@ -47,10 +47,12 @@ def fill_in_child(scenario: Scenario, config: WorldConfig, camera: str, stopped:
 
 def _child() -> None:
     scenario, config, camera = pickle.load(sys.stdin.buffer)
-    from camera_node.build import load
+    from camera_node.sources.with_effects import camera_effects
     from camera_node.synthetic.source import frame_caches
 
-    frames = frame_caches(scenario, config, [camera], {camera: load(scenario, config, camera)})[camera]
+    frames = frame_caches(scenario, config, [camera], {camera: camera_effects(scenario, config, camera)})[
+        camera
+    ]
     frames.fill(stop=lambda: frames.disk_error is not None)
     if frames.disk_error is not None:
         sys.exit(f"camera-node: {frames.disk_error}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from camera_node.config import SourceConfig, WorldConfig
-from camera_node.sources import Shot, Source
+from camera_node.sources.base import Shot, Source
 from camera_node.sources.playback import rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, EffectError
@@ -28,7 +28,7 @@ WORLD_FPS = 15.0
 _MAX_RAYS = 200_000
 
 
-class WorldSource:
+class WorldSource(Source):
     """One camera of a scene, with its frames kept by ``FrameCache``."""
 
     def __init__(
@@ -39,7 +39,7 @@ class WorldSource:
         lens, matrix = frames.scene.cameras[frames.camera_id]
         self.intrinsics = effects.claimed_lens(lens)
         # Frames that look the same but claim different poses are different shots.
-        self.contents: int | None = None if effects.pose_varies else frames.contents
+        self.contents = None if effects.pose_varies else frames.contents
         self._pose = Pose.from_matrix(matrix)
         self._effects = effects
         self._frames = frames
@@ -71,7 +71,7 @@ def open_sources(
     data: Path | None,
     effects: Mapping[str, Effects | None],
 ) -> dict[str, Source]:
-    """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
+    """See ``camera_node.sources.registry.open_sources``; ``data`` is not needed."""
     config = cast(WorldConfig, config)
     frames = frame_caches(scenario, config, cameras, effects)
     carried: dict[str, Source] = {}

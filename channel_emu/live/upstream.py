@@ -15,6 +15,7 @@ import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from freshfield.transport import backoff_s
 from freshfield.v1 import frames_pb2 as pb
 
 log = logging.getLogger("channel-emu")
@@ -92,7 +93,7 @@ class Upstream:
 
     async def run(self) -> None:
         """Keep a stream open until cancelled. What ``forwarded`` and ``broken`` raise ends it."""
-        backoff = FIRST_BACKOFF_S
+        failures = 0
         while True:
             answered = False
             try:
@@ -102,9 +103,8 @@ class Upstream:
                 self._say(error)
             finally:
                 self._end()
-            backoff = FIRST_BACKOFF_S if answered else min(backoff * 2, MAX_BACKOFF_S)
-            # Jitter, so that the cameras do not come back all at once.
-            await asyncio.sleep(backoff * self._jitter.uniform(0.5, 1.0))
+            failures = 0 if answered else failures + 1
+            await asyncio.sleep(backoff_s(failures, FIRST_BACKOFF_S, MAX_BACKOFF_S, self._jitter))
 
     async def _session(self) -> bool:
         """One stream, until it fails; True if the edge answered anything on it."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import grpc
 import grpc.aio
+import numpy as np
 
 from freshfield.payload import MAX_MESSAGE_BYTES
 
@@ -33,7 +34,7 @@ _COMMON: list[tuple[str, Any]] = [
 ]
 CLIENT_OPTIONS = [
     *_COMMON,
-    # The nodes back off themselves; gRPC's own back-off would add up to two minutes on top.
+    # Senders pause by ``backoff_s``; gRPC's own back-off would add up to two minutes on top.
     ("grpc.initial_reconnect_backoff_ms", 200),
     ("grpc.min_reconnect_backoff_ms", 200),
     ("grpc.max_reconnect_backoff_ms", 2_000),
@@ -50,6 +51,16 @@ SERVER_OPTIONS = [
     # Two servers silently sharing one port would split the cameras between them.
     ("grpc.so_reuseport", 0),
 ]
+
+
+def backoff_s(failures: int, first_s: float, max_s: float, jitter: np.random.Generator) -> float:
+    """Pause (seconds) before a stream is opened again: doubled with every failure, times 0.5 to 1.
+
+    failures: failed attempts since the stream last worked, from 0.
+    first_s, max_s: pause before jitter at 0 failures, and its bound.
+    jitter: one draw is taken, so that the cameras do not all come back at once.
+    """
+    return min(first_s * 2.0 ** min(failures, 60), max_s) * float(jitter.uniform(0.5, 1.0))
 
 
 class TransportError(ValueError):

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from camera_node.build import build_cameras
-from camera_node.capture import Encoded, EncodedCache
+from camera_node.capture import EncodedShot, ShotCache
 from camera_node.config import source_config
 from camera_node.outbox import Outbox
 from camera_node.prepare import prepare
@@ -21,8 +21,8 @@ POSE, LENS = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Pinhole.from_fov(8, 8,
 
 
 def test_the_cache_never_exceeds_its_bound_and_keeps_what_it_has():
-    cache = EncodedCache(100)
-    shots = [Encoded(bytes(30), POSE, LENS, 0) for _ in range(5)]
+    cache = ShotCache(100)
+    shots = [EncodedShot(bytes(30), POSE, LENS, 0) for _ in range(5)]
     assert [cache.put("a", k, shots[k]) for k in range(5)] == [True, True, True, False, False]
     assert cache.put("a", 0, shots[0]) and cache.bytes == 90
     assert cache.get("a", 1) is shots[1] and cache.get("a", 4) is None and cache.get("b", 1) is None
@@ -67,16 +67,16 @@ def test_the_outbox_keeps_the_newest_and_books_each_frame(tmp_path):
         for k in range(4):
             box.put(frame(k))
         assert box.waiting == 1
-        await box.wait()
+        await box.wait_frame()
         assert box.take().sequence == 3 and box.waiting == 0
         with pytest.raises(LookupError):
             box.take()
-        box.note(3, "answered", "accepted")
+        box.record(3, "answered", "accepted")
         box.put(frame(4))
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.02):
                 box.take()
-                await box.wait()  # nothing waits any more
+                await box.wait_frame()  # nothing waits any more
         book.close(9)
         return box.counts
 

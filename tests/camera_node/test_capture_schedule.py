@@ -9,62 +9,62 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.capture_schedule import Once, Round, Ticks
+from camera_node.capture_schedule import LoopSchedule, OnceSchedule, RateSchedule
 
 NOW_NS = 1_763_000_000_123_456_789
 TIMES = [0, 33_000_000, 66_000_001, 250_000_000]
 
 
-def walk(pace, now_ns, steps, late_ns=0):
-    """Ticks and due times as a node makes them: each capture ends ``late_ns`` after it was due."""
-    tick, out = pace.first(now_ns), []
+def walk(schedule, now_ns, steps, late_ns=0):
+    """RateSchedule and due times as a node makes them: each capture ends ``late_ns`` after it was due."""
+    tick, out = schedule.first(now_ns), []
     missed = 0
     while tick is not None and len(out) < steps:
-        due_ns = pace.due_ns(tick)
+        due_ns = schedule.due_ns(tick)
         out.append((tick, due_ns))
-        tick, m = pace.after(tick, due_ns + late_ns)
+        tick, m = schedule.next(tick, due_ns + late_ns)
         missed += m
     return out, missed
 
 
 @given(st.fractions(Fraction(1, 10), 200, max_denominator=1001), st.integers(0, 2**62))
 def test_ticks_are_due_after_now_and_follow_each_other(fps, now_ns):
-    pace = Ticks(fps)
-    found, missed = walk(pace, now_ns, 5)
-    assert found[0][1] > now_ns >= pace.due_ns(found[0][0] - 1) and missed == 0
+    schedule = RateSchedule(fps)
+    found, missed = walk(schedule, now_ns, 5)
+    assert found[0][1] > now_ns >= schedule.due_ns(found[0][0] - 1) and missed == 0
     assert [tick for tick, _ in found] == list(range(found[0][0], found[0][0] + 5))
 
 
 def test_a_late_node_skips_to_the_newest_tick():
-    found, missed = walk(Ticks(Fraction(10)), NOW_NS, 3, late_ns=350_000_000)
+    found, missed = walk(RateSchedule(Fraction(10)), NOW_NS, 3, late_ns=350_000_000)
     assert [b[0] - a[0] for a, b in pairwise(found)] == [3, 3] and missed == 6
 
 
 def test_a_recording_is_played_once_whole_however_late():
     for late_ns in (0, 10**10):
-        found, missed = walk(Once(TIMES, NOW_NS), NOW_NS + 5, 10, late_ns)
+        found, missed = walk(OnceSchedule(TIMES, NOW_NS), NOW_NS + 5, 10, late_ns)
         assert found == [(k, NOW_NS + t) for k, t in enumerate(TIMES)] and missed == 0
 
 
 @given(st.integers(0, 2**61))
 def test_rounds_are_in_step_wherever_they_begin(now_ns):
     period = 300_000_007
-    pace = Round(TIMES, period)
-    found, missed = walk(pace, now_ns, 9)
-    assert found[0][1] > now_ns >= pace.due_ns(found[0][0] - 1) and missed == 0
+    schedule = LoopSchedule(TIMES, period)
+    found, missed = walk(schedule, now_ns, 9)
+    assert found[0][1] > now_ns >= schedule.due_ns(found[0][0] - 1) and missed == 0
     assert all(due_ns % period == TIMES[tick % 4] for tick, due_ns in found)
     assert [tick for tick, _ in found] == list(range(found[0][0], found[0][0] + 9))
 
 
 def test_a_late_node_goes_on_with_the_newest_of_a_round():
-    pace = Round(TIMES, 300_000_000)
-    tick = pace.first(300_000_000 * 7 - 1)
-    assert tick == 28 and pace.due_ns(tick) == 300_000_000 * 7
-    assert pace.after(tick, 300_000_000 * 9 + 70_000_000) == (38, 9)
-    assert pace.after(28, pace.due_ns(28)) == (29, 0)
+    schedule = LoopSchedule(TIMES, 300_000_000)
+    tick = schedule.first(300_000_000 * 7 - 1)
+    assert tick == 28 and schedule.due_ns(tick) == 300_000_000 * 7
+    assert schedule.next(tick, 300_000_000 * 9 + 70_000_000) == (38, 9)
+    assert schedule.next(28, schedule.due_ns(28)) == (29, 0)
 
 
-@pytest.mark.parametrize("pace", [Ticks(Fraction(30)), Round([0], 10**9)])
-def test_nothing_is_captured_twice(pace):
-    found, _ = walk(pace, NOW_NS, 50, late_ns=40_000_000)
+@pytest.mark.parametrize("schedule", [RateSchedule(Fraction(30)), LoopSchedule([0], 10**9)])
+def test_nothing_is_captured_twice(schedule):
+    found, _ = walk(schedule, NOW_NS, 50, late_ns=40_000_000)
     assert all(b > a for a, b in pairwise(found))

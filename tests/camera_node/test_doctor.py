@@ -15,7 +15,7 @@ from freshfield.clock import WallClock
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
-from tests.camera_node.sources.devices.test_device import CALIBRATION
+from tests.camera_node.sources.devices.test_live import CALIBRATION
 
 
 def examined(capsys, *arguments):
@@ -73,7 +73,7 @@ def test_a_part_that_fails_in_its_own_way_does_not_end_the_examination():
     def broken():
         raise RuntimeError("xioctl failed\nlast error 5")
 
-    finding = doctor._look("camera eye", broken)
+    finding = doctor._check("camera eye", broken)
     assert (finding.ok, finding.said) == (False, "RuntimeError: xioctl failed last error 5")
 
 
@@ -143,13 +143,13 @@ def test_a_camera_at_a_fraction_of_the_rate_that_was_asked_for_is_wrong(capsys, 
 
 def test_a_missing_package_says_what_to_install(monkeypatch):
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(doctor.Wrong, match=r"ur-rtde is not installed: pip install 'freshfield\[ur\]'"):
+    with pytest.raises(doctor.CheckFailed, match=r"ur-rtde is not installed: pip install 'freshfield\[ur\]'"):
         doctor._package("ur")
 
 
 def test_a_full_disk_is_wrong(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "LEAST_FREE_GB", 1e9)
-    with pytest.raises(doctor.Wrong, match="make room"):
+    with pytest.raises(doctor.CheckFailed, match="make room"):
         doctor._disk(tmp_path)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from camera_node.config import source_config
-from camera_node.sources import open_sources
+from camera_node.sources.registry import open_sources
 from channel_emu.model.config import channel_from_mapping
 from edge_server.config import read_config
 from edge_server.fields.registry import make_field

@@ -9,10 +9,18 @@ import subprocess
 
 import grpc
 import grpc.aio
+import numpy as np
 import pytest
 
 from freshfield.payload import MAX_MESSAGE_BYTES
-from freshfield.transport import Transport, TransportError, add_arguments, from_arguments, host_port
+from freshfield.transport import (
+    Transport,
+    TransportError,
+    add_arguments,
+    backoff_s,
+    from_arguments,
+    host_port,
+)
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
 
@@ -253,3 +261,10 @@ def test_a_slow_reader_is_felt_at_once():
         return written
 
     assert asyncio.run(scene()) < 20
+
+
+def test_the_back_off_doubles_to_its_bound_and_draws_once_each_time():
+    jitter, same = np.random.default_rng(4), np.random.default_rng(4)
+    pauses = [backoff_s(failures, 0.2, 3.0, jitter) for failures in (0, 1, 2, 3, 4, 5, 10_000)]
+    expected = [0.2, 0.4, 0.8, 1.6, 3.0, 3.0, 3.0]
+    assert pauses == [pause * same.uniform(0.5, 1.0) for pause in expected]

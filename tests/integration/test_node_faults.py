@@ -161,7 +161,7 @@ heavy = {
     "torch", "numba", "scipy", "edge_server", "channel_emu", "matplotlib", "depthai", "pyrealsense2",
     "rtde_receive", "rtde_control", "camera_node.robot.arm.kinematics", "camera_node.robot.arm.joint_states",
     "camera_node.pose.pairing", "camera_node.robot.simulated_controller",
-    "camera_node.sources.devices.device", "camera_node.doctor",
+    "camera_node.sources.devices.live", "camera_node.doctor",
 } & set(sys.modules)
 world = [m for m in sys.modules if m.startswith("camera_node.synthetic")]
 print(code, sorted(heavy), sorted(world))

@@ -14,7 +14,7 @@ from freshfield.scenario import load, parse
 from freshfield.transport import Transport
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
-from tests.camera_node.sources.devices.test_device import CALIBRATION
+from tests.camera_node.sources.devices.test_live import CALIBRATION
 from tests.integration.peer import Peer
 
 

@@ -189,8 +189,11 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         (camera,) = build_cameras(scenario, source_config(scenario), ["cam01"])
     assert "cam01: 1 frames do not follow the one before in time" in caplog.text
-    pace = camera.pace(7)
-    assert [pace.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and pace.after(2, 0) == (None, 0)
+    schedule = camera.schedule(7)
+    assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (
+        None,
+        0,
+    )
 
 
 @pytest.mark.slow

@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera_node.pose.pairing import PoseBuffer, SampleBuffer, along_line, along_screw, tidy
+from camera_node.pose.pairing import (
+    PoseBuffer,
+    SampleBuffer,
+    interpolate_linear,
+    interpolate_screw,
+    sort_samples,
+)
 from camera_node.pose.providers import PoseGapError, Trajectory
 from freshfield.geometry import (
     Pose,
@@ -34,7 +40,7 @@ def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
     """Duplicated and shuffled, a stream pairs as its sorted self does."""
     sent = stamps_ms + random.sample(stamps_ms, len(stamps_ms) // 2)
     random.shuffle(sent)
-    buffer = PoseBuffer(along_line, max_gap_ns=30 * MS)
+    buffer = PoseBuffer(interpolate_linear, max_gap_ns=30 * MS)
     for t_ms in sent:
         buffer.add(t_ms * MS, at(t_ms))
     distinct = sorted(set(stamps_ms))
@@ -49,7 +55,7 @@ def test_the_order_and_the_number_of_arrivals_do_not_matter(random, stamps_ms):
         assert buffer.at(t_ms * MS) == expected
     assert buffer.counts.duplicates == len(sent) - len(distinct)
     assert buffer.counts.conflicting == 0
-    assert tidy([t * MS for t in sent], [at(t) for t in sent])[0] == [t * MS for t in distinct]
+    assert sort_samples([t * MS for t in sent], [at(t) for t in sent])[0] == [t * MS for t in distinct]
 
 
 def test_a_hole_is_refused_and_counted_frame_by_frame():
@@ -116,7 +122,7 @@ def test_memory_is_bounded_however_long_it_runs():
     assert len(buffer._times) <= 600
 
 
-@pytest.mark.parametrize("mix", [along_line, along_screw])
+@pytest.mark.parametrize("mix", [interpolate_linear, interpolate_screw])
 @pytest.mark.parametrize(
     "angle", [0.0, 1e-12, 1e-7, 1.0, np.pi - 1e-9, np.pi, np.pi + 1e-9, 2 * np.pi - 1e-9]
 )

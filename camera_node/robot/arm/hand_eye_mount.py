@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import Closing, FixedPose, Paired, PoseProvider
+from camera_node.pose.providers import Closable, FixedPose, PairedPose, PoseProvider
 from freshfield.geometry import GeometryError, Pose
 
 # Of a file: more is the difference of two clocks' beginnings, such as 1970 and a machine's start.
@@ -56,14 +56,14 @@ class Mounted:
         self._transform = calibration.transform
         self._offset_ns = round(calibration.time_offset_s * 1e9)
 
-    def at(self, t_ns: int) -> Paired:
+    def at(self, t_ns: int) -> PairedPose:
         """Raises PoseGapError where the hand has no pose near enough."""
         paired = self._hand.at(t_ns + self._offset_ns)
-        return Paired(Pose.from_matrix(paired.pose.matrix() @ self._transform), paired.gap_ns)
+        return PairedPose(Pose.from_matrix(paired.pose.matrix() @ self._transform), paired.gap_ns)
 
     def close(self) -> None:
         """Let go of what gives the hand's poses."""
-        if isinstance(self._hand, Closing):
+        if isinstance(self._hand, Closable):
             self._hand.close()
 
 

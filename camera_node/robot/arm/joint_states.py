@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.clocks import ArrivalClock
-from camera_node.pose.pairing import SampleBuffer, between_joints
-from camera_node.pose.providers import Paired, PoseGapError
+from camera_node.pose.pairing import SampleBuffer, interpolate_joints
+from camera_node.pose.providers import PairedPose, PoseGapError
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import CONNECT_S, SAMPLE
 from freshfield.clock import Clock
@@ -116,7 +116,9 @@ class ArmStream:
         self._clock = clock
         self._frequency_hz = frequency_hz
         self._interpolate = interpolate
-        self._samples = SampleBuffer[Joints](between_joints if interpolate else None, round(max_gap_ms * 1e6))
+        self._samples = SampleBuffer[Joints](
+            interpolate_joints if interpolate else None, round(max_gap_ms * 1e6)
+        )
         self._arrived = threading.Event()
         self._stop = threading.Event()
         self._child: subprocess.Popen[bytes] | None = None
@@ -212,7 +214,7 @@ class ArmStream:
                     if stamp_s < last_s:
                         clock = ArrivalClock()  # the controller was started anew
                     last_s = stamp_s
-                    t_ns, angles = clock.ours_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints)
+                    t_ns, angles = clock.host_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints)
                     self._samples.add(t_ns, angles)
                     if self._each is not None:
                         self._each(t_ns, angles)
@@ -264,10 +266,10 @@ class HandPoses:
     ) -> None:
         self._stream, self._model, self._base, self._wait_s = stream, model, base, wait_s
 
-    def at(self, t_ns: int) -> Paired:
+    def at(self, t_ns: int) -> PairedPose:
         """Raises PoseGapError where no sample is near enough."""
         joints, gap_ns = self._stream.at(t_ns, self._wait_s)
-        return Paired(Pose.from_matrix(self._base @ self._model.forward(joints)), gap_ns)
+        return PairedPose(Pose.from_matrix(self._base @ self._model.forward(joints)), gap_ns)
 
     def close(self) -> None:
         """Let go of the arm."""

@@ -22,7 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.pose.pairing import Counts, Mix, PoseBuffer, along_line, along_screw
+from camera_node.pose.pairing import (
+    Interpolate,
+    PairingCounts,
+    PoseBuffer,
+    interpolate_linear,
+    interpolate_screw,
+)
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, HandEye
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track
@@ -37,7 +43,11 @@ from freshfield.geometry import Pose
 
 Rows = list[dict[str, Any]]
 
-MIXES: dict[str, Mix[Pose] | None] = {"nearest": None, "line": along_line, "screw": along_screw}
+MIXES: dict[str, Interpolate[Pose] | None] = {
+    "nearest": None,
+    "line": interpolate_linear,
+    "screw": interpolate_screw,
+}
 PERIODS_MS = (2.0, 8.0, 20.0, 50.0, 100.0, 200.0)
 SPEEDS_M_PER_S = (0.05, 0.1, 0.25, 0.5, 1.0)
 COUNTS = (4, 6, 8, 10, 15, 20, 30, 50)
@@ -203,8 +213,10 @@ def streams(
     targets = inverse(simulated.CAMERA_IN_HAND) @ inverse(sweep.hands(seen_s)) @ simulated.TARGET_IN_BASE
     targets = simulated.disturbed(targets, rng, _SEEN_RAD * noise, _SEEN_M * noise)
     return (
-        Track(np.round((hand_s + offset_s) * 1e9).astype(np.int64), hands, Counts(samples=len(hand_s))),
-        Track(np.round(seen_s * 1e9).astype(np.int64), targets, Counts(samples=len(seen_s))),
+        Track(
+            np.round((hand_s + offset_s) * 1e9).astype(np.int64), hands, PairingCounts(samples=len(hand_s))
+        ),
+        Track(np.round(seen_s * 1e9).astype(np.int64), targets, PairingCounts(samples=len(seen_s))),
     )
 
 

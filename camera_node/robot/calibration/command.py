@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from camera_node import stdout
+from camera_node.robot import stdout
 from camera_node.robot.calibration import CalibrationError
 
 if TYPE_CHECKING:
@@ -151,7 +151,11 @@ def run(args: argparse.Namespace) -> int:
     except ImportError:
         raise CalibrationError("calibration needs scipy (pip install 'freshfield[calibrate]')") from None
     try:
-        with stdout.only_ours() if args.what == "hand-eye" and args.drive else contextlib.nullcontext():
+        with (
+            stdout.only_python_output()
+            if args.what == "hand-eye" and args.drive
+            else contextlib.nullcontext()
+        ):
             return {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "accuracy": _accuracy}[args.what](args)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from camera_node.pose.pairing import Counts, tidy
+from camera_node.pose.pairing import PairingCounts, sort_samples
 from camera_node.pose.providers import TrajectoryError, read_samples
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
@@ -34,7 +34,7 @@ class Track:
 
     times_ns: NDArray[np.int64]
     poses: Array
-    counts: Counts
+    counts: PairingCounts
 
 
 def read_pairs(file: Path, setup: str) -> Samples:
@@ -72,7 +72,7 @@ def read_track(file: Path) -> Track:
         times, poses = read_samples(file)
     except TrajectoryError as error:
         raise CalibrationError(str(error)) from None
-    times, poses, counts = tidy(times, poses)
+    times, poses, counts = sort_samples(times, poses)
     if len(times) < 2:
         raise CalibrationError(f"{file}: {len(times)} poses; a moving hand needs many")
     return Track(np.array(times, dtype=np.int64), np.array([p.matrix() for p in poses]), counts)

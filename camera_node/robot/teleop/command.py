@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node import stdout
 from camera_node.config import ArmConfig
+from camera_node.robot import stdout
 from camera_node.robot.arm.camera_poses import arm_model
 from camera_node.robot.arm.drive import agreed
 from camera_node.robot.arm.joint_states import STALE_S, ArmError, ArmStream
@@ -42,7 +42,7 @@ _LONGEST_STOP_S = 3.0
 def run(args: argparse.Namespace) -> int:
     """Until the operator ends it, Ctrl-C or ``--seconds``. Raises ScenarioError, TeleopError and ArmError
     before anything moves; 1 where it had to be ended."""
-    with stdout.only_ours():
+    with stdout.only_python_output():
         return _run(args)
 
 

@@ -11,16 +11,23 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
+from camera_node.config import ColmapConfig
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import Look, Photo, fitted, record_of
-from camera_node.sources.datasets.records import Dataset, DatasetError, Record
-from freshfield.geometry import GeometryError, quaternion_to_matrix, se3_inverse
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    PosedImage,
+    camera_to_world,
+    errors_at,
+    find_files,
+)
+from freshfield.geometry import quaternion_to_matrix
 
-PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")
-# COLMAP's number and name of each model with the number of its parameters; those it has beside them are
-# refused.
+_PLACES = ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
+# Binary ones are preferred, as COLMAP does.
+FILES = tuple(f"{place}cameras{ending}" for place in _PLACES for ending in (".bin", ".txt"))
+# COLMAP's number and name of each supported model with the number of its parameters; others are refused.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -40,35 +47,37 @@ class _Image:
     pose: tuple[float, ...]
 
 
-def find_model(path: Path) -> Path | None:
-    """The file of cameras of the model in or below a folder, or beside the file that is named; None: there is
-    none. Binary ones are preferred, as COLMAP does."""
-    folder = path if path.is_dir() else path.parent
-    for place in PLACES if path.is_dir() else ("",):
-        for ending in (path.suffix,) if path.is_file() else (".bin", ".txt"):
-            file = folder / place / f"cameras{ending}"
-            if file.is_file() and file.with_name(f"images{ending}").is_file():
-                return file
-    return None
+def describes(file: Path) -> bool:
+    """See ``formats.Reader``."""
+    return file.suffix in (".bin", ".txt")
 
 
-def load_dataset(path: Path, look: Look | None = None, images: str | None = None) -> Dataset:
-    """A record for each image of the model that has a file, in the order of their names.
+def from_config(path: Path, config: ColmapConfig) -> Dataset:
+    """See ``formats.Reader``."""
+    return load_dataset(path, ImageOptions(config.scale, config.background), config.images)
 
-    path: the folder, or a file of the model. images: folder of images, beside the model or one or two folders
-    above it (default ``images``, else the data set's folder itself). Raises DatasetError.
+
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | None = None) -> Dataset:
+    """The images of the model that have a file, in the order of their names.
+
+    path: the folder, or a file of the model.
+    images: folder of images, beside the model or one or two folders above it (default ``images``, else the
+        data set's folder itself).
+
+    Images without a file are left out and counted. Raises DatasetError.
     """
-    file = find_model(path)
+    files = find_files(path, FILES) if path.is_dir() else [path.with_name(f"cameras{path.suffix}")]
+    file = next((f for f in files if f.is_file() and f.with_stem("images").is_file()), None)
     if file is None:
         raise DatasetError(
             f"{path}: no COLMAP model: expected cameras and images, .bin or .txt, in it or in sparse/0"
         )
-    lenses, found = (_binary if file.suffix == ".bin" else _text)(file)
+    lenses, entries = (_binary if file.suffix == ".bin" else _text)(file)
     folder = _images(path if path.is_dir() else path.parent, file, images)
     sized: dict[int, Lens] = {}
-    records: list[Record] = []
+    found: list[PosedImage] = []
     missing = 0
-    for image in sorted(found, key=lambda i: i.name):
+    for image in sorted(entries, key=lambda i: i.name):
         where = f"{file.with_stem('images')}: {image.name}"
         if image.camera not in lenses:
             raise DatasetError(f"{where}: its camera {image.camera} is not in {file.name}")
@@ -79,12 +88,14 @@ def load_dataset(path: Path, look: Look | None = None, images: str | None = None
             missing += 1
             continue
         if image.camera not in sized:
-            sized[image.camera] = fitted(lenses[image.camera], picture, where)
-        photo = Photo(picture, sized[image.camera], look or Look())
-        records.append(record_of(photo, image.name, _camera_to_world(image, where), where))
-    if not records:
+            sized[image.camera] = lens_for_image(lenses[image.camera], picture, where)
+        photo = Photo(picture, sized[image.camera], options)
+        with errors_at(where):
+            pose = camera_to_world(quaternion_to_matrix(image.pose[:4]), image.pose[4:])
+        found.append(posed_photo(photo, image.name, pose, where))
+    if not found:
         raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
-    return Dataset(tuple(records), missing)
+    return Dataset(tuple(found), missing)
 
 
 def _images(given: Path, model: Path, images: str | None) -> Path:
@@ -95,16 +106,6 @@ def _images(given: Path, model: Path, images: str | None) -> Path:
     if images is not None:
         raise DatasetError(f"{given}: no folder {images} beside the model or above it")
     return given
-
-
-def _camera_to_world(image: _Image, where: str) -> np.ndarray:
-    world_to_camera = np.eye(4)
-    try:
-        world_to_camera[:3, :3] = quaternion_to_matrix(image.pose[:4])
-    except GeometryError as error:
-        raise DatasetError(f"{where}: {error}") from None
-    world_to_camera[:3, 3] = image.pose[4:]
-    return se3_inverse(world_to_camera)
 
 
 def _lens(model: str, width: int, height: int, p: list[float], where: str) -> Lens:
@@ -124,10 +125,8 @@ def _lens(model: str, width: int, height: int, p: list[float], where: str) -> Le
     fisheye = model == "OPENCV_FISHEYE"
     radial = rest[:2] if model == "OPENCV" else rest
     tangential = (rest[2], rest[3]) if model == "OPENCV" else (0.0, 0.0)
-    try:
+    with errors_at(where):
         return Lens(width, height, fx, fy, cx, cy, tuple(radial), tangential, fisheye)
-    except DatasetError as error:
-        raise DatasetError(f"{where}: {error}") from None
 
 
 # --- text -----------------------------------------------------------------------------------------

@@ -12,15 +12,28 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.sources.datasets.records import Dataset, DatasetError
+from camera_node.config import DynerfConfig
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at
 from camera_node.sources.datasets.video import VideoRig, rig_dataset
 from camera_node.sources.datasets.video_clip import Clip
-from camera_node.sources.rig_calibration import Calibrated
-from freshfield.geometry import GeometryError, Pinhole, Pose
+from camera_node.sources.rig_calibration import CalibratedCamera
+from freshfield.geometry import Pinhole, Pose
 
 POSES = "poses_bounds.npy"
+FILES = (POSES,)
 # Of a video's shape against that of the images its focal length was found on: both are rounded to pixels.
 _SAME_SHAPE = 0.02
+
+
+def describes(file: Path) -> bool:
+    """See ``formats.Reader``."""
+    return file.name == POSES
+
+
+def from_config(path: Path, config: DynerfConfig) -> VideoRig:
+    """See ``formats.Reader``."""
+    return load_rig(path)
 
 
 def load_rig(path: Path) -> VideoRig:
@@ -40,9 +53,9 @@ def load_rig(path: Path) -> VideoRig:
     return VideoRig(cameras, {video.stem: video for video in videos})
 
 
-def load_dataset(path: Path, scale: float = 1.0) -> Dataset:
-    """Every frame of every video as a record. Raises DatasetError."""
-    return rig_dataset(load_rig(path), path, scale)
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
+    """Every frame of every video as an image. Raises DatasetError."""
+    return rig_dataset(load_rig(path), path, options.scale)
 
 
 def _rows(file: Path) -> np.ndarray:
@@ -67,7 +80,7 @@ def _rows(file: Path) -> np.ndarray:
     return rows
 
 
-def _camera(row: np.ndarray, video: Path, where: str) -> Calibrated:
+def _camera(row: np.ndarray, video: Path, where: str) -> CalibratedCamera:
     matrix = row[:15].reshape(3, 5)
     height, width, focal = matrix[:, 4]
     if min(height, width, focal) <= 0:
@@ -80,9 +93,7 @@ def _camera(row: np.ndarray, video: Path, where: str) -> Calibrated:
             f"{where}: is of images of {width:g} x {height:g}, {video.name} has {clip.width} x {clip.height}"
         )
     down, right, backwards, position = matrix[:, :4].T
-    try:
+    with errors_at(where):
         pose = Pose.from_matrix(np.stack([right, down, -backwards, position], axis=-1))
-    except GeometryError as error:
-        raise DatasetError(f"{where}: {error}") from None
     lens = Pinhole(clip.width, clip.height, focal * x, focal * y, clip.width / 2.0, clip.height / 2.0)
-    return Calibrated(lens, pose)
+    return CalibratedCamera(lens, pose)

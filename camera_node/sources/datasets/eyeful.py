@@ -13,7 +13,6 @@ scaled in ``images-jpeg-1k`` to ``images-jpeg`` (full size); ``splits.json`` nam
 
 from __future__ import annotations
 
-import json
 import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
@@ -22,14 +21,23 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.config import EyefulConfig
 from camera_node.sources.datasets.lens import Lens
-from camera_node.sources.datasets.photo import Look, Photo, fitted, record_of
-from camera_node.sources.datasets.records import Dataset, DatasetError, Record
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, lens_for_image, posed_photo
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    PosedImage,
+    errors_at,
+    find_files,
+    read_json,
+)
 from freshfield.geometry import se3_inverse
 
+FILES = ("cameras.json", "cameras.xml")
 # Smallest first: more pixels than a field learns in a second are of no use.
 FOLDERS = ("images-jpeg-1k", "images-jpeg-2k", "images-jpeg-4k", "images-jpeg")
-# (x, y up, z) -> (z, x, y): their height becomes our z.
+# (x, y up, z) -> (z, x, y): the height y becomes our z.
 _UPRIGHT = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -42,21 +50,33 @@ class _Entry:
     camera_to_world: np.ndarray
 
 
-def load_dataset(path: Path, look: Look | None = None, images: str | None = None) -> Dataset:
-    """A record for each image that has a file; cameras are named by their folders ("10").
+def describes(file: Path) -> bool:
+    """See ``formats.Reader``."""
+    data = read_json(file) if file.suffix == ".json" else None
+    return file.suffix == ".xml" or (isinstance(data, dict) and "KRT" in data)
 
-    path: the scene's folder, its ``cameras.json`` or its ``cameras.xml``. images: folder of images (default:
-    the smallest there is). Images without a file are left out and counted. Raises DatasetError."""
+
+def from_config(path: Path, config: EyefulConfig) -> Dataset:
+    """See ``formats.Reader``."""
+    return load_dataset(path, ImageOptions(config.scale), config.images)
+
+
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE, images: str | None = None) -> Dataset:
+    """The images that have a file; cameras are named by their folders ("10").
+
+    path: the scene's folder, its ``cameras.json`` or its ``cameras.xml``.
+    images: folder of images (default: the smallest there is).
+
+    Nothing in a scene moves, and a camera shows its own images, not necessarily those of one position at a
+    time. Images without a file are left out and counted. Raises DatasetError.
+    """
     folder = path if path.is_dir() else path.parent
-    file = next(
-        (f for f in (folder / "cameras.json", folder / "cameras.xml") if f.is_file()), folder / "cameras.json"
-    )
-    file = path if path.is_file() else file
+    file = path if path.is_file() else next(iter(find_files(folder, FILES)), folder / FILES[0])
     entries = _from_xml(file) if file.suffix == ".xml" else _from_json(file)
     held_out = _held_out(folder / "splits.json")
     pictures = _images(folder, images)
     lenses: dict[Lens, Lens] = {}
-    records: list[Record] = []
+    found: list[PosedImage] = []
     missing = 0
     for entry in entries:
         image = next(
@@ -67,13 +87,14 @@ def load_dataset(path: Path, look: Look | None = None, images: str | None = None
             continue
         where = f"{file}: {entry.name}"
         if entry.lens not in lenses:
-            lenses[entry.lens] = fitted(entry.lens, image, where)
-        photo = Photo(image, lenses[entry.lens], look or Look())
+            lenses[entry.lens] = lens_for_image(entry.lens, image, where)
+        photo = Photo(image, lenses[entry.lens], options)
         pose = _UPRIGHT @ entry.camera_to_world
-        records.append(record_of(photo, entry.name, pose, where, entry.name.split("/")[0]))
-    if not records:
+        found.append(posed_photo(photo, entry.name, pose, where, entry.name.split("/")[0]))
+    if not found:
         raise DatasetError(f"{file}: none of its {missing} images exists in {pictures}")
-    return Dataset(tuple(records), missing, held_out=held_out & {r.name for r in records})
+    held_out &= {image.name for image in found}
+    return Dataset(tuple(found), missing, held_out=held_out, per_camera=True)
 
 
 def _images(folder: Path, images: str | None) -> Path:
@@ -87,24 +108,15 @@ def _images(folder: Path, images: str | None) -> Path:
 def _held_out(file: Path) -> frozenset[str]:
     if not file.is_file():
         return frozenset()
-    splits = _json(file)
+    splits = read_json(file)
     test = splits.get("test") if isinstance(splits, dict) else None
     if not isinstance(test, list):
         raise DatasetError(f"{file}: expected a mapping with a list 'test'")
     return frozenset(str(name) for name in test)
 
 
-def _json(file: Path) -> Any:
-    try:
-        return json.loads(file.read_text())
-    except FileNotFoundError:
-        raise DatasetError(f"{file}: no such file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
-
-
 def _from_json(file: Path) -> list[_Entry]:
-    data = _json(file)
+    data = read_json(file)
     krt = data.get("KRT") if isinstance(data, dict) else None
     if not isinstance(krt, list) or not krt or not all(isinstance(entry, dict) for entry in krt):
         raise DatasetError(f"{file}: expected a mapping with a list 'KRT'")
@@ -135,10 +147,8 @@ def _entry(entry: dict[str, Any], where: str) -> _Entry:
             f"{where}: distortionModel {model!r} with {len(d)} coefficients; expected RadialAndTangential "
             "with 5 or Fisheye with 8"
         )
-    try:
+    with errors_at(where):
         lens = Lens(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], *bend)
-    except DatasetError as error:
-        raise DatasetError(f"{where}: {error}") from None
     return _Entry(name, lens, se3_inverse(transform))
 
 

@@ -1,94 +1,73 @@
-"""Which data set lies in a folder, and its images, whatever the format: for what reads data sets offline."""
+"""Formats of data sets, one reader module each, and which of them a folder or file is of.
+
+The formats are the kinds of ``camera_node.config`` whose keys are a ``RecordedConfig``: a new one is a reader
+module here, called as the kind, and its keys there.
+"""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+import importlib
 from pathlib import Path
+from typing import Any, Protocol, cast
 
-from camera_node.sources.datasets import colmap, dynerf, eyeful, transforms, video, zju
-from camera_node.sources.datasets.photo import Look
-from camera_node.sources.datasets.records import Dataset, DatasetError
+from camera_node.config import MODELS, RecordedConfig
+from camera_node.sources.datasets.photo import ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, find_files
+from camera_node.sources.datasets.video import VideoRig
 
-# What nerfstudio and NeRF-synthetic call the file that a training run starts from.
-_PREFERRED = ("transforms.json", "transforms_train.json")
-
-
-def _transforms(folder: Path) -> list[Path]:
-    named = [folder / name for name in _PREFERRED if (folder / name).is_file()]
-    return list(dict.fromkeys([*named, *sorted(folder.glob("transforms*.json"))]))
+# In this order: where several fit, the one that says most about its images comes first.
+FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, RecordedConfig))
 
 
-def _eyeful(folder: Path) -> list[Path]:
-    return [folder / name for name in ("cameras.json", "cameras.xml") if (folder / name).is_file()]
+class Reader(Protocol):
+    """What the module of a format offers. FILES: patterns of the files that describe a data set in a folder;
+    the first usable one is taken."""
+
+    FILES: tuple[str, ...]
+
+    def describes(self, file: Path) -> bool:
+        """Whether a file describes a data set of this format. Raises DatasetError for a damaged one."""
+
+    def load_dataset(self, path: Path, options: ImageOptions) -> Dataset:
+        """The posed images of a folder or describing file. Raises DatasetError."""
+
+    def from_config(self, path: Path, config: Any) -> Dataset | VideoRig:
+        """What a scenario's section, whose ``data`` is at ``path``, asks for. Raises DatasetError."""
 
 
-def _colmap(folder: Path) -> list[Path]:
-    found = colmap.find_model(folder)
-    return [] if found is None else [found]
-
-
-def _called(*patterns: str) -> Callable[[Path], list[Path]]:
-    return lambda folder: [file for pattern in patterns for file in sorted(folder.glob(pattern))]
-
-
-# Name -> (the files that a folder of the format has, of which the first usable one is taken; the loader). In
-# this order: where several fit, the one that says most about its images comes first.
-FORMATS: dict[str, tuple[Callable[[Path], list[Path]], Callable[[Path, float], Dataset]]] = {
-    "transforms": (_transforms, lambda file, scale: transforms.load_dataset(file, scale, "keep")),
-    "video": (_called("calib*.json"), lambda file, scale: video.load_dataset(file, scale)),
-    "dynerf": (_called(dynerf.POSES), lambda file, scale: dynerf.load_dataset(file, scale)),
-    "zju": (_called(zju.ANNOTATIONS), lambda file, scale: zju.load_dataset(file, Look(scale))),
-    "eyeful": (_eyeful, lambda file, scale: eyeful.load_dataset(file, Look(scale))),
-    "colmap": (_colmap, lambda file, scale: colmap.load_dataset(file, Look(scale))),
-}
+def reader(name: str) -> Reader:
+    """The reader of one of ``FORMATS``; only its module is imported."""
+    return cast(Reader, importlib.import_module(f"camera_node.sources.datasets.{name}"))
 
 
 def open_dataset(path: Path, scale: float = 1.0, name: str | None = None) -> tuple[Path, Dataset]:
-    """The file that describes a data set, and its records with alpha kept. Of several in a folder, the first
-    whose images exist.
+    """The describing file of a data set, and its images with alpha kept. Raises DatasetError.
 
-    path: a folder, or the describing file itself. name: of the format, instead of recognising it. Raises
-    DatasetError.
+    path: the describing file, or a folder, of whose describing files the first whose images exist is taken.
+    scale: images are divided by it.
+    name: of the format, instead of recognizing it.
     """
     if name is not None and name not in FORMATS:
         raise DatasetError(f"format {name!r}: expected one of {', '.join(FORMATS)}")
+    options = ImageOptions(scale)
     if path.is_file():
-        return path, FORMATS[name or _of_file(path)][1](path, scale)
+        # What no other format claims is taken for a transforms JSON, whose reader says what is missing.
+        found = (key for key in FORMATS if reader(key).describes(path))
+        return path, reader(name or next(found, "transforms")).load_dataset(path, options)
     if not path.is_dir():
         raise DatasetError(f"{path}: no such file or folder")
-    tried: list[str] = []
+    errors: list[str] = []
     for key in FORMATS if name is None else (name,):
-        find, load = FORMATS[key]
-        for file in find(path):
+        for file in find_files(path, reader(key).FILES):
             try:
-                return file, load(file, scale)
+                return file, reader(key).load_dataset(file, options)
             except DatasetError as error:
-                tried.append(str(error))
-    if tried:
-        raise DatasetError(tried[0])
+                errors.append(str(error))
+    if errors:
+        raise DatasetError(errors[0])
     if name is not None:
         raise DatasetError(f"{path}: holds no data set of the format {name}")
     raise DatasetError(
         f"{path}: holds no data set: expected transforms.json, transforms_*.json, the calibration JSON of "
-        f"videos, {dynerf.POSES}, {zju.ANNOTATIONS}, Eyeful's cameras.json or a COLMAP model"
+        "videos, poses_bounds.npy, annots.npy, Eyeful's cameras.json or a COLMAP model"
     )
-
-
-def _of_file(file: Path) -> str:
-    """The format of a describing file, by its name or what it holds. Raises DatasetError."""
-    if file.name == dynerf.POSES:
-        return "dynerf"
-    if file.name == zju.ANNOTATIONS:
-        return "zju"
-    if file.suffix == ".xml":
-        return "eyeful"
-    if file.suffix in (".bin", ".txt"):
-        return "colmap"
-    try:
-        described = json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
-    if isinstance(described, dict) and "KRT" in described:
-        return "eyeful"
-    return "video" if isinstance(described, dict) and "frames" not in described else "transforms"

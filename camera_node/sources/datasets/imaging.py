@@ -1,4 +1,4 @@
-"""Reading and shrinking images without colour fringes: area averages, alpha premultiplied."""
+"""Reading and shrinking images without color fringes: area averages, alpha premultiplied."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def as_image(array: np.ndarray) -> Image:
 
 
 def resize(image: Image, width: int, height: int) -> Image:
-    """Area-averaged copy; colours are weighted with alpha, so that what hides under transparent pixels
-    does not bleed into the edges."""
+    """Area-averaged copy. Colors are weighted with alpha, so that those of transparent pixels do not bleed
+    into the edges."""
     if image.shape[:2] == (height, width):
         return image
     if image.shape[2] == 3:
@@ -48,8 +48,8 @@ def resize(image: Image, width: int, height: int) -> Image:
     premultiplied = np.concatenate([image[..., :3] * (alpha / 255.0), alpha], axis=-1)
     small = cv2.resize(premultiplied, (width, height), interpolation=cv2.INTER_AREA)
     weight = small[..., 3:] / 255.0
-    colour = np.where(weight > 0, small[..., :3] / np.maximum(weight, 1e-6), 0.0)
-    out = np.concatenate([colour, small[..., 3:]], axis=-1)
+    color = np.where(weight > 0, small[..., :3] / np.maximum(weight, 1e-6), 0.0)
+    out = np.concatenate([color, small[..., 3:]], axis=-1)
     return np.clip(np.rint(out), 0, 255).astype(np.uint8)
 
 

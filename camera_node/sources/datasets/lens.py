@@ -1,7 +1,7 @@
-"""Lenses as data sets describe them, and their pictures as a pinhole camera sees them.
+"""Lenses as data sets describe them, and their images undistorted.
 
-Our cameras know OpenCV's k1, k2, p1, p2 and nothing more. A picture of a lens that needs more (k3, a fisheye)
-is straightened at the door: resampled to the widest undistorted camera of the same size in which every pixel
+``Pinhole`` has OpenCV's k1, k2, p1, p2 and no more. An image of a lens that needs more (k3, a fisheye) is
+undistorted when it is read: resampled to the widest pinhole camera of the same size in which every pixel
 shows something.
 """
 
@@ -23,7 +23,7 @@ import cv2  # isort: skip
 
 Array = NDArray[np.float64]
 
-# Of a straightened picture, to each side of its axis: beyond it a pinhole's corners are mostly stretching.
+# Of an undistorted image, to each side of its axis: beyond it a pinhole's corners are mostly stretching.
 _WIDEST_RAD = math.radians(60.0)
 # Focal lengths tried, as multiples of the lens's own, narrowest view first.
 _ZOOMS = 4.0 * 0.98 ** np.arange(180)
@@ -32,10 +32,13 @@ _BORDER = 65
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera in pixels, their origin the image's corner.
+    """A camera in pixels, whose origin is the image's corner.
 
-    radial: k1, k2, ... of r^2, r^4, ...; tangential: OpenCV's p1, p2. fisheye: equidistant, r is the angle
-    from the axis (OpenCV's and COLMAP's fisheye models where tangential is zero)."""
+    radial: k1, k2, ... of r^2, r^4, ...
+    tangential: OpenCV's p1, p2.
+    fisheye: equidistant, r is the angle from the axis (OpenCV's and COLMAP's fisheye models where tangential
+        is zero).
+    """
 
     width: int
     height: int
@@ -84,26 +87,25 @@ class Lens:
 
 
 def pinhole(lens: Lens) -> Pinhole:
-    """Our camera for the lens's pictures: the same where it can be, else what ``straighten`` makes of them.
-    Raises DatasetError for coefficients that no lens has."""
-    return _as_it_is(lens) or _straight(lens)
+    """The camera of the lens's images: the lens itself where ``Pinhole`` can express it, else that of
+    ``undistort``. Raises DatasetError for coefficients that no lens has."""
+    return _as_pinhole(lens) or _undistorted(lens)
 
 
 def exact(lens: Lens) -> bool:
-    """Whether ``pinhole(lens)`` is the lens itself, so that its pictures stay as they are."""
-    return _as_it_is(lens) is not None
+    """Whether ``pinhole(lens)`` is the lens itself, so that its images stay as they are."""
+    return _as_pinhole(lens) is not None
 
 
-def straighten(lens: Lens, image: NDArray[np.uint8]) -> Image:
-    """A picture (H, W) or (H, W, C) of ``lens`` as ``pinhole(lens)`` sees it; itself where they are the
-    same."""
+def undistort(lens: Lens, image: NDArray[np.uint8]) -> Image:
+    """An image (H, W) or (H, W, C) of ``lens`` as ``pinhole(lens)`` sees it; unchanged where exact."""
     if exact(lens):
         return image
     return as_image(cv2.remap(image, *_maps(lens), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 @lru_cache(maxsize=256)
-def _as_it_is(lens: Lens) -> Pinhole | None:
+def _as_pinhole(lens: Lens) -> Pinhole | None:
     if lens.fisheye or any(lens.radial[2:]):
         return None
     k1, k2 = (*lens.radial, 0.0, 0.0)[:2]
@@ -112,11 +114,11 @@ def _as_it_is(lens: Lens) -> Pinhole | None:
 
 
 @lru_cache(maxsize=256)
-def _straight(lens: Lens) -> Pinhole:
+def _undistorted(lens: Lens) -> Pinhole:
     found: Pinhole | None = None
     for zoom in _ZOOMS:
         tried = Pinhole(lens.width, lens.height, zoom * lens.fx, zoom * lens.fy, lens.cx, lens.cy)
-        if not _filled(lens, tried):
+        if not _covered(lens, tried):
             break
         found = tried
     if found is None:
@@ -126,7 +128,7 @@ def _straight(lens: Lens) -> Pinhole:
     return found
 
 
-def _filled(lens: Lens, straight: Pinhole) -> bool:
+def _covered(lens: Lens, straight: Pinhole) -> bool:
     """Whether the lens has something to show at every pixel of ``straight``, and no part of it twice."""
     side = np.linspace(0.0, 1.0, _BORDER)
     u = np.concatenate([side, side, np.zeros(_BORDER), np.ones(_BORDER)]) * straight.width
@@ -145,7 +147,7 @@ def _filled(lens: Lens, straight: Pinhole) -> bool:
 # Some 22 MB for a camera of two thousand pixels: a rig's cameras take turns.
 @lru_cache(maxsize=8)
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    straight = _straight(lens)
+    straight = _undistorted(lens)
     u, v = np.meshgrid(np.arange(straight.width) + 0.5, np.arange(straight.height) + 0.5)
     x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
     at = lens.project(np.stack([x, y, np.ones_like(x)], axis=-1)) - 0.5  # OpenCV counts pixel centres

@@ -1,7 +1,7 @@
-"""Python objects in a ``.npy`` file, without running what a stranger may have put into it.
+"""Python objects in a ``.npy`` file, without running code from it.
 
-Such a file is a pickle, and a pickle is a program: here it may build arrays, numbers, text, lists and
-dictionaries, and nothing else.
+Such a file is a pickle, and a pickle is a program: here it may only build arrays, numbers, text, lists and
+dictionaries.
 """
 
 from __future__ import annotations

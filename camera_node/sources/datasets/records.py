@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from freshfield.geometry import Pinhole
+from freshfield.geometry import GeometryError, Pinhole, se3_inverse
 
 Image = NDArray[np.uint8]
 
@@ -19,14 +22,17 @@ class DatasetError(ValueError):
 
 
 @dataclass(frozen=True)
-class Record:
+class PosedImage:
     """One posed image of a data set.
 
-    name: as the data set calls it, unique in it. camera: "" in a set of photos taken by one camera that
-    moved. time_s: None where the data set knows no time. camera_to_world: float64 (4, 4), OpenCV axes, in
-    the data set's units. intrinsics: of the image as ``read`` returns it. read: uint8 (H, W, 3) RGB, or
-    (H, W, 4) straight-alpha RGBA; raises DatasetError for a file that is damaged or of another size. path:
-    the image's own file, where it has one and is shown unscaled.
+    name: unique in the data set, which calls it so.
+    camera: "" in a set of photos taken by one camera that moved.
+    time_s: None where the data set knows no time.
+    camera_to_world: float64 (4, 4), OpenCV axes, in the data set's units.
+    intrinsics: of the image as ``read`` returns it.
+    read: uint8 (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA; raises DatasetError for a file that is damaged
+        or of another size.
+    path: the image's own file, where it has one and is shown unscaled.
     """
 
     name: str
@@ -40,34 +46,72 @@ class Record:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Records in the data set's own order; ``missing`` counts entries that have no file. held_out: names of
-    the records that the data set itself keeps for testing, where it says so."""
+    """Images in the data set's own order.
 
-    records: tuple[Record, ...]
+    missing: number of entries without a file.
+    fps: rate of the recording, where the data set says it.
+    held_out: names of the images that the data set keeps for testing, where it says so.
+    per_camera: each image is shown by the camera that took it, also where nothing moves.
+    """
+
+    images: tuple[PosedImage, ...]
     missing: int = 0
     fps: float | None = None
     held_out: frozenset[str] = frozenset()
+    per_camera: bool = False
 
     def __len__(self) -> int:
-        return len(self.records)
+        return len(self.images)
 
-    def __iter__(self) -> Iterator[Record]:
-        return iter(self.records)
+    def __iter__(self) -> Iterator[PosedImage]:
+        return iter(self.images)
 
-    def __getitem__(self, index: int) -> Record:
-        return self.records[index]
+    def __getitem__(self, index: int) -> PosedImage:
+        return self.images[index]
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras in order of appearance; ("",) for a set of photos."""
-        return tuple(dict.fromkeys(r.camera for r in self.records))
+        return tuple(dict.fromkeys(image.camera for image in self.images))
 
     @property
     def moving(self) -> bool:
         """True where cameras and times are known: a recording of something that moves."""
-        return any(r.camera and r.time_s is not None for r in self.records)
+        return any(image.camera and image.time_s is not None for image in self.images)
 
-    def of(self, camera: str) -> tuple[Record, ...]:
-        """The records of one camera, in the order of time."""
-        found = [r for r in self.records if r.camera == camera]
-        return tuple(sorted(found, key=lambda r: 0.0 if r.time_s is None else r.time_s))
+    def of(self, camera: str) -> tuple[PosedImage, ...]:
+        """The images of one camera, in the order of time."""
+        found = [image for image in self.images if image.camera == camera]
+        return tuple(sorted(found, key=lambda image: 0.0 if image.time_s is None else image.time_s))
+
+
+def find_files(folder: Path, patterns: Sequence[str]) -> list[Path]:
+    """The files of a folder that match a pattern, in the order of the patterns."""
+    return list(dict.fromkeys(file for pattern in patterns for file in sorted(folder.glob(pattern))))
+
+
+@contextlib.contextmanager
+def errors_at(where: str) -> Iterator[None]:
+    """Start the message of what is raised within (DatasetError, GeometryError) with ``where``."""
+    try:
+        yield
+    except (DatasetError, GeometryError) as error:
+        raise DatasetError(f"{where}: {error}") from None
+
+
+def read_json(file: Path) -> Any:
+    """The contents of a JSON file. Raises DatasetError."""
+    try:
+        return json.loads(file.read_text())
+    except FileNotFoundError:
+        raise DatasetError(f"{file}: no such file") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
+
+
+def camera_to_world(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
+    """(4, 4) from the rotation (3, 3) and translation (3) that take world points to camera axes."""
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = rotation
+    world_to_camera[:3, 3] = translation
+    return se3_inverse(world_to_camera)

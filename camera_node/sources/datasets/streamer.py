@@ -1,94 +1,61 @@
-"""The images of a data set, streamed by live cameras.
+"""Live cameras that show a recorded data set, whatever its format.
 
-A recording of several cameras plays back at its own pace. A set of photos of something still is dealt out:
-every eighth image to the held-out cameras, the others round-robin to the training cameras, and each camera
-steps through its images back and forth, as a moving camera.
+A recording of several cameras plays back at its own rate. Photos of something still are split: every eighth
+goes to the held-out cameras, the others round-robin to the training cameras, and each camera steps through
+its photos back and forth, as a moving camera.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Sequence
 from fractions import Fraction
+from pathlib import Path
 
-from camera_node.config import RecordedConfig
-from camera_node.sources import Shot, Source
-from camera_node.sources.assignment import assigned
-from camera_node.sources.datasets.records import Dataset, DatasetError, Record
+from camera_node.config import RecordedConfig, TrajectoryConfig, VideoConfig, find_data
+from camera_node.pose.providers import FixedPose, PoseProvider, TrajectoryError, read_tum
+from camera_node.sources.assignment import assign_cameras
+from camera_node.sources.base import Shot, Source
+from camera_node.sources.datasets.formats import reader
+from camera_node.sources.datasets.imaging import shrink
+from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage
+from camera_node.sources.datasets.video import VideoRig, open_clip
+from camera_node.sources.datasets.video_clip import Clip
 from camera_node.sources.playback import Playback, rate
 from freshfield import payload
 from freshfield.geometry import Pose
-from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario, ScenarioError
 
 HOLD_OUT_EVERY = 8
 PHOTO_FPS = 10.0
-
-
-class RecordsSource:
-    """A camera that shows records one after the other."""
-
-    def __init__(self, camera: str, records: Sequence[Record], playback: Playback, codec: str) -> None:
-        self.camera = camera
-        self.fps = playback.fps
-        self.contents: int | None = len(records)
-        self.intrinsics = records[0].intrinsics
-        self._records = records
-        self._playback = playback
-        self._codec = codec
-
-    def content(self, tick: int) -> int:
-        return self._playback.frame(tick)
-
-    def read(self, content: int) -> Shot:
-        record = self._records[content]
-        image = self._as_stored(record) or record.read()
-        return Shot(image, Pose.from_matrix(record.camera_to_world), record.intrinsics)
-
-    def prepare(self, stopped: Callable[[], bool]) -> None:
-        """Nothing beyond the shots themselves can be made ahead."""
-
-    def release(self) -> None:
-        """Nothing is held between reads."""
-
-    def _as_stored(self, record: Record) -> bytes | None:
-        """The file itself where it is what would be sent: compressing twice costs quality for nothing."""
-        if record.path is None or record.path.suffix.lower() not in _SUFFIXES.get(self._codec, ()):
-            return None
-        data = record.path.read_bytes()
-        try:
-            payload.check(data, self._codec, record.intrinsics.width, record.intrinsics.height)
-        except payload.PayloadError:
-            return None
-        return data
-
-
+# Videos only decode forwards: on the way back, this many (shrunk) frames are decoded at once.
+_BLOCK = 12
 _SUFFIXES = {"jpeg": (".jpg", ".jpeg")}
 
 
-def streams(
-    scenario: Scenario,
-    config: RecordedConfig,
-    cameras: Sequence[str],
-    dataset: Dataset,
-    by_camera: bool = False,
+def open_recorded(
+    scenario: Scenario, config: RecordedConfig, cameras: Sequence[str], data: Path | None
 ) -> dict[str, Source]:
-    """Live ``cameras`` that show ``dataset``. by_camera: each image belongs to the camera that took it, also
-    where nothing moves. Raises ScenarioError or DatasetError."""
-    if dataset.moving or by_camera:
-        return _recording(scenario, config, cameras, dataset)
-    shares = deal(len(dataset), scenario.training, scenario.held_out)
-    fps = rate(config.fps or PHOTO_FPS)
+    """See ``camera_node.sources.registry.open_sources``."""
+    path = find_data(config.data, scenario, data)
+    found = reader(config.kind).from_config(path, config)
+    if isinstance(found, VideoRig):
+        return _video_sources(scenario, config, cameras, found, path)
+    if found.moving or found.per_camera:
+        names = assign_cameras(scenario, config.assignment, cameras, found.cameras)
+        shown = {camera: found.of(name) for camera, name in names.items()}
+        recorded = {camera: _recorded_fps(found, shown[camera]) for camera in cameras}
+    else:
+        shares = split_photos(len(found), scenario.training, scenario.held_out)
+        shown = {camera: tuple(found[i] for i in shares[camera]) for camera in cameras}
+        recorded = {camera: rate(config.fps or PHOTO_FPS) for camera in cameras}
     return {
-        camera: RecordsSource(
-            camera,
-            [dataset[i] for i in shares[camera]],
-            Playback(len(shares[camera]), fps, fps, config.loop == "back-and-forth"),
-            config.codec,
-        )
-        for camera in cameras
+        camera: ImageSource(camera, shown[camera], _playback(config, len(shown[camera]), fps), config.codec)
+        for camera, fps in recorded.items()
     }
 
 
-def deal(count: int, training: Sequence[str], held_out: Sequence[str]) -> dict[str, list[int]]:
+def split_photos(count: int, training: Sequence[str], held_out: Sequence[str]) -> dict[str, list[int]]:
     """Image indices of each camera: index % 8 == 0 to the held-out cameras in turn (if there are any), the
     others to the training cameras in turn. Raises DatasetError if a camera would get none."""
     truth = [i for i in range(count) if i % HOLD_OUT_EVERY == 0] if held_out else []
@@ -103,24 +70,140 @@ def deal(count: int, training: Sequence[str], held_out: Sequence[str]) -> dict[s
     return shares
 
 
-def _recording(
-    scenario: Scenario, config: RecordedConfig, cameras: Sequence[str], dataset: Dataset
-) -> dict[str, Source]:
-    names = assigned(scenario, config.assignment, cameras, dataset.cameras)
-    sources: dict[str, Source] = {}
-    for camera, name in names.items():
-        records = dataset.of(name)
-        recorded = _recorded_fps(dataset, records)
-        fps = rate(config.fps) if config.fps else recorded
-        playback = Playback(len(records), fps, recorded, config.loop == "back-and-forth")
-        sources[camera] = RecordsSource(camera, records, playback, config.codec)
-    return sources
+def _playback(config: RecordedConfig, count: int, recorded: Fraction) -> Playback:
+    fps = rate(config.fps) if config.fps else recorded
+    return Playback(count, fps, recorded, config.loop == "back-and-forth")
 
 
-def _recorded_fps(dataset: Dataset, records: Sequence[Record]) -> Fraction:
+def _recorded_fps(dataset: Dataset, images: Sequence[PosedImage]) -> Fraction:
     if dataset.fps:
         return rate(dataset.fps)
-    times = [r.time_s for r in records if r.time_s is not None]
+    times = [image.time_s for image in images if image.time_s is not None]
     if len(times) < 2 or times[-1] <= times[0]:
         return rate(PHOTO_FPS)
     return rate((len(times) - 1) / (times[-1] - times[0]))
+
+
+class ImageSource(Source):
+    """A camera that shows image files one after the other."""
+
+    def __init__(self, camera: str, images: Sequence[PosedImage], playback: Playback, codec: str) -> None:
+        self.camera, self.fps = camera, playback.fps
+        self.contents = len(images)
+        self.intrinsics = images[0].intrinsics
+        self._images, self._playback, self._codec = images, playback, codec
+
+    def content(self, tick: int) -> int:
+        return self._playback.frame(tick)
+
+    def read(self, content: int) -> Shot:
+        shown = self._images[content]
+        image = self._as_stored(shown) or shown.read()
+        return Shot(image, Pose.from_matrix(shown.camera_to_world), shown.intrinsics)
+
+    def _as_stored(self, shown: PosedImage) -> bytes | None:
+        """The file itself where it is what would be sent: compressing twice costs quality for nothing."""
+        if shown.path is None or shown.path.suffix.lower() not in _SUFFIXES.get(self._codec, ()):
+            return None
+        data = shown.path.read_bytes()
+        try:
+            payload.check(data, self._codec, shown.intrinsics.width, shown.intrinsics.height)
+        except payload.PayloadError:
+            return None
+        return data
+
+
+class VideoSource(Source):
+    """One camera of a video rig."""
+
+    def __init__(
+        self, camera: str, rig: VideoRig, name: str, scale: float, playback: Playback, poses: PoseProvider
+    ) -> None:
+        self.camera, self.fps = camera, playback.fps
+        self.contents = playback.count
+        self.intrinsics = shrink(rig.cameras[name].intrinsics, scale)
+        self._rig, self._name = rig, name
+        self._playback, self._poses = playback, poses
+        self._clip: Clip | None = None
+        self._last = -1
+        self._block: OrderedDict[int, Image] = OrderedDict()
+
+    def content(self, tick: int) -> int:
+        return self._playback.frame(tick)
+
+    def read(self, content: int) -> Shot:
+        fps = self._playback.recorded_fps
+        paired = self._poses.at(content * 10**9 * fps.denominator // fps.numerator)
+        return Shot(self._image(content), paired.pose, self.intrinsics, paired.gap_ns)
+
+    def release(self) -> None:
+        if self._clip is not None:
+            self._clip.close()
+        self._clip = None
+        self._block.clear()
+
+    def _image(self, index: int) -> Image:
+        backwards, self._last = index < self._last, index
+        if index in self._block:
+            return self._block[index]
+        if self._clip is None:
+            self._clip = open_clip(self._rig, self._name)
+        self._block.clear()
+        width, height = self.intrinsics.width, self.intrinsics.height
+        if not backwards:
+            return self._clip.frame(index, width, height)
+        for i in range(max(0, index - _BLOCK + 1), index + 1):
+            self._block[i] = self._clip.frame(i, width, height)
+        return self._block[index]
+
+
+def _video_sources(
+    scenario: Scenario, config: RecordedConfig, cameras: Sequence[str], rig: VideoRig, path: Path
+) -> dict[str, Source]:
+    names = assign_cameras(scenario, config.assignment, cameras, list(rig.cameras))
+    clips = {name: open_clip(rig, name) for name in rig.cameras}
+    # All cameras turn round at the same frame, or they would drift apart at every turn.
+    count = min(clip.count for clip in clips.values())
+    rates = {rate(clip.fps) for clip in clips.values()}
+    for clip in clips.values():
+        clip.close()
+    if len(rates) != 1:
+        raise DatasetError(f"{path}: the videos differ in frame rate: {', '.join(map(str, sorted(rates)))}")
+    playback = _playback(config, count, rates.pop())
+    trajectory = config.trajectory if isinstance(config, VideoConfig) else None
+    base = path if path.is_dir() else path.parent
+    where = f"{scenario.path}: source.trajectory"
+    sources: dict[str, Source] = {}
+    for camera, name in names.items():
+        pose = rig.cameras[name].pose
+        if trajectory is not None and camera in trajectory.files:
+            poses = _trajectory_poses(trajectory, camera, base, where)
+        elif pose is not None:
+            poses = FixedPose(pose)
+        else:
+            raise ScenarioError(
+                f"{where}.files.{camera}: missing, and the calibration has no pose for {name}"
+            )
+        sources[camera] = VideoSource(camera, rig, name, config.scale, playback, poses)
+    return sources
+
+
+def _trajectory_poses(config: TrajectoryConfig, camera: str, base: Path, where: str) -> PoseProvider:
+    """Poses of one camera in the clip's time, from the TUM file that the scenario names."""
+    try:
+        poses = read_tum(
+            base / config.files[camera],
+            config.pairing == "interpolated",
+            round(config.max_gap_ms * 1e6),
+            round(config.start_s * 1e9),
+        )
+    except TrajectoryError as error:
+        raise ScenarioError(f"{where}.files.{camera}: {error}") from None
+    if not config.hand_eye:
+        return poses
+    from camera_node.robot.arm.hand_eye_mount import HandEyeError, read_hand_eye
+
+    try:
+        return read_hand_eye(base / config.hand_eye).camera_poses(poses)
+    except HandEyeError as error:
+        raise ScenarioError(f"{where}.hand_eye: {error}") from None

@@ -8,7 +8,6 @@ recording by several cameras of something that moves.
 
 from __future__ import annotations
 
-import json
 import math
 from functools import partial
 from pathlib import Path
@@ -16,51 +15,62 @@ from typing import Any
 
 import numpy as np
 
-from camera_node.config import BACKGROUNDS
+from camera_node.config import BACKGROUNDS, TransformsConfig
 from camera_node.sources.datasets.imaging import composite, read_image, resize, shrink
-from camera_node.sources.datasets.records import Dataset, DatasetError, Image, Record
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    Image,
+    PosedImage,
+    find_files,
+    read_json,
+)
 from freshfield.geometry import OPENGL_TO_OPENCV, GeometryError, Pinhole, Pose
 
+# First what nerfstudio and NeRF-synthetic start a training from.
+FILES = ("transforms.json", "transforms_train.json", "transforms*.json")
 _EXTENSIONS = ("", ".png", ".jpg", ".jpeg")
 _FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO")
 
 
-def load_dataset(path: str | Path, scale: float = 1.0, background: str = "keep") -> Dataset:
-    """Records of a transforms JSON, or of the first one in a folder whose images exist.
+def describes(file: Path) -> bool:
+    """See ``formats.Reader``."""
+    if file.suffix != ".json":
+        return False
+    data = read_json(file)
+    return isinstance(data, dict) and "frames" in data
 
-    scale: images (by area) and intrinsics are divided by it. background: white or black composites RGBA
-    images, keep leaves alpha. Entries without a file are left out and counted. Raises DatasetError.
+
+def from_config(path: Path, config: TransformsConfig) -> Dataset:
+    """See ``formats.Reader``."""
+    return load_dataset(path, ImageOptions(config.scale, config.background))
+
+
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
+    """Images of a transforms JSON, or of the first one in a folder whose images exist.
+
+    Entries without a file are left out and counted. Raises DatasetError.
     """
-    if background not in BACKGROUNDS:
-        raise DatasetError(f"background is {background!r}: expected one of {', '.join(BACKGROUNDS)}")
+    if options.background not in BACKGROUNDS:
+        raise DatasetError(f"background is {options.background!r}: expected one of {', '.join(BACKGROUNDS)}")
+    if not path.exists():
+        raise DatasetError(f"{path}: no such file or folder")
     tried = []
-    for file in _candidates(Path(path)):
-        dataset = _load(file, scale, background)
-        if dataset.records:
+    for file in [path] if path.is_file() else find_files(path, FILES):
+        dataset = _load(file, options.scale, options.background)
+        if dataset.images:
             return dataset
         tried.append(f"{file.name} (all {dataset.missing} images missing)")
     raise DatasetError(f"{path}: no usable transforms JSON: {'; '.join(tried) or 'none found'}")
 
 
-def _candidates(path: Path) -> list[Path]:
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise DatasetError(f"{path}: no such file or folder")
-    preferred = [path / "transforms.json", path / "transforms_train.json"]
-    others = sorted(path.glob("transforms*.json"))
-    return [p for p in dict.fromkeys([*preferred, *others]) if p.is_file()]
-
-
 def _load(file: Path, scale: float, background: str) -> Dataset:
-    try:
-        data = json.loads(file.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{file}: cannot be read as JSON: {error}") from None
+    data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise DatasetError(f"{file}: expected a mapping with a list 'frames'")
-    records, missing = [], 0
+    images, missing = [], 0
     sizes: dict[str, tuple[int, int]] = {}
     for number, frame in enumerate(frames):
         where = f"{file}: frames[{number}]"
@@ -70,8 +80,8 @@ def _load(file: Path, scale: float, background: str) -> Dataset:
             continue
         camera = str(frame.get("camera", frame.get("camera_label", "")))
         full = _intrinsics({**data, **frame}, image, sizes, camera, where)
-        records.append(
-            Record(
+        images.append(
+            PosedImage(
                 name=str(frame["file_path"]),
                 camera=camera,
                 time_s=_number(frame, "time", where) if "time" in frame else None,
@@ -82,7 +92,7 @@ def _load(file: Path, scale: float, background: str) -> Dataset:
             )
         )
     fps = _number(data, "fps", str(file)) if "fps" in data else None
-    return Dataset(tuple(records), missing, fps)
+    return Dataset(tuple(images), missing, fps)
 
 
 def _find_image(folder: Path, frame: dict[str, Any], where: str) -> Path | None:

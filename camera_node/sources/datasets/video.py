@@ -1,4 +1,4 @@
-"""Synchronised videos with a calibration JSON as a data set: every frame of every camera a record."""
+"""Synchronized videos with a calibration JSON as a data set: every frame of every camera is an image."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from camera_node.config import VideoConfig
 from camera_node.sources.datasets.imaging import shrink
-from camera_node.sources.datasets.records import Dataset, DatasetError, Record
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, find_files, read_json
 from camera_node.sources.datasets.video_clip import Clip
-from camera_node.sources.rig_calibration import Calibrated, load_calibration
+from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.geometry import Pinhole
 
+FILES = ("calib*.json",)
 _PLACES = ("videos/{}.mp4", "{}.mp4")
 
 
@@ -20,46 +23,57 @@ _PLACES = ("videos/{}.mp4", "{}.mp4")
 class VideoRig:
     """cameras: name -> calibration (full size). files: name -> video."""
 
-    cameras: dict[str, Calibrated]
+    cameras: dict[str, CalibratedCamera]
     files: dict[str, Path]
 
 
-def load_rig(path: Path, files: Mapping[str, str] | None = None) -> VideoRig:
+def describes(file: Path) -> bool:
+    """See ``formats.Reader``."""
+    data = read_json(file) if file.suffix == ".json" else None
+    return isinstance(data, dict) and not {"frames", "KRT"} & set(data)
+
+
+def from_config(path: Path, config: VideoConfig) -> VideoRig:
+    """See ``formats.Reader``."""
+    return load_rig(path, config.files)
+
+
+def load_rig(path: Path, files: Mapping[str, str]) -> VideoRig:
     """The rig of a calibration JSON, or of the only one in a folder; cameras without a video are left out.
 
-    files: camera -> video, relative to the JSON. Raises DatasetError.
+    files: camera -> video, relative to the JSON, where it is at none of ``_PLACES``. Raises DatasetError.
     """
     calibration = path if path.is_file() else _find_calibration(path)
     cameras = load_calibration(calibration)
-    for name in files or {}:
+    for name in files:
         if name not in cameras:
             raise DatasetError(f"{calibration}: has no camera {name!r}, for which a video is named")
     found: dict[str, Path] = {}
     for name in cameras:
-        places = [(files or {})[name]] if name in (files or {}) else [p.format(name) for p in _PLACES]
+        places = [files[name]] if name in files else [p.format(name) for p in _PLACES]
         video = next((calibration.parent / p for p in places if (calibration.parent / p).is_file()), None)
         if video is not None:
             found[name] = video
-        elif name in (files or {}):
+        elif name in files:
             raise DatasetError(f"{calibration.parent / places[0]}: no such video (camera {name})")
     if not found:
         raise DatasetError(f"{calibration}: none of its cameras has a video at {' or '.join(_PLACES)}")
     return VideoRig({name: cameras[name] for name in found}, found)
 
 
-def load_dataset(path: str | Path, scale: float = 1.0, files: Mapping[str, str] | None = None) -> Dataset:
-    """Every frame of every video as a record, read when asked for; cameras one after the other.
+def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
+    """``rig_dataset`` of a calibration JSON, or of the only one in a folder. Raises DatasetError."""
+    return rig_dataset(load_rig(path, {}), path, options.scale)
 
-    Poses are the calibration's. Videos of different lengths are cut to the shortest. Raises DatasetError.
+
+def rig_dataset(rig: VideoRig, path: Path, scale: float) -> Dataset:
+    """Every frame of every video as an image, read when asked for; cameras one after the other.
+
+    Poses are the calibration's. Videos of different lengths are cut to the shortest. path: for messages.
     """
-    return rig_dataset(load_rig(Path(path), files), Path(path), scale)
-
-
-def rig_dataset(rig: VideoRig, path: Path, scale: float = 1.0) -> Dataset:
-    """``load_dataset`` of a rig that is known already. path: for messages."""
     clips = {name: open_clip(rig, name) for name in rig.cameras}
     count = min(clip.count for clip in clips.values())
-    records: list[Record] = []
+    images: list[PosedImage] = []
     for name, clip in clips.items():
         calibrated = rig.cameras[name]
         if calibrated.pose is None:
@@ -67,8 +81,8 @@ def rig_dataset(rig: VideoRig, path: Path, scale: float = 1.0) -> Dataset:
         small = shrink(calibrated.intrinsics, scale)
         matrix = calibrated.pose.matrix()
         for index in range(count):
-            records.append(
-                Record(
+            images.append(
+                PosedImage(
                     name=f"{name}/{index:04d}",
                     camera=name,
                     time_s=index / clip.fps,
@@ -77,7 +91,7 @@ def rig_dataset(rig: VideoRig, path: Path, scale: float = 1.0) -> Dataset:
                     read=partial(clip.frame, index, small.width, small.height),
                 )
             )
-    return Dataset(tuple(records), 0, next(iter(clips.values())).fps)
+    return Dataset(tuple(images), 0, next(iter(clips.values())).fps)
 
 
 def open_clip(rig: VideoRig, name: str) -> Clip:
@@ -95,7 +109,7 @@ def open_clip(rig: VideoRig, name: str) -> Clip:
 def _find_calibration(folder: Path) -> Path:
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such file or folder")
-    found = sorted(folder.glob("calib*.json"))
+    found = find_files(folder, FILES)
     if len(found) != 1:
         names = ", ".join(p.name for p in found) or "none"
         raise DatasetError(f"{folder}: expected one calib*.json, found {names}; name the file itself")

@@ -1,4 +1,4 @@
-"""One video file as numbered frames: decoded forwards, one at a time, whatever order they are asked in."""
+"""One video file as numbered frames, in any order. Decoded forwards, one at a time."""
 
 from __future__ import annotations
 

@@ -16,28 +16,48 @@ from typing import Any
 
 import numpy as np
 
+from camera_node.config import ZjuConfig
 from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
-from camera_node.sources.datasets.photo import Look, Photo, record_of
-from camera_node.sources.datasets.records import Dataset, DatasetError, Record
-from freshfield.geometry import se3_inverse
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
+from camera_node.sources.datasets.records import (
+    Dataset,
+    DatasetError,
+    PosedImage,
+    camera_to_world,
+    errors_at,
+)
 
 ANNOTATIONS = "annots.npy"
-# The files do not say; what the studio's cameras are taken to run at where a scenario does not.
+FILES = (ANNOTATIONS,)
+# Assumed rate of the studio's cameras: the files do not say it.
 FPS = 50.0
 _MM = 1e-3
 
 
-def load_dataset(
-    path: Path, look: Look | None = None, masks: str | None = None, fps: float | None = None
-) -> Dataset:
-    """A record for each image of each camera, at instants ``fps`` apart (default ``FPS``).
+def describes(file: Path) -> bool:
+    """See ``formats.Reader``."""
+    return file.name == ANNOTATIONS
 
-    path: the folder, or its ``annots.npy``. masks: a folder beside the cameras' whose masks cut the
-    background out. Images without a file are left out and counted. Raises DatasetError."""
+
+def from_config(path: Path, config: ZjuConfig) -> Dataset:
+    """See ``formats.Reader``."""
+    options = ImageOptions(config.scale, config.background)
+    return load_dataset(path, options, config.masks, config.recorded_fps)
+
+
+def load_dataset(
+    path: Path, options: ImageOptions = FULL_SIZE, masks: str | None = None, fps: float = FPS
+) -> Dataset:
+    """Every image of every camera, at instants 1 / ``fps`` apart.
+
+    path: the folder, or its ``annots.npy``.
+    masks: a folder beside the cameras' whose masks cut the background out.
+
+    Images without a file are left out and counted. Raises DatasetError.
+    """
     file = path if path.is_file() else path / ANNOTATIONS
-    look, rate = look or Look(), fps or FPS
     annotations = load_object(file)
     try:
         cams, instants = annotations["cams"], [list(instant["ims"]) for instant in annotations["ims"]]
@@ -49,12 +69,12 @@ def load_dataset(
         f"ims[{k}]": len(names) for k, names in enumerate(instants) if len(names) != count
     }
     if count < 1 or not instants or set(counts.values()) != {count}:
-        raise DatasetError(f"{file}: the numbers of cameras differ: {_said(counts)}")
+        raise DatasetError(f"{file}: the numbers of cameras differ: {_listed(counts)}")
     folder = file.parent
     if masks is not None and not (folder / masks).is_dir():
         raise DatasetError(f"{folder / masks}: no such folder of masks")
     missing = 0
-    records: list[Record] = []
+    images: list[PosedImage] = []
     for index in range(count):
         lens: Lens | None = None
         where = f"{file}: camera {index}"
@@ -71,16 +91,16 @@ def load_dataset(
             mask = None if masks is None else (folder / masks / name).with_suffix(".png")
             if mask is not None and not mask.is_file():
                 raise DatasetError(f"{mask}: missing, the mask of {name}")
-            photo = Photo(folder / name, lens, look, mask)
-            records.append(record_of(photo, f"{camera}/{k:06d}", pose, where, camera, k / rate))
-    if not records:
+            photo = Photo(folder / name, lens, options, mask)
+            images.append(posed_photo(photo, f"{camera}/{k:06d}", pose, where, camera, k / fps))
+    if not images:
         raise DatasetError(f"{file}: none of its {missing} images exists in {folder}")
-    if len({r.camera for r in records}) != len({(r.camera, r.camera_to_world.tobytes()) for r in records}):
+    if len({i.camera for i in images}) != len({(i.camera, i.camera_to_world.tobytes()) for i in images}):
         raise DatasetError(f"{file}: two of its cameras keep their images in one folder")
-    return Dataset(tuple(records), missing, rate)
+    return Dataset(tuple(images), missing, fps)
 
 
-def _said(counts: dict[str, int]) -> str:
+def _listed(counts: dict[str, int]) -> str:
     return ", ".join(f"{key} {n}" for key, n in list(counts.items())[:6])
 
 
@@ -97,10 +117,7 @@ def _pose(rotation: np.ndarray, translation: np.ndarray, where: str) -> np.ndarr
         raise DatasetError(
             f"{where}: R and T are {rotation.shape} and {translation.shape}, expected 3 x 3 and 3"
         )
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = rotation
-    world_to_camera[:3, 3] = translation.ravel() * _MM
-    return se3_inverse(world_to_camera)
+    return camera_to_world(rotation, translation.ravel() * _MM)
 
 
 def _lens(k: np.ndarray, distortion: np.ndarray, width: int, height: int, where: str) -> Lens:
@@ -110,10 +127,8 @@ def _lens(k: np.ndarray, distortion: np.ndarray, width: int, height: int, where:
     if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
         raise DatasetError(f"{where}: K has skew, which no camera here has")
     d[: distortion.size] = distortion.ravel()
-    try:
+    with errors_at(where):
         return Lens(
             width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5,
             (float(d[0]), float(d[1]), float(d[4])), (float(d[2]), float(d[3])),
         )  # fmt: skip
-    except DatasetError as error:
-        raise DatasetError(f"{where}: {error}") from None

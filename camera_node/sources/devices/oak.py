@@ -1,4 +1,4 @@
-"""Luxonis OAK cameras through depthai 3: colour frames with the instant of their exposure (thesis 4.3.1).
+"""Luxonis OAK cameras through depthai 3: color frames with the instant of their exposure (thesis 4.3.1).
 
 The device's clock is kept in step with the host's by the library; a frame's stamp is taken at the middle of
 its exposure. Intrinsics come from the calibration that is burnt into the device, and a lens that can focus
@@ -10,25 +10,22 @@ from __future__ import annotations
 import datetime
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from camera_node.config import OakConfig, SourceConfig
-from camera_node.sources import Source
-from camera_node.sources.devices.device import (
+from camera_node.config import OakConfig
+from camera_node.sources.devices.feed import (
     CameraError,
     Feed,
     Image,
     as_camera_error,
-    lens_or_why,
-    meant,
-    open_live,
+    intrinsics_or_reason,
+    select_device,
 )
-from camera_node.sources.lens_coefficients import four_coefficients
+from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError
@@ -65,13 +62,21 @@ def find(camera: str, device: str | None) -> Any:
             f"{camera}: no OAK camera found: is it plugged in (USB 3, its own supply), and may this "
             "user open it (udev rule for vendor 03e7, see deploy/lab)?"
         )
-    return there[meant(camera, "OAK", device, ids)]
+    return there[select_device(camera, "OAK", device, ids)]
 
 
-class OakFeed:
+class OakFeed(Feed):
     """A running pipeline of one camera."""
 
     stamped_by = "the device, at the middle of the exposure"
+
+    @classmethod
+    def check(cls, scenario: Scenario, config: OakConfig, cameras: Sequence[str]) -> None:
+        sockets = library().CameraBoardSocket.__members__
+        if config.socket not in sockets:
+            raise ScenarioError(f"{scenario.path}: source.socket: expected one of {', '.join(sockets)}")
+        for camera in cameras:
+            find(camera, config.devices.get(camera))
 
     def __init__(
         self, camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock
@@ -96,10 +101,10 @@ class OakFeed:
                 fps=float(fps),
                 enableUndistortion=config.rectify,
             )
-            self._frames = Frames(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
+            self._frames = FrameQueue(camera, output.createOutputQueue(maxSize=2, blocking=False), clock)
             self._pipeline.start()
             size = (config.width, config.height)
-            self.intrinsics, self.no_lens = lens_or_why(
+            self.intrinsics, self.no_intrinsics = intrinsics_or_reason(
                 lambda: lens(camera, calibration, socket, size, config.rectify)
             )
         except Exception as error:
@@ -111,7 +116,6 @@ class OakFeed:
             ) from None
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        """See ``Feed``."""
         return self._frames.grab(timeout_s)
 
     def close(self) -> None:
@@ -121,8 +125,8 @@ class OakFeed:
             self._device.close()
 
 
-class Frames:
-    """Frames of a depthai queue, as ``Feed.grab`` gives them."""
+class FrameQueue:
+    """Frames of a depthai queue, as ``Feed.grab`` returns them."""
 
     def __init__(self, camera: str, queue: Any, clock: Clock) -> None:
         self._camera, self._queue, self._clock = camera, queue, clock
@@ -170,7 +174,7 @@ def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rect
             f"{camera}: its lens is {model.name.lower()}: set source.rectify: true, or calibrate it and name "
             "the file in source.calibration"
         )
-    found, off_px = four_coefficients(width, height, matrix, distortion)
+    found, off_px = fit_opencv_distortion(width, height, matrix, distortion)
     if off_px > _WORST_LENS_PX:
         log.warning(
             "%s: four coefficients describe this lens to %.1f px only: set source.rectify: true",
@@ -178,25 +182,6 @@ def lens(camera: str, calibration: Any, socket: Any, size: tuple[int, int], rect
             off_px,
         )
     return found
-
-
-def open_sources(
-    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
-) -> dict[str, Source]:
-    """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
-    config = cast(OakConfig, config)
-    sockets = library().CameraBoardSocket.__members__
-    if config.socket not in sockets:
-        raise ScenarioError(f"{scenario.path}: source.socket: expected one of {', '.join(sockets)}")
-    for camera in cameras:
-        find(camera, config.devices.get(camera))  # before an arm is connected to
-    return open_live(scenario, config, cameras, opener)
-
-
-def opener(
-    camera: str, device: str | None, config: OakConfig, fps: Fraction, clock: Clock
-) -> Callable[[], Feed]:
-    return lambda: OakFeed(camera, device, config, fps, clock)
 
 
 def _first_line(error: Exception) -> str:

@@ -1,17 +1,16 @@
 """Any camera that OpenCV opens: USB cameras, and network cameras by address.
 
 Drivers of Linux (V4L2) stamp a frame when its transfer begins, on the machine's monotonic clock, and OpenCV
-hands that on; where the exposure was set, half of it is taken off. Other back ends give no stamp that can be
-trusted, so there the instant of arrival less ``latency_ms`` has to do. Which of the two it is, the first
-frame decides for as long as the camera is open. A thread reads without a pause, so that nothing waits in the
-driver and grows old.
+returns that stamp; where the exposure was set, half of it is subtracted. Stamps of other back ends cannot be
+trusted, so there the instant of arrival less ``latency_ms`` is used. The first frame decides which of the two
+holds for as long as the camera is open. A thread reads without a pause, so that no frame waits in the driver
+and grows old.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -19,12 +18,9 @@ from typing import cast
 import cv2
 import numpy as np
 
-from camera_node.config import CameraConfig, SourceConfig
-from camera_node.sources import Source
-from camera_node.sources.devices.device import CameraError, Feed, Image, open_live
+from camera_node.config import CameraConfig
+from camera_node.sources.devices.feed import CameraError, Feed, Image
 from freshfield.clock import Clock
-from freshfield.geometry import Pinhole
-from freshfield.scenario import Scenario
 
 log = logging.getLogger("camera-node")
 
@@ -36,17 +32,14 @@ _BY_KERNEL, _BY_ARRIVAL = "the kernel", "their arrival, less latency_ms"
 _MANUAL = 1  # V4L2 calls it so
 
 
-class OpenCvFeed:
-    """An open capture. intrinsics: OpenCV knows none."""
-
-    intrinsics: Pinhole | None = None
-    stamped_by = ""
+class OpenCvFeed(Feed):
+    """An open capture. OpenCV knows no intrinsics."""
 
     def __init__(
         self, camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock
     ) -> None:
         self._camera, self._clock = camera, clock
-        self.no_lens = (
+        self.no_intrinsics = (
             f"{camera}: this camera does not know its intrinsics: calibrate it (camera-node calibrate "
             "intrinsics) and name the file in source.calibration"
         )
@@ -66,7 +59,7 @@ class OpenCvFeed:
             self._capture.set(cv2.CAP_PROP_EXPOSURE, config.exposure_us / 100.0)  # V4L2 counts 100 us
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        """See ``Feed``; waits as long as the driver does (network cameras: two seconds)."""
+        """Waits as long as the driver does (network cameras: two seconds)."""
         if not self._capture.grab():
             raise CameraError(
                 f"{self._camera}: the camera gives no more frames: unplugged, or its stream ended"
@@ -81,8 +74,8 @@ class OpenCvFeed:
         return captured_ns, cast(Image, np.ascontiguousarray(picture[:, :, ::-1]))
 
     def _age_ns(self) -> int | None:
-        """Of the frame that was just grabbed; None for one whose stamp is of another clock than the first
-        one's, so that nobody knows when it was."""
+        """Age of the frame that was just grabbed; None where its stamp is of another clock than the first
+        frame's, so that its instant is unknown."""
         stamp_age_ns = None
         if self._v4l2 and self.stamped_by != _BY_ARRIVAL:
             stamp_age_ns = time.monotonic_ns() - round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
@@ -97,19 +90,6 @@ class OpenCvFeed:
 
     def close(self) -> None:
         self._capture.release()
-
-
-def open_sources(
-    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
-) -> dict[str, Source]:
-    """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
-    return open_live(scenario, cast(CameraConfig, config), cameras, opener)
-
-
-def opener(
-    camera: str, device: str | None, config: CameraConfig, fps: Fraction, clock: Clock
-) -> Callable[[], Feed]:
-    return lambda: OpenCvFeed(camera, device, config, fps, clock)
 
 
 def _open(camera: str, device: str) -> cv2.VideoCapture:

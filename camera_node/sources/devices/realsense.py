@@ -1,4 +1,4 @@
-"""Intel RealSense D400 cameras, the thesis's D435i among them: the colour stream (thesis 4.3.1).
+"""Intel RealSense D400 cameras, the thesis's D435i among them: the color stream (thesis 4.3.1).
 
 With the library's global time, a stamp is already the host's; where a device has none, its own clock is
 mapped to ours by the samples that took least. A stamp is of when a frame's readout began; where the frame's
@@ -11,29 +11,26 @@ import contextlib
 import time
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from camera_node.clocks import ArrivalClock
-from camera_node.config import RealsenseConfig, SourceConfig
-from camera_node.sources import Source
-from camera_node.sources.devices.device import (
+from camera_node.config import RealsenseConfig
+from camera_node.sources.devices.feed import (
     CameraError,
     Feed,
     Image,
     as_camera_error,
-    lens_or_why,
-    meant,
-    open_live,
+    intrinsics_or_reason,
+    select_device,
 )
-from camera_node.sources.lens_coefficients import four_coefficients
+from camera_node.sources.devices.lens_coefficients import fit_opencv_distortion
 from freshfield.clock import Clock
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario
 
-_LONGEST_EXPOSURE_US = 200_000  # a colour sensor of the series exposes no longer than 165 ms
+_LONGEST_EXPOSURE_US = 200_000  # a color sensor of the series exposes no longer than 165 ms
 
 
 def library() -> Any:
@@ -67,13 +64,18 @@ def find(camera: str, device: str | None) -> str:
             f"{camera}: no RealSense camera found: is it plugged in (USB 3), and may this user open it (udev "
             "rules of librealsense, see deploy/lab)?"
         )
-    return serials[meant(camera, "RealSense", device, serials)]
+    return serials[select_device(camera, "RealSense", device, serials)]
 
 
-class RealsenseFeed:
-    """A running pipeline of one camera's colour stream."""
+class RealsenseFeed(Feed):
+    """A running pipeline of one camera's color stream."""
 
     stamped_by = "the device, at the middle of the exposure where it tells that"
+
+    @classmethod
+    def check(cls, scenario: Scenario, config: RealsenseConfig, cameras: Sequence[str]) -> None:
+        for camera in cameras:
+            find(camera, config.devices.get(camera))
 
     def __init__(
         self, camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock
@@ -88,7 +90,7 @@ class RealsenseFeed:
             profile = self._pipeline.start(wanted)
         except RuntimeError as error:
             raise CameraError(
-                f"{camera}: the RealSense camera offers no colour stream of {config.width} x "
+                f"{camera}: the RealSense camera offers no color stream of {config.width} x "
                 f"{config.height} at {round(fps)} a second: {error}"
             ) from None
         try:
@@ -96,11 +98,11 @@ class RealsenseFeed:
         except RuntimeError as error:
             self.close()
             raise as_camera_error(camera, error) from None
-        self.intrinsics, self.no_lens = lens_or_why(lambda: lens(camera, found))
-        self._stamps = Stamps(clock)
+        self.intrinsics, self.no_intrinsics = intrinsics_or_reason(lambda: lens(camera, found))
+        self._stamps = FrameClock(clock)
 
     def _set_up(self, profile: Any, config: RealsenseConfig) -> Any:
-        """Stamps of the host's time and the exposure asked for; intrinsics as the library has them."""
+        """FrameClock of the host's time and the exposure asked for; intrinsics as the library has them."""
         rs = library()
         for sensor in profile.get_device().query_sensors():
             if sensor.supports(rs.option.global_time_enabled):
@@ -112,20 +114,19 @@ class RealsenseFeed:
         return stream.get_intrinsics()
 
     def grab(self, timeout_s: float) -> tuple[int, Image] | None:
-        """See ``Feed``."""
         try:
             arrived, frames = self._pipeline.try_wait_for_frames(round(timeout_s * 1e3))
         except RuntimeError as error:
             raise CameraError(f"{self._camera}: the RealSense camera is gone: {error}") from None
         frame = frames.get_color_frame() if arrived else None
-        return taken(frame, self._stamps) if frame else None
+        return as_grabbed(frame, self._stamps) if frame else None
 
     def close(self) -> None:
         with contextlib.suppress(RuntimeError):  # it may be gone
             self._pipeline.stop()
 
 
-class Stamps:
+class FrameClock:
     """A frame's stamp as nanoseconds of our clock. utc: the host's, which the library stamps by."""
 
     def __init__(self, clock: Clock, utc: Callable[[], int] = time.time_ns) -> None:
@@ -137,7 +138,7 @@ class Stamps:
         rs = library()
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6) - _since_exposed_ns(frame)
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
-            return self._device.ours_ns(stamp_ns, now_ns)
+            return self._device.host_ns(stamp_ns, now_ns)
         return now_ns - (self._utc() - stamp_ns)
 
 
@@ -151,7 +152,7 @@ def _since_exposed_ns(frame: Any) -> int:
     return max(0, min(readout_us - exposed_us, _LONGEST_EXPOSURE_US)) * 1000
 
 
-def taken(frame: Any, stamps: Stamps) -> tuple[int, Image]:
+def as_grabbed(frame: Any, stamps: FrameClock) -> tuple[int, Image]:
     """What ``Feed.grab`` gives of an RGB frame; a copy, because the library takes the memory back."""
     return stamps.captured_ns(frame), cast(Image, np.array(frame.get_data(), dtype=np.uint8))
 
@@ -176,20 +177,4 @@ def lens(camera: str, intrinsics: Any) -> Pinhole:
             "the camera and name the file in source.calibration"
         )
     matrix = [[intrinsics.fx, 0, intrinsics.ppx], [0, intrinsics.fy, intrinsics.ppy], [0, 0, 1]]
-    return four_coefficients(intrinsics.width, intrinsics.height, matrix, distortion)[0]
-
-
-def open_sources(
-    scenario: Scenario, config: SourceConfig, cameras: Sequence[str], data: Path | None
-) -> dict[str, Source]:
-    """See ``camera_node.sources.open_sources``; ``data`` is not needed."""
-    config = cast(RealsenseConfig, config)
-    for camera in cameras:
-        find(camera, config.devices.get(camera))  # before an arm is connected to
-    return open_live(scenario, config, cameras, opener)
-
-
-def opener(
-    camera: str, device: str | None, config: RealsenseConfig, fps: Fraction, clock: Clock
-) -> Callable[[], Feed]:
-    return lambda: RealsenseFeed(camera, device, config, fps, clock)
+    return fit_opencv_distortion(intrinsics.width, intrinsics.height, matrix, distortion)[0]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from camera_node.build import build_cameras, load
+from camera_node.build import build_cameras
 from camera_node.capture import Camera
 from camera_node.config import LiveConfig, SourceConfig, WorldConfig, source_config
+from camera_node.sources.with_effects import camera_effects
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from channel_emu.model.config import channel_from_mapping
@@ -111,7 +112,7 @@ def exact_scene(scenario: Scenario, source: WorldConfig) -> tuple[Scene, Effects
         scene = make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: source: {error}") from None
-    effects = load(scenario, source, (scenario.held_out or scenario.cameras)[0])
+    effects = camera_effects(scenario, source, (scenario.held_out or scenario.cameras)[0])
     return (scene, NO_EFFECTS) if effects is None else (effects.extend(scene), effects)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.capture import Camera, Encoded
+from camera_node.capture import Camera, EncodedShot
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from freshfield import payload
@@ -93,7 +93,7 @@ def _instant_ns(camera: Camera, tick: int) -> int:
     return tick * 10**9 * camera.fps.denominator // camera.fps.numerator
 
 
-def _image(camera: Camera, shot: Encoded) -> NDArray[np.uint8]:
+def _image(camera: Camera, shot: EncodedShot) -> NDArray[np.uint8]:
     return payload.decode(shot.payload, camera.codec, shot.intrinsics.width, shot.intrinsics.height)
 
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from camera_node.pose.pairing import (
     PoseBuffer,
     SampleBuffer,
-    along_line,
-    along_screw,
-    between_joints,
-    tidy,
+    interpolate_joints,
+    interpolate_linear,
+    interpolate_screw,
+    sort_samples,
 )
 from camera_node.pose.providers import PoseGapError
 from freshfield.geometry import Pose, so3_exp
@@ -31,9 +31,9 @@ def test_a_screw_keeps_what_is_mounted_on_the_hand_on_its_circle():
     """Half way through a quarter turn about z at (1, 0): the origin stays at distance 1, which a straight
     line between the ends does not."""
     a, b = pose((0, 0, 0)), pose((0, 0, np.pi / 2), (1.0, -1.0, 0.0))
-    middle = np.array(along_screw(a, b, 0.5).translation_m)
+    middle = np.array(interpolate_screw(a, b, 0.5).translation_m)
     assert np.linalg.norm(middle - [1, 0, 0]) == pytest.approx(1.0, abs=1e-12)
-    line = np.array(along_line(a, b, 0.5).translation_m)
+    line = np.array(interpolate_linear(a, b, 0.5).translation_m)
     assert np.linalg.norm(line - [1, 0, 0]) == pytest.approx(np.sqrt(0.5), abs=1e-12)
 
 
@@ -51,20 +51,20 @@ def test_the_screw_is_the_constant_twist_between_its_ends(seed, fraction):
         power.append(power[-1] @ small)
     end = Pose.from_matrix(start.matrix() @ power[steps])
     at = round(fraction * steps)
-    found = along_screw(start, end, at / steps).matrix()
+    found = interpolate_screw(start, end, at / steps).matrix()
     np.testing.assert_allclose(found, start.matrix() @ power[at], atol=1e-9)
 
 
 def test_the_ends_of_an_interpolation_are_its_samples_and_tiny_turns_are_no_danger():
     for size in (0.0, 1e-300, 1e-9, 1e-4, 3.0):
         a, b = pose((0.3, 0, 0), (1, 2, 3)), pose((0.3 + size, 0, 0), (1.1, 2, 3))
-        for mix in (along_line, along_screw):
+        for mix in (interpolate_linear, interpolate_screw):
             np.testing.assert_allclose(mix(a, b, 0.0).matrix(), a.matrix(), atol=1e-12)
             np.testing.assert_allclose(mix(a, b, 1.0).matrix(), b.matrix(), atol=1e-12)
 
 
 def test_nearest_or_between_with_the_gap_and_a_bound_that_counts():
-    joints = SampleBuffer(between_joints, max_gap_ns=10 * MS)
+    joints = SampleBuffer(interpolate_joints, max_gap_ns=10 * MS)
     nearest = SampleBuffer(None, max_gap_ns=10 * MS)
     for t_ms in (0, 8, 16, 60, 68):
         for buffer in (joints, nearest):
@@ -92,6 +92,6 @@ def test_bounds_that_make_no_sense_are_refused():
 
 
 def test_tidy_sorts_and_keeps_the_first_of_a_stamp():
-    times, values, counts = tidy([5, 1, 3, 3, 9], [np.array([float(k)]) for k in range(5)])
+    times, values, counts = sort_samples([5, 1, 3, 3, 9], [np.array([float(k)]) for k in range(5)])
     assert times == [1, 3, 5, 9] and [v[0] for v in values] == [1, 2, 0, 4]
     assert (counts.duplicates, counts.conflicting, counts.reordered) == (1, 1, 2)

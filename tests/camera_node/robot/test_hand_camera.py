@@ -100,7 +100,7 @@ from camera_node.build import build_cameras
 from camera_node.config import source_config
 from freshfield.scenario import load
 build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
-unasked = ("camera_node.pose", "camera_node.robot.hand_camera", "camera_node.sources.devices.device", "rtde",
+unasked = ("camera_node.pose", "camera_node.robot.hand_camera", "camera_node.sources.devices.live", "rtde",
            "depthai")
 print([name for name in sys.modules if name.startswith(unasked)])
 """

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera_node.sources.datasets.records import DatasetError
-from camera_node.sources.datasets.streamer import deal
+from camera_node.sources.datasets.streamer import split_photos
 from camera_node.sources.playback import Playback, rate
 
 
@@ -49,7 +49,7 @@ def test_rates_are_exact():
 def test_photos_are_dealt_once_and_every_eighth_is_held_out(count, training, held_out):
     names = [f"t{k}" for k in range(training)], [f"h{k}" for k in range(held_out)]
     try:
-        shares = deal(count, *names)
+        shares = split_photos(count, *names)
     except DatasetError as error:
         assert "too few" in str(error)
         assert count < 8 * max(training, held_out) + 8
@@ -64,4 +64,4 @@ def test_photos_are_dealt_once_and_every_eighth_is_held_out(count, training, hel
 
 def test_too_few_photos_say_so():
     with pytest.raises(DatasetError, match="3 images are too few"):
-        deal(3, ["a", "b", "c"], ["d"])
+        split_photos(3, ["a", "b", "c"], ["d"])

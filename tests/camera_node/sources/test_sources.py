@@ -11,7 +11,7 @@ import pytest
 from camera_node.build import build_cameras
 from camera_node.config import source_config
 from camera_node.prepare import prepare
-from camera_node.sources import open_sources
+from camera_node.sources.registry import open_sources
 from camera_node.synthetic import make_scene
 from freshfield import payload
 from freshfield.geometry import Pose

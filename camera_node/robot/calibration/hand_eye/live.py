@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.config import ArmConfig, source_config
-from camera_node.pose.pairing import tidy
+from camera_node.pose.pairing import sort_samples
 from camera_node.pose.providers import PoseProvider, Trajectory, TrajectoryError, read_samples
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
 from camera_node.robot.calibration import ArmStopped, CalibrationError
@@ -30,7 +30,8 @@ from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.hand_eye.session import KEPT, MOVING, Session, Step, preview
 from camera_node.robot.calibration.hand_eye.tracks import Tracks, follow_arm
 from camera_node.robot.calibration.targets import Target
-from camera_node.sources import Source, open_sources
+from camera_node.sources.base import Source
+from camera_node.sources.registry import open_sources
 from freshfield import files, payload, scenario
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, se3_inverse
@@ -85,7 +86,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     hands = None
     if args.hand is not None:
         try:
-            times, poses, _ = tidy(*read_samples(args.hand))
+            times, poses, _ = sort_samples(*read_samples(args.hand))
             hands = Trajectory(times, poses, max_gap_ns=round(args.max_gap_ms * 1e6))
         except TrajectoryError as error:
             raise CalibrationError(str(error)) from None

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from camera_node.pose.pairing import tidy
+from camera_node.pose.pairing import sort_samples
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye.samples import Array
@@ -103,7 +103,7 @@ def follow_arm(scenario: Scenario, config: ArmConfig, tracks: Tracks) -> ArmStre
 
 
 def _track(rows: list[tuple[int, Array]], what: str) -> Track:
-    times, poses, counts = tidy([t for t, _ in rows], [pose for _, pose in rows])
+    times, poses, counts = sort_samples([t for t, _ in rows], [pose for _, pose in rows])
     if len(times) < 2:
         raise CalibrationError(f"{len(times)} {what}: a time offset needs many of a moving hand")
     return Track(np.array(times, dtype=np.int64), np.array(poses), counts)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import itertools
 import sys
 from collections.abc import Generator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +17,10 @@ from camera_node.robot.calibration.hand_eye.live import Pace, say, write_picture
 from camera_node.robot.calibration.lens.session import LensSession
 from camera_node.robot.calibration.lens.solve import Lens
 from camera_node.robot.calibration.targets import Target
-from camera_node.sources import open_sources, source_module
-from camera_node.sources.devices.device import DEFAULT_FPS, as_camera_error, opened
+from camera_node.sources.devices.feed import as_camera_error
+from camera_node.sources.devices.live import DEFAULT_FPS, open_feed
 from camera_node.sources.playback import rate
+from camera_node.sources.registry import open_sources
 from freshfield import payload, scenario
 from freshfield.clock import WallClock
 
@@ -68,11 +67,9 @@ def _taken(
     plan: scenario.Scenario, config: LiveConfig, args: argparse.Namespace
 ) -> Generator[Image, None, None]:
     """Of the camera itself: a source would ask for the lens that is to be found."""
-    module: Any = importlib.import_module(source_module(config.kind))
     fps = rate(config.fps or DEFAULT_FPS)
-    device = config.devices.get(args.camera)
     try:
-        feed = opened(args.camera, module.opener(args.camera, device, config, fps, WallClock()))
+        feed = open_feed(args.camera, config, fps, WallClock())
     except ValueError as error:
         raise CalibrationError(str(error)) from None
     pace = Pace(float(fps), args.seconds)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from camera_node.config import source_config
-from camera_node.sources import open_sources
 from camera_node.sources.datasets import colmap, dynerf, eyeful, zju
 from camera_node.sources.datasets.formats import FORMATS, open_dataset
-from camera_node.sources.datasets.lens import Lens, exact, pinhole, straighten
-from camera_node.sources.datasets.photo import Look
+from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
+from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import DatasetError
+from camera_node.sources.registry import open_sources
 from camera_node.synthetic import make_scene
 from freshfield.geometry import Pinhole, se3_inverse
 from freshfield.scenario import parse
@@ -129,12 +129,12 @@ def test_zju_masks_cut_the_person_out(tmp_path):
     inside = np.zeros((48, 64), bool)
     inside[8:40, 16:48] = True
     np.testing.assert_array_equal(image[..., 3], np.where(inside, 255, 0))
-    laid = zju.load_dataset(folder, Look(background="black"), "mask_cihp").of("Camera_B2")[0].read()
+    laid = zju.load_dataset(folder, ImageOptions(background="black"), "mask_cihp").of("Camera_B2")[0].read()
     np.testing.assert_array_equal(laid[inside], image[inside][:, :3])
     assert laid[~inside].max() == 0
     (folder / "mask_cihp/Camera_B1/000002.png").unlink()
-    fails(r"mask_cihp.Camera_B1.000002\.png: missing", zju.load_dataset, folder, None, "mask_cihp")
-    fails("no such folder of masks", zju.load_dataset, folder, None, "mask")
+    fails(r"mask_cihp.Camera_B1.000002\.png: missing", zju.load_dataset, folder, FULL_SIZE, "mask_cihp")
+    fails("no such folder of masks", zju.load_dataset, folder, FULL_SIZE, "mask")
 
 
 def test_zju_damage_is_named(tmp_path):
@@ -225,7 +225,7 @@ def test_eyeful_damage_is_named(tmp_path):
     folder = sets.write_eyeful(tmp_path, sets.rig(2))
     (folder / "images-jpeg-2k/11/11_DSC0001.jpg").unlink()
     assert eyeful.load_dataset(folder).missing == 1
-    fails(r"no folder images-jpeg-4k;", eyeful.load_dataset, folder, None, "images-jpeg-4k")
+    fails(r"no folder images-jpeg-4k;", eyeful.load_dataset, folder, FULL_SIZE, "images-jpeg-4k")
     file = folder / "cameras.json"
     whole = file.read_text()
     for change, message in (
@@ -391,7 +391,7 @@ def test_straightened_pictures_show_each_ray_where_it_belongs(lens):
     assert not exact(lens)
     straight = pinhole(lens)
     u, v = np.meshgrid(np.arange(96) + 0.5, np.arange(64) + 0.5)
-    found = straighten(lens, np.dstack([u, v]).astype(np.float32))  # a picture of where its pixels are
+    found = undistort(lens, np.dstack([u, v]).astype(np.float32))  # a picture of where its pixels are
     k = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
     rays = straight.rays().reshape(-1, 1, 3)
     if lens.fisheye:

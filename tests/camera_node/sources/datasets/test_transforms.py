@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.transforms import load_dataset
 from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
@@ -32,12 +33,12 @@ def test_poses_become_opencv_and_images_rgb(tmp_path):
 
 
 def test_scale_divides_images_and_intrinsics(tmp_path):
-    (record,) = load_dataset(write_photos(tmp_path, 1), scale=2)
+    (record,) = load_dataset(write_photos(tmp_path, 1), ImageOptions(2))
     assert record.intrinsics == Pinhole(16, 12, 20.0, 20.5, 8.0, 6.0)
     means = picture(0)[..., ::-1].reshape(12, 2, 16, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(record.read(), means, atol=0.51)
     with pytest.raises(DatasetError, match="scale"):
-        load_dataset(tmp_path, scale=0.5)
+        load_dataset(tmp_path, ImageOptions(0.5))
 
 
 def test_entries_without_a_file_are_counted(tmp_path):
@@ -82,12 +83,12 @@ def test_alpha_is_kept_laid_on_a_colour_and_weighted_when_shrinking(tmp_path):
     rgba[:, :, :3] = (0, 255, 0)  # green, as BGR and as RGB, hidden where alpha is 0
     rgba[:, 1::2] = (200, 100, 50, 255)  # every second column is seen
     cv2.imwrite(str(tmp_path / "images/000.png"), rgba)
-    kept = load_dataset(file, scale=2)[0].read()
+    kept = load_dataset(file, ImageOptions(2))[0].read()
     assert kept.shape == (12, 16, 4)
     assert np.unique(kept.reshape(-1, 4), axis=0).tolist() == [[50, 100, 200, 128]]  # no green
-    white = load_dataset(file, scale=2, background="white")[0].read()
+    white = load_dataset(file, ImageOptions(2, "white"))[0].read()
     np.testing.assert_allclose(white[0, 0], (np.array([50, 100, 200]) + 255) / 2, atol=0.51)
-    black = load_dataset(file, background="black")[0].read()
+    black = load_dataset(file, ImageOptions(background="black"))[0].read()
     assert black[0, 0].tolist() == [0, 0, 0] and black[0, 1].tolist() == [50, 100, 200]
 
 
@@ -128,12 +129,12 @@ def test_an_image_of_another_size_or_damaged_is_refused_when_read(tmp_path):
 
 
 def test_a_folder_uses_the_first_file_whose_images_exist():
-    dataset = load_dataset(data_dir("fox"), scale=4)
+    dataset = load_dataset(data_dir("fox"), ImageOptions(4))
     # transforms.json names full-size images that are not there; transforms_2.json those that are.
     assert len(dataset) == 50 and dataset.missing == 0
     assert (dataset[0].intrinsics.width, dataset[0].intrinsics.height) == (135, 240)
     assert dataset[0].read().shape == (240, 135, 3)
-    assert load_dataset(data_dir("fox") / "transforms_2.json").records[3].intrinsics.distorted
+    assert load_dataset(data_dir("fox") / "transforms_2.json")[3].intrinsics.distorted
 
 
 def test_matches_between_fox_photos_agree_with_their_poses():
@@ -168,7 +169,7 @@ def _essential(b_from_a):
 
 
 def test_lego_looks_at_its_middle():
-    dataset = load_dataset(data_dir("lego_synthetic"), scale=2, background="white")
+    dataset = load_dataset(data_dir("lego_synthetic"), ImageOptions(2, "white"))
     assert len(dataset) == 100
     image = dataset[7].read()
     assert image.shape == (200, 200, 3) and image[0, 0].tolist() == [255, 255, 255]

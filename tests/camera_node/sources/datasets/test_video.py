@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from camera_node.config import source_config
-from camera_node.sources import open_sources
+from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.datasets.video import load_dataset
 from camera_node.sources.datasets.video_clip import Clip
+from camera_node.sources.registry import open_sources
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import look_at, se3_inverse
 from freshfield.scenario import ScenarioError, parse
@@ -127,7 +128,7 @@ def test_a_trajectory_gives_the_poses(tmp_path):
 
 
 def test_the_data_set_lists_every_frame_of_every_camera():
-    dataset = load_dataset(data_dir("pose2sim_single_person"), scale=8)
+    dataset = load_dataset(data_dir("pose2sim_single_person"), ImageOptions(8))
     assert len(dataset) == 400 and dataset.cameras == ("cam01", "cam02", "cam03", "cam04")
     record = dataset.of("cam03")[59]
     assert record.time_s == pytest.approx(59 / 60)

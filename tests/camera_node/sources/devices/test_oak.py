@@ -17,7 +17,8 @@ from camera_node.build import build_cameras
 from camera_node.config import source_config
 from camera_node.pose.providers import FixedPose
 from camera_node.sources.devices import oak
-from camera_node.sources.devices.device import CameraError, LiveSource
+from camera_node.sources.devices.feed import CameraError
+from camera_node.sources.devices.live import LiveSource
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import ScenarioError, parse
@@ -60,7 +61,7 @@ def replay(tmp_path):
 def test_real_frames_come_as_rgb_with_their_time_on_our_clock(replay):
     _, queue = replay
     clock = WallClock()
-    frames = oak.Frames("eye", queue, clock)
+    frames = oak.FrameQueue("eye", queue, clock)
     seen = []
     for _ in range(6):
         captured_ns, image = frames.grab(10.0)
@@ -76,7 +77,7 @@ def test_it_is_a_source_like_any_other_and_says_when_it_is_gone(replay):
     pipeline, queue = replay
     clock = WallClock()
 
-    class Feed(oak.Frames):
+    class Feed(oak.FrameQueue):
         intrinsics = oak.lens("eye", calibration(), dai.CameraBoardSocket.CAM_A, (WIDTH, HEIGHT), False)
 
         def close(self):
@@ -151,7 +152,7 @@ def test_a_device_without_calibration_opens_all_the_same(monkeypatch):
     monkeypatch.setattr(oak, "find", lambda camera, name: None)
     scenario = plan()
     feed = oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock())
-    assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_lens
+    assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_intrinsics
     device.readCalibration.return_value = calibration()
     assert oak.OakFeed("eye", None, source_config(scenario), Fraction(10), WallClock()).intrinsics
 

@@ -13,7 +13,7 @@ import pytest
 
 from camera_node.build import build_cameras
 from camera_node.config import source_config
-from camera_node.sources.devices.device import CameraError
+from camera_node.sources.devices.feed import CameraError
 from freshfield.clock import WallClock
 from freshfield.scenario import parse
 
@@ -66,7 +66,7 @@ def test_global_time_is_the_hosts():
     clock = WallClock()
     stamp_ms = time.time() * 1e3 - 40.0
     (frame,) = frames(rs.timestamp_domain.global_time, [stamp_ms])
-    captured_ns, image = realsense.taken(frame, realsense.Stamps(clock))
+    captured_ns, image = realsense.as_grabbed(frame, realsense.FrameClock(clock))
     assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.uint8
     assert abs(captured_ns / 1e6 - stamp_ms) < 5.0
 
@@ -76,7 +76,7 @@ def test_a_stamp_is_moved_to_the_middle_of_the_exposure():
     stamp_ms = time.time() * 1e3 - 40.0
     told = [(key.frame_timestamp, 5_012_000), (key.sensor_timestamp, 5_000_000)]
     (frame,) = frames(rs.timestamp_domain.global_time, [stamp_ms], told)
-    captured_ns, _ = realsense.taken(frame, realsense.Stamps(clock))
+    captured_ns, _ = realsense.as_grabbed(frame, realsense.FrameClock(clock))
     assert captured_ns / 1e6 - (stamp_ms - 12.0) == pytest.approx(0.0, abs=5.0)
 
 
@@ -89,7 +89,7 @@ def test_a_lens_that_is_not_opencvs_opens_all_the_same(monkeypatch):
     monkeypatch.setattr(realsense, "find", lambda camera, device: "1")
     scenario = parse({"cameras": {"ids": ["eye"]}, "source": {"kind": "realsense"}}, Path("scenario.yaml"))
     feed = realsense.RealsenseFeed("eye", None, source_config(scenario), Fraction(15), WallClock())
-    assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_lens
+    assert feed.intrinsics is None and "name the file in source.calibration" in feed.no_intrinsics
     stream.get_intrinsics.side_effect = RuntimeError("get_intrinsics failed")
     with pytest.raises(CameraError, match="eye: RuntimeError: get_intrinsics failed"):
         realsense.RealsenseFeed("eye", None, source_config(scenario), Fraction(15), WallClock())
@@ -98,11 +98,11 @@ def test_a_lens_that_is_not_opencvs_opens_all_the_same(monkeypatch):
 
 def test_a_devices_own_time_is_mapped_by_arrival():
     clock = WallClock()
-    stamps = realsense.Stamps(clock)
+    stamps = realsense.FrameClock(clock)
     begin_ns = clock.now_ns()
     taken = []
     for number, frame in enumerate(frames(rs.timestamp_domain.hardware_clock, [1000.0, 1033.0, 1066.0])):
-        taken.append(realsense.taken(frame, stamps))
+        taken.append(realsense.as_grabbed(frame, stamps))
         assert taken[-1][1][0, 0, 0] == 10 * number
     assert all(begin_ns - 10**8 < captured_ns <= clock.now_ns() for captured_ns, _ in taken)
 

@@ -36,7 +36,7 @@ from camera_node.robot.calibration.hand_eye.session import Session
 from camera_node.robot.calibration.hand_eye.tracks import HAND_FILE, LEAST_S, TARGET_FILE, Tracks
 from camera_node.robot.calibration.targets import parse
 from camera_node.robot.hand_camera import Truth
-from camera_node.sources import Shot
+from camera_node.sources.base import Shot
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import load

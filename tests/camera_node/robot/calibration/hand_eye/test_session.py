@@ -18,7 +18,7 @@ from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, calibrat
 from camera_node.robot.calibration.hand_eye.live import guide
 from camera_node.robot.calibration.hand_eye.session import Session, preview
 from camera_node.robot.calibration.targets import parse
-from camera_node.sources import Shot
+from camera_node.sources.base import Shot
 from freshfield.geometry import Pose
 from tests.camera_node.robot.calibration.pictures import BOARD, LENS, as_scenario, taken
 from tests.conftest import data_dir

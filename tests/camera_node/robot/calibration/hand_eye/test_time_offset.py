@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.pose.pairing import Counts
+from camera_node.pose.pairing import PairingCounts
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.accuracy_cost import streams
@@ -55,8 +55,8 @@ def turning(angle_of, seconds=12.0) -> tuple[Track, Track]:
         a = angle_of(t_s)
         poses[:, 0, 0] = poses[:, 1, 1] = np.cos(a)
         poses[:, 1, 0], poses[:, 0, 1] = np.sin(a), -np.sin(a)
-        out.append(Track((t_s * 1e9).astype(np.int64), poses, Counts()))
-    return out[0], Track(out[1].times_ns, inverse(out[1].poses), Counts())
+        out.append(Track((t_s * 1e9).astype(np.int64), poses, PairingCounts()))
+    return out[0], Track(out[1].times_ns, inverse(out[1].poses), PairingCounts())
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_streams_of_different_bodies_are_refused():
     hand, _ = streams(simulated.Sweep(0.15), 20.0, 0.0, np.random.default_rng(4))
     still = simulated.Sweep(0.05)
     t_s = (hand.times_ns / 1e9)[::8]
-    other = Track(hand.times_ns[::8], simulated.seen_targets(still.hands(t_s + 300.0)), Counts())
+    other = Track(hand.times_ns[::8], simulated.seen_targets(still.hands(t_s + 300.0)), PairingCounts())
     with pytest.raises(CalibrationError, match=r"turn alike|does not settle|repeats"):
         calibrate_streams(hand, other, EYE_IN_HAND)
 

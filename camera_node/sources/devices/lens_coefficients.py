@@ -13,14 +13,16 @@ from freshfield.geometry import Pinhole
 _RASTER = 25
 
 
-def four_coefficients(
+def fit_opencv_distortion(
     width: int, height: int, k: ArrayLike, distortion: Sequence[float]
 ) -> tuple[Pinhole, float]:
-    """The camera that comes nearest, and how far (pixels) it is off at most, anywhere in the picture.
+    """The nearest camera with k1, k2, p1, p2, and its largest error (pixels) anywhere in the image.
 
-    k: OpenCV's camera matrix (3, 3), pixel centres at whole numbers. distortion: 4 to 14 of OpenCV's
-    coefficients (k1, k2, p1, p2, k3, k4, k5, k6, s1 .. s4, tx, ty). The four are fitted by least squares to
-    where the lens puts a raster of points.
+    width, height: of the image, pixels.
+    k: OpenCV's camera matrix (3, 3), pixel centers at whole numbers.
+    distortion: 4 to 14 of OpenCV's coefficients (k1, k2, p1, p2, k3, k4, k5, k6, s1 .. s4, tx, ty).
+
+    Least squares over where the lens puts a raster of points.
     """
     matrix = np.asarray(k, dtype=np.float64).reshape(3, 3)
     given = np.zeros(max(5, len(distortion)))

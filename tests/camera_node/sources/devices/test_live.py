@@ -15,7 +15,8 @@ from camera_node.build import build_cameras
 from camera_node.config import CameraConfig, source_config
 from camera_node.pose.providers import FixedPose
 from camera_node.sources.devices import opencv as opencv_camera
-from camera_node.sources.devices.device import CameraError, LiveSource, meant, open_live
+from camera_node.sources.devices.feed import CameraError, select_device
+from camera_node.sources.devices.live import LiveSource, open_live
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, Pose
@@ -199,10 +200,10 @@ STANDING = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 class Feed:
     """A camera that gives frames until ``breaks_after`` of them, and then ``trouble``."""
 
-    stamped_by, no_lens = "itself", ""
+    stamped_by, no_intrinsics = "itself", ""
 
-    def __init__(self, intrinsics=LENS, no_lens="", breaks_after=10**9, trouble=None):
-        self.intrinsics, self.no_lens = intrinsics, no_lens
+    def __init__(self, intrinsics=LENS, no_intrinsics="", breaks_after=10**9, trouble=None):
+        self.intrinsics, self.no_intrinsics = intrinsics, no_intrinsics
         self._left, self._trouble = breaks_after, trouble
         self.closed = False
 
@@ -273,22 +274,20 @@ def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
         def close(self):
             arms.append("closed")
 
-    def opener(camera, device, config, fps, clock):
-        def open_feed():
-            if camera == "other":
-                raise CameraError("other: no camera")
-            return first
-
-        return open_feed
+    def open_feed(camera, config, fps, clock):
+        if camera == "other":
+            raise CameraError("other: no camera")
+        return first
 
     plan = scenario(tmp_path, "0", {"eye": CALIBRATION["eye"], "other": CALIBRATION["eye"]})
     both = {**plan.source, "devices": {"eye": "0", "other": "1"}}
     plan = parse({"cameras": {"ids": ["eye", "other"]}, "source": both}, tmp_path / "scenario.yaml")
     monkeypatch.setattr(
-        "camera_node.sources.devices.device._poses", lambda *_: {"eye": Arm(), "other": STANDING}
+        "camera_node.sources.devices.live._poses", lambda *_: {"eye": Arm(), "other": STANDING}
     )
+    monkeypatch.setattr("camera_node.sources.devices.live.open_feed", open_feed)
     with pytest.raises(CameraError, match="other: no camera"):
-        open_live(plan, source_config(plan), plan.cameras, opener)
+        open_live(plan, source_config(plan), plan.cameras)
     assert first.closed and arms == ["closed"]
     assert "camera eye" not in [thread.name for thread in threading.enumerate()]
 
@@ -338,8 +337,8 @@ def test_the_first_frame_decides_whose_stamps_count(monkeypatch, clock, ages_ms,
 
 
 def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
-    assert meant("eye", "OAK", None, ["a"]) == 0 and meant("eye", "OAK", "b", ["a", "b"]) == 1
+    assert select_device("eye", "OAK", None, ["a"]) == 0 and select_device("eye", "OAK", "b", ["a", "b"]) == 1
     with pytest.raises(CameraError, match=r"^eye: several OAK cameras, name one in source.devices: a, b$"):
-        meant("eye", "OAK", None, ["a", "b"])
+        select_device("eye", "OAK", None, ["a", "b"])
     with pytest.raises(CameraError, match=r"^eye: no OAK camera c; there are a, b$"):
-        meant("eye", "OAK", "c", ["a", "b"])
+        select_device("eye", "OAK", "c", ["a", "b"])

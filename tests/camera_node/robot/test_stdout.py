@@ -5,15 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from camera_node import stdout
+from camera_node.robot import stdout
 
 SPEAKS = """
 import ctypes, os, sys, threading
-from camera_node import stdout
+from camera_node.robot import stdout
 
 libc = ctypes.CDLL(None)
 print("before")
-with stdout.only_ours():
+with stdout.only_python_output():
     os.write(1, b"from a library\\n")
     libc.printf(b"held back by one\\n")
     print("the answer")
@@ -32,7 +32,7 @@ def test_only_what_python_prints_comes_out():
 
 
 def test_what_stands_in_for_standard_output_is_left_alone(capsys):
-    with stdout.only_ours():
+    with stdout.only_python_output():
         print("the answer")
     print("after")
     assert capsys.readouterr().out == "the answer\nafter\n"

@@ -1,4 +1,4 @@
-"""Standard output for what a command says, whatever libraries print there."""
+"""Keeps what libraries print off standard output."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _libc = ctypes.CDLL(None)
 
 
 @contextlib.contextmanager
-def only_ours() -> Iterator[None]:
-    """Meanwhile what is written to file descriptor 1 goes to standard error, but for Python's own ``print``:
-    ur_rtde, for one, tells there from threads of its own that it is reconnecting."""
+def only_python_output() -> Iterator[None]:
+    """Send what is written to file descriptor 1 to standard error, except Python's own ``print``: ur_rtde,
+    for one, writes there from threads of its own when it reconnects."""
     ours = sys.stdout
     ours.flush()
     _libc.fflush(None)
@@ -33,7 +33,7 @@ def only_ours() -> Iterator[None]:
 
 
 def _descriptor(stream: object) -> int | None:
-    """None where it is no file."""
+    """File descriptor of a stream; None where it is no file."""
     try:
         return int(stream.fileno())  # type: ignore[attr-defined]
     except (AttributeError, OSError):

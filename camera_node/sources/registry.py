@@ -1,0 +1,53 @@
+"""Opens the sources of a scenario. Only the module of the kind in use is imported."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from camera_node.config import LiveConfig, McapConfig, RecordedConfig, SourceConfig, WorldConfig
+from camera_node.sources.base import Source
+from freshfield.scenario import Scenario
+
+if TYPE_CHECKING:
+    from camera_node.synthetic.effects import Effects
+
+
+def open_sources(
+    scenario: Scenario,
+    config: SourceConfig,
+    cameras: Sequence[str],
+    data: Path | None = None,
+    effects: Mapping[str, Effects | None] | None = None,
+) -> dict[str, Source]:
+    """The sources of ``cameras``, sharing what can be shared, with each camera's effects.
+
+    data: folder of the data sets, else $FRESHFIELD_DATA. Raises ScenarioError, DatasetError, CameraError or
+    ArmError.
+    """
+    effects = effects or {}
+    if isinstance(config, WorldConfig):
+        from camera_node.synthetic.source import open_sources as open_world
+
+        return open_world(scenario, config, cameras, data, effects)
+    sources: dict[str, Source]
+    if isinstance(config, RecordedConfig):
+        from camera_node.sources.datasets.streamer import open_recorded
+
+        sources = open_recorded(scenario, config, cameras, data)
+    elif isinstance(config, LiveConfig):
+        from camera_node.sources.devices.live import open_live
+
+        sources = open_live(scenario, config, cameras)
+    else:
+        from camera_node.sources.mcap import open_replay
+
+        assert isinstance(config, McapConfig)
+        sources = open_replay(scenario, config, cameras, data)
+    for camera, made in effects.items():
+        if made is not None and (made.image or made.pose):
+            from camera_node.sources.with_effects import AffectedSource
+
+            sources[camera] = AffectedSource(sources[camera], made, config.codec)
+    return sources
