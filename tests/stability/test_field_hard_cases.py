@@ -79,7 +79,7 @@ def test_constant_black_and_saturated_pictures(case: Case, value: int, channels:
     case.healthy(field, VIEWS)
     out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
     alpha = value / 255.0 if channels == 4 else 1.0
-    expected = value / 255.0 * alpha + (1.0 - alpha) * field.rig.background().mean()
+    expected = value / 255.0 * alpha + (1.0 - alpha) * field.view_store.background().mean()
     assert abs(out.mean() - expected) < 0.1
 
 
@@ -136,7 +136,7 @@ def test_a_thousand_updates_do_not_drift_or_grow(case: Case) -> None:
     assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
     assert last > 15.0
     assert np.mean(sizes[-12:]) < 3.0 * np.mean(sizes[12:24]), "parameters grow"
-    assert len(field.rig.memory) == 9
+    assert len(field.view_store.memory) == 9
 
 
 @every

@@ -85,7 +85,8 @@ field = VoxelField(replace(TINY, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow
 for later in range(3):
     field.fit([replace(v, image=np.roll(v.image, 3 * later, axis=0), generated_ns=later * 10**8 + k * 10**7)
                for k, v in enumerate(VIEWS)], Budget(steps=10))
-assert (field.rig._packed[1].weight > 0).any() and field.rig._packed[1].drawn.size, "nothing is masked"
+packed = field.view_store._packed[1]
+assert (packed.weight > 0).any() and packed.drawn.size, "nothing is masked"
 print("kept")
 """
     run_with_bounds_checks(code, tmp_path, request)

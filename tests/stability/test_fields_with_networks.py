@@ -79,7 +79,7 @@ def go_through_all(kind: str) -> None:
              for k, (v, image) in enumerate(zip(VIEWS, rolled))],
             Budget(steps=10),
         )  # fmt: skip
-    packed = field.rig._packed
+    packed = field.view_store._packed
     assert packed is not None
     assert (packed[1].weight > 0).any() and packed[1].drawn.size, "nothing is masked"
 

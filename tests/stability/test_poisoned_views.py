@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from camera_node.synthetic import make_scene
 from edge_server.fields import Budget, View
 from edge_server.fields.common.scene_box import scene_box
-from edge_server.fields.common.view_outliers import PATIENCE
+from edge_server.fields.common.view_outliers import MOST_REFUSALS
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from edge_server.fields.ngp.field import NgpField
@@ -209,7 +209,7 @@ def test_wrong_pictures_are_refused_while_they_last(kind: Any, settings: Any, po
         deployment.update(15, poison)
         scores.append(deployment.score())
     expected = _unharmed(kind, settings, 15)
-    assert scores[0] > expected - WITHIN_DB, "it was learnt from"
+    assert scores[0] > expected - WITHIN_DB, "it was learned from"
     assert scores[1] < scores[0] - 0.5 * WITHIN_DB, "it does no harm anyway: nothing was tested"
 
 
@@ -217,20 +217,20 @@ def test_wrong_pictures_are_refused_while_they_last(kind: Any, settings: Any, po
 def test_a_picture_that_stays_different_is_learnt_in_the_end(kind: Any, settings: Any) -> None:
     """The camera was right after all, say because somebody hung a cloth before it: patience ends."""
     deployment = _deployment(kind, settings)
-    deployment.update(PATIENCE, _black)
-    assert deployment.field.rig.memory[SEEN[BAD].camera].credit == 0
+    deployment.update(MOST_REFUSALS, _black)
+    assert deployment.field.view_store.memory[SEEN[BAD].camera].refusals_left == 0
     refused, losses = deployment.loss, []
     for _ in range(-(-len(SEEN) // STEPS)):  # splat looks at one view a step
         deployment.update(1, _black)
         losses.append(deployment.loss)
-    assert max(losses) > 3.0 * refused, "it still is not learnt from"
+    assert max(losses) > 3.0 * refused, "it still is not learned from"
 
 
 @every
 def test_a_picture_repeated_is_not_a_scene_in_motion(kind: Any, settings: Any) -> None:
     """One wrong picture makes all of the next one seem to have moved; equal ones after it must end that."""
     deployment = _deployment(kind, settings)
-    memory = deployment.field.rig.memory
+    memory = deployment.field.view_store.memory
     deployment.update(1, _noise)
     deployment.update(1)
     moved = memory[SEEN[BAD].camera].moved
@@ -251,7 +251,7 @@ def test_two_poisoned_views_and_refusals_resume_bit_for_bit(kind: Any, settings:
     for deployment in (one, two):
         deployment.update(3, _noise)
     a, b = one.field.state(), two.field.state()
-    assert one.field.rig.memory[SEEN[BAD].camera].credit == PATIENCE - 6
+    assert one.field.view_store.memory[SEEN[BAD].camera].refusals_left == MOST_REFUSALS - 6
     for name in a.keys() - {"meta"}:
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
@@ -327,18 +327,18 @@ def test_what_only_a_refused_view_shows_is_kept(asked: bool) -> None:
         field.fit(now, Budget(steps=STEPS))
 
     update(1, away)
-    assert field.rig.memory["away"].credit == PATIENCE and field.rig.box is not None
-    place = field.rig.box.normalise(pose[:3, 3] + 2.0 * pose[:3, 2])
+    assert field.view_store.memory["away"].refusals_left == MOST_REFUSALS and field.view_store.box is not None
+    place = field.view_store.box.normalise(pose[:3, 3] + 2.0 * pose[:3, 2])
     params = field.cloud.params[:4].copy()
     params[:, :3], params[:, SCALE:QUATERNION], params[:, OPACITY] = place, -5.0, 2.0
     nowhere = params.copy()
-    nowhere[:, :3] = field.rig.box.normalise(np.array([0.0, 0.0, -40.0]))  # under the feet of all
+    nowhere[:, :3] = field.view_store.box.normalise(np.array([0.0, 0.0, -40.0]))  # under the feet of all
     field.cloud.keep(np.arange(len(field.cloud)) >= 8)
     field.cloud.add(Cloud.of(params))
     field.cloud.add(Cloud.of(nowhere))
     for number in range(2, 10):
         update(number, *([_noise(away, number)] if asked else []))
-    assert field.rig.memory["away"].credit == (PATIENCE - 8 if asked else PATIENCE)
+    assert field.view_store.memory["away"].refusals_left == (MOST_REFUSALS - 8 if asked else MOST_REFUSALS)
     for where, count in ((place, 4), (nowhere[0, :3], 0)):
         left = np.linalg.norm(field.cloud.params[:, :3] - where, axis=1) < 0.02
         assert left.sum() == count

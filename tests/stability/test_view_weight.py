@@ -45,7 +45,7 @@ def weighed(view: View, weight: float) -> View:
 
 
 def fitted(case: Case, *sets: list[View], steps: int = 12) -> Any:
-    # The colour behind everything and what contradicts are judged by whole pictures, not by what they teach.
+    # The color behind everything and what contradicts are judged by whole pictures, not by what they teach.
     field = case.kind(replace(case.tiny, background="#808080", refuse_beyond=0.0))
     for views in sets:
         field.fit(views, Budget(steps=steps))

@@ -55,7 +55,7 @@ def small(name: str, **changed: Any) -> Any:
 
 
 def score(field: Any, view: View = HELD) -> float:
-    """PSNR of a view, dB; that of the views' mean colour is below 16."""
+    """PSNR of a view, dB; that of the views' mean color is below 16."""
     return psnr(field.render(view.camera_to_world, view.intrinsics).color, view.image / 255.0)
 
 

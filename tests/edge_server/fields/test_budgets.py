@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.thread_pool import CallerPool
-from edge_server.fields.common.training_schedule import Pace, Usual
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.splat.field import SplatField
@@ -25,17 +25,17 @@ class Fits:
     """Fits on a clock of its own. step_s: what a step takes; usual: what is known of it."""
 
     def __init__(self) -> None:
-        self.clock_s, self.step_s, self.usual = 0.0, 1.0, Usual()
+        self.clock_s, self.step_s, self.usual = 0.0, 1.0, StepTimer()
 
     def fit(self, budget_s: float, first_s: float = 0.0, then_s: float = 0.0) -> tuple[int, float]:
         """first_s: taken before the first step. Returns steps and seconds."""
-        pace = Pace(Budget(seconds=budget_s), lambda: self.clock_s)
+        pace = StepBudget(Budget(seconds=budget_s), lambda: self.clock_s)
         self.clock_s += first_s
-        while (progress := pace.begin(self.usual, then_s)) is not None:
+        while (progress := pace.begin_step(self.usual, then_s)) is not None:
             assert 0.0 <= progress <= 1.0
             self.clock_s += self.step_s
-            pace.end()
-        return pace.steps, pace.seconds()
+            pace.end_step()
+        return pace.steps, pace.elapsed_s()
 
 
 @pytest.mark.parametrize("first_s", [0.0, 0.7])
@@ -95,10 +95,10 @@ def test_what_must_follow_finds_room() -> None:
 
 
 def test_budgets_in_steps_ask_no_clock() -> None:
-    pace, usual, said = Pace(Budget(steps=4), lambda: 0.0), Usual(), []
-    while (progress := pace.begin(usual, then_s=1e9)) is not None:
+    pace, usual, said = StepBudget(Budget(steps=4), lambda: 0.0), StepTimer(), []
+    while (progress := pace.begin_step(usual, then_s=1e9)) is not None:
         said.append(progress)
-        pace.end()
+        pace.end_step()
     assert said == [0.0, 0.25, 0.5, 0.75]
 
 

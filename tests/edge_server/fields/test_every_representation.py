@@ -129,12 +129,12 @@ def test_results_are_equal_bit_for_bit_whatever_the_thread_count(name: str, extr
 @EVERY
 def test_another_seed_is_another_field(name: str) -> None:
     a, b = small(name), small(name, seed=1)
-    learnt = "params" if name == "splat" else "table"
+    learned = "params" if name == "splat" else "table"
     if name not in ("splat", "voxel"):  # whose first values come from the pictures, or are all the same
-        assert not np.array_equal(a.state()[learnt], b.state()[learnt])
+        assert not np.array_equal(a.state()[learned], b.state()[learned])
     for field in (a, b):
         field.fit(SEEN[:3], Budget(steps=1))
-    assert not np.array_equal(a.state()[learnt], b.state()[learnt])
+    assert not np.array_equal(a.state()[learned], b.state()[learned])
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_transparent_views_are_seen_against_the_background(name: str) -> None:
     field.fit(views, Budget(steps=120))
     out = field.render(views[0].camera_to_world, views[0].intrinsics)
     clear = views[0].image[..., 3] == 0
-    assert field.rig.box is not None and not field.rig.box.contracted
+    assert field.view_store.box is not None and not field.view_store.box.contracted
     assert out.color[clear].mean() > 0.9 and out.opacity[clear].mean() < 0.3
     assert out.opacity[~clear].mean() > 0.7
 
@@ -242,4 +242,4 @@ def test_views_that_cannot_be_are_refused(name: str) -> None:
     ):
         with pytest.raises(ValueError, match=text):
             field.fit([wrong], Budget(steps=1))
-    assert field.step == 0 and not field.rig.memory
+    assert field.step == 0 and not field.view_store.memory

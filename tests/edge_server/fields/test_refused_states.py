@@ -54,7 +54,7 @@ def _said(change: Callable[[dict[str, Any]], Any]) -> Callable[[State], None]:
 
 
 def _last_array_cut(state: State) -> None:
-    """Of what is learnt: what comes before it is right."""
+    """Of what is learned: what comes before it is right."""
     name = [n for n in state if n not in ("meta", "behind") and not n.startswith(("image", "pose", "moved"))][
         -1
     ]

@@ -1,4 +1,4 @@
-"""Exposure and pose errors of cameras: learnt where asked for, harmless where there are none, else absent."""
+"""Exposure and pose errors of cameras: learned if enabled, harmless where there are none, else absent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.camera_refinement import Exposures, Poses
+from edge_server.fields.common.camera_refinement import Exposures, PoseCorrections
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.tensorf.field import TensorfField
 from freshfield.geometry import so3_exp
@@ -82,7 +82,7 @@ def test_poses_are_improved_and_kept_within_their_bounds() -> None:
     assert tight._cameras.poses is not None
     for known in tight._cameras.poses.known.values():
         assert np.linalg.norm(known.shift_m) <= 1e-3 + 1e-12
-        assert np.linalg.norm(known.turn) <= np.deg2rad(0.1) + 1e-12
+        assert np.linalg.norm(known.rotation) <= np.deg2rad(0.1) + 1e-12
 
 
 def test_exact_poses_and_equal_exposures_are_not_harmed() -> None:
@@ -124,7 +124,7 @@ def test_what_is_not_finite_or_says_nothing_changes_nothing() -> None:
     exposures.learn(["a", "b"], np.full((2, 3, 5), np.nan))
     exposures.learn(["a", "b"], np.full((2, 3, 5), 1e300))
     assert all(np.isfinite(pair).all() for pair in exposures.known.values())
-    poses, rng = Poses(0.1, 2.0), np.random.default_rng(0)
+    poses, rng = PoseCorrections(0.1, 2.0), np.random.default_rng(0)
     for value in (0.5, np.nan):
         poses.correct(
             SEEN[0], lambda pose, at, v=value: np.full((len(at), 3), v, np.float32), 0.01, rng, np.zeros(3)
@@ -133,8 +133,8 @@ def test_what_is_not_finite_or_says_nothing_changes_nothing() -> None:
 
 
 def test_a_camera_that_moved_starts_anew() -> None:
-    poses = Poses(0.1, 2.0)
+    poses = PoseCorrections(0.1, 2.0)
     poses.pose(SEEN[0])
-    poses.known[SEEN[0].camera].turn = np.array([0.01, 0.0, 0.0])
+    poses.known[SEEN[0].camera].rotation = np.array([0.01, 0.0, 0.0])
     moved = replace(SEEN[0], camera_to_world=SEEN[1].camera_to_world)
     np.testing.assert_allclose(poses.pose(moved), moved.camera_to_world)

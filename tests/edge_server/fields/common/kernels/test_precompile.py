@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.precompile import _Listing, _size, compile_ahead
+from edge_server.fields.common.kernels.precompile import _RecordingPool, _size, compile_ahead
 from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE, CallerPool, Pool
 from edge_server.fields.registry import field_names, make_field
 
@@ -41,7 +41,7 @@ def only_after(counter, worker, out):
     out[1] = np.float64(worker) + 1.0
 
 
-def tour(pool: Pool) -> None:
+def run_kernels(pool: Pool) -> None:
     values, out = np.full(3, 2.0, np.float32), np.zeros(2)
     pool.run(double, values)
     pool.run(total, values, out)
@@ -54,11 +54,11 @@ TOLD = """
 import sys
 from edge_server.fields.common.kernels import precompile
 from edge_server.fields.common.kernels.precompile import compile_ahead
-from tests.edge_server.fields.common.kernels.test_precompile import double, only_after, total, tour
+from tests.edge_server.fields.common.kernels.test_precompile import double, only_after, total, run_kernels
 if sys.argv[1:]:
     sys.executable = sys.argv[1]
     precompile.PATIENCE_S = 1.0
-compile_ahead(tour)
+compile_ahead(run_kernels)
 for k in (double, total, only_after):
     print("loaded" if k.stats.cache_hits else "compiled", len(k.signatures))
 """
@@ -172,10 +172,10 @@ class _Noting(CallerPool):
 
 @pytest.mark.parametrize("name", field_names())
 def test_every_field_lists_its_large_kernels_without_running_them(name: str) -> None:
-    field, listing, run = make_field(name), _Listing(), _Noting()
+    field, listing, run = make_field(name), _RecordingPool(), _Noting()
     with np.errstate(all="ignore"):
-        field._tour(listing)
-    field._tour(run)
+        field._run_kernels(listing)
+    field._run_kernels(run)
     listed = {kernel for kernel, _ in listing.calls}
     assert listed <= run.kernels, "compiled for nothing"
     wanted = {k for k in run.kernels if k.py_func.__name__.startswith(("train_", "render_"))}
