@@ -38,7 +38,7 @@ class View:
 
     @property
     def shows_ns(self) -> int:
-        """The instant that the image shows. Reported ages go by capture; motion and weights by age go by this."""
+        """The instant that the image shows: motion and weights by age go by it, reported ages by capture."""
         return self.generated_ns if self.carried_to_ns is None else self.carried_to_ns
 
 

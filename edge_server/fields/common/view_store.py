@@ -93,7 +93,7 @@ class ViewStore:
         """The newest view of every camera."""
         return tuple(m.view for m in self.memory.values())
 
-    def take_in(self, views: Sequence[View]) -> PackedUpdate:
+    def add(self, views: Sequence[View]) -> PackedUpdate:
         """Remember ``views`` and pack them for a fit. ValueError for one that cannot be a view."""
         if self._packed is not None and same_views(views, self._packed[0]):
             return PackedUpdate(self._packed[1], False, False, False)
@@ -143,7 +143,7 @@ class ViewStore:
             self.refused_cameras = (self.refused_cameras - given) | refused
         return without_views(update.data, np.array([view.camera in self.refused_cameras for view in views]))
 
-    def left_out_of(self, views: Sequence[View]) -> tuple[str, ...]:
+    def refused_among(self, views: Sequence[View]) -> tuple[str, ...]:
         """The cameras of ``views`` that are refused."""
         return tuple(view.camera for view in views if view.camera in self.refused_cameras)
 

@@ -11,7 +11,7 @@ from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.radiance_model import query_backward, query_color, query_density
 from edge_server.fields.common.kernels.rays import interval
 from edge_server.fields.common.kernels.simd import fetch_add, uniform
-from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, add_exposure_sums, draw
+from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, add_exposure_sums, draw_ray
 from edge_server.fields.common.kernels.volume_rendering import (
     activate_color,
     activate_density,
@@ -103,7 +103,7 @@ def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray
         end, drawn = n, rays
         while drawn < limit and end + 2 * plan.samples + 1 <= CHUNK:
             index = chunk * CHUNK_RAYS + drawn
-            view = draw(views, recipe, index, ray[drawn])
+            view = draw_ray(views, recipe, index, ray[drawn])
             ray[drawn, 9] = np.float32(view)
             o = views.origin[view]
             ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
