@@ -12,13 +12,8 @@ import pytest
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
-from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.splat.field import SplatField
-from edge_server.fields.tensorf.field import TensorfField
-from edge_server.fields.voxel.field import VoxelField
 from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
+from tests.edge_server.fields.small import CLASSES, SMALL, every_field
 
 
 class Fits:
@@ -115,26 +110,17 @@ class Work(CallerPool):
         self.seconds += self.each_s
 
 
-FIELDS: dict[str, Callable[[Work], Any]] = {
-    "ngp": lambda work: NgpField(NGP, work),
-    "nerfacto": lambda work: NerfactoField(NERFACTO, work),
-    "tensorf": lambda work: TensorfField(TENSORF, work),
-    "splat": lambda work: SplatField(SPLAT, work),
-    "voxel": lambda work: VoxelField(VOXEL, work),
-}
-
-
 def _moving(frame: int) -> list[View]:
     ball = np.array([0.05 * frame - 0.3, 0.0, 0.5])
     return [replace(v, generated_ns=frame * 10**8) for v in ring(7, size=32, ball_m=ball)]
 
 
 @pytest.mark.parametrize("each_s", [0.01, 0.04])
-@pytest.mark.parametrize("name", FIELDS)
+@every_field
 def test_updates_of_a_moving_scene_keep_their_budget(name: str, each_s: float) -> None:
     """The second time, on a machine that got busy after a calm beginning."""
     work = Work()
-    field = FIELDS[name](work)
+    field = CLASSES[name](SMALL[name], work)
     field.now = lambda: work.seconds
     field.fit(_moving(0), Budget(steps=130))  # voxel's grid has its last size by then
     field.fit(_moving(1), Budget(seconds=1.0))

@@ -11,21 +11,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
-from edge_server.fields.registry import field_names
 from tests.edge_server.fields.scenes import psnr
-from tests.edge_server.fields.small import (
-    CLASSES,
-    HELD,
-    SEEN,
-    SMALL,
-    cut_out,
-    moved,
-    same_state,
-    score,
-    small,
-)
-
-EVERY = pytest.mark.parametrize("name", tuple(SMALL))
+from tests.edge_server.fields.small import HELD, SEEN, cut_out, every_field, moved, same_state, score, small
 
 
 @lru_cache
@@ -35,18 +22,14 @@ def _trained(name: str) -> Any:
     return field
 
 
-def test_none_is_left_out() -> None:
-    assert set(SMALL) == set(CLASSES) == set(field_names())
-
-
-@EVERY
+@every_field
 def test_it_learns_a_view_it_has_not_seen(name: str) -> None:
     mean = np.mean([v.image for v in SEEN], axis=(0, 1, 2)) / 255.0
     assert psnr(mean, HELD.image / 255.0) < 16.0
     assert score(_trained(name)) > 20.0
 
 
-@EVERY
+@every_field
 def test_depth_is_in_metres(name: str) -> None:
     out = _trained(name).render(HELD.camera_to_world, HELD.intrinsics)
     middle = out.depth[22:26, 22:26]
@@ -57,7 +40,7 @@ def test_depth_is_in_metres(name: str) -> None:
     assert out.opacity.min() >= 0.0 and out.opacity.max() <= 1.0 + 1e-5
 
 
-@EVERY
+@every_field
 def test_points_lie_on_surfaces(name: str) -> None:
     points, colors = _trained(name).points(500)
     assert 100 < len(points) <= 500 and points.dtype == colors.dtype == np.float32
@@ -67,7 +50,7 @@ def test_points_lie_on_surfaces(name: str) -> None:
     assert colors.min() >= 0.0 and colors.max() <= 1.0
 
 
-@EVERY
+@every_field
 def test_a_warm_start_follows_what_moved(name: str) -> None:
     field, target = small(name), moved(HELD)
     field.load_state(_trained(name).state())
@@ -76,7 +59,7 @@ def test_a_warm_start_follows_what_moved(name: str) -> None:
     assert score(field, target) > stale + 2.0
 
 
-@EVERY
+@every_field
 @pytest.mark.alone
 def test_a_budget_in_seconds_is_kept(name: str) -> None:
     trained = small(name)
@@ -87,7 +70,7 @@ def test_a_budget_in_seconds_is_kept(name: str) -> None:
     assert 0.85 * 0.3 <= spent <= 1.1 * 0.3 and all(r.steps > 3 for r in reports)
 
 
-@EVERY
+@every_field
 def test_a_snapshot_does_not_change_while_the_field_trains(name: str) -> None:
     trained = small(name)
     trained.load_state(_trained(name).state())
@@ -126,7 +109,7 @@ def test_results_are_equal_bit_for_bit_whatever_the_thread_count(name: str, extr
         np.testing.assert_array_equal(first.depth, out.depth)
 
 
-@EVERY
+@every_field
 def test_another_seed_is_another_field(name: str) -> None:
     a, b = small(name), small(name, seed=1)
     learned = "params" if name == "splat" else "table"
@@ -164,7 +147,7 @@ def test_resuming_continues_bit_for_bit(name: str, extra: dict[str, Any], steps:
         assert a._cameras.meta() == b._cameras.meta()
 
 
-@EVERY
+@every_field
 def test_a_state_of_another_kind_is_refused(name: str) -> None:
     field, other = small(name), "ngp" if name != "ngp" else "voxel"
     with pytest.raises(ValueError, match=f"a field called {other}, this one is {name}"):
@@ -175,7 +158,7 @@ def test_a_state_of_another_kind_is_refused(name: str) -> None:
         field.load_state(state)
 
 
-@EVERY
+@every_field
 def test_reset_forgets_everything(name: str) -> None:
     field = small(name)
     before = field.state()
@@ -185,7 +168,7 @@ def test_reset_forgets_everything(name: str) -> None:
     assert before.keys() == after.keys() and all((before[k] == after[k]).all() for k in before)
 
 
-@EVERY
+@every_field
 def test_others_render_while_it_trains(name: str) -> None:
     """Snapshots stay what they were, also where the field grows meanwhile, and who looks changes nothing."""
     field = small(name)
@@ -208,7 +191,7 @@ def test_others_render_while_it_trains(name: str) -> None:
     same_state(field, alone)
 
 
-@EVERY
+@every_field
 def test_transparent_views_are_seen_against_the_background(name: str) -> None:
     views = [cut_out(view) for view in SEEN]
     field = small(name, background="white")
@@ -220,7 +203,7 @@ def test_transparent_views_are_seen_against_the_background(name: str) -> None:
     assert out.opacity[~clear].mean() > 0.7
 
 
-@EVERY
+@every_field
 def test_no_views_do_nothing_and_the_report_says_so(name: str) -> None:
     field = small(name)
     before = field.state()
@@ -229,7 +212,7 @@ def test_no_views_do_nothing_and_the_report_says_so(name: str) -> None:
     assert all((before[k] == v).all() for k, v in field.state().items())
 
 
-@EVERY
+@every_field
 def test_views_that_cannot_be_are_refused(name: str) -> None:
     field, good = small(name), SEEN[0]
     pose = good.camera_to_world.copy()

@@ -110,7 +110,16 @@ def _cached(dispatcher: Any) -> Any:
     file = dispatcher._cache._cache_file
     file._source_stamp = (*file._source_stamp, SOURCES)
     file.save = partial(_save_alone, Path(file._cache_path), file.save)
+    file._load_index = partial(_load_index, file._load_index)
     return dispatcher
+
+
+def _load_index(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
+    """``load``; empty if the index names types that today's sources no longer have."""
+    try:
+        return load()
+    except (AttributeError, ImportError):  # numba reads the types before it compares the stamp
+        return {}
 
 
 def _save_alone(folder: Path, save: Callable[..., None], key: Any, data: Any) -> None:

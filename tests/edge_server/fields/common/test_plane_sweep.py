@@ -15,7 +15,7 @@ from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.supervision import pack_views, without_views
 from tests.edge_server.fields.scenes import ring, seen
-from tests.edge_server.fields.small import NGP, SEEN, cut_out, same_state, score, small
+from tests.edge_server.fields.small import SEEN, SMALL, cut_out, same_state, score, small
 
 GUIDED = ("ngp", "nerfacto", "tensorf")
 
@@ -26,7 +26,7 @@ def _packed(views: list[View]) -> tuple[Views, SceneBox]:
 
 
 def _guide(views: list[View], data: Views, box: SceneBox, threads: int = 2) -> np.ndarray:
-    return depth_guide(NGP, shared_pool(threads), box, views, data)
+    return depth_guide(SMALL["ngp"], shared_pool(threads), box, views, data)
 
 
 @pytest.mark.parametrize("size", [48, 131, 301])

@@ -14,15 +14,10 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.supervision import CameraMemory, remember_views, without_views
 from edge_server.fields.common.view_outliers import MOST_REFUSALS, find_outliers, pixel_weights
 from edge_server.fields.common.view_store import ViewStore
-from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings, make_settings
-from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.settings import make_settings as make_splat_settings
-from edge_server.fields.tensorf.field import TensorfField
-from edge_server.fields.voxel.field import VoxelField
 from tests.edge_server.fields.scenes import picture, psnr, ring
-from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
+from tests.edge_server.fields.small import SMALL, every_field, small
 
 MS = 1_000_000
 AGES_MS = (0, 50, 100, 200)
@@ -135,7 +130,9 @@ def test_options_are_checked(name: str, value: float) -> None:
 
 def test_every_representation_has_the_same_options() -> None:
     for name in ("age_tau_ms", "mask_stale_ms", "mask_grow_px_s", "refuse_beyond"):
-        kept = {(getattr(s, name), type(s).__dataclass_fields__[name].metadata["help"]) for _, s in FIELDS}
+        kept = {
+            (getattr(s, name), type(s).__dataclass_fields__[name].metadata["help"]) for s in SMALL.values()
+        }
         assert len(kept) == 1
 
 
@@ -157,22 +154,9 @@ def test_the_rig_packs_weights_only_where_asked() -> None:
     assert 0 < masked.changed.size < off.changed.size and (masked.weight[masked.changed] == 1.0).all()
 
 
-FIELDS: list[tuple[Any, Any]] = [
-    (NgpField, NGP),
-    (TensorfField, TENSORF),
-    (SplatField, SPLAT),
-    (VoxelField, VOXEL),
-    (NerfactoField, NERFACTO),
-]
-every = pytest.mark.parametrize(
-    ("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "splat", "voxel", "nerfacto"]
-)
-
-
-@every
-def test_masked_pixels_teach_nothing(kind: Any, settings: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@every_field
+def test_masked_pixels_teach_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views whose moving pixels are noise: with the mask the field does not see the noise."""
-    options = replace(settings, mask_stale_ms=60.0, changed_share=0.5)
     rng = np.random.default_rng(5)
     old, before = ring(13, size=32), ring(13, size=32, ball_m=BALL)
     fresh = [replace(v, generated_ns=200 * MS) for v in before[::2]]
@@ -197,7 +181,7 @@ def test_masked_pixels_teach_nothing(kind: Any, settings: Any, monkeypatch: pyte
         for view in spoilt:
             inverted = masks[view.camera][..., None] & other
             stale.append(replace(view, image=np.where(inverted, 255 - view.image, view.image)))
-        field = kind(options)
+        field = small(name, mask_stale_ms=60.0, changed_share=0.5)
         field.fit(old, Budget(steps=20))
         field.fit(fresh + stale, Budget(steps=30))
         field.fit([replace(v, generated_ns=400 * MS) for v in on] + stale, Budget(steps=30))
@@ -208,13 +192,13 @@ def test_masked_pixels_teach_nothing(kind: Any, settings: Any, monkeypatch: pyte
         np.testing.assert_array_equal(states[0][name], states[1][name], err_msg=name)
 
 
-@every
-def test_weighted_fits_repeat_and_resume_bit_for_bit(kind: Any, settings: Any) -> None:
-    options = replace(settings, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=20.0)
+@every_field
+def test_weighted_fits_repeat_and_resume_bit_for_bit(name: str) -> None:
+    options = {"age_tau_ms": 100.0, "mask_stale_ms": 60.0, "mask_grow_px_s": 20.0}
     ages = tuple(25.0 * k for k in range(13))
     still = [replace(v, generated_ns=0) for v in ring(13, size=32)]
     now = _later(still, ages)
-    one, two = kind(replace(options, threads=1)), kind(replace(options, threads=3))
+    one, two = small(name, threads=1, **options), small(name, threads=3, **options)
     one.fit(still, Budget(steps=15))
     one.fit(now, Budget(steps=10))
     middle = one.state()
@@ -296,11 +280,9 @@ def test_what_moves_through_a_picture_is_no_reason_to_refuse_it() -> None:
     assert not find_outliers(views, memory, 2.5, True, lambda *of: list(map(pixels, *of))).any()
 
 
-@every
-def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_again(
-    kind: Any, settings: Any
-) -> None:
-    field = kind(settings)
+@every_field
+def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_again(name: str) -> None:
+    field = small(name)
     views = ring(13, size=32)
     for update in range(4):
         field.fit([replace(v, generated_ns=update * 100 * MS) for v in views], Budget(steps=40))
@@ -311,7 +293,7 @@ def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_ag
     credit = field.view_store.memory["cam03"].refusals_left
     assert credit < MOST_REFUSALS
     again = field.fit(wrong, Budget(steps=2))
-    other = kind(settings)
+    other = small(name)
     other.load_state(field.state())
     resumed = other.fit(wrong, Budget(steps=2))
     assert again.refused == resumed.refused == ("cam03",)
@@ -324,7 +306,7 @@ def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_ag
 
 
 def test_cameras_whose_errors_are_learnt_are_not_refused() -> None:
-    field = NgpField(replace(NGP, exposure=True))
+    field = small("ngp", exposure=True)
     views = ring(13, size=32)
     field.fit(views, Budget(steps=150))
     dark = [replace(v, generated_ns=100 * MS) for v in views]
@@ -332,10 +314,10 @@ def test_cameras_whose_errors_are_learnt_are_not_refused() -> None:
     assert field.fit(dark, Budget(steps=2)).refused == ()
 
 
-@every
-def test_a_snapshot_is_of_the_box_the_field_has(kind: Any, settings: Any) -> None:
+@every_field
+def test_a_snapshot_is_of_the_box_the_field_has(name: str) -> None:
     """Two cameras find one box, all of them another: what was learned is void, what is shown too."""
-    field = kind(settings)
+    field = small(name)
     views, shift = ring(13, size=32), np.eye(4)
     shift[:3, 3] = 3.0
     field.fit([replace(v, camera_to_world=shift @ v.camera_to_world) for v in views[:2]], Budget(steps=5))

@@ -10,9 +10,9 @@ import pytest
 from edge_server.fields import Budget
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.torch_field import NgpTorchField, cuda_present
+from tests.edge_server.fields.ngp.small import SMALL
 from tests.edge_server.fields.scenes import psnr, ring
 from tests.edge_server.fields.small import HELD, SEEN
-from tests.edge_server.fields.small import NGP as SMALL
 
 
 @pytest.mark.parametrize("contracted", [False, True])

@@ -23,7 +23,7 @@ from edge_server.fields.splat.motion import drift
 from edge_server.fields.splat.seeding import seeds
 from tests.edge_server.fields.scenes import mean_psnr, picture
 from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, same_state, score
-from tests.edge_server.fields.small import SPLAT as SMALL
+from tests.edge_server.fields.splat.small import SMALL
 
 
 def test_a_state_knows_the_views_it_was_fitted_to() -> None:

@@ -14,7 +14,7 @@ from edge_server.fields.voxel.field import VoxelField
 from edge_server.fields.voxel.settings import EFFORTS, help_text, make_settings
 from tests.edge_server.fields.scenes import mean_psnr, psnr
 from tests.edge_server.fields.small import HELD, SEEN, same_state
-from tests.edge_server.fields.small import VOXEL as SMALL
+from tests.edge_server.fields.voxel.small import SMALL
 
 
 def test_a_long_fit_is_no_worse_than_a_short_one() -> None:

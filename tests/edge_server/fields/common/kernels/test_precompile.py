@@ -150,6 +150,31 @@ for kind in sys.argv[1:]:
 """
 
 
+RENAMED = """
+from typing import NamedTuple
+from edge_server.fields.common.kernels.jit import kernel
+class {name}(NamedTuple):
+    x: float
+@kernel
+def one(pair):
+    return pair.x
+print(one({name}(2.0)))
+"""
+
+
+def test_code_for_a_type_that_was_renamed_is_compiled_anew(tmp_path: Path) -> None:
+    """numba reads the types of what it has stored before it asks whether the sources are still the same."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    environment["PYTHONPATH"] = os.pathsep.join((str(tmp_path), *filter(None, sys.path)))
+    for name in ("Old", "New"):
+        (tmp_path / "one.py").write_text(RENAMED.format(name=name))
+        done = subprocess.run(
+            [sys.executable, "-c", "import one"], env=environment, capture_output=True, text=True, timeout=60
+        )
+        assert done.stdout == "2.0\n", done.stderr
+    assert list((tmp_path / "cache").rglob("*.nbi")), "nothing was stored: nothing was tested"
+
+
 def test_what_is_inlined_counts() -> None:
     def own(kernel: Any) -> int:  # of what passes the arguments on, and of what it passes them to
         return len(kernel.py_func.__code__.co_code) + _size(kernel.py_func.__globals__["inside"].py_func)
