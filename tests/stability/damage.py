@@ -47,8 +47,8 @@ def overflows_and_begins_anew(field: Any, views: Sequence[View], damage: Callabl
     assert mean_psnr(field, views) > 15.0
 
 
-def follows_cameras_that_move(field: Any, still: Sequence[View]) -> None:
-    """Four cameras, each elsewhere at every update."""
+def follows_cameras_that_move(field: Any, still: Sequence[View]) -> float:
+    """Four cameras, each elsewhere at every update; returns the mean PSNR of the last views, dB."""
     for update in range(30):
         views = []
         for view in still[:4]:
@@ -57,4 +57,4 @@ def follows_cameras_that_move(field: Any, still: Sequence[View]) -> None:
             views.append(replace(view, camera_to_world=pose, image=picture(view.intrinsics, pose)))
         field.fit(views, Budget(steps=5))
     healthy(field, views)
-    assert mean_psnr(field, views) > 15.0
+    return mean_psnr(field, views)

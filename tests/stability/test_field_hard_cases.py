@@ -13,7 +13,7 @@ import pytest
 from edge_server.fields import Budget
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring
-from tests.edge_server.fields.small import NAMES, every_field, tiny
+from tests.edge_server.fields.small import NAMES, every_field, reaches, tiny
 from tests.stability.damage import follows_cameras_that_move, healthy
 
 VIEWS = ring(9, size=24)
@@ -39,7 +39,7 @@ def test_one_view(name: str) -> None:
     field = tiny(name)
     field.fit(VIEWS[:1], Budget(steps=60))
     healthy(field, VIEWS)
-    assert mean_psnr(field, VIEWS[:1]) > 15.0
+    reaches(name, "one view", mean_psnr(field, VIEWS[:1]))
 
 
 @with_rays
@@ -96,7 +96,7 @@ def test_views_that_contradict_each_other(name: str) -> None:
         field.fit(views, Budget(steps=20))
     healthy(field, VIEWS)
     field.fit(VIEWS, Budget(steps=150))  # and it recovers
-    assert mean_psnr(field, VIEWS) > 16.0
+    reaches(name, "after noise", mean_psnr(field, VIEWS), margin_db=1.0)  # learning noise is chaotic
 
 
 @long
@@ -123,4 +123,4 @@ def test_a_thousand_updates_do_not_drift_or_grow(name: str) -> None:
 
 @every_field
 def test_cameras_that_move_at_every_update(name: str) -> None:
-    follows_cameras_that_move(tiny(name), VIEWS)
+    reaches(name, "moving cameras", follows_cameras_that_move(tiny(name), VIEWS))

@@ -11,7 +11,7 @@ import pytest
 from edge_server.fields import Budget, View
 from edge_server.fields.ngp.torch_field import NgpTorchField
 from tests.edge_server.fields.scenes import mean_psnr, ring
-from tests.edge_server.fields.small import CLASSES, NAMES, TINY, tiny
+from tests.edge_server.fields.small import CLASSES, NAMES, TINY, reaches, tiny
 
 VIEWS = ring(7, size=24)
 
@@ -58,7 +58,7 @@ def test_views_of_no_weight_at_all_break_nothing(name: str) -> None:
     field = fitted(name, VIEWS, nothing, [weighed(VIEWS[0], 0.0)], steps=40)
     finite(field)
     field.fit(VIEWS, Budget(steps=120))
-    assert mean_psnr(field, VIEWS) > 14.0, "and it goes on learning"
+    reaches(name.removesuffix("-torch"), "after no weights", mean_psnr(field, VIEWS))  # it goes on learning
 
 
 @every

@@ -122,6 +122,22 @@ def test_nothing_behind_an_opaque_sample_has_a_gradient() -> None:
     assert (d_out[:, 7:] == 0).all() and (d_out[1:4, 6] != 0).all()
 
 
+def test_a_ray_ends_where_a_ten_thousandth_of_the_light_is_left() -> None:
+    """Later, samples are evaluated for nothing; earlier, what is left out can be seen."""
+    raw, line, ray = _ray(5, 0.0)
+    line[1], raw[0] = 0.05, np.log(0.7 / 0.05)  # an optical depth of .7 a sample
+    out = raw.copy()
+    activate(out, 0, SAMPLES)
+    through = np.exp(-np.cumsum(out[0].astype(np.float64) * line[1]))
+    seen = samples_until_opaque(out, line[1], 0, SAMPLES)
+    assert through[seen - 1] < 1e-4 < through[seen - 2]
+    error, d_out = _kernel(raw, line, ray, Weights(*np.float32([0, 0, 0])), 1)
+    weight = np.concatenate([[1.0], through[:-1]]) - through
+    color = (weight * out[1:4]).sum(axis=1) + through[-1] * ray[6:9]
+    assert error == pytest.approx(float(np.square(color - ray[3:6]).sum()), abs=3e-4)
+    assert (d_out[0, seen:] == 0).all() and (d_out[0, :seen] != 0).all()
+
+
 def test_clamped_density_has_no_gradient() -> None:
     raw, line, ray = _ray(6, 0.0)
     raw[0, 0], raw[0, 1] = -40.0, -11.0
