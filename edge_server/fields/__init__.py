@@ -1,8 +1,7 @@
 """Radiance fields behind one small protocol: fit a view set within a budget, render a camera, save, load.
 
-Adding a representation NAME is one file here with its settings beside it (``NAME_settings``: the class
-``NameSettings``, ``EFFORTS``, ``make_settings``, ``help_text``), its kernels in ``kernels/``, and a line in
-``registry``.
+A representation is one folder here and one line in ``registry``, which says what a folder must have. The
+tests of all representations find what they need in ``tests/edge_server/fields/NAME/small.py``.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ class View:
     camera_to_world: float64 (4, 4), OpenCV axes, metres. generated_ns: capture time, edge clock.
     weight: float32 (H, W) in [0, 1], how much each pixel supervises; None: all of them in full.
     carried_to_ns: the instant that the image has been carried forward to since its capture
-    (``treatments.freshen``); None: it shows the instant of its capture.
+    (``treatments.flow_warp``); None: it shows the instant of its capture.
     """
 
     camera: str
@@ -39,14 +38,13 @@ class View:
 
     @property
     def shows_ns(self) -> int:
-        """The instant that the image shows. Ages are reported by capture; what a field makes of time (how
-        things move, whom to trust less) goes by this."""
+        """The instant that the image shows: motion and weights by age go by it, reported ages by capture."""
         return self.generated_ns if self.carried_to_ns is None else self.carried_to_ns
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What one fit may spend: wall seconds (live) or optimiser steps (virtual time). One of the two."""
+    """What one fit may spend: wall seconds (live) or optimizer steps (virtual time)."""
 
     seconds: float | None = None
     steps: int | None = None
@@ -60,10 +58,11 @@ class Budget:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What one fit did: optimiser steps, wall seconds, mean loss of the last steps, rays and samples.
+    """What one fit did: optimizer steps, wall seconds, mean loss of the last steps, rays and samples.
 
-    dropped: rays and gradients that were not finite and were left out. refused: cameras whose view was left
-    out because it contradicts all that is known (``trust.refused``). note: why nothing was done, if so.
+    dropped: rays and gradients that were not finite and were left out.
+    refused: cameras whose view was left out as an outlier (``common.view_outliers``).
+    note: why nothing was done, if so.
     """
 
     steps: int
@@ -92,7 +91,7 @@ class Renderer(Protocol):
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering: ...
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` surface points (N, 3) in world metres and colours (N, 3) in [0, 1]."""
+        """Up to ``count`` surface points (N, 3) in world metres and colors (N, 3) in [0, 1]."""
         ...
 
 
@@ -104,21 +103,23 @@ class Field(Renderer, Protocol):
         ...
 
     def snapshot(self, present_ns: int | None = None) -> Renderer:
-        """The field as it is now, for others to render from while it trains on. present_ns: the instant it is
-        to show, on the clock of the views' ``generated_ns``, where a representation knows how things move;
-        none: that of its newest view."""
+        """The field as it is now, for others to render from while it trains on.
+
+        present_ns: the instant to show, on the clock of the views' ``generated_ns``, where a representation
+        knows how things move; None: that of its newest view.
+        """
         ...
 
     def warm_up(self) -> float:
-        """Compile or load every kernel, so that the first fit is not the slow one; seconds it took."""
+        """Compile or load every kernel, so that the first fit is as fast as others; returns the seconds."""
         ...
 
     def state(self) -> dict[str, NDArray]:
-        """Everything needed to go on as if nothing had happened: plain arrays, no pickle."""
+        """Everything needed to continue bit for bit: plain arrays, no pickle."""
         ...
 
     def load_state(self, state: dict[str, NDArray]) -> None:
-        """Go on where ``state`` was taken. ValueError where this field cannot; it then stays as it was."""
+        """Continue from ``state``. ValueError if this field cannot; it then stays as it was."""
         ...
 
     def reset(self) -> None:

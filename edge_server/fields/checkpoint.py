@@ -1,4 +1,4 @@
-"""Fields and schedulers on disk: arrays in one npz, no pickle, facts in JSON inside it; all or nothing."""
+"""Checkpoints of fields and schedulers: one npz of arrays (no pickle) with facts as JSON inside it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FORMAT = "freshfield-{kind}-1"
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used; the message says which file and why."""
+    """An unusable checkpoint; the message says which file and why."""
 
 
 def save(
@@ -27,11 +27,14 @@ def save(
     kind: str = "field",
     durable: bool = True,
 ) -> None:
-    """Write ``Field.state()``, or the state of another ``kind``, and a few facts about it (JSON) to ``path``.
+    """Write a checkpoint. A temporary file is renamed into place, so a crash leaves the old checkpoint or the
+    new one.
 
-    A temporary file beside it is renamed into place, so that a crash leaves the old checkpoint or the new
-    one, never half of one. durable: also a crash of the machine, which takes waiting for the disk.
-    OSError where the folder cannot be written.
+    path: of the npz file; its folder is made.
+    state: ``Field.state()``, or the state of another ``kind``.
+    about: facts for JSON.
+    durable: wait for the disk, so that this also holds if the machine crashes.
+    OSError: the folder cannot be written.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -52,8 +55,11 @@ def save(
 def load(
     path: Path | str, kind: str = "field", most_bytes: int | None = None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """The state and the facts of a checkpoint. most_bytes: of all arrays, unpacked; more are not read.
-    CheckpointError: not there, damaged, or something else."""
+    """The state and the facts of a checkpoint.
+
+    most_bytes: of all arrays, unpacked; a larger file is not read.
+    CheckpointError: the file is missing, damaged, or of another kind.
+    """
     path, expected = Path(path), _FORMAT.format(kind=kind)
     try:
         if most_bytes is not None:

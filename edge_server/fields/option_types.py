@@ -1,7 +1,7 @@
-"""Options of a representation held against the types of its settings, before anything is made with them.
+"""Checks the types of a representation's options, before anything is made with them.
 
-What is out of range is for the settings to say; this is for what is no number, no truth value or no text:
-an ``exposure: "no"`` would count as yes, and a rate of NaN as a field that learns nothing.
+Otherwise ``exposure: "no"`` would count as yes, and with a rate of NaN a field would learn nothing. Ranges
+are checked by the settings themselves.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 
 def checked(name: str, kind: type, options: Mapping[str, Any]) -> dict[str, Any]:
-    """``options`` of the representation ``name`` as ``kind``, its settings, wants them. ValueError where one
-    is of another type. Options that ``kind`` does not have, and lists of any length, are left to others."""
+    """``options`` with the types that the settings class ``kind`` of representation ``name`` wants.
+
+    ValueError: an option of another type. Unknown options and lists of any length are passed on unchecked.
+    """
     hints = get_type_hints(kind)
-    return {key: _as(hints[key], f"{name}: {key}", v) if key in hints else v for key, v in options.items()}
+    return {key: _typed(hints[key], f"{name}: {key}", v) if key in hints else v for key, v in options.items()}
 
 
-def _as(hint: Any, what: str, value: Any) -> Any:
+def _typed(hint: Any, what: str, value: Any) -> Any:
     if isinstance(hint, UnionType):
         if value is None:
             return None
@@ -31,7 +33,7 @@ def _as(hint: Any, what: str, value: Any) -> Any:
             return value
         if not isinstance(value, (list, tuple)) or len(value) != len(parts):
             raise ValueError(f"{what} must be a list of {len(parts)} numbers, not {value!r}")
-        return tuple(_as(part, what, v) for part, v in zip(parts, value))
+        return tuple(_typed(part, what, v) for part, v in zip(parts, value))
     if hint is float:
         return _number(what, value)
     right = {

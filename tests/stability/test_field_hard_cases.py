@@ -1,144 +1,126 @@
-"""Hard cases that every field with rays has in common: whatever comes, it stays finite and useful afterwards.
+"""Hard cases of every representation: whatever comes, a field stays finite and useful afterwards.
 
-What is particular to one (damage to its parameters, its limits) is in its own ``test_field_*``, as is splat.
+Damage to parameters, and limits of a single representation, are in ``test_field_*`` of their own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget, View
-from edge_server.fields.voxel.field import VoxelField
+from edge_server.fields import Budget
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import mean_psnr, picture, ring
-from tests.stability import test_field_voxel
-from tests.stability import test_fields_with_networks as with_networks
-from tests.stability.damage import follows_cameras_that_move
-from tests.stability.test_fields_with_networks import VIEWS
+from tests.edge_server.fields.small import NAMES, every_field, reaches, tiny
+from tests.stability.damage import follows_cameras_that_move, healthy
 
-
-class Case(NamedTuple):
-    """One representation, small, and what has to hold of it after anything."""
-
-    kind: Any
-    tiny: Any
-    healthy: Callable[[Any, list[View]], None]
-
-
-CASES = {
-    "ngp": Case(*with_networks.TINY["ngp"], with_networks.healthy),
-    "tensorf": Case(*with_networks.TINY["tensorf"], with_networks.healthy),
-    "voxel": Case(VoxelField, test_field_voxel.TINY, test_field_voxel._healthy),
-    "nerfacto": Case(*with_networks.TINY["nerfacto"], with_networks.healthy),
-}
-every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-# Of what takes a minute, one is for every day (and splat's own is); the others are for CI.
+VIEWS = ring(9, size=24)
+# Splat has its own variants in ``test_field_splat``.
+with_rays = pytest.mark.parametrize("name", [name for name in NAMES if name != "splat"])
+# Of what takes a minute, ngp's is for every day; the others are for CI.
 long = pytest.mark.parametrize(
-    "case", [pytest.param(c, id=k, marks=[pytest.mark.slow] * (k != "ngp")) for k, c in CASES.items()]
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "ngp")) for n in NAMES if n != "splat"]
 )
 
 
-@every
-def test_nothing_at_all(case: Case) -> None:
-    field = case.kind(case.tiny)
+@every_field
+def test_nothing_at_all(name: str) -> None:
+    field = tiny(name)
     assert field.fit([], Budget(steps=3)).steps == 0
     points, colors = field.points(10)
     assert points.shape == (0, 3) and colors.shape == (0, 3)
-    case.healthy(field, VIEWS)
+    healthy(field, VIEWS)
 
 
-@every
-def test_one_view(case: Case) -> None:
-    field = case.kind(case.tiny)
+@every_field
+def test_one_view(name: str) -> None:
+    field = tiny(name)
     field.fit(VIEWS[:1], Budget(steps=60))
-    case.healthy(field, VIEWS)
-    assert mean_psnr(field, VIEWS[:1]) > 15.0
+    healthy(field, VIEWS)
+    reaches(name, "one view", mean_psnr(field, VIEWS[:1]))
 
 
-@every
-def test_one_pixel(case: Case) -> None:
+@with_rays
+def test_one_pixel(name: str) -> None:
     camera = replace(VIEWS[0].intrinsics, width=1, height=1, cx=0.5, cy=0.5)
     view = replace(VIEWS[0], image=np.full((1, 1, 3), 99, np.uint8), intrinsics=camera)
-    field = case.kind(case.tiny)
+    field = tiny(name)
     field.fit([view], Budget(steps=10))
-    case.healthy(field, [view])
+    healthy(field, [view])
 
 
 @pytest.mark.parametrize("value", [0, 255, 77])
 @pytest.mark.parametrize("channels", [3, 4])
-@every
-def test_constant_black_and_saturated_pictures(case: Case, value: int, channels: int) -> None:
+@every_field
+def test_constant_black_and_saturated_pictures(name: str, value: int, channels: int) -> None:
     views = [replace(v, image=np.full((24, 24, channels), value, np.uint8)) for v in VIEWS]
-    field = case.kind(case.tiny)
+    field = tiny(name)
     field.fit(views, Budget(steps=60))
-    case.healthy(field, VIEWS)
+    healthy(field, VIEWS)
     out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color
     alpha = value / 255.0 if channels == 4 else 1.0
-    expected = value / 255.0 * alpha + (1.0 - alpha) * field.rig.background().mean()
+    expected = value / 255.0 * alpha + (1.0 - alpha) * field.view_store.background().mean()
     assert abs(out.mean() - expected) < 0.1
 
 
-@every
-def test_all_poses_identical(case: Case) -> None:
+@every_field
+def test_all_poses_identical(name: str) -> None:
     pose = VIEWS[0].camera_to_world
     views = [replace(v, camera_to_world=pose, image=VIEWS[0].image) for v in VIEWS]
-    field = case.kind(case.tiny)
+    field = tiny(name)
     field.fit(views, Budget(steps=60))
-    case.healthy(field, VIEWS)
+    healthy(field, VIEWS)
 
 
-@every
-def test_rays_that_miss_the_box(case: Case) -> None:
-    field = case.kind(replace(case.tiny, centre_m=(50.0, 0.0, 0.0), radius_m=0.5, contracted=False))
+@with_rays
+def test_rays_that_miss_the_box(name: str) -> None:
+    field = tiny(name, centre_m=(50.0, 0.0, 0.0), radius_m=0.5, contracted=False)
     report = field.fit(VIEWS, Budget(steps=20))
     assert report.steps == 20 and report.rays > 0 and report.samples == 0
-    case.healthy(field, VIEWS)
+    healthy(field, VIEWS)
     away = look_at((0, 0, 3.0), (0, 0, 9.0), up=(0, 1, 0))
-    trained = case.kind(case.tiny)
+    trained = tiny(name)
     trained.fit(VIEWS, Budget(steps=20))
     out = trained.render(away, VIEWS[0].intrinsics)
     assert np.isfinite(out.color).all()
 
 
-@every
-def test_views_that_contradict_each_other(case: Case) -> None:
+@every_field
+def test_views_that_contradict_each_other(name: str) -> None:
     rng = np.random.default_rng(0)
     views = [replace(v, image=rng.integers(0, 256, (24, 24, 3), dtype=np.uint8)) for v in VIEWS]
-    field = case.kind(case.tiny)
+    field = tiny(name)
     for _ in range(5):
         field.fit(views, Budget(steps=20))
-    case.healthy(field, VIEWS)
+    healthy(field, VIEWS)
     field.fit(VIEWS, Budget(steps=150))  # and it recovers
-    assert mean_psnr(field, VIEWS) > 16.0
+    reaches(name, "after noise", mean_psnr(field, VIEWS), margin_db=1.0)  # learning noise is chaotic
 
 
 @long
-def test_a_thousand_updates_do_not_drift_or_grow(case: Case) -> None:
+def test_a_thousand_updates_do_not_drift_or_grow(name: str) -> None:
     """A moving ball, a new selection of views each time, warm starts only."""
     rng = np.random.default_rng(1)
     still = ring(9, size=24)
     places = [np.array([0.3 * np.sin(a), 0.3 * np.cos(a), 0.5]) for a in np.linspace(0, 2 * np.pi, 12)]
     frames = [[replace(v, image=picture(v.intrinsics, v.camera_to_world, p)) for v in still] for p in places]
-    field, scores, sizes = case.kind(case.tiny), [], []
+    field, scores, sizes = tiny(name), [], []
     for update in range(1000):
         frame = frames[update % 12]
         field.fit([frame[k] for k in rng.choice(9, 6, replace=False)], Budget(steps=2))
         if update % 100 >= 88:
             scores.append(mean_psnr(field, frame[::4]))
             sizes.append(np.abs(field.state()["table"]).mean())
-    case.healthy(field, VIEWS)
+    healthy(field, VIEWS)
     first, last = np.mean(scores[12:36]), np.mean(scores[-24:])
     assert last > first - 1.0, f"drifted from {first:.1f} to {last:.1f} dB"
     assert last > 15.0
     assert np.mean(sizes[-12:]) < 3.0 * np.mean(sizes[12:24]), "parameters grow"
-    assert len(field.rig.memory) == 9
+    assert len(field.view_store.memory) == 9
 
 
-@every
-def test_cameras_that_move_at_every_update(case: Case) -> None:
-    follows_cameras_that_move(case.kind(case.tiny), VIEWS, case.healthy)
+@every_field
+def test_cameras_that_move_at_every_update(name: str) -> None:
+    reaches(name, "moving cameras", follows_cameras_that_move(tiny(name), VIEWS))

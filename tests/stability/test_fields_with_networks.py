@@ -11,34 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_server.fields import Budget, View
+from edge_server.fields import Budget
 from edge_server.fields.common.kernels.adam import PARAMETER_LIMIT
 from edge_server.fields.common.trained_field import TrainedField
 from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.nerfacto.settings import NerfactoSettings
-from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.ngp.settings import NgpSettings
-from edge_server.fields.tensorf.field import TensorfField
-from edge_server.fields.tensorf.settings import TensorfSettings
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import ring
+from tests.edge_server.fields.small import tiny
 from tests.stability.damage import counts_and_heals, overflows_and_begins_anew
 
-TINY: dict[str, tuple[type[TrainedField], Any]] = {
-    "ngp": (NgpField, NgpSettings(
-        levels=4, levels_every=10, log2_table=11, finest_resolution=32, hidden=16, rays=512,
-        batch_samples=4096, samples=48, samples_ramp=100, cells=16, threads=2,
-    )),
-    "tensorf": (TensorfField, TensorfSettings(
-        color_rank=8, resolution_start=12, resolution=32, upsample=(10, 25), hidden=16, rays=512,
-        batch_samples=4096, samples=48, samples_ramp=100, cells=16, threads=2,
-    )),
-    "nerfacto": (NerfactoField, NerfactoSettings(
-        levels=5, log2_table=11, base_resolution=8, finest_resolution=48, hidden=16, rays=512,
-        batch_samples=4096, samples=12, samples_start=16, bins=48, cells=16, proposal_cells=16, anneal=40,
-        threads=2,
-    )),
-}  # fmt: skip
+KINDS = ("ngp", "tensorf", "nerfacto")
 VIEWS = ring(9, size=24)
 
 _PLAIN = {"contracted": False, "radius_m": 1.0}
@@ -65,13 +47,13 @@ def go_through_all(kind: str) -> None:
     """Fits, renderings and an update with every one of the settings; and what is stale is masked."""
     steps, settings = THROUGH_ALL[kind]
     for extra in settings:
-        field = make(kind, **extra)
+        field = tiny(kind, **extra)
         field.fit(VIEWS, Budget(steps=steps))
         out = field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics)
         field.points(50)
         assert np.isfinite(out.color).all()
     field.fit([replace(v, image=np.roll(v.image, 5, axis=1)) for v in VIEWS], Budget(steps=20))
-    field = make(kind, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0)
+    field = tiny(kind, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=9.0)
     for later in range(3):
         rolled = [np.roll(v.image, 3 * later, axis=0) for v in VIEWS]
         field.fit(
@@ -79,28 +61,9 @@ def go_through_all(kind: str) -> None:
              for k, (v, image) in enumerate(zip(VIEWS, rolled))],
             Budget(steps=10),
         )  # fmt: skip
-    packed = field.rig._packed
+    packed = field.view_store._packed
     assert packed is not None
     assert (packed[1].weight > 0).any() and packed[1].drawn.size, "nothing is masked"
-
-
-def make(kind: str, **changed: Any) -> TrainedField:
-    """A small field of that kind."""
-    field, settings = TINY[kind]
-    return field(replace(settings, **changed))
-
-
-def healthy(field: TrainedField, views: list[View] = VIEWS) -> None:
-    state = field.state()
-    for name in ("table", "net", "density", "behind"):
-        assert np.isfinite(state[name]).all(), f"{name} is not finite"
-    assert abs(state["table"]).max() <= PARAMETER_LIMIT
-    for view in (views[0], views[-1]):
-        out = field.render(view.camera_to_world, view.intrinsics)
-        for part in (out.color, out.depth, out.opacity):
-            assert np.isfinite(part).all()
-        assert out.color.min() >= 0.0 and out.color.max() <= 1.0 and out.depth.min() >= 0.0
-        assert out.opacity.min() >= -1e-6 and out.opacity.max() <= 1.0 + 1e-5
 
 
 def _poison_table(field: TrainedField) -> None:
@@ -137,21 +100,21 @@ def _saturate(field: TrainedField) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "damage"),
-    [*product(TINY, (_poison_table, _poison_net, _poison_moments, _poison_gradient)),
+    [*product(KINDS, (_poison_table, _poison_net, _poison_moments, _poison_gradient)),
      ("nerfacto", _poison_proposal)],
 )  # fmt: skip
 def test_damage_is_counted_and_healed(kind: str, damage: Callable[[TrainedField], None]) -> None:
-    counts_and_heals(make(kind), VIEWS, damage, healthy, damage is not _poison_moments)
+    counts_and_heals(tiny(kind), VIEWS, damage, damage is not _poison_moments)
 
 
-@pytest.mark.parametrize("kind", TINY)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("damage", [_overflow, _saturate])
 def test_density_that_overflows_stays_finite(kind: str, damage: Callable[[TrainedField], None]) -> None:
-    overflows_and_begins_anew(make(kind), VIEWS, damage, healthy)
+    overflows_and_begins_anew(tiny(kind), VIEWS, damage)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", TINY)
+@pytest.mark.parametrize("kind", KINDS)
 def test_bounds_are_kept_in_every_kernel(kind: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """A whole fit and rendering with numba's bounds checks, in a process of its own."""
     code = f"from {__name__} import go_through_all\ngo_through_all({kind!r})\nprint('kept')\n"

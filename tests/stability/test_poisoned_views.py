@@ -17,50 +17,15 @@ from numpy.typing import NDArray
 from camera_node.synthetic import make_scene
 from edge_server.fields import Budget, View
 from edge_server.fields.common.scene_box import scene_box
-from edge_server.fields.common.view_outliers import PATIENCE
-from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.nerfacto.settings import NerfactoSettings
-from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.common.view_outliers import MOST_REFUSALS
 from edge_server.fields.splat import field as splat
 from edge_server.fields.splat.densification import Cloud
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.motion import Moved
-from edge_server.fields.splat.settings import SplatSettings
-from edge_server.fields.tensorf.field import TensorfField
-from edge_server.fields.tensorf.settings import TensorfSettings
-from edge_server.fields.voxel.field import VoxelField
-from edge_server.fields.voxel.settings import VoxelSettings
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import picture, psnr, ring
-
-SMALL: dict[str, Any] = {
-    "hidden": 16, "rays": 512, "batch_samples": 4096, "samples": 64, "samples_ramp": 100, "cells": 32,
-    "threads": 2,
-}  # fmt: skip
-NGP = NgpSettings(levels=6, levels_every=10, log2_table=12, finest_resolution=64, **SMALL)
-NERFACTO = NerfactoSettings(
-    levels=6,
-    levels_every=10,
-    log2_table=12,
-    finest_resolution=64,
-    bins=48,
-    proposal_cells=32,
-    **SMALL | {"samples": 16, "samples_start": 16},
-)
-TENSORF = TensorfSettings(color_rank=8, resolution_start=16, resolution=48, upsample=(40, 100), **SMALL)
-VOXEL = VoxelSettings(sizes=(16, 32, 48), refine_at=(20, 60), rays=1024, cells=32, threads=2)
-SPLAT = SplatSettings(gaussians=600, start=400, seed_cells=24, densify_every=20, views_a_step=3, threads=2)
-FIELDS: list[tuple[Any, Any]] = [
-    (NgpField, NGP),
-    (TensorfField, TENSORF),
-    (SplatField, SPLAT),
-    (VoxelField, VOXEL),
-    (NerfactoField, NERFACTO),
-]
-NAMES = ["ngp", "tensorf", "splat", "voxel", "nerfacto"]
-every = pytest.mark.parametrize(("kind", "settings"), FIELDS, ids=NAMES)
+from tests.edge_server.fields.small import CLASSES, NAMES, POISONED, every_field
 
 STEPS, WARM, AFTER = 4, 40, 50  # of an update; updates before and after the poison
 WITHIN_DB = 0.5
@@ -122,12 +87,17 @@ def each_with(poisons: list[Poison], soon: list[Poison]) -> pytest.MarkDecorator
     """Every field with every poison. Networks take ten times as long as the others, and share what refuses
     views: theirs are slow tests but for ngp's with a poison in ``soon``."""
     cases = []
-    for name, (kind, settings) in zip(NAMES, FIELDS):
+    for name in NAMES:
         for poison in poisons:
-            slow = kind not in (SplatField, VoxelField, NgpField) or (kind is NgpField and poison not in soon)
+            slow = name not in ("splat", "voxel") and not (name == "ngp" and poison in soon)
             marks = [pytest.mark.slow] if slow else []
-            cases.append(pytest.param(kind, settings, poison, id=f"{name}-{poison.__name__}", marks=marks))
-    return pytest.mark.parametrize(("kind", "settings", "poison"), cases)
+            cases.append(pytest.param(name, poison, id=f"{name}-{poison.__name__}", marks=marks))
+    return pytest.mark.parametrize(("name", "poison"), cases)
+
+
+def field_of(name: str, **changed: Any) -> Any:
+    """A field of these tests, with other settings as ``changed`` says."""
+    return CLASSES[name](replace(POISONED[name], **changed))
 
 
 class Deployment:
@@ -151,24 +121,24 @@ class Deployment:
 
 
 @cache
-def _warm(kind: Any, settings: Any) -> dict[str, NDArray[Any]]:
-    deployment = Deployment(kind(settings))
+def _warm(name: str) -> dict[str, NDArray[Any]]:
+    deployment = Deployment(field_of(name))
     deployment.update(WARM)
     return deployment.field.state()
 
 
-def _deployment(kind: Any, settings: Any) -> Deployment:
-    field = kind(settings)
-    field.load_state(_warm(kind, settings))
+def _deployment(name: str) -> Deployment:
+    field = field_of(name)
+    field.load_state(_warm(name))
     deployment = Deployment(field)
     deployment.updates = WARM
     return deployment
 
 
 @cache
-def _unharmed(kind: Any, settings: Any, updates: int, warm: bool = True) -> float:
+def _unharmed(name: str, updates: int, warm: bool = True) -> float:
     """The score of a field that never saw the poison, after as many updates."""
-    deployment = _deployment(kind, settings) if warm else Deployment(kind(settings))
+    deployment = _deployment(name) if warm else Deployment(field_of(name))
     deployment.update(updates)
     return deployment.score()
 
@@ -179,58 +149,57 @@ def _finite(field: Any) -> None:
 
 @pytest.mark.parametrize("updates", [1, pytest.param(10, marks=pytest.mark.slow)])
 @each_with(PICTURES + POSES, soon=[_noise, _a_metre_off])
-def test_a_poisoned_view_is_survived(kind: Any, settings: Any, poison: Poison, updates: int) -> None:
-    deployment = _deployment(kind, settings)
+def test_a_poisoned_view_is_survived(name: str, poison: Poison, updates: int) -> None:
+    deployment = _deployment(name)
     deployment.update(updates, poison)
     deployment.update(AFTER)
     _finite(deployment.field)
-    expected = _unharmed(kind, settings, updates + AFTER)
+    expected = _unharmed(name, updates + AFTER)
     assert expected > 22.0 and deployment.score() > expected - WITHIN_DB
 
 
 @each_with(PICTURES + POSES, soon=[_in_millimetres])
-def test_poison_in_the_very_first_update_is_survived(kind: Any, settings: Any, poison: Poison) -> None:
+def test_poison_in_the_very_first_update_is_survived(name: str, poison: Poison) -> None:
     """Before anything is known, and where the scene's box is found."""
-    deployment = Deployment(kind(settings))
+    deployment = Deployment(field_of(name))
     deployment.update(1, poison)
     deployment.update(AFTER)
-    assert deployment.score() > _unharmed(kind, settings, 1 + AFTER, warm=False) - WITHIN_DB
+    assert deployment.score() > _unharmed(name, 1 + AFTER, warm=False) - WITHIN_DB
 
 
 @each_with([_noise, _black, _inverted], soon=[_inverted])
-def test_wrong_pictures_are_refused_while_they_last(kind: Any, settings: Any, poison: Poison) -> None:
+def test_wrong_pictures_are_refused_while_they_last(name: str, poison: Poison) -> None:
     """What is shown meanwhile is not spoilt either; and without refusals it would be."""
-    without = replace(settings, refuse_beyond=0.0)
     scores = []
-    for options in (settings, without):
-        deployment = Deployment(kind(options))
-        deployment.field.load_state(_warm(kind, settings))
+    for options in ({}, {"refuse_beyond": 0.0}):
+        deployment = Deployment(field_of(name, **options))
+        deployment.field.load_state(_warm(name))
         deployment.updates = WARM
         deployment.update(15, poison)
         scores.append(deployment.score())
-    expected = _unharmed(kind, settings, 15)
-    assert scores[0] > expected - WITHIN_DB, "it was learnt from"
+    expected = _unharmed(name, 15)
+    assert scores[0] > expected - WITHIN_DB, "it was learned from"
     assert scores[1] < scores[0] - 0.5 * WITHIN_DB, "it does no harm anyway: nothing was tested"
 
 
-@every
-def test_a_picture_that_stays_different_is_learnt_in_the_end(kind: Any, settings: Any) -> None:
+@every_field
+def test_a_picture_that_stays_different_is_learnt_in_the_end(name: str) -> None:
     """The camera was right after all, say because somebody hung a cloth before it: patience ends."""
-    deployment = _deployment(kind, settings)
-    deployment.update(PATIENCE, _black)
-    assert deployment.field.rig.memory[SEEN[BAD].camera].credit == 0
+    deployment = _deployment(name)
+    deployment.update(MOST_REFUSALS, _black)
+    assert deployment.field.view_store.memory[SEEN[BAD].camera].refusals_left == 0
     refused, losses = deployment.loss, []
     for _ in range(-(-len(SEEN) // STEPS)):  # splat looks at one view a step
         deployment.update(1, _black)
         losses.append(deployment.loss)
-    assert max(losses) > 3.0 * refused, "it still is not learnt from"
+    assert max(losses) > 3.0 * refused, "it still is not learned from"
 
 
-@every
-def test_a_picture_repeated_is_not_a_scene_in_motion(kind: Any, settings: Any) -> None:
+@every_field
+def test_a_picture_repeated_is_not_a_scene_in_motion(name: str) -> None:
     """One wrong picture makes all of the next one seem to have moved; equal ones after it must end that."""
-    deployment = _deployment(kind, settings)
-    memory = deployment.field.rig.memory
+    deployment = _deployment(name)
+    memory = deployment.field.view_store.memory
     deployment.update(1, _noise)
     deployment.update(1)
     moved = memory[SEEN[BAD].camera].moved
@@ -239,19 +208,19 @@ def test_a_picture_repeated_is_not_a_scene_in_motion(kind: Any, settings: Any) -
     assert memory[SEEN[BAD].camera].moved is None
 
 
-@every
-def test_two_poisoned_views_and_refusals_resume_bit_for_bit(kind: Any, settings: Any) -> None:
+@every_field
+def test_two_poisoned_views_and_refusals_resume_bit_for_bit(name: str) -> None:
     """Refusals depend on what a state keeps."""
-    one = _deployment(kind, settings)
+    one = _deployment(name)
     one.update(3, _black)
-    field = kind(settings)
+    field = field_of(name)
     field.load_state(one.field.state())
     two = Deployment(field)
     two.updates = one.updates
     for deployment in (one, two):
         deployment.update(3, _noise)
     a, b = one.field.state(), two.field.state()
-    assert one.field.rig.memory[SEEN[BAD].camera].credit == PATIENCE - 6
+    assert one.field.view_store.memory[SEEN[BAD].camera].refusals_left == MOST_REFUSALS - 6
     for name in a.keys() - {"meta"}:
         np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
@@ -271,8 +240,8 @@ def _in_motion(poison: Poison | None, updates: int = 3) -> tuple[Shown, Shown]:
             for v in views
         ]
 
-    field, result = SplatField(SPLAT), []
-    field.load_state(_warm(SplatField, SPLAT))
+    field, result = field_of("splat"), []
+    field.load_state(_warm("splat"))
     for update in range(WARM + 1, WARM + 15):
         now, poisoned = frames(SEEN, update), WARM + 4 <= update < WARM + 4 + updates
         if poison is not None and poisoned:
@@ -319,26 +288,26 @@ def test_what_only_a_refused_view_shows_is_kept(asked: bool) -> None:
     pose = look_at((2.5, 0.0, 1.0), (3.5, 0.0, 9.0))  # up, over the heads of the others
     sky = np.broadcast_to(SEEN[0].image[0, 0], SEEN[0].image.shape)
     away = replace(SEEN[0], camera="away", image=sky, camera_to_world=pose)
-    field = SplatField(SPLAT)
-    field.load_state(_warm(SplatField, SPLAT))
+    field = field_of("splat")
+    field.load_state(_warm("splat"))
 
     def update(number: int, *more: View) -> None:
         now = [replace(v, generated_ns=(WARM + number) * 10**8) for v in (*SEEN, *more)]
         field.fit(now, Budget(steps=STEPS))
 
     update(1, away)
-    assert field.rig.memory["away"].credit == PATIENCE and field.rig.box is not None
-    place = field.rig.box.normalise(pose[:3, 3] + 2.0 * pose[:3, 2])
+    assert field.view_store.memory["away"].refusals_left == MOST_REFUSALS and field.view_store.box is not None
+    place = field.view_store.box.normalise(pose[:3, 3] + 2.0 * pose[:3, 2])
     params = field.cloud.params[:4].copy()
     params[:, :3], params[:, SCALE:QUATERNION], params[:, OPACITY] = place, -5.0, 2.0
     nowhere = params.copy()
-    nowhere[:, :3] = field.rig.box.normalise(np.array([0.0, 0.0, -40.0]))  # under the feet of all
+    nowhere[:, :3] = field.view_store.box.normalise(np.array([0.0, 0.0, -40.0]))  # under the feet of all
     field.cloud.keep(np.arange(len(field.cloud)) >= 8)
     field.cloud.add(Cloud.of(params))
     field.cloud.add(Cloud.of(nowhere))
     for number in range(2, 10):
         update(number, *([_noise(away, number)] if asked else []))
-    assert field.rig.memory["away"].credit == (PATIENCE - 8 if asked else PATIENCE)
+    assert field.view_store.memory["away"].refusals_left == (MOST_REFUSALS - 8 if asked else MOST_REFUSALS)
     for where, count in ((place, 4), (nowhere[0, :3], 0)):
         left = np.linalg.norm(field.cloud.params[:, :3] - where, axis=1) < 0.02
         assert left.sum() == count

@@ -1,7 +1,7 @@
-"""What a field may learn about its cameras: each one's exposure, and small errors of its pose.
+"""Camera refinement while a field trains: each camera's exposure, and small corrections of its pose.
 
-Both are off unless asked for, cost nothing then, and serve every representation of ``trained_field``.
-Pictures are rendered at the mean exposure and, for a known camera, at the pose that is asked for.
+Both are off by default, cost nothing then, and serve every representation of ``trained_field``. Pictures are
+rendered at the mean exposure and at the given pose.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.ray_snapshot import NgpSnapshot
+from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import SceneBox
 from freshfield.geometry import so3_exp
 
 Array = NDArray[np.float64]
 
-START = 40  # steps before anything is corrected: first the scene must be told from the camera
-_SHARE = 0.1  # of the least-squares answer of one step's rays that is believed
-_DAMPING = 0.02  # in least squares: a camera that sees one plain colour learns a bias at most
+START = 40  # steps before anything is corrected: first the scene must take shape
+_SHARE = 0.1  # of the least-squares solution of one step's rays that is applied
+_DAMPING = 0.02  # in least squares: a camera that sees one plain color learns a bias at most
 _GAIN, _BIAS = 3.0, 0.3  # bounds: gain in 1/3..3
 
 EVERY = 2  # steps between corrections of a pose, of one camera after the other
 PIXELS = 384  # compared for one correction
-_TRUST = 0.8  # of a Gauss-Newton step that is taken
+_STEP_SHARE = 0.8  # of a Gauss-Newton step that is taken
 _LONGEST = 1.0  # pixels, of one step in one parameter
-_PRIOR = 1e-2  # of the squared error, at the bound: a picture that says nothing leaves the pose as given
+_PRIOR = 1e-2  # of the squared error, at the bound: a picture without detail leaves the pose as given
 _OUTLIER = 0.15  # residual from which on a pixel counts less: something moved, or is hidden
 
 
 class Exposures:
-    """Per camera and channel, the ``a`` and ``b`` that bring its pictures to the common exposure:
-    a picture + b. The mean over cameras is kept at a = 1 (geometric) and b = 0."""
+    """Gain ``a`` and bias ``b`` per camera and channel; a * picture + b has the common exposure. Their means
+    over the cameras are kept at a = 1 (geometric) and b = 0."""
 
     def __init__(self) -> None:
         self.known: dict[str, Array] = {}  # camera -> (3, 2)
@@ -49,8 +49,11 @@ class Exposures:
         return np.array([self.known[camera] for camera in cameras], dtype=np.float32)
 
     def learn(self, cameras: list[str], sums: Array) -> None:
-        """One step. sums: float64 (V, 3, 5); per view and channel, over its rays: their number, and the sums
-        of t, t^2, e and e t, where t is the corrected pixel and e = rendered - t."""
+        """One step.
+
+        sums: float64 (V, 3, 5); per view and channel, over its rays: their number, and the sums of t, t^2, e
+        and e t, where t is the corrected pixel and e = rendered - t.
+        """
         n, t, tt, e, et = np.moveaxis(sums, -1, 0)
         m = np.maximum(n, 1.0)
         # Damped least squares for e = p t + q, per ray; (V, 3) each.
@@ -58,16 +61,16 @@ class Exposures:
         determinant = a11 * a22 - a12 * a12
         p = (a22 * et / m - a12 * e / m) / determinant
         q = (a11 * e / m - a12 * et / m) / determinant
-        believed = _SHARE * np.minimum(n / 32.0, 1.0)  # little, where there were few rays
+        share = _SHARE * np.minimum(n / 32.0, 1.0)  # small where there were few rays
         for k, camera in enumerate(cameras):
             now = self.known[camera]
-            step = 1.0 + believed[k] * np.clip(p[k], -0.5, 0.5)
-            new = np.stack([step * now[:, 0], step * now[:, 1] + believed[k] * q[k]], axis=-1)
+            step = 1.0 + share[k] * np.clip(p[k], -0.5, 0.5)
+            new = np.stack([step * now[:, 0], step * now[:, 1] + share[k] * q[k]], axis=-1)
             if np.isfinite(new).all():
                 self.known[camera] = new
-        self._centre()
+        self._center()
 
-    def _centre(self) -> None:
+    def _center(self) -> None:
         both = np.array(list(self.known.values()))
         both[..., 0] = np.clip(both[..., 0], 1.0 / _GAIN, _GAIN)
         both[..., 0] /= np.exp(np.log(both[..., 0]).mean(axis=0))
@@ -78,17 +81,17 @@ class Exposures:
 
 @dataclass
 class _Correction:
-    given: Array  # (4, 4): another pose is another error
-    turn: Array  # (3,) radians, world axes
+    given: Array  # (4, 4), the pose it belongs to: a camera with another pose starts anew
+    rotation: Array  # (3,) rotation vector in radians, world axes
     shift_m: Array  # (3,) world axes
 
 
-class Poses:
-    """Bounded corrections of the poses of cameras, found by comparing rendered pixels with the picture.
+class PoseCorrections:
+    """Bounded corrections of camera poses, found by comparing rendered pixels with the picture.
 
-    A correction turns a camera about its own centre by exp(turn) and shifts it. Gauss-Newton with the
-    derivatives of rendered colours by small motions of the camera, which ask nothing of a representation
-    but to be rendered. The mean correction of all cameras is kept at 0: the scene stays where it is.
+    A correction rotates a camera about its own center by exp(rotation) and shifts it. Gauss-Newton with
+    finite differences of the rendered colors by small motions of the camera, so any representation will do.
+    The mean correction of all cameras is kept at 0: the scene stays where it is.
     """
 
     def __init__(self, most_m: float, most_deg: float) -> None:
@@ -99,7 +102,7 @@ class Poses:
         """The corrected camera_to_world (4, 4) of a view."""
         known, given = self._of(view), np.asarray(view.camera_to_world, dtype=np.float64)
         pose = given.copy()
-        pose[:3, :3] = so3_exp(known.turn) @ given[:3, :3]
+        pose[:3, :3] = so3_exp(known.rotation) @ given[:3, :3]
         pose[:3, 3] += known.shift_m
         return pose
 
@@ -116,8 +119,9 @@ class Poses:
     ) -> None:  # fmt: skip
         """One Gauss-Newton step for one camera.
 
-        render: (pose (4, 4), image points (N, 2)) -> colours (N, 3). pixel_m: what a pixel spans at the
-        scene, the scale of all parameters.
+        view: of that camera. render: (pose (4, 4), image points (N, 2)) -> colors (N, 3).
+        pixel_m: width of a pixel at the scene, the scale of all parameters.
+        rng: chooses the pixels. background: float32 (3,), behind transparent pixels.
         """
         known, camera = self._of(view), view.intrinsics
         column = rng.integers(0, camera.width, PIXELS)
@@ -139,42 +143,42 @@ class Poses:
                 moved[:3, 3] += axis
             slopes[k] = (render(moved, points) - here) / 0.5  # per pixel's worth of motion
         error = here - seen
-        trust = 1.0 / (1.0 + (np.square(error).sum(axis=1, keepdims=True) / _OUTLIER**2))
+        robust = 1.0 / (1.0 + (np.square(error).sum(axis=1, keepdims=True) / _OUTLIER**2))
         # Sums by einsum without BLAS: its order of summation depends on the number of threads.
-        total = np.concatenate([known.turn, known.shift_m]) / scale
-        curve = np.einsum("inc,jnc,nk->ij", slopes, slopes, trust, optimize=False) / PIXELS
-        slope = np.einsum("inc,nc,nk->i", slopes, error, trust, optimize=False) / PIXELS
-        # How far an error may plausibly go is what the bounds say: without that, turning and shifting, which
-        # look alike from afar, would be confused.
+        total = np.concatenate([known.rotation, known.shift_m]) / scale
+        hessian = np.einsum("inc,jnc,nk->ij", slopes, slopes, robust, optimize=False) / PIXELS
+        gradient = np.einsum("inc,nc,nk->i", slopes, error, robust, optimize=False) / PIXELS
+        # The prior follows the bounds: without it, rotations and shifts, which look alike from afar, would be
+        # confused.
         bounds = np.array([self.most_rad] * 3 + [self.most_m] * 3) / scale
         prior = _PRIOR / np.square(np.maximum(bounds, 1e-3))
-        step = -_TRUST * np.linalg.solve(curve + np.diag(prior), slope + prior * total)
+        step = -_STEP_SHARE * np.linalg.solve(hessian + np.diag(prior), gradient + prior * total)
         if not np.isfinite(step).all():
             return
         step = np.clip(step, -_LONGEST, _LONGEST) * scale
-        known.turn, known.shift_m = known.turn + step[:3], known.shift_m + step[3:]
+        known.rotation, known.shift_m = known.rotation + step[:3], known.shift_m + step[3:]
         everyone = list(self.known.values())
-        mean_turn = np.mean([c.turn for c in everyone], axis=0)
+        mean_rotation = np.mean([c.rotation for c in everyone], axis=0)
         mean_shift = np.mean([c.shift_m for c in everyone], axis=0)
         for c in everyone:
-            c.turn = _at_most(c.turn - mean_turn, self.most_rad)
+            c.rotation = _at_most(c.rotation - mean_rotation, self.most_rad)
             c.shift_m = _at_most(c.shift_m - mean_shift, self.most_m)
 
 
-class CameraErrors:
-    """What one field knows of its cameras' errors; does nothing where nothing is asked for."""
+class CameraRefinement:
+    """Exposures and pose corrections of one field's cameras, each None unless enabled."""
 
     def __init__(self, exposure: bool, most_m: float, most_deg: float) -> None:
         self.exposures = Exposures() if exposure else None
-        self.poses = Poses(most_m, most_deg) if most_m > 0 or most_deg > 0 else None
+        self.poses = PoseCorrections(most_m, most_deg) if most_m > 0 or most_deg > 0 else None
 
     @property
-    def asked(self) -> bool:
-        """Whether any error is to be learnt. Then a view that looks wrong may only not be understood yet."""
+    def enabled(self) -> bool:
+        """Whether anything is to be learned. If so, a view that looks wrong may not be an outlier."""
         return self.exposures is not None or self.poses is not None
 
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
-        """``data`` as it is to be read with what is known by now."""
+        """``data`` with the corrections known by now."""
         if self.exposures is not None:
             data = data._replace(exposure=self.exposures.rows([v.camera for v in views]))
         if self.poses is not None:
@@ -187,18 +191,22 @@ class CameraErrors:
 
     def learn(
         self, views: Sequence[View], data: Views, box: SceneBox, step: int, seed: int,
-        sums: NDArray[np.float64], live: Callable[[], NgpSnapshot],
+        sums: NDArray[np.float64], make_renderer: Callable[[], RaySnapshot],
     ) -> Views:  # fmt: skip
-        """After ``step``: learn from it; returns the corrected data. sums: float64 (chunks, V, 3, 5), what
-        ``kernels.train`` found, cleared. live: makes a renderer of the field."""
-        news = False
+        """Learn from a step; returns the corrected data.
+
+        step: number of steps made. seed: of the field.
+        sums: float64 (chunks, V, 3, 5), see ``Exposures.learn``; cleared.
+        make_renderer: returns a renderer of the field as it is.
+        """
+        changed = False
         if self.exposures is not None:
             if step >= START:
                 self.exposures.learn([v.camera for v in views], sums.sum(axis=0))
-                news = True
+                changed = True
             sums[...] = 0.0
         if self.poses is not None and step >= START and step % EVERY == 0:
-            view, renderer = views[step // EVERY % len(views)], live()
+            view, renderer = views[step // EVERY % len(views)], make_renderer()
 
             def render(pose: Array, points: Array) -> NDArray[np.float32]:
                 return renderer.render_pixels(pose, view.intrinsics, points)[0]
@@ -206,21 +214,21 @@ class CameraErrors:
             rng = np.random.default_rng(np.random.SeedSequence([seed, step, 1]))
             pixel_m = box.distance_m / view.intrinsics.fx
             self.poses.correct(view, render, pixel_m, rng, renderer.background)
-            news = True
-        return self.corrected(views, data, box) if news else data
+            changed = True
+        return self.corrected(views, data, box) if changed else data
 
     def meta(self) -> dict[str, Any]:
-        """What a state keeps, ready for JSON, to the last bit."""
+        """What a state keeps: exact, ready for JSON."""
         return {
             "exposures": {c: p.tolist() for c, p in self.exposures.known.items()} if self.exposures else {},
             "poses": {
-                name: [c.given.tolist(), c.turn.tolist(), c.shift_m.tolist()]
+                name: [c.given.tolist(), c.rotation.tolist(), c.shift_m.tolist()]
                 for name, c in (self.poses.known.items() if self.poses else ())
             },
         }
 
     def load(self, meta: dict[str, Any]) -> None:
-        """Undo ``meta``; what this field was not asked to learn is left out."""
+        """Restore what ``meta`` returned; what is not enabled here is left out."""
         if self.exposures is not None:
             self.exposures.known = {c: np.array(p) for c, p in meta.get("exposures", {}).items()}
         if self.poses is not None:

@@ -1,4 +1,4 @@
-"""The state of a trained field as plain arrays: the same for every device."""
+"""The state of a field as plain arrays, the same for every device."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.fields.common.view_store import Arrays, Rig
+from edge_server.fields.common.view_store import Arrays, ViewStore
 
 
-def pack(name: str, settings: Any, rig: Rig, counters: dict[str, Any], arrays: Arrays) -> Arrays:
-    """Everything in one dictionary of copies."""
-    meta = {"version": 1, "field": name, "settings": asdict(settings), **counters, **rig.meta()}
-    both = {"meta": np.array(json.dumps(meta)), **arrays, **rig.arrays()}
+def pack_state(
+    name: str, settings: Any, view_store: ViewStore, counters: dict[str, Any], arrays: Arrays
+) -> Arrays:
+    """All of it in one dictionary of copies. counters: facts for JSON. arrays: what was learned."""
+    meta = {"version": 1, "field": name, "settings": asdict(settings), **counters, **view_store.meta()}
+    both = {"meta": np.array(json.dumps(meta)), **arrays, **view_store.arrays()}
     return {name: np.array(array) for name, array in both.items()}
 
 
 def unpack_meta(settings: Any, state: Arrays, name: str, shape: tuple[str, ...]) -> dict[str, Any]:
-    """The facts in ``state``. ValueError unless it is a state of a field called ``name`` and was made with
-    settings that agree in ``shape``; all others may differ."""
+    """The facts in ``state``. ValueError unless it is the state of a field called ``name`` whose settings
+    agree with these in the options ``shape``; all other options may differ."""
     try:
         meta = json.loads(str(state["meta"]))
         theirs = meta["settings"]
@@ -43,15 +45,15 @@ def unpack_meta(settings: Any, state: Arrays, name: str, shape: tuple[str, ...])
 
 @contextmanager
 def all_or_nothing(field: Any) -> Iterator[None]:
-    """Around the loading of a state: where that fails, ``field`` stays as it was. ValueError where the state
-    lacks something, or holds something else. New arrays and objects must take the place of the old ones:
-    what is written into these is not undone.
+    """Around loading a state: if that fails, ``field`` gets back the attributes it had. The body must replace
+    arrays and objects, not write into them, which is not undone. ValueError: the state lacks something or
+    holds something else.
     """
     before = dict(vars(field))
     try:
         yield
     except BaseException as error:
-        # Nothing is missing meanwhile: others may ask the field for a picture, and wait for their turn.
+        # No attribute is missing in between: other threads may ask the field for a picture.
         vars(field).update(before)
         for name in vars(field).keys() - before.keys():
             delattr(field, name)
@@ -62,8 +64,9 @@ def all_or_nothing(field: Any) -> Iterator[None]:
         raise
 
 
-def fill(wanted: Arrays, state: Arrays) -> None:
-    """Copy the arrays of ``state`` into those of the same name; ValueError if one is missing or different."""
+def load_arrays(wanted: Arrays, state: Arrays) -> None:
+    """Copy the arrays of ``state`` into those of the same name. ValueError: one is missing or differs in
+    shape or type."""
     for name, mine in wanted.items():
         if name not in state or state[name].shape != mine.shape or state[name].dtype != mine.dtype:
             raise ValueError(f"the state lacks {name!r}, {mine.dtype} of shape {mine.shape}")

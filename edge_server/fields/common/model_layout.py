@@ -1,4 +1,4 @@
-"""Sizes and first values of an Instant-NGP style model: which level is how large, and where it starts."""
+"""Sizes and initial values of a hash grid's levels (Mueller et al. 2022) and of the small network behind."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.common.kernels.mlp import Net, param_count
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.trainer_settings import TrainerSettings
-from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.common.trainer_settings import HashGridSettings, TrainerSettings
 
 FINENESS = 1.0  # cells of the finest level per pixel
 FIRST_DENSITY = 0.3  # a scene unit of fog dims by a quarter: every sample gets a gradient at first
@@ -21,15 +20,15 @@ def _multiple_of_4(n: int) -> int:
     return (n + 3) // 4 * 4
 
 
-def finest_resolution(settings: NgpSettings, box: SceneBox | None) -> int:
-    """As set, or as fine as pictures can tell: finer levels would only learn noise."""
+def finest_resolution(settings: HashGridSettings, box: SceneBox | None) -> int:
+    """As set, or about one cell a pixel: finer levels would only learn noise."""
     if settings.finest_resolution is not None:
         return settings.finest_resolution
     pixels = FINENESS * box.pixels_across if box is not None else 256.0
     return int(np.clip(pixels, settings.base_resolution, 512))
 
 
-def make_grid(settings: NgpSettings, box: SceneBox | None, rng: np.random.Generator) -> Grid:
+def make_grid(settings: HashGridSettings, box: SceneBox | None, rng: np.random.Generator) -> Grid:
     """Levels growing geometrically from base to finest resolution, tables near zero."""
     share = np.arange(settings.levels) / max(settings.levels - 1, 1)
     ratio = finest_resolution(settings, box) / settings.base_resolution
@@ -43,22 +42,17 @@ def make_grid(settings: NgpSettings, box: SceneBox | None, rng: np.random.Genera
     return Grid(resolution, first, dense, table)
 
 
-def net_widths(inputs: int, settings: TrainerSettings, looks: int = 0) -> NDArray[np.int64]:
-    """Widths of the layers: ``inputs`` features in; density, colour, the colour's harmonics and three
-    numbers for each of ``looks`` out; padded to 4."""
-    outputs = _multiple_of_4(1 + 3 * settings.harmonics + 3 * looks)
+def net_widths(inputs: int, settings: TrainerSettings, appearance: int = 0) -> NDArray[np.int64]:
+    """Widths of the layers, padded to 4: ``inputs`` features in; density, color, the color's harmonics and
+    three numbers for each dimension of ``appearance`` out."""
+    outputs = _multiple_of_4(1 + 3 * settings.harmonics + 3 * appearance)
     hidden = [settings.hidden] * settings.hidden_layers
     return np.array([_multiple_of_4(inputs), *hidden, outputs], dtype=np.int64)
 
 
-def make_net(settings: NgpSettings, rng: np.random.Generator) -> Net:
-    """The network of a hash-grid field."""
-    return first_net(FEATURES * settings.levels, settings, rng)
-
-
-def first_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator, looks: int = 0) -> Net:
-    """He initialisation, small output; a thin grey fog everywhere."""
-    widths = net_widths(inputs, settings, looks)
+def init_net(inputs: int, settings: TrainerSettings, rng: np.random.Generator, appearance: int = 0) -> Net:
+    """He initialization with a small output: thin gray fog everywhere."""
+    widths = net_widths(inputs, settings, appearance)
     params = np.zeros(param_count(widths), np.float32)
     first = 0
     for layer, (n_in, n_out) in enumerate(pairwise(widths)):

@@ -1,4 +1,4 @@
-"""The field's knowledge of where something is: an occupancy grid fed by the field and by the cameras."""
+"""An occupancy grid: which cells of space get samples, by the field's density and the cameras' views."""
 
 from __future__ import annotations
 
@@ -15,17 +15,21 @@ from edge_server.fields.common.kernels.train import CHUNK
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.common.trainer_settings import TrainerSettings
-from edge_server.fields.common.view_store import Rig
+from edge_server.fields.common.view_store import ViewStore
 
 EVERY = 8  # steps between refreshes
-PHASES = 4  # refreshes until every cell has been looked at
-FADE = 0.75  # of a cell's density per look
-EMPTY = 0.5  # density per scene unit that counts as nothing: a step of it dims by a hundredth or two
+PHASES = 4  # refreshes until every cell has been sampled
+FADE = 0.75  # of a cell's density per sample
+EMPTY = 0.5  # density per scene unit that counts as empty: a step of it dims by a hundredth or two
 
 
-class Occupancy:
-    """density: float32 (cells^3,), x fastest; seen: uint16, cameras that look at each cell. unknown: the
-    density of what was never looked at; with ``EMPTY`` the first look decides."""
+class OccupancyGrid:
+    """The grid's arrays, each of cells^3 elements, x fastest.
+
+    density: float32, per scene unit. seen: uint16, how many cameras see each cell. occupied: uint8, whether
+    it gets samples; coarse: the same of blocks of COARSE^3 cells. needed: cameras that must see a cell.
+    unknown: density of what was never sampled; with ``EMPTY`` the first sample decides.
+    """
 
     def __init__(
         self, cells: int, contracted: bool, near: float, min_views: int, unknown: float = EMPTY
@@ -38,13 +42,15 @@ class Occupancy:
         self.needed = 1
 
     @classmethod
-    def for_box(cls, settings: TrainerSettings, box: SceneBox | None, unknown: float = EMPTY) -> Occupancy:
-        """An occupancy that knows nothing yet of the scene in ``box``."""
+    def for_box(
+        cls, settings: TrainerSettings, box: SceneBox | None, unknown: float = EMPTY
+    ) -> OccupancyGrid:
+        """A grid that knows nothing yet of the scene in ``box``."""
         near = box.near_m / box.radius_m if box else 0.1
         return cls(settings.cells, box.contracted if box else False, near, settings.min_views, unknown)
 
     def space(self, step: float) -> Space:
-        """The grid as the kernels read it: a view on the living arrays."""
+        """The grid as kernels read it, without copies."""
         return Space(
             self.occupied,
             self.coarse,
@@ -55,16 +61,16 @@ class Occupancy:
             np.float32(self.near),
         )
 
-    def look(self, pool: Pool, rig: Rig, empty: float = EMPTY) -> NDArray[np.bool_] | None:
-        """Count anew which cells the known cameras see, and open those where something moved.
+    def recount_views(self, pool: Pool, store: ViewStore, empty: float = EMPTY) -> NDArray[np.bool_] | None:
+        """Count anew which cells the known cameras see, and occupy those where something moved.
 
-        A cell where something moved is seen to change by most cameras that see it at all: the hull of the
-        changed pixels. Without it a moving body could not grow where space was known to be empty.
-        empty: the density below which a cell gets no samples. Returns the opened cells (cells^3,), if any.
+        Something moved where most cameras that see a cell see it change: the visual hull of the changed
+        pixels. Otherwise a moving body could not appear where space was known to be empty.
+        empty: density below which a cell gets no samples. Returns the cells (cells^3,) opened, if any.
         """
-        assert rig.box is not None
-        views = pack_cameras(rig.views, rig.box)
-        masks = [m.moved for m in rig.memory.values()]
+        assert store.box is not None
+        views = pack_cameras(store.views, store.box)
+        masks = [m.moved for m in store.memory.values()]
         mask_first = np.full(len(masks), -1, np.int64)
         parts, length = [np.zeros(0, np.uint8)], 0
         for k, mask in enumerate(masks):
@@ -77,25 +83,25 @@ class Occupancy:
             count_views, self.cells, self.contracted, self.near, views, mask_first, np.concatenate(parts),
             self.seen, marked,
         )  # fmt: skip
-        self.needed = min(self.min_views, len(rig.memory))
+        self.needed = min(self.min_views, len(store.memory))
         moving = None
         if length:
             moving = (marked >= max(self.needed, 1)) & (2 * marked >= self.seen)
             np.maximum(self.density, np.float32(1.5 * empty), out=self.density, where=moving)
-        self.mark(empty)
+        self.update_occupied(empty)
         return moving
 
-    def refresh(self, pool: Pool, key: np.uint64, turn: int, encoding: Any, levels: int, net: Net,
+    def refresh(self, pool: Pool, key: np.uint64, phase: int, encoding: Any, levels: int, net: Net,
                 acts: NDArray[np.float32], x: NDArray[np.float32]) -> None:  # fmt: skip
-        """Look at a part of the cells again."""
+        """Sample the density of every ``PHASES``-th cell, from cell ``phase`` on."""
         pool.run(
-            sample_density, key, turn % PHASES, PHASES, np.float32(FADE), encoding, levels, net, self.cells,
+            sample_density, key, phase % PHASES, PHASES, np.float32(FADE), encoding, levels, net, self.cells,
             self.contracted, self.seen, self.needed, self.density, acts, x,
         )  # fmt: skip
-        self.mark()
+        self.update_occupied()
 
-    def mark(self, empty: float = EMPTY) -> None:
-        """Decide anew which cells get samples: those with a density of ``empty`` or more."""
+    def update_occupied(self, empty: float = EMPTY) -> None:
+        """Give samples to the cells with a density of ``empty`` or more."""
         threshold(self.density, self.seen, self.needed, empty, self.cells, self.occupied, self.coarse)
 
 

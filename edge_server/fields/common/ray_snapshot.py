@@ -23,7 +23,7 @@ SOLID = 0.5  # opacity from which on a ray has met a surface
 
 
 @dataclass(frozen=True)
-class NgpSnapshot:
+class RaySnapshot:
     """Parameters, occupancy and cameras of one instant. Nothing in it is written after it is made."""
 
     box: SceneBox
@@ -43,7 +43,7 @@ class NgpSnapshot:
         intrinsics: Pinhole,
         max_samples: int | None = None,
     ) -> Rendering:
-        """The picture a camera at this pose would take; max_samples: a ray's samples at most (faster)."""
+        """Render a camera. max_samples: of a ray at most (fewer are faster)."""
         w, h = intrinsics.width, intrinsics.height
         v, u = np.mgrid[0:h, 0:w]
         pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
@@ -57,7 +57,7 @@ class NgpSnapshot:
         pixels: NDArray[np.float64],
         max_samples: int | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Colour (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
+        """Color (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
         pose = np.asarray(camera_to_world, dtype=np.float64)
         n, room, workers = len(pixels), TILE * ROUND, self.pool.threads
         color, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
@@ -86,16 +86,15 @@ class NgpSnapshot:
         return color, depth, opacity
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras' rays
-        meet a surface: their pixels are sampled evenly."""
+        """See ``surface_points``; from all known cameras."""
         return surface_points(self, self.cameras, count)
 
 
 def surface_points(
     renderer: PixelRenderer, cameras: Sequence[View], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points (N, 3) in world metres and colours (N, 3) where evenly spaced pixels of ``cameras`` meet a
-    surface; N <= count."""
+    """At most ``count`` points (N, 3) in world metres and colors (N, 3): where the rays of evenly spaced
+    pixels of ``cameras`` meet a surface."""
     positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
     share = max(count // max(len(cameras), 1), 1)
     for view in cameras:

@@ -1,7 +1,7 @@
-"""Where the scene is, found from the rig: the normalisation of poses before a field is trained (4.4.4).
+"""The scene's box, found from the cameras: poses are normalized by it before a field is trained (4.4.4).
 
-The thesis re-centres the world on the geometric centre of the cameras. Inward-looking rigs are better
-served by the point their optical axes approach most closely, so that is taken where there is one.
+The thesis re-centers the world on the geometric center of the cameras. For cameras that look inwards, the
+point nearest to their optical axes is better, so it is taken where there is one.
 """
 
 from __future__ import annotations
@@ -16,21 +16,24 @@ from edge_server.fields import View
 
 Array = NDArray[np.float64]
 
-NEAR_SHARE = 0.4  # of the cameras' distance to the scene: nothing nearer to a lens, where rooms are found
-ASTRAY = 0.3  # sine of the angle by which a camera may look past the scene without being doubted
-AGREED = 0.15  # the same, within which half of the cameras look at a point that they do meet in
-ASIDE = 0.7  # the same, by which half of them look past a point that is none
-MOST_TRIED = 32  # cameras whose pairs are tried where they do not
-FAR = 10.0  # times the usual distance between cameras: nearer ones belong to the rig
+NEAR_SHARE = 0.4  # of the cameras' distance to the scene: no density nearer to a lens, in contracted scenes
+# Sines of the angle between a camera's axis and the direction to a point.
+ASTRAY = 0.3  # a camera further off than this may be an outlier
+AGREED = 0.15  # half of the cameras are within this of a true meeting point
+ASIDE = 0.7  # half of them are further than this from a point that is none
+MOST_TRIED = 32  # cameras whose pairs are tried if no meeting point was found
+FAR = 10.0  # times the usual distance between cameras: nearer ones belong together
 PLAIN = 8  # of 255, by which a plain background may vary
 
 
 @dataclass(frozen=True)
 class SceneBox:
-    """Scene coordinates are (world - centre_m) / radius_m; contracted: the scene goes on beyond the box.
+    """Scene coordinates are (world - centre_m) / radius_m.
 
-    near_m: how near to a camera density may be. distance_m: median distance of the cameras to the centre.
-    pixel_m: what a pixel of most cameras spans there.
+    contracted: whether the scene goes on beyond the box.
+    near_m: how near to a camera density may be.
+    distance_m: median distance of the cameras to the center.
+    pixel_m: width of a pixel there, for most cameras.
     """
 
     centre_m: tuple[float, float, float]
@@ -42,7 +45,7 @@ class SceneBox:
 
     @property
     def pixels_across(self) -> float:
-        """The encoding's cube in pixels: finer detail than that no camera sees."""
+        """The encoding's cube in pixels: no camera sees finer detail."""
         return (4.0 if self.contracted else 2.0) * self.radius_m / self.pixel_m
 
     def normalise(self, points_m: Array) -> Array:
@@ -50,8 +53,8 @@ class SceneBox:
         return (points_m - np.asarray(self.centre_m)) / self.radius_m
 
 
-# Stands in for the box of a field that has seen nothing yet.
-NOWHERE = SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0, 0.01)
+# The box of a field that has seen nothing yet.
+UNIT_BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.1, False, 1.0, 0.01)
 
 
 def converging_point(origins: Array, directions: Array) -> Array | None:
@@ -72,9 +75,9 @@ def scene_box(
     near_m: float | None = None,
     contracted: bool | None = None,
 ) -> SceneBox:
-    """The box for these views; what is given is kept, the rest is found from the cameras.
+    """The box for these views; arguments other than None are kept, the rest is found from the cameras.
 
-    Pictures with transparency or before one plain colour show an object: the box is what nearly all
+    Pictures with transparency or before one plain color show an object: the box is what nearly all
     cameras see around the point they look at. Otherwise the surroundings belong to the scene: the box
     reaches from there to the cameras, and space beyond it is contracted.
     """
@@ -86,12 +89,12 @@ def scene_box(
     elif point is not None:
         centre = point
     elif len(views) > 1 and np.linalg.norm(axes.mean(axis=0)) < 0.5:
-        centre = _together(origins).mean(axis=0)  # looking outwards
+        centre = _main_group(origins).mean(axis=0)  # looking outwards
     else:
-        # Nothing tells how far the scene is: a few times the rig's own extent, or a room's width.
-        rig = _together(origins)
-        spread = float(np.linalg.norm(rig - rig.mean(axis=0), axis=1).max())
-        centre = rig.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
+        # Nothing tells how far the scene is: a few times the group's own extent, or a room's width.
+        group = _main_group(origins)
+        spread = float(np.linalg.norm(group - group.mean(axis=0), axis=1).max())
+        centre = group.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
     distance = float(np.median(np.linalg.norm(origins - centre, axis=1)))
     distance = distance if distance > 1e-6 else 1.0
     pixel = distance / float(np.median([v.intrinsics.fx for v in views]))
@@ -107,35 +110,35 @@ def scene_box(
 
 
 def _meeting_point(origins: Array, axes: Array) -> Array | None:
-    """``converging_point`` without cameras that look past it while all others meet there: a wrong pose in
-    the first views must not decide for good where the scene is. At most a quarter of them, and not of three.
+    """``converging_point`` without outliers, cameras that look past it while all others meet there: a wrong
+    pose in the first views must not decide for good where the scene is. At most a quarter are left out, and
+    none of three.
     """
     point = converging_point(origins, axes)
     kept = np.ones(len(origins), np.bool_)
     for _ in range(len(origins) // 4):
         if point is None:
             break
-        worst = int(np.argmax(np.where(kept, _past(origins, axes, point), -1.0)))
+        worst = int(np.argmax(np.where(kept, _off_axis(origins, axes, point), -1.0)))
         kept[worst] = False
         others = converging_point(origins[kept], axes[kept])
         if others is None:
             break
-        past = _past(origins, axes, others)
+        past = _off_axis(origins, axes, others)
         if past[worst] < max(ASTRAY, 4.0 * float(np.median(past[kept]))):
             break
         point = others
     if point is not None and _agreed(origins, axes, point):
         return point
-    # A camera that is far away drags the point along, from where honest ones look as far astray as it does.
+    # A camera that is far away moves the point so far that the right ones seem as wrong as it is.
     better = _where_most_meet(origins, axes)
     if better is not None or point is None:
         return better
-    return point if np.median(_past(origins, axes, point)) < ASIDE else None
+    return point if np.median(_off_axis(origins, axes, point)) < ASIDE else None
 
 
 def _where_most_meet(origins: Array, axes: Array) -> Array | None:
-    """The point where all cameras but a quarter at most meet, if there is one: found from where two of them
-    do."""
+    """The point where at least three quarters of the cameras look, if any, found by trying pairs of them."""
     some = np.unique(np.linspace(0, len(origins) - 1, MOST_TRIED).astype(int))
     i, j = (some[k] for k in np.triu_indices(len(some), 1))
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -145,9 +148,9 @@ def _where_most_meet(origins: Array, axes: Array) -> Array | None:
         return None
     place = (projectors @ origins[:, :, None])[:, :, 0]
     points = np.linalg.solve(both[apart], (place[i] + place[j])[apart][:, :, None])[:, :, 0]
-    astray = np.median(_past(origins, axes, points), axis=-1)
+    astray = np.median(_off_axis(origins, axes, points), axis=-1)
     first = int(np.argmin(astray))
-    past = _past(origins, axes, points[first])
+    past = _off_axis(origins, axes, points[first])
     kept = past <= max(ASTRAY, 4.0 * float(astray[first]))
     if astray[first] >= AGREED or 4 * np.count_nonzero(~kept) > len(origins):
         return None
@@ -157,26 +160,26 @@ def _where_most_meet(origins: Array, axes: Array) -> Array | None:
 
 
 def _agreed(origins: Array, axes: Array, point: Array) -> bool:
-    return bool(np.median(_past(origins, axes, point)) < AGREED)
+    return bool(np.median(_off_axis(origins, axes, point)) < AGREED)
 
 
-def _past(origins: Array, axes: Array, point: Array) -> Array:
-    """How far cameras (N,) look past a point (3,), or past each of several (M, 3) -> (M, N): the sine of the
-    angle, 1 and more where it is behind them."""
+def _off_axis(origins: Array, axes: Array, point: Array) -> Array:
+    """The sine of the angle by which cameras (N,) look past a point (3,), or past each of several (M, 3) ->
+    (M, N); 1 and more where it is behind them."""
     to_point = point[..., None, :] - origins
     ahead = (to_point * axes).sum(axis=-1) / np.maximum(np.linalg.norm(to_point, axis=-1), 1e-12)
     return np.where(ahead < 0.0, 1.0 - ahead, np.sqrt(np.maximum(1.0 - ahead**2, 0.0)))
 
 
-def _together(origins: Array) -> Array:
-    """The places of cameras without those far away from the others; all, if those are more than a quarter."""
+def _main_group(origins: Array) -> Array:
+    """The positions of the cameras without those far from the others; all, if those are over a quarter."""
     apart = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
     kept = apart <= FAR * max(float(np.median(apart)), 1e-3)
     return origins[kept] if 4 * np.count_nonzero(~kept) <= len(origins) else origins
 
 
 def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
-    """The colour (3,) in [0, 1] that nearly all pictures have nearly everywhere along their edges, if any."""
+    """The color (3,) in [0, 1] that nearly all pictures have nearly everywhere along their edges, if any."""
     edges = []
     for view in views:
         if view.image.shape[2] == 4:
@@ -189,7 +192,7 @@ def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
 
 
 def _seen_radius(views: Sequence[View], centre: Array) -> float:
-    """Radius in metres of the ball around ``centre`` that nine in ten cameras see whole."""
+    """Radius in metres of the ball around ``centre`` that nine of ten cameras see whole."""
     radii = []
     for view in views:
         camera = view.intrinsics

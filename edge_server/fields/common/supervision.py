@@ -1,4 +1,4 @@
-"""From views to what the kernels read: packed pixels, cameras in scene units, and what has moved."""
+"""Checks views and packs them for the kernels: pixels, cameras in scene units, and what has moved."""
 
 from __future__ import annotations
 
@@ -16,20 +16,23 @@ from freshfield.geometry import GeometryError, Pinhole, Pose, invertible
 
 CHANGE = 16  # of 255, after blurring: above the noise of sensors and of video compression
 MARGIN_PX = 2
-# What no camera has and float32 would not bear: positions (geographic grids reach 1e7 m), and focal lengths,
-# as a share of the image's longer side.
+# Limits beyond any real camera, within what float32 can represent: positions (geographic grids reach 1e7 m),
+# and focal lengths as a share of the image's longer side.
 FARTHEST_M = 1e9
 FOCAL = (1e-3, 1e6)
 
 
 @dataclass
 class CameraMemory:
-    """The newest view of one camera, and the pixels that moved in it: bool (H, W), or None. credit: how many
-    views that contradict the field will still be refused (``trust.refused``)."""
+    """The newest view of one camera.
+
+    moved: bool (H, W), the pixels that moved since the view before; None where that is unknown.
+    refusals_left: remaining number of contradicting views to refuse (``view_outliers.find_outliers``).
+    """
 
     view: View
     moved: NDArray[np.bool_] | None = None
-    credit: int = 0
+    refusals_left: int = 0
 
 
 def lens_row(camera: Pinhole) -> list[float]:
@@ -37,7 +40,7 @@ def lens_row(camera: Pinhole) -> list[float]:
 
 
 def check_view(view: View) -> None:
-    """Refuse what would poison a field; ValueError says which camera and why."""
+    """ValueError for a view that would poison a field; it says which camera and why."""
     image, camera = view.image, view.intrinsics
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise ValueError(f"camera {view.camera}: image must be uint8 (H, W, 3 or 4), not {image.shape}")
@@ -77,7 +80,7 @@ def check_view(view: View) -> None:
 
 
 def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
-    """Where a camera that stood still sees something else than before; None where that cannot be said."""
+    """Where a camera sees a change, bool (H, W); None if nothing moved, or the camera did."""
     if before.image.shape != now.image.shape or before.intrinsics != now.intrinsics:
         return None
     if not np.allclose(before.camera_to_world, now.camera_to_world, atol=1e-6):
@@ -94,8 +97,8 @@ def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
     return cv2.dilate(moved, np.ones((size, size), np.uint8)).astype(bool)
 
 
-def remember(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
-    """Take in the newest view of each camera; whether one is new, has moved or has a new lens."""
+def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
+    """Store the newest view of each camera. Returns whether a camera is new, has moved or has a new lens."""
     news = False
     for view in views:
         known = memory.get(view.camera)
@@ -108,13 +111,15 @@ def remember(memory: dict[str, CameraMemory], views: Sequence[View]) -> bool:
         news = news or not stood
         moved = None
         if known is not None:
-            # The same frame decoded once more says nothing new; an equal but newer one says: nothing moved.
-            # What one wrong picture seemed to move would otherwise count as moving for as long as all stands.
+            # The same frame decoded once more is no news; an equal but newer one says that nothing moved.
+            # Otherwise what one wrong picture seemed to move would count as moving while the scene stands.
             again = known.view.shows_ns == view.shows_ns
             same = again and np.array_equal(known.view.image, view.image)
             moved = known.moved if same else moved_pixels(known.view, view)
-        # What a camera sees from elsewhere may be what no other camera has seen: no reason to doubt it.
-        memory[view.camera] = CameraMemory(view, moved, known.credit if known is not None and stood else 0)
+        # A camera that moved may see what no other has seen: that is no reason to refuse it.
+        memory[view.camera] = CameraMemory(
+            view, moved, known.refusals_left if known is not None and stood else 0
+        )
     return news
 
 
@@ -141,7 +146,8 @@ def pack_views(
 ) -> Views:
     """Everything one fit reads. Opaque and transparent pictures may be mixed.
 
-    weights: float32 (H, W) of each view (``trust.weights``); None: all 1.
+    memory: by camera; says which pixels moved.
+    weights: float32 (H, W) of each view (``view_outliers.pixel_weights``); None: all 1.
     """
     packed = pack_cameras(views, box)
     channels = max(v.image.shape[2] for v in views)
@@ -160,8 +166,8 @@ def pack_views(
     return _weighted(packed._replace(pixels=pixels, changed=moved), weight)
 
 
-def leave_out(data: Views, refused: NDArray[np.bool_]) -> Views:
-    """``data`` without the pixels of the views (V,) that are refused."""
+def without_views(data: Views, refused: NDArray[np.bool_]) -> Views:
+    """``data`` with weight 0 for the pixels of the refused views, bool (V,)."""
     if not refused.any():
         return data
     weight = data.weight.copy() if data.weight.size else np.ones(len(data.pixels), np.float32)
@@ -170,8 +176,8 @@ def leave_out(data: Views, refused: NDArray[np.bool_]) -> Views:
     return _weighted(data, weight)
 
 
-def asked_views(data: Views) -> list[int]:
-    """The views that have pixels of more weight than 0."""
+def supervising_views(data: Views) -> list[int]:
+    """The numbers of the views that have pixels of weight above 0."""
     spans = zip(data.first[:-1], data.first[1:])
     return [k for k, (a, b) in enumerate(spans) if not data.weight.size or data.weight[a:b].any()]
 

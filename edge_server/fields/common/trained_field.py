@@ -1,11 +1,10 @@
-"""What representations of an encoding and a small network share: training, rendering, state, cameras.
+"""The base class of representations with an encoding and a small network: training, rendering, state.
 
-One step: chunks of rays are drawn, sampled, rendered and differentiated side by side
-(``kernels.train``); the encoding's gradients are added up by its own kernel; Adam touches what received a
-gradient (``kernels.adam``). Every 8 steps a part of the occupancy grid is refreshed.
+In a step, chunks of rays are drawn, sampled, rendered and differentiated in parallel (``kernels.train``), the
+encoding's gradients are added up by its own kernel, and Adam updates what received a gradient
+(``kernels.adam``). Every 8 steps a part of the occupancy grid is refreshed.
 
-A representation is a subclass that makes, grows and differentiates its encoding (``ngp``, ``tensorf``),
-and the kernels for it (``kernels.model``).
+A subclass makes, grows and differentiates its encoding, and has kernels for it (``kernels.radiance_model``).
 """
 
 from __future__ import annotations
@@ -20,44 +19,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, FitReport, Rendering, View
-from edge_server.fields.common.camera_refinement import CameraErrors
-from edge_server.fields.common.fair_lock import Turn
-from edge_server.fields.common.field_state import all_or_nothing, fill, pack, unpack_meta
+from edge_server.fields.common.camera_refinement import CameraRefinement
+from edge_server.fields.common.fair_lock import FairLock
+from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
 from edge_server.fields.common.kernels.adam import PART, Rule, adam
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.precompile import compile_ahead
 from edge_server.fields.common.kernels.rays import Space, Views
 from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
-from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, Batch, Recipe, Scratch, train_chunks
+from edge_server.fields.common.kernels.train import (
+    CHUNK,
+    CHUNK_RAYS,
+    Batch,
+    RaySampling,
+    Scratch,
+    train_chunks,
+)
 from edge_server.fields.common.kernels.volume_rendering import Weights
-from edge_server.fields.common.occupancy_grid import EVERY, Occupancy
-from edge_server.fields.common.ray_snapshot import NgpSnapshot
-from edge_server.fields.common.scene_box import NOWHERE, SceneBox
-from edge_server.fields.common.supervision import asked_views
+from edge_server.fields.common.occupancy_grid import EVERY, OccupancyGrid
+from edge_server.fields.common.ray_snapshot import RaySnapshot
+from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
+from edge_server.fields.common.supervision import supervising_views
 from edge_server.fields.common.trainer_settings import BATCH
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
     BETA2,
     NOMINAL_RAYS,
-    Pace,
-    Usual,
+    StepBudget,
+    StepTimer,
     step_key,
     step_length,
 )
-from edge_server.fields.common.view_store import Arrays, Rig, same_views
+from edge_server.fields.common.view_store import Arrays, ViewStore, same_views
 from freshfield.geometry import Pinhole
 
 TINY: dict[str, Any] = {"batch_samples": CHUNK, "cells": 16, "samples": 16}  # for compiling kernels
-assert BATCH == CHUNK, "settings and kernels must mean the same by a chunk"
-GUIDED, FEW = 0.1, 6  # the weight of a depth guide, and with how many views it is used in any scene
-SWEEP_SHARE = 0.5  # of a budget in seconds that finding it may take
-DIRTY = 32  # parameters that one dirty flag stands for: what ``adam`` calls a segment, times its width
+assert BATCH == CHUNK, "settings and kernels must agree on the size of a chunk"
+GUIDE_WEIGHT = 0.1  # of a depth guide, where the settings leave it open
+FEW_VIEWS = 6  # with up to so many views, a depth guide is used in any scene
+SWEEP_SHARE = 0.5  # of a budget in seconds that a plane sweep may take
+DIRTY = 32  # parameters for one dirty flag: a segment of ``adam``, times its width
 
 
 class TrainedField:
     """A radiance field that learns while it is used. See ``fields.Field`` for the protocol.
 
-    name: what messages call it. shape: the settings in which a state must agree with the field it is for.
+    name: of the representation. shape: options in which a state and the field that loads it must agree.
 
     ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
     meanwhile: they wait for the end of the present step, some milliseconds.
@@ -68,14 +75,16 @@ class TrainedField:
     _encoding: Any  # a named tuple with a ``table`` of float32 parameters, as kernels.model wants it
     _net: Net
     _batch: Batch
-    _cameras: CameraErrors
-    _occupancy: Occupancy
-    _swept: tuple[tuple[View, ...], NDArray[np.float32]] | None  # views, and what a plane sweep said of them
+    _cameras: CameraRefinement
+    _occupancy: OccupancyGrid
+    _swept: (
+        tuple[tuple[View, ...], NDArray[np.float32]] | None
+    )  # views, and what ``depth_guide`` returned for them
 
     def __init__(self, settings: Any, pool: Pool | None = None) -> None:
         self.settings = settings
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
-        self._turn = Turn()
+        self._lock = FairLock()
         self.now = time.perf_counter  # the clock of budgets in seconds
         self.reset()
 
@@ -83,64 +92,64 @@ class TrainedField:
 
     def reset(self) -> None:
         """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        with self._turn.mine():
+        with self._lock:
             self.dropped = 0
-            self.rig = Rig(self.settings)
-            self._snapshot: NgpSnapshot | None = None
+            self.view_store = ViewStore(self.settings)
+            self._snapshot: RaySnapshot | None = None
             self._forget_parameters()
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Train on ``views`` from the present parameters. Raises ValueError for a view that cannot be one.
+        """Train on ``views`` from the present parameters. ValueError for an impossible view.
 
-        In a budget in seconds, no step begins that would end too late as steps usually go. New pictures are
-        taken in first, however short it is. The learning rate falls over the budget, so every
-        fit ends with a settled field.
+        New pictures are always taken in, however short the budget. With a budget in seconds, no step begins
+        that would probably end too late. The learning rate falls over the budget, so that every fit ends with
+        a settled field.
         """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace = Pace(budget, self.now)
-        with self._turn.mine():
-            intake = self.rig.take_in(views)
-            if intake.new_box:
+        step_budget = StepBudget(budget, self.now)
+        with self._lock:
+            intake = self.view_store.add(views)
+            if intake.box_changed:
                 self._forget_parameters()
-            if intake.look:
-                self._occupancy.look(self.pool, self.rig)
-            assert self.rig.box is not None
-            box, cameras = self.rig.box, self._cameras
+            if intake.visibility_changed:
+                self._occupancy.recount_views(self.pool, self.view_store)
+            assert self.view_store.box is not None
+            box, cameras = self.view_store.box, self._cameras
             data = intake.data
-            if not cameras.asked:
-                data = self.rig.trusted(views, intake, self.step, self._live())
+            if not cameras.enabled:
+                data = self.view_store.without_outliers(views, intake, self.step, self._live())
             data = cameras.corrected(views, data, box)
-            data = self._guided(views, data, box, pace, intake.fresh)
+            data = self._add_depth_guide(views, data, box, step_budget, intake.has_new_images)
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
             self._batch = self._batch._replace(exposure=sums)
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
-        while (progress := pace.begin(self._usual)) is not None:
-            with self._turn.mine():
+        while (progress := step_budget.begin_step(self._step_timer)) is not None:
+            with self._lock:
                 losses.append(self._one_step(data, progress))
                 data = cameras.learn(views, data, box, self.step, self.settings.seed, sums, self._live)
                 rays += int(self._batch.rays.sum())
                 samples += int(self._batch.samples.sum())
                 dropped += int(self._batch.dropped.sum() + self._dropped_by_task.sum())
-            pace.end()
+            step_budget.end_step()
         self.dropped += dropped
         loss = float(np.mean(losses)) if losses else 0.0
-        refused = self.rig.left_out_of(views)
-        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped, refused)
+        refused = self.view_store.refused_among(views)
+        return FitReport(step_budget.steps, step_budget.elapsed_s(), loss, rays, samples, dropped, refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """The picture of a camera, from the present parameters."""
+        """Render a camera from the present parameters."""
         return self.snapshot().render(camera_to_world, intrinsics)
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world metres and their colours; none before the first fit."""
+        """Surface points in world metres and their colors; none before the first fit."""
         return self.snapshot().points(count)
 
-    def snapshot(self, present_ns: int | None = None) -> NgpSnapshot:
+    def snapshot(self, present_ns: int | None = None) -> RaySnapshot:
         """A copy that renders from any thread and never changes."""
-        with self._turn.mine():
+        with self._lock:
             if self._snapshot is None or self._snapshot.step != self.step:
                 live = self._live()
                 self._snapshot = replace(
@@ -155,31 +164,31 @@ class TrainedField:
                 )
             return self._snapshot
 
-    def _live(self) -> NgpSnapshot:
-        """A renderer of the living arrays, for whoever has the turn."""
-        return NgpSnapshot(
-            box=self.rig.box or NOWHERE,
+    def _live(self) -> RaySnapshot:
+        """A renderer of the present arrays, without copies, for the holder of the lock."""
+        return RaySnapshot(
+            box=self.view_store.box or UNIT_BOX,
             encoding=self._encoding,
             levels=self._levels(),
             net=self._net,
             harmonics=self.settings.harmonics,
             space=self._occupancy.space(step_length(self.settings, self.step)),
-            background=self.rig.background(),
-            cameras=self.rig.views,
+            background=self.view_store.background(),
+            cameras=self.view_store.views,
             pool=self.pool,
             step=self.step,
         )
 
     def warm_up(self) -> float:
-        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
+        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds.
 
-        Works on small fields of its own, in the calling thread and at its priority: the workers' low one
-        would make compiling on a busy machine take minutes. This field's state is not touched.
+        Trains small fields of its own, in the calling thread and at its priority: at the workers' low one,
+        compiling on a busy machine takes minutes. This field's state is not touched.
         """
-        return compile_ahead(self._tour)
+        return compile_ahead(self._run_kernels)
 
-    def _tour(self, pool: Pool) -> None:
-        """Go through every kernel once."""
+    def _run_kernels(self, pool: Pool) -> None:
+        """Run every kernel once."""
         tiny = self._tiny()
         camera = Pinhole.from_fov(8, 8, 60.0)
         pose = np.eye(4)
@@ -195,7 +204,7 @@ class TrainedField:
 
     def state(self) -> Arrays:
         """Everything needed to go on bit for bit: parameters, moments, occupancy, cameras, counters."""
-        with self._turn.mine():
+        with self._lock:
             counters = {
                 "step": self.step,
                 "updates": self._updates,
@@ -203,21 +212,21 @@ class TrainedField:
                 "needed": self._occupancy.needed,
                 "camera_errors": self._cameras.meta(),
             }
-            return pack(self.name, self.settings, self.rig, counters, self._arrays())
+            return pack_state(self.name, self.settings, self.view_store, counters, self._arrays())
 
     def load_state(self, state: Arrays) -> None:
-        """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        with self._turn.mine(), all_or_nothing(self):
+        """Continue from ``state``. ValueError: it is not the state of a field of this shape."""
+        with self._lock, all_or_nothing(self):
             meta = unpack_meta(self.settings, state, self.name, self.shape)
-            self.rig = Rig(self.settings)
-            self.rig.load(meta, state)
+            self.view_store = ViewStore(self.settings)
+            self.view_store.load(meta, state)
             self._forget_parameters()
             self.step, self._updates = int(meta["step"]), int(meta["updates"])
             self._grow()
-            fill(self._arrays(), state)
+            load_arrays(self._arrays(), state)
             self._cameras.load(meta.get("camera_errors", {}))
             self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
-            self._occupancy.mark()
+            self._occupancy.update_occupied()
             self._snapshot = None
 
     def _arrays(self) -> Arrays:
@@ -236,15 +245,15 @@ class TrainedField:
     # --- what a representation is -------------------------------------------------------------
 
     def _make(self, rng: np.random.Generator) -> tuple[Any, Net]:
-        """A fresh encoding and network for ``self.rig.box`` (None: no scene yet)."""
+        """A fresh encoding and network for ``self.view_store.box`` (None: no scene yet)."""
         raise NotImplementedError
 
     def _tiny(self) -> Any:
-        """The settings with everything small: what ``warm_up`` compiles the kernels with."""
+        """Small settings, with which ``warm_up`` compiles the kernels."""
         return replace(self.settings, **TINY)
 
     def _levels(self) -> int:
-        """The part of the encoding that is switched on, as its kernels count it."""
+        """How many levels of the encoding are in use."""
         return 1
 
     def _feature_rows(self) -> int:
@@ -252,46 +261,48 @@ class TrainedField:
         return int(self._net.widths[0])
 
     def _grow(self) -> None:
-        """Bring the encoding to the size it has at ``self.step``: called after every step."""
+        """Give the encoding the size it has at ``self.step``; called after every step."""
 
-    def _train(self, data: Views, recipe: Recipe, space: Space, weights: Weights) -> None:
-        """Fill ``self._batch`` and the gradients in it from one step's rays."""
+    def _train(self, data: Views, recipe: RaySampling, space: Space, weights: Weights) -> None:
+        """Fill ``self._batch``, gradients included, from one step's rays."""
         self.pool.run(
             train_chunks, data, recipe, space, self._encoding, self._net, weights, self._batch, self._scratch
         )
 
     def _gather(self, levels: int, scale: float) -> None:
-        """Add the encoding's gradient of the present batch to ``self._table_g``, set ``self._dirty``.
+        """Add the encoding's gradient of ``self._batch`` to ``self._table_g`` and set ``self._dirty``.
 
-        scale: what Adam will multiply it with.
+        scale: by which Adam will multiply it.
         """
         raise NotImplementedError
 
-    def _guided(self, views: Sequence[View], data: Views, box: SceneBox, pace: Pace, fresh: bool) -> Views:
-        """``data`` with what a plane sweep says about depth, if that is called for and fits the budget."""
+    def _add_depth_guide(
+        self, views: Sequence[View], data: Views, box: SceneBox, step_budget: StepBudget, fresh: bool
+    ) -> Views:
+        """``data`` with a depth guide, if the settings ask for one and a plane sweep fits the budget."""
         s = self.settings
         weight = s.depth_guide
         if weight is None:
-            # Rooms that many cameras look into are as good without, sooner or later.
-            plain = self.rig.plain and s.background == "auto"
-            weight = GUIDED if plain or len(asked_views(data)) <= FEW else 0.0
-        # Colours and poses that are still to be learnt do not agree.
-        self._guide_weight = 0.0 if self._cameras.asked else weight
-        if self._guiding() == 0.0:
+            # With many cameras in a room, a field is as good without a guide, sooner or later.
+            plain = self.view_store.background_is_plain and s.background == "auto"
+            weight = GUIDE_WEIGHT if plain or len(supervising_views(data)) <= FEW_VIEWS else 0.0
+        # Cameras do not agree while their exposures and poses are still to be learned.
+        self._guide_weight = 0.0 if self._cameras.enabled else weight
+        if self._present_guide_weight() == 0.0:
             return data
         if fresh or self._swept is None or not same_views(views, self._swept[0]):
-            if not pace.has_room(self._usual_sweep.seconds, SWEEP_SHARE, self._usual.seconds):
+            if not step_budget.has_room(self._sweep_timer.seconds, SWEEP_SHARE, self._step_timer.seconds):
                 return data
-            # Only where it is called for: other scenes shall neither load nor compile what they do not use.
-            from edge_server.fields.common.plane_sweep import guide
+            # Imported here: other scenes need neither load nor compile it.
+            from edge_server.fields.common.plane_sweep import depth_guide
 
             begun = self.now()
-            self._swept = (tuple(views), guide(s, self.pool, box, views, data))
-            self._usual_sweep.took(self.now() - begun)
+            self._swept = (tuple(views), depth_guide(s, self.pool, box, views, data))
+            self._sweep_timer.add(self.now() - begun)
         return data._replace(guide=self._swept[1])
 
-    def _guiding(self) -> float:
-        """The present weight of what a plane sweep says about depth."""
+    def _present_guide_weight(self) -> float:
+        """The weight of the depth guide at this step."""
         return float(self._guide_weight * max(1.0 - self.step / self.settings.guide_steps, 0.0))
 
     # --- inside -------------------------------------------------------------------------------
@@ -300,16 +311,16 @@ class TrainedField:
         s = self.settings
         rng = np.random.default_rng(np.random.SeedSequence(s.seed))
         self.step = 0
-        self._snapshot = None  # it is known by its step alone
-        self._updates = 0  # optimiser steps that Adam's bias correction counts
-        self._usual, self._usual_sweep = Usual(), Usual()
+        self._snapshot = None  # it is identified by its step alone
+        self._updates = 0  # optimizer steps that Adam's bias correction counts
+        self._step_timer, self._sweep_timer = StepTimer(), StepTimer()
         self._guide_weight = 0.0
         self._swept = None
         self._encoding, self._net = self._make(rng)
         self._take_table(self._encoding.table)
         self._net_m, self._net_v, self._net_g = (np.zeros_like(self._net.params) for _ in range(3))
-        self._occupancy = Occupancy.for_box(s, self.rig.box)
-        self._cameras = CameraErrors(s.exposure, s.refine_m, s.refine_deg)
+        self._occupancy = OccupancyGrid.for_box(s, self.view_store.box)
+        self._cameras = CameraRefinement(s.exposure, s.refine_m, s.refine_deg)
         chunks, workers = max(s.batch_samples // CHUNK, 1), self.pool.threads
         units = int(self._net.widths.sum())
         self._batch = Batch(
@@ -327,24 +338,24 @@ class TrainedField:
             acts=np.zeros((workers, units, CHUNK), np.float32),
             d_acts=np.zeros((workers, units, CHUNK), np.float32),
             line=np.zeros((workers, 2, CHUNK), np.float32),
-            laid=np.zeros((workers, 11, CHUNK), np.float32),
+            by_ray=np.zeros((workers, 11, CHUNK), np.float32),
             column=np.zeros((workers, CHUNK), np.int64),
             ray_first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
             ray=np.zeros((workers, CHUNK_RAYS, 12), np.float32),
-            way=np.zeros((workers, CHUNK_RAYS, 3), np.float32),
-            piece=np.zeros((workers, CHUNK, 4), np.int64),
+            travel=np.zeros((workers, CHUNK_RAYS, 3), np.float32),
+            span=np.zeros((workers, CHUNK, 4), np.int64),
         )
         self._scratch_x = np.zeros((workers, 3, CHUNK), np.float32)
 
     def _take_table(self, table: NDArray[np.float32]) -> None:
-        """Make room for the moments and gradients of a table."""
+        """Allocate the moments and gradients of a table."""
         self._table_m, self._table_v, self._table_g = (np.zeros_like(table) for _ in range(3))
         self._dirty = np.zeros(table.size // DIRTY, np.bool_)
         self._dropped_by_task = np.zeros(1 + -(-self._dirty.size // PART), np.int64)
 
     def _one_step(self, data: Views, progress: float) -> float:
-        """One optimiser step; returns its mean squared error. progress: of the fit, in [0, 1]."""
-        s, levels, box = self.settings, self._levels(), self.rig.box
+        """One optimizer step; returns its mean squared error. progress: of the fit, in [0, 1]."""
+        s, levels, box = self.settings, self._levels(), self.view_store.box
         assert box is not None
         key = step_key(s.seed, self.step)
         if self.step % EVERY == 0:
@@ -354,20 +365,20 @@ class TrainedField:
             )  # fmt: skip
         space: Space = self._occupancy.space(step_length(self.settings, self.step))
         batch = self._batch
-        recipe = Recipe(
+        recipe = RaySampling(
             key=np.uint64(key + np.uint64(1)),
             chunk_rays=max(s.rays // batch.samples.size, 1),
             levels=levels,
             harmonics=s.harmonics,
             changed_share=np.float32(s.changed_share),
-            background=self.rig.background(),
+            background=self.view_store.background(),
             random_background=s.background == "random",
         )
         weights = Weights(
             distortion=np.float32(s.distortion),
             sparsity=np.float32(s.sparsity),
             near=np.float32(s.near_fade * box.distance_m / box.radius_m),
-            guide=np.float32(self._guiding()),
+            guide=np.float32(self._present_guide_weight()),
         )
         self._train(data, recipe, space, weights)
         rays = max(int(batch.rays.sum()), 1)
@@ -401,7 +412,7 @@ class TrainedField:
         return float(batch.loss.sum()) / (3 * rays)
 
     def _repair(self) -> None:
-        """Set to zero whatever is not finite: rays that meet it give no gradient that would lead there."""
+        """Set parameters and moments that are not finite to zero: rays that meet them give no gradient."""
         arrays = (self._encoding.table, self._table_m, self._table_v)
         for array in (*arrays, self._net.params, self._net_m, self._net_v):
             np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)

@@ -1,4 +1,4 @@
-"""Settings that all representations of ``trained_field`` share; their texts become help and messages."""
+"""Settings that representations share; their texts become help and error messages."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ def option(default: Any, text: str) -> Any:
     return field(default=default, metadata={"help": text})
 
 
-# The bounds of the options of ``trust``, which ``splat`` has too: (option, low, high) each.
-TRUST_BOUNDS = (
+# Bounds that other families of settings share: (option, low, high) each.
+VIEW_WEIGHT_BOUNDS = (
     ("age_tau_ms", 0.0, 1e9),
     ("mask_stale_ms", 0.0, 1e9),
     ("mask_grow_px_s", 0.0, 1e6),
     ("refuse_beyond", 0.0, 1e6),
 )
-# The same of options that ``splat`` has, too. Adam divides by epsilon where there is no gradient to speak of.
+# Adam divides by epsilon where there is no gradient to speak of.
 COMMON_BOUNDS = (
     ("min_views", 0, 1000),
     ("rate_end", 1e-4, 1.0),
@@ -28,10 +28,10 @@ COMMON_BOUNDS = (
     ("changed_share", 0.0, 1.0),
     ("seed", 0, (1 << 63) - 1),
     ("nice", 0, 19),
-    *TRUST_BOUNDS,
+    *VIEW_WEIGHT_BOUNDS,
 )
 MOST_THREADS = 1024
-BATCH = 2048  # samples of a chunk of ``kernels.train``, which is not imported for a number
+BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class TrainerSettings:
 
     hidden: int = option(32, "units of each hidden layer, a multiple of 4")
     hidden_layers: int = option(1, "hidden layers of the network")
-    harmonics: int = option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
+    harmonics: int = option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
     rays: int = option(4096, "rays of one step at most")
     batch_samples: int = option(16384, "samples of one step at most, a multiple of 2048")
     samples: int = option(192, "steps across the scene's box, corner to corner")
@@ -53,7 +53,7 @@ class TrainerSettings:
     radius_m: float | None = option(None, "half the side of the scene's box")
     near_m: float | None = option(None, "no density is seen nearer to a camera than this")
     contracted: bool | None = option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
-    background: str = option("auto", "auto (plain, or the mean colour), white, black, random, or '#rrggbb'")
+    background: str = option("auto", "auto (plain, or the mean color), white, black, random, or '#rrggbb'")
     min_views: int = option(2, "no density where fewer cameras than this look (never more than there are)")
     rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
     rate_end: float = option(0.1, "share of the learning rate that is left at the end of a fit")
@@ -78,7 +78,7 @@ class TrainerSettings:
     refuse_beyond: float = option(
         2.5,
         "a view is refused whose typical error is so many times the usual one; 0, or while cameras' "
-        "errors are learnt: none is",
+        "errors are learned: none is",
     )
     exposure: bool = option(False, "whether to learn each camera's exposure (gain and bias a channel)")
     refine_m: float = option(0.0, "by how much a camera's given position may be corrected; 0: not at all")
@@ -125,7 +125,7 @@ class TrainerSettings:
         named = self.background in ("auto", "white", "black", "random")
         if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
             raise ValueError(
-                f"{name}: background must be auto, white, black, random or a colour like '#80c0ff', "
+                f"{name}: background must be auto, white, black, random or a color like '#80c0ff', "
                 f"not {self.background!r}"
             )
         for length in ("radius_m", "near_m"):
@@ -139,17 +139,49 @@ class TrainerSettings:
                 raise ValueError(f"{self.name}: {key} must be in {low}..{high}, not {getattr(self, key)}")
 
 
+@dataclass(frozen=True)
+class HashGridSettings(TrainerSettings):
+    """What representations with a hash grid add. Lengths in metres; None means: found from the cameras."""
+
+    levels: int = option(8, "levels of the hash grid, coarse to fine")
+    log2_table: int = option(16, "largest number of vertices a level stores, as a power of two")
+    base_resolution: int = option(16, "cells a side of the coarsest level")
+    finest_resolution: int | None = option(None, "cells a side of the finest level; None: about a pixel")
+    rate: float = option(8e-2, "learning rate of the hash tables at the start of a fit")
+    rate_net: float = option(3e-2, "learning rate of the network at the start of a fit")
+    decay: float = option(0.0, "pull of the tables' entries towards zero, per step and rate")
+    smooth: float = option(1.5e-3, "weight of the total variation of the levels that are not hashed")
+    levels_start: int = option(4, "levels in use at first; the finer ones follow (coarse to fine)")
+    levels_every: int = option(30, "steps after which one more level is switched on")
+    samples_start: int = option(32, "``samples`` at first: fog is cheaper to see through in long steps")
+
+    def __post_init__(self) -> None:
+        self._within(
+            ("levels", 1, 24),
+            ("log2_table", 8, 24),
+            ("base_resolution", 2, 512),
+            ("levels_start", 1, 24),
+            ("levels_every", 0, 1 << 30),
+            ("rate", 0.0, 10.0),
+            ("decay", 0.0, 1e3),
+            ("smooth", 0.0, 1e3),
+        )
+        if self.finest_resolution is not None:
+            self._within(("finest_resolution", 2, 4096))
+        super().__post_init__()
+
+
 Settings = TypeVar("Settings", bound=TrainerSettings)
 
 
-def shared_option(name: str) -> Any:
-    """The option ``name`` as all of these representations have it, for settings of another family."""
+def copy_option(name: str) -> Any:
+    """The option ``name`` of ``TrainerSettings``, for settings of another family."""
     known = TrainerSettings.__dataclass_fields__[name]
     return option(known.default, known.metadata["help"])
 
 
 def option_names(kind: type[TrainerSettings]) -> list[str]:
-    """The options of a settings class, its own before those that all have."""
+    """The options of a settings class, its own before those of ``TrainerSettings``."""
     common = [f.name for f in fields(TrainerSettings)]
     return [f.name for f in fields(kind) if f.name not in common] + common
 
@@ -157,9 +189,12 @@ def option_names(kind: type[TrainerSettings]) -> list[str]:
 def settings_from(
     kind: type[Settings], efforts: Mapping[str, Mapping[str, Any]], options: Mapping[str, Any], seed: int
 ) -> Settings:
-    """Settings from plain options (a scenario's ``field`` section). ``effort``, a name of ``efforts``,
-    chooses a preset that the other options override. ValueError names an unknown option and lists the
-    valid ones."""
+    """Settings from plain options (a scenario's ``field`` section).
+
+    kind: the settings class. efforts: preset -> its options. options: override those of the preset that
+    their ``effort`` names ("medium" by default). seed: of the field, unless ``options`` has one.
+    ValueError: unknown option or effort (the message lists the known ones), or a value out of range.
+    """
     given = dict(options)
     effort = given.pop("effort", "medium")
     if effort not in efforts:

@@ -1,9 +1,9 @@
-"""How far each pixel of each view is to be trusted: a stale view is only wrong where something moved.
+"""How much each pixel of each view counts, and which views are refused as outliers.
 
-Every representation multiplies a pixel's loss by these weights. A view may bring its own (``View.weight``:
-what a policy's treatment made of a stale view). Two options make others, both off by default: ``age_tau_ms``
-trusts a view less the older it is, ``mask_stale_ms`` leaves out of an old view what was moving when it was
-taken. They are multiplied. ``refused`` is for pictures that cannot be of this scene at all.
+Every representation multiplies a pixel's loss by its weight, the product of three factors:
+``View.weight`` (what a policy's treatment made of a stale view), ``age_tau_ms`` (older views count less) and
+``mask_stale_ms`` (an old view does not teach what was moving when it was taken). The two options are off by
+default. ``find_outliers`` is for pictures that cannot be of this scene at all.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.supervision import CameraMemory
 
-JUDGES = 4  # views a set needs before the others can outvote one
-RASTER = 8  # pixels a side of the raster that a view is judged by
-LEAST_ERROR = 0.1  # nothing is refused for less, in [0, 1]: a well-learnt scene has small usual errors
-AGREES = 1.5  # times the usual error with which a view agrees
-PATIENCE = 20  # refusals in a row
+LEAST_VIEWS = 4  # views a set needs before the others can outvote one
+GRID = 8  # pixels a side of the grid that a view is judged by
+LEAST_ERROR = 0.1  # no view is refused for less, in [0, 1]: a well-learned scene has small usual errors
+AGREEMENT = 1.5  # times the usual error up to which a view agrees with the field
+MOST_REFUSALS = 20  # in a row
+
+# (views, image points (N, 2) of each) -> the colors (N, 3) that a field renders there, of each.
+RenderPoints = Callable[[Sequence[View], Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float32]]]
 
 
-# What a field shows of each view at image points (N, 2): colours (N, 3).
-Pixels = Callable[[Sequence[View], Sequence[NDArray[np.float64]]], Sequence[NDArray[np.float32]]]
-
-
-class TrustSettings(Protocol):
+class ViewWeightSettings(Protocol):
     """The options that are read here; ``TrainerSettings`` says what they mean."""
 
     @property
@@ -39,107 +39,97 @@ class TrustSettings(Protocol):
     def mask_grow_px_s(self) -> float: ...
 
 
-class Remembered(Protocol):
-    """A camera's newest view and the pixels that moved in it: bool (H, W), None where that is unknown."""
-
-    @property
-    def view(self) -> View: ...
-    @property
-    def moved(self) -> NDArray[np.bool_] | None: ...
-
-
-class Credited(Protocol):
-    """What is known of a camera's credit: ``supervision.CameraMemory``."""
-
-    credit: int
-
-
-def weights(
-    views: Sequence[View], memory: Mapping[str, Remembered], settings: TrustSettings
+def pixel_weights(
+    views: Sequence[View], memory: Mapping[str, CameraMemory], settings: ViewWeightSettings
 ) -> list[NDArray[np.float32]] | None:
-    """A weight in [0, 1] for each pixel of each view, float32 (H, W); None: all of them count in full.
+    """A weight in [0, 1] for each pixel of each view, float32 (H, W); None: all pixels count in full.
 
-    Ages are differences of ``shows_ns`` to the newest view of the set: that view is always trusted whole, and
-    one that was carried forward to the present is not doubted for an age that it no longer has. What moved
-    is known of cameras that stood still between their own last two views. Of one that was moving, or that
-    has sent a single view, it is unknown: its views are not masked, since a field of few views loses more
-    with a whole view than through what moved in it, and are weighed by age alone.
+    An age is the difference of ``shows_ns`` to the newest view of the set. The newest view therefore counts
+    in full, and a view that was carried forward to the present has no age. What moved is known only of
+    cameras that stood still between their last two views. Other views are not masked but weighted by age
+    alone: a field of few views loses more with a whole view than through what moved in it.
     """
     tau_ms, stale_ms = settings.age_tau_ms, settings.mask_stale_ms
     if not views or (tau_ms <= 0.0 and stale_ms <= 0.0 and all(view.weight is None for view in views)):
         return None
     newest_ns = max(view.shows_ns for view in views)
-    result, whole = [], True
+    result, all_ones = [], True
     for view in views:
         age_ms = (newest_ns - view.shows_ns) / 1e6
-        trust = np.exp(-age_ms / tau_ms) if tau_ms > 0.0 else 1.0
-        weight = np.full(view.image.shape[:2], trust, np.float32)
+        by_age = np.exp(-age_ms / tau_ms) if tau_ms > 0.0 else 1.0
+        weight = np.full(view.image.shape[:2], by_age, np.float32)
         known = memory.get(view.camera)
         moved = known.moved if known is not None and known.view is view else None
         if moved is not None and 0.0 < stale_ms < age_ms:
-            weight[_grown(moved, settings.mask_grow_px_s * age_ms / 1e3)] = 0.0
+            weight[_dilated(moved, settings.mask_grow_px_s * age_ms / 1e3)] = 0.0
         if view.weight is not None:
             weight *= view.weight
-        whole = whole and bool((weight == 1.0).all())
+        all_ones = all_ones and bool((weight == 1.0).all())
         result.append(weight)
-    return None if whole else result
+    return None if all_ones else result
 
 
-def refused(
+def find_outliers(
     views: Sequence[View],
-    memory: Mapping[str, Credited],
+    memory: Mapping[str, CameraMemory],
     beyond: float,
     settled: bool,
-    pixels: Pixels,
+    render_points: RenderPoints,
 ) -> NDArray[np.bool_]:
-    """Which views (V,) contradict the field so much that they are to be left out of this fit.
+    """Which views contradict the field so much that this fit leaves them out: bool (V,).
 
-    A view contradicts when half of it is off by more than ``beyond`` times what is usual for the views of
-    the set (0: none ever does): a picture of noise, of another scene, of nothing. What moves through a
-    picture does not reach that. It is refused only where an earlier view from the same place agreed, so a
-    camera that sees what no other does is learnt; only ``PATIENCE`` times, for then the scene must have
-    changed; and never more than a quarter of the views. settled: whether the field knows enough to agree
-    with. pixels: what it shows. Updates the credits in ``memory``.
+    A view contradicts when half of it is off by more than ``beyond`` times what is usual for the set: a
+    picture of noise, of another scene, of nothing. What moves through a picture does not reach that. A view
+    is refused only where an earlier one from the same place agreed (a camera that sees what no other does is
+    learned from), only ``MOST_REFUSALS`` times in a row (then the scene must have changed), and never
+    together with more than a quarter of the views.
+
+    views: of this fit; each has an entry in ``memory``.
+    memory: ``refusals_left`` of its entries is updated.
+    beyond: times the usual error; 0: no view is refused.
+    settled: whether the field has learned enough to be agreed with.
+    render_points: what the field renders.
     """
-    none = np.zeros(len(views), np.bool_)
-    if beyond <= 0.0 or not settled or len(views) < JUDGES:
-        return none
-    shown = pixels(views, [_raster(view) for view in views])
-    off = np.array([_typical_error(view, colors) for view, colors in zip(views, shown)])
-    # No less than this: where half of every picture is plain sky, shown exactly, no view else would agree.
-    usual = max(float(np.median(off)), LEAST_ERROR / beyond)
-    contradicts = off > beyond * usual
+    refused = np.zeros(len(views), np.bool_)
+    if beyond <= 0.0 or not settled or len(views) < LEAST_VIEWS:
+        return refused
+    rendered = render_points(views, [_grid_points(view) for view in views])
+    errors = np.array([_typical_error(view, colors) for view, colors in zip(views, rendered)])
+    # The lower bound matters where half of every picture is plain sky, rendered exactly: no other view
+    # would agree.
+    usual = max(float(np.median(errors)), LEAST_ERROR / beyond)
+    contradicts = errors > beyond * usual
     few = 4 * contradicts.sum() <= len(views)
     for k, view in enumerate(views):
         known = memory[view.camera]
-        if off[k] <= AGREES * usual:
-            known.credit = PATIENCE
-        elif contradicts[k] and few and known.credit > 0:
-            known.credit -= 1
-            none[k] = True
-    return none
+        if errors[k] <= AGREEMENT * usual:
+            known.refusals_left = MOST_REFUSALS
+        elif contradicts[k] and few and known.refusals_left > 0:
+            known.refusals_left -= 1
+            refused[k] = True
+    return refused
 
 
-def _raster(view: View) -> NDArray[np.float64]:
-    """The centres (N, 2) of the pixels that a view is judged by."""
+def _grid_points(view: View) -> NDArray[np.float64]:
+    """The centers (N, 2) of the pixels that a view is judged by."""
     height, width = view.image.shape[:2]
-    middle = (np.arange(RASTER) + 0.5) / RASTER
+    middle = (np.arange(GRID) + 0.5) / GRID
     column, row = np.meshgrid(np.floor(middle * width), np.floor(middle * height))
     return np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=-1)
 
 
-def _typical_error(view: View, shown: NDArray[np.float32]) -> float:
-    """The median over the raster of how far the field (N, 3) is off in the worst channel, in [0, 1]."""
-    column, row = _raster(view).astype(np.int64).T
+def _typical_error(view: View, rendered: NDArray[np.float32]) -> float:
+    """The median over the grid of the error of the worst channel, in [0, 1]. rendered: (N, 3)."""
+    column, row = _grid_points(view).astype(np.int64).T
     taken = view.image[row, column].astype(np.float32) / 255.0
-    off = np.abs(shown - taken[:, :3]).max(axis=1)
+    off = np.abs(rendered - taken[:, :3]).max(axis=1)
     if taken.shape[1] == 4:
-        off *= taken[:, 3]  # what is cut away is not the field's business
+        off *= taken[:, 3]  # transparent pixels are not judged
     return float(np.median(np.nan_to_num(off, nan=1.0)))
 
 
-def _grown(mask: NDArray[np.bool_], by_px: float) -> NDArray[np.bool_]:
-    """The mask dilated by so many pixels to each side: what moved has moved on since."""
+def _dilated(mask: NDArray[np.bool_], by_px: float) -> NDArray[np.bool_]:
+    """The mask grown by so many pixels to each side: what moved has moved on since."""
     margin = int(min(round(by_px), max(mask.shape)))
     if margin < 1:
         return mask

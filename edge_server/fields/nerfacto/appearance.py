@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.camera_refinement import CameraErrors
+from edge_server.fields.common.camera_refinement import CameraRefinement
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.ray_snapshot import NgpSnapshot
+from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.training_schedule import BETA1, BETA2
 
@@ -70,7 +70,7 @@ class Appearances:
             known[0] -= mean
 
 
-class CameraLooks(CameraErrors):
+class CameraLooks(CameraRefinement):
     """What one field knows of its cameras: errors (``refinement``) and, where asked for, appearances.
 
     now: float32 (V, A), the embeddings of the views in training. gradient: float32 (chunks, V, A), filled
@@ -84,9 +84,9 @@ class CameraLooks(CameraErrors):
         self.gradient, self.rays = np.zeros((0, 0, 0), np.float32), 0
 
     @property
-    def asked(self) -> bool:
+    def enabled(self) -> bool:
         """Whether any error or look is to be learnt."""
-        return super().asked or self.appearances is not None
+        return super().enabled or self.appearances is not None
 
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
         """``data`` as it is to be read with what is known by now; takes note of the embeddings."""
@@ -98,7 +98,7 @@ class CameraLooks(CameraErrors):
 
     def learn(
         self, views: Sequence[View], data: Views, box: SceneBox, step: int, seed: int,
-        sums: NDArray[np.float64], live: Callable[[], NgpSnapshot],
+        sums: NDArray[np.float64], live: Callable[[], RaySnapshot],
     ) -> Views:  # fmt: skip
         """After ``step``: learn from it; returns the corrected data."""
         if self.appearances is not None:

@@ -17,10 +17,10 @@ from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid,
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
 from edge_server.fields.common.kernels.thread_pool import Pool
-from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, Recipe
+from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, RaySampling
 from edge_server.fields.common.kernels.volume_rendering import Weights
-from edge_server.fields.common.model_layout import first_net, make_grid
-from edge_server.fields.common.ray_snapshot import NgpSnapshot
+from edge_server.fields.common.model_layout import init_net, make_grid
+from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.trained_field import TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
@@ -33,7 +33,7 @@ from freshfield.geometry import Pinhole
 
 
 @dataclass(frozen=True)
-class NerfactoSnapshot(NgpSnapshot):
+class NerfactoSnapshot(RaySnapshot):
     """A snapshot that is rendered with samples from its proposal, at the mean appearance."""
 
     plan: Plan
@@ -91,11 +91,11 @@ class NerfactoField(TrainedField):
 
     def _make(self, rng: np.random.Generator) -> tuple[Proposed, Net]:
         s = self.settings
-        grid = make_grid(s, self.rig.box, rng)
+        grid = make_grid(s, self.view_store.box, rng)
         per_segment = SEGMENT * FEATURES
         rows = -(-(s.proposal_cells**3) // per_segment) * SEGMENT
         table = np.concatenate([grid.table, np.zeros((rows, FEATURES), np.float32)])
-        net = first_net(FEATURES * s.levels, s, rng, s.appearance)
+        net = init_net(FEATURES * s.levels, s, rng, s.appearance)
         return Proposed(grid.resolution, grid.first, grid.dense, table, s.proposal_cells), net
 
     def _tiny(self) -> NerfactoSettings:
@@ -137,7 +137,7 @@ class NerfactoField(TrainedField):
             decay=np.float32(s.proposal_decay),
         )
 
-    def _train(self, data: Views, recipe: Recipe, space: Space, weights: Weights) -> None:
+    def _train(self, data: Views, recipe: RaySampling, space: Space, weights: Weights) -> None:
         cameras, bins = self._cameras, self._bins
         if bins.looks.shape[1:] != cameras.now.shape:
             bins = self._bins = bins._replace(

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from edge_server.fields.common.trainer_settings import help_of, option, settings_from
-from edge_server.fields.ngp.settings import NgpSettings
+from edge_server.fields.common.trainer_settings import HashGridSettings, help_of, option, settings_from
 
 
 @dataclass(frozen=True)
-class NerfactoSettings(NgpSettings):
+class NerfactoSettings(HashGridSettings):
     """What can be chosen about a ``NerfactoField``. Lengths in metres; None: found from the cameras."""
 
     name = "nerfacto"

@@ -14,7 +14,7 @@ from edge_server.fields import Field
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.thread_pool import Pool
-from edge_server.fields.common.model_layout import make_grid, make_net
+from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings, make_settings
@@ -38,7 +38,9 @@ class NgpField(TrainedField):
         return grid
 
     def _make(self, rng: np.random.Generator) -> tuple[Grid, Net]:
-        return make_grid(self.settings, self.rig.box, rng), make_net(self.settings, rng)
+        return make_grid(self.settings, self.view_store.box, rng), init_net(
+            FEATURES * self.settings.levels, self.settings, rng
+        )
 
     def _tiny(self) -> NgpSettings:
         return replace(self.settings, **TINY, log2_table=10)

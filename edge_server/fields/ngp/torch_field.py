@@ -20,25 +20,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.fields import Budget, FitReport, Rendering, View
-from edge_server.fields.common.field_state import all_or_nothing, fill, pack, unpack_meta
+from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
 from edge_server.fields.common.kernels.adam import GRADIENT_LIMIT, PARAMETER_LIMIT
+from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.rays import HORIZON, Views
 from edge_server.fields.common.kernels.thread_pool import shared_pool
-from edge_server.fields.common.model_layout import make_grid, make_net
-from edge_server.fields.common.occupancy_grid import EVERY, FADE, Occupancy
+from edge_server.fields.common.model_layout import init_net, make_grid
+from edge_server.fields.common.occupancy_grid import EVERY, FADE, OccupancyGrid
 from edge_server.fields.common.ray_snapshot import surface_points
-from edge_server.fields.common.scene_box import NOWHERE, SceneBox
+from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
     BETA2,
     NOMINAL_RAYS,
-    Pace,
-    Usual,
+    StepBudget,
+    StepTimer,
     active_levels,
     step_key,
     step_length,
 )
-from edge_server.fields.common.view_store import Arrays, Rig
+from edge_server.fields.common.view_store import Arrays, ViewStore
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
 from edge_server.fields.ngp.torch_model import TorchGrid, encode, mlp, ray_losses, shade, to_torch, weights_of
 from freshfield.geometry import Pinhole
@@ -155,7 +156,7 @@ class TorchModel:
 
 @dataclass(frozen=True)
 class TorchSnapshot:
-    """``NgpSnapshot`` of a torch field."""
+    """``RaySnapshot`` of a torch field."""
 
     model: TorchModel
     cameras: tuple[View, ...]
@@ -171,7 +172,7 @@ class TorchSnapshot:
         return Rendering(color.reshape(h, w, 3), depth.reshape(h, w), opacity.reshape(h, w))
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """As ``NgpSnapshot.points``."""
+        """As ``RaySnapshot.points``."""
         return surface_points(self.model, self.cameras, count)
 
 
@@ -193,29 +194,31 @@ class NgpTorchField:
 
     def reset(self) -> None:
         with self._lock:
-            self.rig, self.dropped = Rig(self.settings), 0
+            self.view_store, self.dropped = ViewStore(self.settings), 0
             self._forget_parameters()
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace, losses, samples, dropped = Pace(budget, self.now), [0.0], 0, 0
+        pace, losses, samples, dropped = StepBudget(budget, self.now), [0.0], 0, 0
         with self._lock:
-            intake = self.rig.take_in(views)
-            if intake.new_box:
+            intake = self.view_store.add(views)
+            if intake.box_changed:
                 self._forget_parameters()
-            if intake.look:
-                self._occupancy.look(self.pool, self.rig)
-            data = self.rig.trusted(views, intake, self.step, self._model())
-        while (progress := pace.begin(self._usual)) is not None:
+            if intake.visibility_changed:
+                self._occupancy.recount_views(self.pool, self.view_store)
+            data = self.view_store.without_outliers(views, intake, self.step, self._model())
+        while (progress := pace.begin_step(self._usual)) is not None:
             with self._lock:
                 loss, used, bad = self._one_step(data, progress)
             losses, samples, dropped = [*losses[-31:], loss], samples + used, dropped + bad
-            pace.end()
+            pace.end_step()
         self.dropped += dropped
         rays = pace.steps * self.settings.rays
-        refused = self.rig.left_out_of(views)
-        return FitReport(pace.steps, pace.seconds(), float(np.mean(losses)), rays, samples, dropped, refused)
+        refused = self.view_store.refused_among(views)
+        return FitReport(
+            pace.steps, pace.elapsed_s(), float(np.mean(losses)), rays, samples, dropped, refused
+        )
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         return self.snapshot().render(camera_to_world, intrinsics)
@@ -228,7 +231,7 @@ class NgpTorchField:
             model = self._model()
             grid = replace(model.grid, table=model.grid.table.detach().clone())
             model = replace(model, grid=grid, net=model.net.detach().clone())
-            return TorchSnapshot(model, self.rig.views)
+            return TorchSnapshot(model, self.view_store.views)
 
     def warm_up(self) -> float:
         """Nothing to compile; the same call as the kernels' field has."""
@@ -238,23 +241,23 @@ class NgpTorchField:
         with self._lock:
             counters = {"step": self.step, "updates": self._updates, "dropped": self.dropped}
             counters["needed"] = self._occupancy.needed
-            return pack(NgpSettings.name, self.settings, self.rig, counters, self._arrays())
+            return pack_state(NgpSettings.name, self.settings, self.view_store, counters, self._arrays())
 
     def load_state(self, state: Arrays) -> None:
         with self._lock, all_or_nothing(self):
             meta = unpack_meta(self.settings, state, NgpSettings.name, STATE_SHAPE)
-            self.rig = Rig(self.settings)
-            self.rig.load(meta, state)
+            self.view_store = ViewStore(self.settings)
+            self.view_store.load(meta, state)
             self._forget_parameters()
             arrays = {name: array.copy() for name, array in self._arrays().items()}
-            fill(arrays, state)
+            load_arrays(arrays, state)
             for name, tensor in self._tensors().items():
                 tensor.copy_(torch.as_tensor(arrays[name]))
             for name in ("density", "seen", "occupied"):
                 getattr(self._occupancy, name)[...] = arrays[name]
             self.step, self._updates = int(meta["step"]), int(meta["updates"])
             self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
-            self._occupancy.mark()
+            self._occupancy.update_occupied()
 
     # --- inside -------------------------------------------------------------------------------
 
@@ -270,31 +273,31 @@ class NgpTorchField:
     def _forget_parameters(self) -> None:
         rng = np.random.default_rng(np.random.SeedSequence(self.settings.seed))
         self.step = self._updates = 0
-        self._usual = Usual()
-        self._grid = to_torch(make_grid(self.settings, self.rig.box, rng), self.device)
-        net = make_net(self.settings, rng)
+        self._usual = StepTimer()
+        self._grid = to_torch(make_grid(self.settings, self.view_store.box, rng), self.device)
+        net = init_net(FEATURES * self.settings.levels, self.settings, rng)
         self._widths = net.widths.tolist()
         self._net = torch.as_tensor(net.params, device=self.device)
         self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in (self._grid.table, self._net)]
-        self._occupancy: Occupancy = Occupancy.for_box(self.settings, self.rig.box)
+        self._occupancy: OccupancyGrid = OccupancyGrid.for_box(self.settings, self.view_store.box)
 
     def _model(self) -> TorchModel:
         o, s = self._occupancy, self.settings
         occupied = torch.as_tensor(o.occupied, device=self.device).view(s.cells, s.cells, s.cells)
         return TorchModel(
             settings=s,
-            box=self.rig.box or NOWHERE,
+            box=self.view_store.box or UNIT_BOX,
             grid=self._grid,
             levels=active_levels(s, self.step),
             widths=self._widths,
             net=self._net,
             occupied=occupied,
-            background=torch.as_tensor(self.rig.background(), device=self.device),
+            background=torch.as_tensor(self.view_store.background(), device=self.device),
             step=step_length(s, self.step),
         )
 
     def _one_step(self, data: Views, progress: float) -> tuple[float, int, int]:
-        s, box, model = self.settings, self.rig.box, self._model()
+        s, box, model = self.settings, self.view_store.box, self._model()
         assert box is not None
         rng = np.random.default_rng(int(step_key(s.seed, self.step)))
         if self.step % EVERY == 0:
@@ -358,7 +361,7 @@ class NgpTorchField:
             rays = camera.rays(np.stack([local % width + 0.5, local // width + 0.5], axis=-1))
             directions[rows] = rays @ data.rotation[k].T
         rgb = data.pixels[pixel].astype(np.float32) / 255.0
-        background = np.broadcast_to(self.rig.background(), (count, 3))
+        background = np.broadcast_to(self.view_store.background(), (count, 3))
         if self.settings.background == "random":
             background = rng.random((count, 3), dtype=np.float32)
         alpha = rgb[:, 3:] if rgb.shape[1] == 4 else np.ones((count, 1), np.float32)
@@ -384,4 +387,4 @@ class NgpTorchField:
             fresh *= np.where(m > 1.0, 1.0 / np.maximum(2.0 - m, 1e-6), 1.0) ** 2
         fresh = np.where(np.isfinite(fresh), fresh, np.float32(1e3))
         o.density[:] = np.where(o.seen >= o.needed, np.maximum(o.density * np.float32(FADE), fresh), 0.0)
-        o.mark()
+        o.update_occupied()

@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Field, FitReport, Rendering, View
-from edge_server.fields.common.fair_lock import Turn
+from edge_server.fields.common.fair_lock import FairLock
 from edge_server.fields.common.field_state import all_or_nothing, unpack_meta
 from edge_server.fields.common.kernels.precompile import compile_ahead
 from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
-from edge_server.fields.common.scene_box import NOWHERE
-from edge_server.fields.common.supervision import asked_views, leave_out
-from edge_server.fields.common.training_schedule import BETA1, BETA2, Pace, Usual, step_key
-from edge_server.fields.common.view_store import Arrays, Rig, same_views
+from edge_server.fields.common.scene_box import UNIT_BOX
+from edge_server.fields.common.supervision import supervising_views, without_views
+from edge_server.fields.common.training_schedule import BETA1, BETA2, StepBudget, StepTimer, step_key
+from edge_server.fields.common.view_store import Arrays, ViewStore, same_views
 from edge_server.fields.splat.buffers import Passes, camera_rows
 from edge_server.fields.splat.densification import Cloud, grow_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import Rule, bound_all, update
@@ -69,7 +69,7 @@ class SplatField:
         calm = np.maximum(np.minimum(self.settings.settle_after / age, 1.0), self.settings.rate_settled)
         corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), calm], axis=-1)
         self._corrections = corrections.astype(np.float32)
-        self._turn = Turn()
+        self._lock = FairLock()
         self.now = time.perf_counter  # the clock of budgets in seconds
         self._now_ns: int | None = None  # the instant that the Gaussians stand for
         self._snapshot: SplatSnapshot | None = None
@@ -82,9 +82,9 @@ class SplatField:
 
     def reset(self) -> None:
         """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        with self._turn.mine():
+        with self._lock:
             self.dropped = 0
-            self.rig = Rig(self.settings)
+            self.view_store = ViewStore(self.settings)
             self._forget_gaussians()
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
@@ -96,23 +96,23 @@ class SplatField:
         """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace = Pace(budget, self.now)
+        pace = StepBudget(budget, self.now)
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
-        with self._turn.mine():
+        with self._lock:
             motion = self._take_in(views)
         if motion is not None:
             rays, samples = self._follow(motion, pace, self._carries(budget))
-        while (progress := pace.begin(self._usual)) is not None:
-            with self._turn.mine():
+        while (progress := pace.begin_step(self._usual)) is not None:
+            with self._lock:
                 loss, seen, pairs, lost = self._one_step(progress)
             losses.append(loss)
             rays, samples, dropped = rays + seen, samples + pairs, dropped + lost
-            pace.end()
+            pace.end_step()
         self.dropped += dropped
         refused = tuple(v.camera for v in views if v.camera in self._refused)
         loss = float(np.mean(losses)) if losses else 0.0
-        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped, refused=refused)
+        return FitReport(pace.steps, pace.elapsed_s(), loss, rays, samples, dropped=dropped, refused=refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture of a camera, from the present Gaussians."""
@@ -125,7 +125,7 @@ class SplatField:
     def snapshot(self, present_ns: int | None = None) -> SplatSnapshot:
         """A copy that renders from any thread and never changes. present_ns: what moves is shown where
         it will be then, if it goes on as it went."""
-        with self._turn.mine():
+        with self._lock:
             now_ns = self._now_ns
             ahead_s = 0.0 if present_ns is None or now_ns is None else (present_ns - now_ns) / 1e9
             ahead_s = min(max(ahead_s, 0.0), AHEAD_S)
@@ -142,10 +142,10 @@ class SplatField:
     def _live(self) -> SplatSnapshot:
         """A renderer of the living arrays, for whoever has the turn."""
         return SplatSnapshot(
-            box=self.rig.box or NOWHERE,
+            box=self.view_store.box or UNIT_BOX,
             gaussians=self.cloud.gaussians(self.settings.harmonics),
-            background=self.rig.background(),
-            cameras=self.rig.views,
+            background=self.view_store.background(),
+            cameras=self.view_store.views,
             pool=self.pool,
             step=self.step,
             passes=self._looker,
@@ -158,9 +158,9 @@ class SplatField:
         Works on small fields of its own, in the calling thread and at its priority: the workers' low one
         would make compiling on a busy machine take minutes. This field's state is not touched.
         """
-        return compile_ahead(self._tour)
+        return compile_ahead(self._run_kernels)
 
-    def _tour(self, pool: Pool) -> None:
+    def _run_kernels(self, pool: Pool) -> None:
         """Go through every kernel once."""
         tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
         camera = Pinhole.from_fov(32, 32, 60.0)
@@ -173,34 +173,36 @@ class SplatField:
                 image[8:16, 8 + 2 * k : 16 + 2 * k, :3] = 255
                 field.fit([View("warm-up", image, pose, camera, k * 10**8)], Budget(steps=8))
             field.render(pose, camera)
-            field._live().colors_at(field.rig.views, [np.full((1, 2), 0.5)])  # as ``trust`` asks
+            field._live().colors_at(
+                field.view_store.views, [np.full((1, 2), 0.5)]
+            )  # as ``find_outliers`` asks
 
     # --- state --------------------------------------------------------------------------------
 
     def state(self) -> Arrays:
         """Everything needed to go on bit for bit: Gaussians, moments, cameras, counters."""
-        with self._turn.mine():
+        with self._lock:
             meta = {
                 "version": 1, "field": "splat", "settings": asdict(self.settings), "step": self.step,
                 "grown": self._grown, "dropped": self.dropped,
                 "now_ns": self._now_ns, "given": [v.camera for v in self._given],
-                "refused": sorted(self._refused), "unsure": sorted(self._unsure), **self.rig.meta(),
+                "refused": sorted(self._refused), "unsure": sorted(self._unsure), **self.view_store.meta(),
             }  # fmt: skip
             cloud = {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
-            both = {"meta": np.array(json.dumps(meta)), **cloud, **self.rig.arrays()}
+            both = {"meta": np.array(json.dumps(meta)), **cloud, **self.view_store.arrays()}
             return {name: np.array(array) for name, array in both.items()}
 
     def load_state(self, state: Arrays) -> None:
         """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        with self._turn.mine(), all_or_nothing(self):
+        with self._lock, all_or_nothing(self):
             meta, cloud = _unpack(self.settings, state)
-            self.rig = Rig(self.settings)
-            self.rig.load(meta, state)
+            self.view_store = ViewStore(self.settings)
+            self.view_store.load(meta, state)
             self._forget_gaussians()
             self.cloud = cloud
             self.step, self._grown, self.dropped = (int(meta[k]) for k in ("step", "grown", "dropped"))
             self._now_ns = None if meta["now_ns"] is None else int(meta["now_ns"])
-            self._given = tuple(self.rig.memory[camera].view for camera in meta.get("given", ()))
+            self._given = tuple(self.view_store.memory[camera].view for camera in meta.get("given", ()))
             self._refused, self._unsure = (set(meta.get(key, ())) for key in ("refused", "unsure"))
 
     # --- inside -------------------------------------------------------------------------------
@@ -208,7 +210,7 @@ class SplatField:
     def _forget_gaussians(self) -> None:
         self.step = 0
         self._grown = 0  # step of the last splitting and pruning
-        self._usual, self._usual_carrying, self._usual_renewal = Usual(), Usual(), Usual()
+        self._usual, self._usual_carrying, self._usual_renewal = StepTimer(), StepTimer(), StepTimer()
         self.cloud = Cloud.empty(self.settings)
         self._passes, self._follower, self._looker = (Passes(self.pool) for _ in range(3))
         self._now_ns = None
@@ -225,26 +227,28 @@ class SplatField:
         """Learn of new pictures; begin a cloud. Returns what they show to have moved, if anything."""
         motion = None
         if not same_views(views, self._views):
-            memory = self.rig.memory
+            memory = self.view_store.memory
             news = {v.camera for v in views if v.camera not in memory or memory[v.camera].view is not v}
             known = _equal(views, self._given)  # decoded once more, or the first after ``load_state``
-            intake = self.rig.take_in(views)
-            if intake.new_box:
+            intake = self.view_store.add(views)
+            if intake.box_changed:
                 self._forget_gaussians()
-            assert self.rig.box is not None
+            assert self.view_store.box is not None
             now_ns = max(v.shows_ns for v in views)
             elapsed_s = 0.0 if self._now_ns is None else (now_ns - self._now_ns) / 1e9
             self._now_ns = now_ns
             self._cams = camera_rows(
-                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.rig.box,
+                [v.camera_to_world for v in views], [v.intrinsics for v in views], self.view_store.box,
                 [max((v.shows_ns - now_ns) / 1e9, -LONGEST_S) for v in views],
             )  # fmt: skip
             if not known:
                 self._before = self.cloud.params[:, :3].copy()
                 drift(self.cloud, elapsed_s, any(memory[v.camera].moved is not None for v in views))
                 self._doubt(views, news)
-            data = self._data = leave_out(intake.data, np.array([v.camera in self._refused for v in views]))
-            self._asked = asked_views(data) or list(range(len(views)))  # of none, all teach nothing
+            data = self._data = without_views(
+                intake.data, np.array([v.camera in self._refused for v in views])
+            )
+            self._asked = supervising_views(data) or list(range(len(views)))  # of none, all teach nothing
             moved = trusted_moves(
                 [None if v.camera in self._unsure else memory[v.camera].moved for v in views], data
             )
@@ -252,8 +256,8 @@ class SplatField:
             self._views, self._given, self._epoch = tuple(views), tuple(views), -1
             fresh = any(v.camera in news for k, v in enumerate(views) if k in self._asked)
             if len(self.cloud) and fresh and not known and any(m is not None for m in moved):
-                motion = Moved(self.rig.box, views, data, moved, self._changed, self._cams,
-                               self.rig.background(), elapsed_s, len(self._asked))  # fmt: skip
+                motion = Moved(self.view_store.box, views, data, moved, self._changed, self._cams,
+                               self.view_store.background(), elapsed_s, len(self._asked))  # fmt: skip
         if len(self.cloud) == 0:
             self._begin()
         self._snapshot = None
@@ -272,28 +276,28 @@ class SplatField:
         """Refuse the views that contradict what is known. What a camera's next one seems to show to have
         moved is beside a picture that was wrong, so that is not known."""
         self._unsure = (self._unsure - news) | (self._refused & news)
-        flags = self.rig.refused(views, self.step, self._live().colors_at)
+        flags = self.view_store.find_outliers(views, self.step, self._live().colors_at)
         given = {v.camera for v in views}
         self._refused = (self._refused - given) | {v.camera for v, flag in zip(views, flags) if flag}
 
-    def _follow(self, motion: Moved, pace: Pace, carries: int) -> tuple[int, int]:
+    def _follow(self, motion: Moved, pace: StepBudget, carries: int) -> tuple[int, int]:
         """Carry along what moved, and begin anew where that does not do; returns pixels and pairs."""
         s, rays, samples = self.settings, 0, 0
-        with self._turn.mine():
+        with self._lock:
             going = carry(s, self._follower, self.cloud, motion, carries)
-        while pace.begin(self._usual_carrying, then_s=self._usual_renewal.seconds) is not None:
-            with self._turn.mine():
+        while pace.begin_step(self._usual_carrying, then_s=self._usual_renewal.seconds) is not None:
+            with self._lock:
                 done = next(going, None)
             if done is None:
                 break
             rays, samples = rays + done[1], samples + done[2]
-            pace.end()
-        began = pace.seconds()
-        with self._turn.mine():
+            pace.end_step()
+        began = pace.elapsed_s()
+        with self._lock:
             leave_behind(s, self.pool, self.cloud, motion, self._before)
             renew(s, self._follower, self.cloud, motion, self._rng(2))
             self._snapshot = None
-        self._usual_renewal.took(pace.seconds() - began)
+        self._usual_renewal.add(pace.elapsed_s() - began)
         return rays, samples
 
     def _choose(self, key: np.uint64) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
@@ -325,7 +329,7 @@ class SplatField:
     def _one_step(self, progress: float) -> tuple[float, int, int, int]:
         """One optimiser step; returns its mean squared error, pixels, pairs of a Gaussian and a tile, and
         how many tiles and gradients were not finite. progress: of the fit, in [0, 1]."""
-        s, box = self.settings, self.rig.box
+        s, box = self.settings, self.view_store.box
         assert box is not None
         key = step_key(s.seed, self.step)
         picked, wanted = self._choose(key)
@@ -338,7 +342,7 @@ class SplatField:
         loss = Loss(
             absolute=s.loss == "l1",
             dssim=np.float32(s.dssim),
-            background=self.rig.background(),
+            background=self.view_store.background(),
             random=s.background == "random",
             key=key,
         )
@@ -380,7 +384,7 @@ class SplatField:
             self._grow()
 
     def _rule(self, progress: float) -> Rule:
-        s, box = self.settings, self.rig.box
+        s, box = self.settings, self.view_store.box
         assert box is not None
         rates = np.full(BASE + 3 * (s.harmonics - 1), 0.1 * s.rate_color)
         rates[:SCALE] = s.rate_position * box.pixel_m / box.radius_m
@@ -413,12 +417,12 @@ class SplatField:
         """What shows in tiles with pixels of weight 0, or in the last picture of a camera that is not among
         the views now, counts as seen: that no picture needed it means nothing while those that may are not
         asked."""
-        cloud, box = self.cloud, self.rig.box
+        cloud, box = self.cloud, self.view_store.box
         assert box is not None
         tiles = silent_tiles(self._data)
         slots = [k for k, mask in enumerate(tiles) if mask is not None]
         given = {view.camera for view in self._views}
-        others = [view for view in self.rig.views if view.camera not in given]
+        others = [view for view in self.view_store.views if view.camera not in given]
         if not slots and not others:
             return
         cams = np.concatenate([
@@ -432,11 +436,11 @@ class SplatField:
 
     def _begin(self) -> None:
         """First Gaussians, from the views at hand."""
-        assert self.rig.box is not None
+        assert self.view_store.box is not None
         s = self.settings
         first, weight = min(s.start, s.gaussians), self._data.weight
         self.cloud = Cloud.of(
-            seeds(s, self.pool, self.rig.box, self._views, None, weight, first, self._rng(1))
+            seeds(s, self.pool, self.view_store.box, self._views, None, weight, first, self._rng(1))
         )
 
     def _repair(self) -> None:

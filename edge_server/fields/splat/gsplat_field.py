@@ -107,7 +107,7 @@ class SplatCudaField(SplatField):
         shares = params[:, COLOR + 3 :].view(len(params), count - 1, 3)
         shades = params[:, COLOR : COLOR + 3]
         shades = shades + (shares * harmonics_of(count, direction)[..., None]).sum(dim=1)
-        back = torch.tensor(self.rig.background(), device=self._device)
+        back = torch.tensor(self.view_store.background(), device=self._device)
         if self.settings.background == "random":
             back = torch.tensor(self._rng(6).random(3), dtype=torch.float32, device=self._device)
         color, _, info = self._rasterise(

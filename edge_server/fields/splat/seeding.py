@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import Pool
-from edge_server.fields.common.plane_sweep import empty_color, score, shows, sweep
+from edge_server.fields.common.plane_sweep import empty_color, foreground_mask, score_grid, sweep_depths
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.supervision import asked_views, pack_cameras
+from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.splat.kernels.optimizer_step import bound_all
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.settings import SplatSettings
@@ -38,8 +38,8 @@ def seeds(
     local = drawn - data.first[view_of]
     if settings.seed_cells:
         cells = max(settings.seed_cells, 8)
-        distance = sweep(
-            pool, box, data, view_of, local, score(settings, pool, box, views, moved, data, cells), cells
+        distance = sweep_depths(
+            pool, box, data, view_of, local, score_grid(settings, pool, box, views, moved, data, cells), cells
         )
     else:
         middle = box.distance_m / box.radius_m
@@ -72,10 +72,10 @@ def _pixels(
     masks: Sequence[NDArray[np.bool_] | None] | None,
 ) -> NDArray[np.int64]:  # fmt: skip
     """Numbers of the pixels that show something, over all views."""
-    plain = empty_color(settings, [views[k] for k in asked_views(data)])
+    plain = empty_color(settings, [views[k] for k in supervising_views(data)])
     parts = [np.zeros(0, np.int64)]
     for k, view in enumerate(views):
-        there = shows(view.image, plain)
+        there = foreground_mask(view.image, plain)
         if masks is not None:
             mask = masks[k]
             there = there & mask if mask is not None else np.zeros_like(there)

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from edge_server.fields.common.trainer_settings import COMMON_BOUNDS, MOST_THREADS, shared_option
+from edge_server.fields.common.trainer_settings import COMMON_BOUNDS, MOST_THREADS, copy_option
 from edge_server.fields.common.trainer_settings import option as _option
 
 
@@ -57,10 +57,10 @@ class SplatSettings:
         0.0, "share by which Gaussians turn to the normals of the depth they show, for surfaces (.3); 0: none"
     )
     align_every: int = _option(5, "steps between two turns of ``align``")
-    age_tau_ms: float = shared_option("age_tau_ms")
-    mask_stale_ms: float = shared_option("mask_stale_ms")
-    mask_grow_px_s: float = shared_option("mask_grow_px_s")
-    refuse_beyond: float = shared_option("refuse_beyond")
+    age_tau_ms: float = copy_option("age_tau_ms")
+    mask_stale_ms: float = copy_option("mask_stale_ms")
+    mask_grow_px_s: float = copy_option("mask_grow_px_s")
+    refuse_beyond: float = copy_option("refuse_beyond")
     seed: int = _option(0, "seed of initial values and of all sampling")
     threads: int | None = _option(None, "worker threads; results do not depend on it. None: all cores")
     nice: int = _option(0, "how far workers lower their own priority (Linux); in a server 5")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Field
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.thread_pool import Pool
-from edge_server.fields.common.model_layout import FIRST_DENSITY, first_net
+from edge_server.fields.common.model_layout import FIRST_DENSITY, init_net
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.trained_field import DIRTY, TrainedField
 from edge_server.fields.tensorf.kernels.vector_matrix import (
@@ -47,7 +47,7 @@ class TensorfField(TrainedField):
 
     def _make(self, rng: np.random.Generator) -> tuple[Planes, Net]:
         s = self.settings
-        size = size_at(s, self.rig.box, 0)
+        size = size_at(s, self.view_store.box, 0)
         density, color = MODES * s.density_rank // CHANNELS, MODES * s.color_rank // CHANNELS
         rows = _rows(size)
         table = np.zeros((density + color, rows, CHANNELS), np.float32)
@@ -58,13 +58,13 @@ class TensorfField(TrainedField):
             size, density, density + color, rows, np.float32(np.log(FIRST_DENSITY)),
             table.reshape(-1, CHANNELS),
         )  # fmt: skip
-        return planes, first_net(CHANNELS * color, s, rng)
+        return planes, init_net(CHANNELS * color, s, rng)
 
     def _feature_rows(self) -> int:
         return int(self._net.widths[0]) + 1  # density's own
 
     def _grow(self) -> None:
-        size = size_at(self.settings, self.rig.box, self.step)
+        size = size_at(self.settings, self.view_store.box, self.step)
         planes: Planes = self._encoding
         if size == planes.size:
             return

@@ -18,16 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Field, FitReport, Rendering, View
-from edge_server.fields.common.fair_lock import Turn
-from edge_server.fields.common.field_state import all_or_nothing, fill, pack, unpack_meta
+from edge_server.fields.common.fair_lock import FairLock
+from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
 from edge_server.fields.common.kernels.precompile import compile_ahead
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
-from edge_server.fields.common.kernels.train import Recipe
-from edge_server.fields.common.occupancy_grid import EMPTY, Occupancy
-from edge_server.fields.common.scene_box import NOWHERE, PLAIN
-from edge_server.fields.common.training_schedule import Pace, Usual, step_key
-from edge_server.fields.common.view_store import Arrays, Rig
+from edge_server.fields.common.kernels.train import RaySampling
+from edge_server.fields.common.occupancy_grid import EMPTY, OccupancyGrid
+from edge_server.fields.common.scene_box import PLAIN, UNIT_BOX
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer, step_key
+from edge_server.fields.common.view_store import Arrays, ViewStore
 from edge_server.fields.voxel.kernels.rays import SEGMENT, Clearing, Voxels, train_rays
 from edge_server.fields.voxel.kernels.update import (
     DENSEST,
@@ -65,7 +65,7 @@ class VoxelField:
     def __init__(self, settings: VoxelSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or VoxelSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
-        self._turn = Turn()
+        self._lock = FairLock()
         self.now = time.perf_counter  # the clock of budgets in seconds
         self.reset()
 
@@ -73,9 +73,9 @@ class VoxelField:
 
     def reset(self) -> None:
         """Forget the scene, its box and its cameras; keep settings and compiled kernels."""
-        with self._turn.mine():
+        with self._lock:
             self.dropped = 0
-            self.rig = Rig(self.settings)
+            self.view_store = ViewStore(self.settings)
             self._snapshot: VoxelSnapshot | None = None
             self._forget()
 
@@ -87,17 +87,17 @@ class VoxelField:
         """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace, s = Pace(budget, self.now), self.settings
-        with self._turn.mine():
-            intake = self.rig.take_in(views)
-            if intake.new_box:
+        pace, s = StepBudget(budget, self.now), self.settings
+        with self._lock:
+            intake = self.view_store.add(views)
+            if intake.box_changed:
                 self._forget()
-            if intake.look:
-                moving = self._occupancy.look(self.pool, self.rig, self._empty())
-                if intake.fresh:
+            if intake.visibility_changed:
+                moving = self._occupancy.recount_views(self.pool, self.view_store, self._empty())
+                if intake.has_new_images:
                     self._soften(moving)
                 self._clear()
-            data = self._outlined(self.rig.trusted(views, intake, self.step, self._live()))
+            data = self._outlined(self.view_store.without_outliers(views, intake, self.step, self._live()))
             # Once the grid is fine, most of what a fit meets is known: full rates would undo it.
             share = s.warm if self.step >= WARM * max(s.refine_at, default=s.prune_from) else 1.0
             # Steps at full rates: a grid that meets the same pixels over and over learns them by heart.
@@ -107,18 +107,18 @@ class VoxelField:
             diffuse_by = s.diffuse * min(s.diffuse_views / max(places, 1), 1.0)
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
-        while (progress := pace.begin(self._usual)) is not None:
-            with self._turn.mine():
+        while (progress := pace.begin_step(self._usual)) is not None:
+            with self._lock:
                 fall = s.rate_end**progress * min(full / max(pace.steps, 1), 1.0)
                 losses.append(self._one_step(data, share * fall, diffuse_by))
                 rays += self.settings.rays
                 samples += int(self._samples.sum())
                 dropped += int(self._bad_rays.sum() + self._bad_gradients.sum())
-            pace.end()
+            pace.end_step()
         self.dropped += dropped
         loss = float(np.mean(losses)) if losses else 0.0
-        refused = self.rig.left_out_of(views)
-        return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped, refused)
+        refused = self.view_store.refused_among(views)
+        return FitReport(pace.steps, pace.elapsed_s(), loss, rays, samples, dropped, refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture of a camera, from the present grid."""
@@ -130,7 +130,7 @@ class VoxelField:
 
     def snapshot(self, present_ns: int | None = None) -> VoxelSnapshot:
         """A copy that renders from any thread and never changes."""
-        with self._turn.mine():
+        with self._lock:
             if self._snapshot is None or self._snapshot.step != self.step:
                 live = self._live()
                 self._snapshot = replace(
@@ -143,11 +143,11 @@ class VoxelField:
     def _live(self) -> VoxelSnapshot:
         """A snapshot of living arrays: valid until the next step."""
         return VoxelSnapshot(
-            box=self.rig.box or NOWHERE,
+            box=self.view_store.box or UNIT_BOX,
             voxels=self._voxels,
             space=self._clearing(),
-            background=self.rig.background(),
-            cameras=self.rig.views,
+            background=self.view_store.background(),
+            cameras=self.view_store.views,
             pool=self.pool,
             step=self.step,
         )
@@ -158,9 +158,9 @@ class VoxelField:
         Works on small fields of its own, in the calling thread and at its priority: the workers' low one
         would make compiling on a busy machine take minutes. This field's state is not touched.
         """
-        return compile_ahead(self._tour)
+        return compile_ahead(self._run_kernels)
 
-    def _tour(self, pool: Pool) -> None:
+    def _run_kernels(self, pool: Pool) -> None:
         """Go through every kernel once."""
         tiny = replace(
             self.settings, rays=64, cells=16, sizes=(8, 12), refine_at=(1,), prune_from=0, min_views=1
@@ -178,25 +178,25 @@ class VoxelField:
 
     def state(self) -> Arrays:
         """Everything needed to go on bit for bit: grid, moments, occupancy, cameras, counters."""
-        with self._turn.mine():
+        with self._lock:
             counters = {
                 "step": self.step,
                 "updates": self._updates,
                 "dropped": self.dropped,
                 "needed": self._occupancy.needed,
             }
-            return pack("voxel", self.settings, self.rig, counters, self._arrays())
+            return pack_state("voxel", self.settings, self.view_store, counters, self._arrays())
 
     def load_state(self, state: Arrays) -> None:
         """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
-        with self._turn.mine(), all_or_nothing(self):
+        with self._lock, all_or_nothing(self):
             meta = unpack_meta(self.settings, state, "voxel", SHAPE)
-            self.rig = Rig(self.settings)
-            self.rig.load(meta, state)
+            self.view_store = ViewStore(self.settings)
+            self.view_store.load(meta, state)
             self._forget()
             self.step, self._updates = int(meta["step"]), int(meta["updates"])
             self._grow(max(self.step - 1, 0))
-            fill(self._arrays(), state)
+            load_arrays(self._arrays(), state)
             self.dropped, self._occupancy.needed = int(meta["dropped"]), int(meta["needed"])
             self._clear()
             self._snapshot = None
@@ -217,13 +217,13 @@ class VoxelField:
         self._snapshot = None  # it is known by its step alone
         self._outlines: tuple[Views, Views] | None = None  # of the views last seen, before and after
         self._updates = 0  # optimiser steps that Adam's bias correction counts
-        self._usual = Usual()
+        self._usual = StepTimer()
         s = self.settings
-        self._sizes = sizes_of(s, self.rig.box)
+        self._sizes = sizes_of(s, self.view_store.box)
         table = _room_for(self._sizes[0])
         table[:] = (s.first, 0.5, 0.5, 0.5)
         self._take(self._sizes[0], table)
-        self._occupancy = Occupancy.for_box(s, self.rig.box, unknown=2.0 * EMPTY)
+        self._occupancy = OccupancyGrid.for_box(s, self.view_store.box, unknown=2.0 * EMPTY)
         self._away = np.zeros(s.cells**3, np.uint8)
         self._memory = make_trace(self.pool.threads)
         self._samples, self._bad_rays = np.zeros(s.parts, np.int64), np.zeros(s.parts, np.int64)
@@ -270,8 +270,13 @@ class VoxelField:
         if self._outlines is not None and self._outlines[0] is data:
             return self._outlines[1]
         s, outlined = self.settings, data
-        if s.outline > 0.0 and s.background == "auto" and data.pixels.shape[1] == 3 and self.rig.plain:
-            color = np.rint(255.0 * self.rig.background()).astype(np.int16)
+        if (
+            s.outline > 0.0
+            and s.background == "auto"
+            and data.pixels.shape[1] == 3
+            and self.view_store.background_is_plain
+        ):
+            color = np.rint(255.0 * self.view_store.background()).astype(np.int16)
             apart = np.abs(data.pixels.astype(np.int16) - color).max(axis=1)
             alpha = np.where(apart > TOLERANCE, 255, 0).astype(np.uint8)
             outlined = data._replace(pixels=np.concatenate([data.pixels, alpha[:, None]], axis=1))
@@ -302,15 +307,15 @@ class VoxelField:
                 np.float32(1.0 / length), occupancy.cells, occupancy.seen, occupancy.needed,
                 occupancy.density,
             )  # fmt: skip
-            occupancy.mark(self._empty())
+            occupancy.update_occupied(self._empty())
             self._clear()
-        recipe = Recipe(
+        recipe = RaySampling(
             key=np.uint64(key + np.uint64(1)),
             chunk_rays=s.rays,
             levels=1,
             harmonics=1,
             changed_share=np.float32(s.changed_share),
-            background=self.rig.background(),
+            background=self.view_store.background(),
             random_background=s.background == "random",
         )
         self.pool.run(

@@ -11,31 +11,26 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.thread_pool import CallerPool
-from edge_server.fields.common.training_schedule import Pace, Usual
-from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.splat.field import SplatField
-from edge_server.fields.tensorf.field import TensorfField
-from edge_server.fields.voxel.field import VoxelField
+from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
+from tests.edge_server.fields.small import CLASSES, SMALL, every_field
 
 
 class Fits:
     """Fits on a clock of its own. step_s: what a step takes; usual: what is known of it."""
 
     def __init__(self) -> None:
-        self.clock_s, self.step_s, self.usual = 0.0, 1.0, Usual()
+        self.clock_s, self.step_s, self.usual = 0.0, 1.0, StepTimer()
 
     def fit(self, budget_s: float, first_s: float = 0.0, then_s: float = 0.0) -> tuple[int, float]:
         """first_s: taken before the first step. Returns steps and seconds."""
-        pace = Pace(Budget(seconds=budget_s), lambda: self.clock_s)
+        pace = StepBudget(Budget(seconds=budget_s), lambda: self.clock_s)
         self.clock_s += first_s
-        while (progress := pace.begin(self.usual, then_s)) is not None:
+        while (progress := pace.begin_step(self.usual, then_s)) is not None:
             assert 0.0 <= progress <= 1.0
             self.clock_s += self.step_s
-            pace.end()
-        return pace.steps, pace.seconds()
+            pace.end_step()
+        return pace.steps, pace.elapsed_s()
 
 
 @pytest.mark.parametrize("first_s", [0.0, 0.7])
@@ -95,10 +90,10 @@ def test_what_must_follow_finds_room() -> None:
 
 
 def test_budgets_in_steps_ask_no_clock() -> None:
-    pace, usual, said = Pace(Budget(steps=4), lambda: 0.0), Usual(), []
-    while (progress := pace.begin(usual, then_s=1e9)) is not None:
+    pace, usual, said = StepBudget(Budget(steps=4), lambda: 0.0), StepTimer(), []
+    while (progress := pace.begin_step(usual, then_s=1e9)) is not None:
         said.append(progress)
-        pace.end()
+        pace.end_step()
     assert said == [0.0, 0.25, 0.5, 0.75]
 
 
@@ -115,26 +110,17 @@ class Work(CallerPool):
         self.seconds += self.each_s
 
 
-FIELDS: dict[str, Callable[[Work], Any]] = {
-    "ngp": lambda work: NgpField(NGP, work),
-    "nerfacto": lambda work: NerfactoField(NERFACTO, work),
-    "tensorf": lambda work: TensorfField(TENSORF, work),
-    "splat": lambda work: SplatField(SPLAT, work),
-    "voxel": lambda work: VoxelField(VOXEL, work),
-}
-
-
 def _moving(frame: int) -> list[View]:
     ball = np.array([0.05 * frame - 0.3, 0.0, 0.5])
     return [replace(v, generated_ns=frame * 10**8) for v in ring(7, size=32, ball_m=ball)]
 
 
 @pytest.mark.parametrize("each_s", [0.01, 0.04])
-@pytest.mark.parametrize("name", FIELDS)
+@every_field
 def test_updates_of_a_moving_scene_keep_their_budget(name: str, each_s: float) -> None:
     """The second time, on a machine that got busy after a calm beginning."""
     work = Work()
-    field = FIELDS[name](work)
+    field = CLASSES[name](SMALL[name], work)
     field.now = lambda: work.seconds
     field.fit(_moving(0), Budget(steps=130))  # voxel's grid has its last size by then
     field.fit(_moving(1), Budget(seconds=1.0))

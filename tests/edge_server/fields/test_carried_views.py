@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from edge_server.fields import Budget
-from edge_server.fields.common.view_outliers import weights
+from edge_server.fields.common.view_outliers import pixel_weights
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import TIME
 from edge_server.fields.splat.settings import SplatSettings
@@ -29,14 +29,14 @@ def test_the_splat_takes_them_as_seen_at_the_instant_they_show():
 
 def test_they_are_not_doubted_for_an_age_that_they_no_longer_have():
     settings = replace(SMALL, age_tau_ms=50.0)
-    assert weights(OLD, {}, settings)[5].max() < 0.2
-    assert weights(CARRIED, {}, settings) is None
+    assert pixel_weights(OLD, {}, settings)[5].max() < 0.2
+    assert pixel_weights(CARRIED, {}, settings) is None
 
 
 def test_weights_of_their_own_multiply_with_those_of_age():
     half = [replace(view, weight=np.full((24, 24), 0.5, np.float32)) for view in OLD]
-    alone = weights(OLD, {}, replace(SMALL, age_tau_ms=50.0))
-    both = weights(half, {}, replace(SMALL, age_tau_ms=50.0))
+    alone = pixel_weights(OLD, {}, replace(SMALL, age_tau_ms=50.0))
+    both = pixel_weights(half, {}, replace(SMALL, age_tau_ms=50.0))
     assert all(np.allclose(b, 0.5 * a) for a, b in zip(alone, both))
     assert half[0].weight.max() == 0.5, "a view's own weight is left alone"
 

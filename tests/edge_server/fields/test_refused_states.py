@@ -11,33 +11,20 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, Field
-from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.splat.field import SplatField
-from edge_server.fields.tensorf.field import TensorfField
-from edge_server.fields.voxel.field import VoxelField
 from tests.edge_server.fields.scenes import ring
-from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
+from tests.edge_server.fields.small import NAMES, SMALL, small
 
 VIEWS = ring(5, size=24)
 State = dict[str, Any]
 
 
-def _torch() -> Field:
+def _make(name: str) -> Field:
+    if name != "ngp in torch":
+        return small(name)
     pytest.importorskip("torch", reason="torch is not installed")
     from edge_server.fields.ngp.torch_field import NgpTorchField
 
-    return NgpTorchField(replace(NGP, rays=64), device="cpu")
-
-
-MAKERS: dict[str, Callable[[], Field]] = {
-    "ngp": lambda: NgpField(NGP),
-    "ngp in torch": _torch,
-    "nerfacto": lambda: NerfactoField(NERFACTO),
-    "tensorf": lambda: TensorfField(TENSORF),
-    "splat": lambda: SplatField(SPLAT),
-    "voxel": lambda: VoxelField(VOXEL),
-}
+    return NgpTorchField(replace(SMALL["ngp"], rays=64), device="cpu")
 
 
 def _without(name: str) -> Callable[[State], None]:
@@ -54,7 +41,7 @@ def _said(change: Callable[[dict[str, Any]], Any]) -> Callable[[State], None]:
 
 
 def _last_array_cut(state: State) -> None:
-    """Of what is learnt: what comes before it is right."""
+    """Of what is learned: what comes before it is right."""
     name = [n for n in state if n not in ("meta", "behind") and not n.startswith(("image", "pose", "moved"))][
         -1
     ]
@@ -86,9 +73,9 @@ DAMAGE: dict[str, Callable[[State], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", [*NAMES, "ngp in torch"])
 def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
-    field, other = MAKERS[name](), MAKERS[name]()
+    field, other = _make(name), _make(name)
     field.fit(VIEWS, Budget(steps=3))
     other.fit(VIEWS[:4], Budget(steps=1))
     other.fit([replace(v, image=255 - v.image) for v in VIEWS], Budget(steps=1))
@@ -104,7 +91,7 @@ def test_a_refused_state_leaves_the_field_as_it_was(name: str) -> None:
         assert after.keys() == before.keys(), damage
         assert all(np.array_equal(after[key], before[key]) for key in before), damage
     np.testing.assert_array_equal(shown, field.render(VIEWS[0].camera_to_world, VIEWS[0].intrinsics).color)
-    twin = MAKERS[name]()
+    twin = _make(name)
     twin.load_state(before)
     for either in (field, twin):  # nothing that a state does not hold was lost or gained either
         either.fit(VIEWS, Budget(steps=2))

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) that touches only what received a gradient, and refuses what is not finite."""
+"""Sparse Adam (Kingma and Ba 2015): updates only what received a gradient, drops what is not finite."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 class Rule(NamedTuple):
-    """One step's rule, float32: rate, moments' decays, epsilon, what gradients are multiplied with, the
-    parameter's own decay, and the corrections 1 / (1 - beta^t)."""
+    """One step's hyperparameters, float32. scale: what gradients are multiplied by. decay: of the parameter.
+    correct1, correct2: the bias corrections 1 / (1 - beta^t)."""
 
     rate: np.float32
     beta1: np.float32
@@ -61,7 +61,7 @@ def _update(rule, p, g, m, v):
 
 @kernel
 def adam(counter, worker, net, table, d_params, rule_net, rule_table, dropped):
-    """One optimiser step.
+    """One optimizer step.
 
     net: tuple of float32 (P,) arrays (params, m, v, g). d_params: float32 (chunks, P), summed here in the
     order of the chunks. table: (params, m, v, g) float32 (vertices, 2) and dirty, bool

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.mlp import backward, forward
-from edge_server.fields.common.kernels.radiance_model import is_a, query_back, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import add_pair, fetch_add, weighted_pairs
 
 FEATURES = 2  # a vertex; one 64-bit load
@@ -221,12 +221,12 @@ def _query_density(encoding, levels, net, x, start, end, acts):
 
 @overload(query_color)
 def _query_color(encoding, levels, net, x, start, end, acts):
-    """The network has said it already."""
+    """``query_density`` has done it already."""
     return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, Grid) else None
 
 
-@overload(query_back)
-def _query_back(encoding, net, acts, d_acts, n, d_params, d_features):
+@overload(query_backward)
+def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
     if not is_a(encoding, Grid):
         return None
 

@@ -1,5 +1,5 @@
-"""How the kernels are compiled: without the GIL, with safe fast mathematics, cached on disk, and without
-counting who holds an array."""
+"""How kernels are compiled: without the GIL, with safe fast math, cached on disk, and without reference
+counts of arrays."""
 
 from __future__ import annotations
 
@@ -21,28 +21,29 @@ try:
 except ImportError:  # not on Windows
     fcntl = None  # type: ignore[assignment]
 
-# No "nnan"/"ninf": the kernels test for non-finite numbers, which those flags would optimise away.
+# No "nnan"/"ninf": the kernels test for non-finite numbers, which those flags would optimize away.
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
-def _digest() -> str:
-    """Of all kernel sources."""
+def _digest(fields: Path) -> str:
+    """Of the kernel sources of all representations. Kernels elsewhere (``surface.kernels``) call
+    parts of these only, and numba's own stamp covers the file that they stand in."""
     total = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[2].glob("*/kernels/*.py")):
-        total.update(path.relative_to(Path(__file__).parents[2]).as_posix().encode() + path.read_bytes())
+    for path in sorted(fields.glob("*/kernels/*.py")):
+        total.update(path.relative_to(fields).as_posix().encode() + path.read_bytes())
     return total.hexdigest()
 
 
-SOURCES = _digest()
+SOURCES = _digest(Path(__file__).parents[2])
 
 
 @intrinsic
 def borrowed(typingctx: Any, value: Any) -> Any:
-    """``value``, an array or a tuple of whatever, whose arrays no longer know their owner.
+    """``value``, an array or a (nested) tuple, with arrays that are not reference counted.
 
-    numba counts references wherever an array, or a tuple that holds some, is given to a function or a row is
-    taken of it, one atomic operation each: passing ten arrays on for every ray costs ten times what drawing
-    the ray does. Whoever calls a kernel holds its arrays until it returns; a kernel returns none of them.
+    numba counts references wherever an array, or a tuple that holds some, is passed to a function or indexed,
+    one atomic operation each: passing ten arrays on for every ray costs ten times what drawing the ray does.
+    The caller of a kernel holds its arrays until it returns; a kernel returns none of them.
     """
 
     def strip(context: Any, builder: Any, kind: Any, given: Any) -> Any:
@@ -68,20 +69,19 @@ _compiled = partial(njit, nogil=True, fastmath=FAST, error_model="numpy", no_cfu
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """A function that kernels call: it becomes a part of each of them.
+    """A function that kernels call, always inlined.
 
-    Left to itself, the compiler leaves a copy in every caller's object code, and the one that a process
-    happens to load first serves all: copies differ in the last bits, so results would depend on what was
-    called, or compiled, before.
+    Otherwise every caller's object code has a copy, and the copy that a process happens to load first serves
+    all callers. Copies differ in the last bits, so results would depend on what was called before.
     """
     return _cached(_compiled(forceinline=True)(function))
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """``njit`` for arguments that are ``borrowed``, with a cache that knows what a kernel is made of.
+    """``njit`` with ``borrowed`` arguments, and a cache that depends on the sources of all kernels.
 
-    ValueError for a function within another one: all that this makes would share the first one's code, since
-    what they enclose is not part of the cache's key. Its ``__qualname__`` can be set to a name of its own.
+    ValueError: the function stands inside another one. All functions made there would share one cached code,
+    since what they enclose is not part of the cache's key, unless ``__qualname__`` is set to a unique name.
     """
     if "<locals>" in function.__qualname__:
         raise ValueError(f"{function.__qualname__} needs a __qualname__ of its own to be a kernel")
@@ -92,7 +92,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     exec(text, scope)
     outer = scope[function.__name__]
     assert isinstance(outer, FunctionType)
-    # Where it stands says which file of the cache is its own.
+    # The cache finds a function's file by where it stands.
     place = {"co_filename": function.__code__.co_filename, "co_firstlineno": function.__code__.co_firstlineno}
     outer.__code__ = outer.__code__.replace(**place)
     for name in ("__module__", "__qualname__", "__doc__"):
@@ -101,21 +101,30 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def _cached(dispatcher: Any) -> Any:
-    """A compiled function, kept on disk.
+    """A compiled function, cached on disk.
 
-    numba's own cache looks at the file a function stands in; kernels here inline functions of other files,
-    and would go on running yesterday's. The digest of all of them is made part of the cache's stamp.
+    numba's own cache checks only the file a function stands in, but kernels inline functions of other files.
+    The digest of all of them is made part of the cache's stamp, so that no outdated code runs.
     """
     dispatcher.enable_caching()
     file = dispatcher._cache._cache_file
     file._source_stamp = (*file._source_stamp, SOURCES)
     file.save = partial(_save_alone, Path(file._cache_path), file.save)
+    file._load_index = partial(_load_index, file._load_index)
     return dispatcher
 
 
+def _load_index(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:
+    """``load``; empty if the index names types that today's sources no longer have."""
+    try:
+        return load()
+    except (AttributeError, ImportError):  # numba reads the types before it compares the stamp
+        return {}
+
+
 def _save_alone(folder: Path, save: Callable[..., None], key: Any, data: Any) -> None:
-    """``save``, one process at a time: numba reads a function's index, changes and writes it, and two that
-    compile the same function for other types would each name the other's code."""
+    """``save`` under a lock between processes: numba reads a function's index, changes and writes it, so that
+    two processes that compile it for different types would overwrite each other's entries."""
     if fcntl is None:
         return save(key, data)
     with open(folder / ".lock", "w") as lock:
@@ -124,7 +133,7 @@ def _save_alone(folder: Path, save: Callable[..., None], key: Any, data: Any) ->
 
 
 def is_stored(dispatcher: Any, types: tuple[Any, ...]) -> bool:
-    """Whether a kernel need not be compiled for arguments of these numba types: it was, here or on disk."""
+    """Whether a kernel is compiled for arguments of these numba types, in this process or on disk."""
     if types in dispatcher.overloads:
         return True
     cache, target = dispatcher._cache, dispatcher.targetctx

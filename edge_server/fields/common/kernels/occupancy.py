@@ -1,4 +1,4 @@
-"""Which cells of space are worth a sample: those that are seen by enough cameras and not known empty."""
+"""Which cells of space get samples: those that enough cameras see and that are not known to be empty."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CELLS_A_TASK = 2048  # at most train.CHUNK: they share its scratch
 
 @part
 def cell_centre(index, cells, contracted):
-    """Centre of a cell in scene units (contraction undone) and how much longer a step is there."""
+    """Center of a cell in scene units (contraction undone) and how much longer a step is there."""
     i, j, k = index % cells, (index // cells) % cells, index // (cells * cells)
     half = 2.0 if contracted else 1.0
     scale = 2.0 * half / cells
@@ -30,11 +30,12 @@ def cell_centre(index, cells, contracted):
 
 @kernel
 def count_views(counter, worker, cells, contracted, near, views, mask_first, mask, seen, marked):
-    """For each cell, how many cameras see its centre from farther than ``near``.
+    """For each cell, how many cameras see its center from farther than ``near``.
 
-    seen: uint16 (cells^3,). mask: uint8, one flag a pixel of the views that have one, from mask_first[v]
-    (int64 (V,), -1: none) on: marked, uint16 (cells^3,), counts the cameras that see the cell at a flagged
-    pixel. Lens distortion is left out: it moves a cell's centre by less than a cell.
+    mask: uint8, a flag for each pixel of the views that have a mask, of view v from mask_first[v] on.
+    mask_first: int64 (V,), -1: no mask. seen: uint16 (cells^3,), the count.
+    marked: uint16 (cells^3,), how many cameras see the cell at a flagged pixel.
+    Lens distortion is left out: it moves a cell's center by less than a cell.
     """
     tasks = (seen.size + CELLS_A_TASK - 1) // CELLS_A_TASK
     while True:
@@ -66,9 +67,9 @@ def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, 
                    min_views, density, acts, x):  # fmt: skip
     """Refresh every ``phases``-th cell's density: the larger of the faded old one and a new random sample.
 
+    key: uint64, random stream. seen: uint16 (cells^3,); cells seen by fewer than min_views get 0.
     density: float32 (cells^3,), per scene unit, times how much longer steps are where space is contracted.
-    seen: uint16 (cells^3,); cells with fewer than min_views are 0. acts: float32 (W, units, CHUNK) and x:
-    float32 (W, 3, CHUNK), scratch.
+    acts: float32 (W, units, CHUNK) and x: float32 (W, 3, CHUNK), scratch.
     """
     per_task = CELLS_A_TASK
     cells_here = (density.size + phases - 1 - phase) // phases
@@ -81,11 +82,11 @@ def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, 
             return
         start = n = np.int64(0)
         first, end = task * per_task, min((task + 1) * per_task, cells_here)
-        for turn in range(first, end):
-            cell = turn * phases + phase
+        for index in range(first, end):
+            cell = index * phases + phase
             if seen[cell] < min_views:
                 continue
-            k = np.uint64(turn) * np.uint64(4)
+            k = np.uint64(index) * np.uint64(4)
             i, j, l = cell % cells, (cell // cells) % cells, cell // (cells * cells)
             x[worker, 0, n] = (np.float32(i) + uniform(key, k)) * size
             x[worker, 1, n] = (np.float32(j) + uniform(key, k + np.uint64(1))) * size
@@ -94,15 +95,15 @@ def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, 
         query_density(encoding, levels, net, x[worker], start, n, acts[worker])
         raw = acts[worker, out_row]
         n = 0
-        for turn in range(first, end):
-            cell = turn * phases + phase
+        for index in range(first, end):
+            cell = index * phases + phase
             if seen[cell] < min_views:
                 density[cell] = np.float32(0.0)
                 continue
             sigma = exp32(min(max(raw[n], np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
             _, _, _, stretch = cell_centre(cell, cells, contracted)
             fresh = sigma * np.float32(stretch)
-            # A density that is not finite says nothing: look again, and let training repair it.
+            # A density that is not finite: sample the cell again, and let training repair it.
             density[cell] = max(density[cell] * fade, fresh) if is_finite(fresh) else np.float32(1e3)
             n += 1
 

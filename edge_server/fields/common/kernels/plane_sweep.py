@@ -1,5 +1,5 @@
-"""Where surfaces are likely, before anything is known: cells whose colour the cameras agree on, and for each
-pixel the best of the cells its ray passes (plane sweep by votes, after Seitz and Dyer's voxel colouring)."""
+"""Where surfaces are likely before anything is learned: cells whose color the cameras agree on, and for each
+pixel the best cell on its ray (plane sweep by votes, after Seitz and Dyer's voxel coloring)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from edge_server.fields.splat.kernels.project import LENS, NEAR, ORIGIN, bent, h
 
 MOST_VIEWS = 32  # that vote
 NOT_SEEN = -2.0
-# What a pixel says of a cell. Added up over all views, the first stays below the second.
+# Flags of a pixel. Added up over all views, the first stays below the second.
 SEES, UNMARKED = 1, 256
-_NO_COLOR = 1e3  # times a number of its own: no colour, and near no other
+_NO_COLOR = 1e3  # times a number of its own: far from every color and from each other
 _BYTE = np.float32(1.0 / 255.0)
-_EMPTY_VIEWS = 2  # that see plain background through a cell suffice to empty it
+_EMPTY_VIEWS = 2  # so many views that see plain background at a cell empty it
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
@@ -29,8 +29,10 @@ def _spread(u):
 
 @part
 def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
-    """Where camera ``held`` sees each cell of a row (its places: float32 (3, cells)): the pixel's number,
-    ``nowhere`` if it is not in the picture, to pixels: int32 (cells,)."""
+    """Which pixel shows each cell of a row: pixels, int32 (cells,), receives its number, or ``nowhere``.
+
+    cam: of ``held``. first: the picture's first pixel. row: float32 (3, cells), the cells' centers.
+    """
     for k in range(pixels.size):
         x, y, z = row[0, k] - cam[ORIGIN], row[1, k] - cam[ORIGIN + 1], row[2, k] - cam[ORIGIN + 2]
         depth = cam[6] * x + cam[7] * y + cam[8] * z
@@ -45,51 +47,55 @@ def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
 
 
 @part
-def _hidden_cells(cams, size, first, says, nowhere, row, pixels, told, hidden):
-    """Where each camera sees each cell of a row, to pixels: int32 (MOST_VIEWS, cells), and which of them most
-    cameras that see them see unmarked, to hidden: bool (cells,); returns whether all are, and the rest of
-    ``pixels`` is not needed. Side by side, since nearly all are: few of hundred thousands need a closer look.
+def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden):
+    """Which pixels show each cell of a row, and which cells are hidden: most cameras that see them see them
+    unmarked. Returns whether all are; then the rest of ``pixels`` is not filled.
 
-    says: int32 (P + 1,), what a pixel says: ``SEES``, ``SEES + UNMARKED``, or nothing, as number P does,
-    which is ``nowhere``; or (0,): nothing is hidden."""
+    flags: int32 (P + 1,), of each pixel: ``SEES``, ``SEES + UNMARKED``, or 0, as of number P, which is
+        ``nowhere``; or (0,): no cell is hidden. row: float32 (3, cells). tally: int32 (cells,), scratch.
+    pixels: int32 (MOST_VIEWS, cells) and hidden: bool (cells,), receive the results. Cells are looked at side
+    by side, since nearly all are hidden: few of hundred thousands need a closer look.
+    """
     total, cells = cams.shape[0], hidden.size
     for k in range(cells):
-        told[k] = 0
+        tally[k] = 0
     for v in range(total):
         width, height, seen = np.int32(size[v, 0]), np.int32(size[v, 1]), pixels[v]
         _pixels_of_row(held(cams, v), np.int32(first[v]), width, height, np.int32(nowhere), row, seen)
-        if says.size == 0:
+        if flags.size == 0:
             continue
         few = 0
         for k in range(cells):
-            told[k] += says[np.int64(seen[k])]
+            tally[k] += flags[np.int64(seen[k])]
         if 2 * v < total:
             continue
         for k in range(cells):
-            few += np.int32(2 * (told[k] // UNMARKED) <= total)
+            few += np.int32(2 * (tally[k] // UNMARKED) <= total)
         if few == 0:
             return True
     for k in range(cells):
-        hidden[k] = 2 * (told[k] // UNMARKED) > told[k] % UNMARKED
+        hidden[k] = 2 * (tally[k] // UNMARKED) > tally[k] % UNMARKED
     return False
 
 
 @kernel
-def score_cells(counter, worker, cams, views, blurred, says, plain, plain_color, tolerance, contracted,
+def score_cells(counter, worker, cams, views, blurred, flags, plain, plain_color, tolerance, contracted,
                 cells, min_views, scores):  # fmt: skip
-    """scores: float32 (cells^3,), x fastest: how well the cameras agree on a colour there, up to 1; NOT_SEEN
-    where fewer than min_views look or background shows. Tasks are layers along z.
+    """How well the cameras agree on the color of each cell. Tasks are layers along z.
 
-    views: ``rays.Views`` of at most MOST_VIEWS cameras, rows of ``cams``; blurred: uint8 (pixels, 3 or 4),
-    their pictures at the cells' sharpness; pixels of weight 0 have no say. says: see ``_hidden_cells``:
-    only cells that most cameras see marked are looked at, the others are NOT_SEEN; or (0,): all are. plain:
-    whether plain_color (3,) is an empty background; tolerance: of a colour, summed over channels, in [0, 3].
+    cams: float32 rows of at most MOST_VIEWS cameras; views: ``rays.Views`` of the same. Pixels of weight 0 do
+        not vote. blurred: uint8 (pixels, 3 or 4), the pictures as sharp as the cells.
+    flags: see ``_hidden_cells``; (0,): all cells are scored.
+    plain: whether plain_color, float32 (3,), is an empty background.
+    tolerance: float32, between agreeing colors, summed over channels, in [0, 3].
+    scores: float32 (cells^3,), x fastest, receives up to 1; NOT_SEEN where fewer than min_views see the cell,
+        where it is hidden, or where background shows.
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
     red, green, blue = np.empty(MOST_VIEWS, np.float32), np.empty(MOST_VIEWS, np.float32), (
         np.empty(MOST_VIEWS, np.float32))  # fmt: skip
     places, pixels = np.empty((3, cells), np.float32), np.empty((MOST_VIEWS, cells), np.int32)
-    told, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
+    tally, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
     sizes, firsts, weight, nowhere = views.size, views.first, views.weight, blurred.shape[0]
     size = np.float32(2.0) * half / np.float32(cells)
     while True:
@@ -103,7 +109,7 @@ def score_cells(counter, worker, cams, views, blurred, says, plain, plain_color,
                 z = (np.float32(layer) + np.float32(0.5)) * size - half
                 s = _spread(max(abs(x), max(abs(y), abs(z)))) if contracted else _F1
                 places[0, ix], places[1, ix], places[2, ix] = x * s, y * s, z * s
-            nothing = _hidden_cells(cams, sizes, firsts, says, nowhere, places, pixels, told, hidden)
+            nothing = _hidden_cells(cams, sizes, firsts, flags, nowhere, places, pixels, tally, hidden)
             for ix in range(cells):
                 at = ix + cells * (iy + cells * layer)
                 scores[at] = np.float32(NOT_SEEN)
@@ -144,11 +150,13 @@ def score_cells(counter, worker, cams, views, blurred, says, plain, plain_color,
 @kernel
 def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted, cells, least, scores,
                distance):  # fmt: skip
-    """For ray n, through pixel ``pixels[n]`` (int64, within the view) of view ``view_of[n]`` (int64), the
-    distance in scene units of the best cell on it; 0 where none is better than ``least``, float32. Tasks are
-    runs of 256 rays.
+    """The distance of the best cell on each ray. Tasks are runs of 256 rays.
 
-    middle: the distance that is taken where nothing speaks for another one."""
+    view_of: int64 (N,), each ray's view; pixels: int64 (N,), its pixel within that.
+    near, middle: float32, scene units: the nearest distance, and the one preferred between equal scores.
+    scores: of ``score_cells``.
+    distance: float32 (N,), receives scene units; 0 where no cell scores above ``least``, float32.
+    """
     half = np.float32(2.0) if contracted else _F1
     size = np.float32(2.0) * half / np.float32(cells)
     horizon = np.float32(HORIZON) if contracted else _F1

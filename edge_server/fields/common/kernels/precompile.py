@@ -1,5 +1,5 @@
 """Compiling before the first fit, on every core: numba compiles one function at a time in a process, so other
-processes compile the rest and leave it in the cache on disk."""
+processes compile the rest into the cache on disk."""
 
 from __future__ import annotations
 
@@ -35,30 +35,29 @@ log = logging.getLogger(__name__)
 Call = tuple[Dispatcher, tuple[Any, ...]]  # a kernel and the numba types of its arguments
 
 
-def compile_ahead(tour: Callable[[Pool], None]) -> float:
-    """Compile, or load from numba's cache, the kernels that ``tour`` runs through the pool that it is given;
-    returns the seconds that took.
+def compile_ahead(run_kernels: Callable[[Pool], None]) -> float:
+    """Compile, or load from numba's cache, all kernels that ``run_kernels`` runs; returns the seconds.
 
-    ``tour`` is gone through twice: first nothing is run and it is noted what would be, then all of it is.
-    What the first pass misses, because it depends on what a kernel computes, the second compiles.
+    run_kernels: called twice with a pool to run kernels in. The first pool only records them, the second runs
+    them. Kernels that are missed at first, because they depend on what others compute, are compiled then.
     """
     start = time.perf_counter()
-    listing = _Listing()
-    with np.errstate(all="ignore"):  # of memory that nobody filled
-        tour(listing)
+    recording = _RecordingPool()
+    with np.errstate(all="ignore"):  # of memory that no kernel filled
+        run_kernels(recording)
     missing = sorted(
-        (c for c in listing.calls if not is_stored(*c)), key=lambda call: -_size(call[0].py_func)
+        (c for c in recording.calls if not is_stored(*c)), key=lambda call: -_size(call[0].py_func)
     )
     if len(missing) > 1:
-        own = [(kernel, tuple(map(typeof, args))) for kernel, args in work_queue.calls()]  # a pool's
+        own = [(kernel, tuple(map(typeof, args))) for kernel, args in work_queue.kernel_calls()]  # a pool's
         missing += [call for call in own if not is_stored(*call)]
         _compile_together(missing, min(cores() - 1, HELPERS, len(missing) - 1))
-    tour(CallerPool())
+    run_kernels(CallerPool())
     return time.perf_counter() - start
 
 
-class _Listing(CallerPool):
-    """Runs nothing and notes what would be called, each once, in order."""
+class _RecordingPool(CallerPool):
+    """Runs nothing and records what would be called, each once, in order."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -71,12 +70,12 @@ class _Listing(CallerPool):
 
 
 def _compile_together(calls: list[Call], helpers: int) -> None:
-    """Compile the kernels, the largest first, here and in ``helpers`` other processes. Whatever goes wrong
-    there is compiled here when it is needed."""
+    """Compile the kernels, the largest first, here and in ``helpers`` other processes. What fails there is
+    compiled here when it is needed."""
     waiting = deque(calls)
-    # The largest here: a helper has to be started first.
+    # The largest one here: a helper takes time to start.
     mine = waiting.popleft()
-    running = [_Helper(waiting) for _ in range(helpers)]
+    running = [_CompilerProcess(waiting) for _ in range(helpers)]
     try:
         mine[0].compile(mine[1])
         for kernel, types in _drawn(waiting):
@@ -97,8 +96,8 @@ def _drawn(waiting: deque[Call]) -> Iterator[Call]:
             return
 
 
-class _Helper(threading.Thread):
-    """Has a process of its own compile kernels until none are left."""
+class _CompilerProcess(threading.Thread):
+    """A thread whose own process compiles kernels until none are left."""
 
     def __init__(self, waiting: deque[Call]) -> None:
         super().__init__(name="compiles-ahead", daemon=True)
@@ -129,12 +128,12 @@ class _Helper(threading.Thread):
             return
 
     def join(self, timeout: float | None = None) -> None:
-        """Wait for the kernel that is being compiled, if the process could be started."""
+        """Wait for the kernel being compiled, if the process could be started."""
         if self._process is not None:
             super().join(timeout)
 
     def end(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process."""
         if self._process is None:
             return
         self._process.kill()
@@ -142,12 +141,12 @@ class _Helper(threading.Thread):
         super().join(1.0)
         for pipe in () if self.is_alive() else (self._process.stdin, self._process.stdout):
             if pipe is not None:
-                with suppress(OSError):  # what it was still to be told has nowhere to go
+                with suppress(OSError):  # what was still buffered has nowhere to go
                     pipe.close()
 
 
 def _serve() -> None:
-    """In a helper: compile what the lines of stdin ask for, answer each with a line, end where they end."""
+    """The helper process: compile what each line of stdin asks for and answer with a line, until it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends who asked, and with it stdin
     for line in sys.stdin.buffer:
         module, name, types = pickle.loads(base64.b64decode(line))
@@ -157,8 +156,8 @@ def _serve() -> None:
 
 
 def _size(function: Callable[..., Any], inside: frozenset[Any] = frozenset()) -> int:
-    """How much there is to compile: bytes of code, of its parts and theirs."""
-    inside |= {function}  # names are attributes', too: what looks like a call may be none, and lead back
+    """How much there is to compile: bytes of code of a function and of the parts that it calls."""
+    inside |= {function}  # names may be attributes', and lead back here
     named = (function.__globals__.get(name) for name in function.__code__.co_names)
     parts = {value.py_func for value in named if isinstance(value, Dispatcher)} - inside
     return len(function.__code__.co_code) + sum(_size(part, inside) for part in parts)

@@ -1,4 +1,4 @@
-"""From a pixel to the samples of its ray: lens, pose, the scene's box, contraction and occupancy.
+"""From a pixel to the samples of its ray: lens, pose, the scene's box, contraction and occupancy grid.
 
 Scene coordinates: the box of interest is [-1, 1]^3. Where the scene goes on beyond it, space is contracted
 (Barron et al. 2022, with the maximum norm): |x| > 1 becomes (2 - 1/|x|) x/|x|, so that all of it lies in
@@ -20,9 +20,13 @@ HORIZON = 20.0  # contracted scenes end here, in scene units: nothing behind it 
 
 
 class Space(NamedTuple):
-    """Where samples are taken. occupied: uint8 (cells^3,), x fastest; coarse: the same for blocks of
-    COARSE^3. density: float32 (cells^3,), what is known of it (``occupancy``), read only where a ray is to
-    end early. step, near: float32, scene units; contracted: whether space goes on beyond the box."""
+    """Where samples are taken.
+
+    occupied: uint8 (cells^3,), x fastest; coarse: the same for blocks of COARSE^3 cells.
+    density: float32 (cells^3,), see ``occupancy``; read only if a ray is to end early.
+    contracted: whether space goes on beyond the box.
+    step: float32, distance between samples; near: float32, of the first one; scene units.
+    """
 
     occupied: NDArray[np.uint8]
     coarse: NDArray[np.uint8]
@@ -34,15 +38,17 @@ class Space(NamedTuple):
 
 
 class Views(NamedTuple):
-    """The pictures of one fit, V of them, in one piece of memory.
+    """The pictures of one fit, V of them with N pixels together, packed.
 
-    first: int64 (V + 1,), each view's first pixel. size: int64 (V, 2), width and height. lens: float64
-    (V, 8), fx fy cx cy k1 k2 p1 p2. rotation: float64 (V, 3, 3), camera to world. origin: float64 (V, 3),
-    scene units. pixels: uint8 (N, 3 or 4). changed: int64 (M,), pixels that moved since the camera's
-    previous view. exposure: float32 (V, 3, 2), gain and bias that pixels are corrected by; V = 0: none.
-    weight: float32 (N,), what each pixel's loss is multiplied by; size 0: all by 1. drawn: int64 (K,), the
-    pixels of weight above 0; size 0: all of them. ``changed`` holds none of weight 0. guide: float32 (N,),
-    distance in scene units of what a pixel shows (``plane_sweep.guide``), 0: not known; size 0: of none.
+    first: int64 (V + 1,), each view's first pixel. size: int64 (V, 2), width and height.
+    lens: float64 (V, 8), fx fy cx cy k1 k2 p1 p2. rotation: float64 (V, 3, 3), camera to world.
+    origin: float64 (V, 3), scene units. pixels: uint8 (N, 3 or 4).
+    changed: int64 (M,), pixels that moved since the camera's previous view, none of weight 0.
+    exposure: float32 (V, 3, 2), gain and bias that correct pixels; V = 0: none.
+    weight: float32 (N,), of each pixel's loss; size 0: all 1.
+    drawn: int64 (K,), the pixels of weight above 0; size 0: all of them.
+    guide: float32 (N,), distance in scene units of what a pixel shows (``plane_sweep.depth_guide``), 0:
+        unknown; size 0: all unknown.
     """
 
     first: NDArray[np.int64]
@@ -90,8 +96,8 @@ def slab(o, d, half, enter, leave):
 
 @part
 def interval(space, ox, oy, oz, dx, dy, dz):
-    """Where a ray enters and leaves the scene; leave <= enter where it misses it, or is no ray at all: the
-    undistortion of a lens that no glass has diverges, and NaN must not become the number of a cell."""
+    """Where a ray enters and leaves the scene; leave <= enter if it misses it or is not finite: undistortion
+    may diverge for an impossible lens, and NaN must not become the number of a cell."""
     # Not is_finite(): numba loses the name of an inlined function's own inlined callee.
     if not abs(dx + dy + dz + ox + oy + oz) <= np.float32(3.4e38):
         return np.float32(0.0), np.float32(-1.0)

@@ -1,4 +1,4 @@
-"""Render rays of a camera, front to back, a few samples at a time, until each ray is opaque or through."""
+"""Render rays of a camera front to back, a few samples at a time, until each ray is opaque or has left."""
 
 from __future__ import annotations
 
@@ -19,13 +19,19 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 @kernel
 def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encoding, levels, net, harmonics,
                  max_samples, background, acts, x, line, color, depth, opacity):  # fmt: skip
-    """pixels: float64 (N, 2), image points. color: float32 (N, 3), depth (scene units) and opacity: (N,),
-    all written. max_samples: a ray's samples at most. acts: float32 (W, units, TILE ROUND), x: (W, 3, same),
-    line: (W, 2, same), scratch."""
+    """Render image points; tasks are runs of TILE of them.
+
+    lens: float64 (8,). rotation: float64 (3, 3), camera to world. origin: float64 (3,), scene units.
+    pixels: float64 (N, 2), image points. max_samples: of a ray. background: float32 (3,).
+    acts: float32 (W, units, TILE ROUND), x: (W, 3, same), line: (W, 2, same), scratch.
+    color: float32 (N, 3), depth (scene units) and opacity: float32 (N,); all written.
+    """
     out_row = acts.shape[1] - net.widths[-1]
     ts, dts = line[worker, 0], line[worker, 1]
     out = acts[worker, out_row:]
-    way = np.empty((TILE, 6), np.float32)  # direction, distance reached, distance of leaving, optical depth
+    travel = np.empty(
+        (TILE, 6), np.float32
+    )  # direction, distance reached, distance of leaving, optical depth
     first = np.empty(TILE + 1, np.int64)
     active = np.empty(TILE, np.int64)
     taken = np.empty(TILE, np.int64)
@@ -39,8 +45,8 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
         for r in range(rays):
             dx, dy, dz = pixel_direction(lens, rotation, pixels[base + r, 0], pixels[base + r, 1])
             enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
-            way[r, 0], way[r, 1], way[r, 2] = dx, dy, dz
-            way[r, 3], way[r, 4], way[r, 5] = enter + np.float32(0.5) * space.step, leave, _F0
+            travel[r, 0], travel[r, 1], travel[r, 2] = dx, dy, dz
+            travel[r, 3], travel[r, 4], travel[r, 5] = enter + np.float32(0.5) * space.step, leave, _F0
             taken[r] = 0
             color[base + r] = _F0
             depth[base + r] = opacity[base + r] = _F0
@@ -54,9 +60,11 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
                 r = active[k]
                 limit = n + min(ROUND, max_samples - taken[r])
                 before = n
-                n, t, _ = march(space, ox, oy, oz, way[r, 0], way[r, 1], way[r, 2], way[r, 3], way[r, 4],
-                             x[worker], ts, dts, n, limit, NEVER)  # fmt: skip
-                way[r, 3] = t
+                n, t, _ = march(
+                    space, ox, oy, oz, travel[r, 0], travel[r, 1], travel[r, 2], travel[r, 3],
+                    travel[r, 4], x[worker], ts, dts, n, limit, NEVER,
+                )  # fmt: skip
+                travel[r, 3] = t
                 taken[r] += n - before
                 first[k + 1] = n
             query_density(encoding, levels, net, x[worker], start, n, acts[worker])
@@ -64,16 +72,18 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
             if harmonics > 1:
                 for k in range(count):
                     r = active[k]
-                    add_harmonics(out, harmonics, first[k], first[k + 1], way[r, 0], way[r, 1], way[r, 2])
+                    add_harmonics(
+                        out, harmonics, first[k], first[k + 1], travel[r, 0], travel[r, 1], travel[r, 2]
+                    )
             activate(out, start, n)
             left = 0
             for k in range(count):
                 r = active[k]
                 pixel = base + r
-                through = exp32(-way[r, 5])
+                through = exp32(-travel[r, 5])
                 for s in range(first[k], first[k + 1]):
-                    way[r, 5] += out[0, s] * dts[s]
-                    after = exp32(-way[r, 5])
+                    travel[r, 5] += out[0, s] * dts[s]
+                    after = exp32(-travel[r, 5])
                     w = through - after
                     color[pixel, 0] += w * out[1, s]
                     color[pixel, 1] += w * out[2, s]
@@ -81,7 +91,11 @@ def render_tiles(counter, worker, lens, rotation, origin, pixels, space, encodin
                     depth[pixel] += w * ts[s]
                     opacity[pixel] += w
                     through = after
-                if way[r, 5] <= np.float32(OPAQUE_DEPTH) and way[r, 3] < way[r, 4] and taken[r] < max_samples:
+                if (
+                    travel[r, 5] <= np.float32(OPAQUE_DEPTH)
+                    and travel[r, 3] < travel[r, 4]
+                    and taken[r] < max_samples
+                ):
                     active[left] = r
                     left += 1
             count = left

@@ -1,4 +1,4 @@
-"""What numba lacks on CPUs: an atomic counter, a number's bits, a vectorisable exp, counter-based noise."""
+"""What numba lacks on CPUs: atomic counters, bits of numbers, vectorizable exp and log, counter-based RNG."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def fetch_add(typingctx: Any, array: Any, value: Any) -> Any:
 
 
 @intrinsic
-def _fetch_add_at(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """``fetch_add`` of any element."""
+def fetch_add_at(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """``fetch_add`` of element ``index``."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -41,13 +41,15 @@ COUNTER = 8
 
 @part
 def draw(counter, worker, tasks):
-    """The number of a task that nobody has drawn, ``tasks`` or more where none is left. Each worker has a
-    range of its own to begin with, the same in every kernel, so that its core still has in its cache what it
-    wrote there the last time; then it helps the others."""
+    """The number of a task that no worker has drawn yet; ``tasks`` or more if none is left.
+
+    Each worker begins with a range of its own, the same in every kernel, so that its core's cache still has
+    what it wrote there the last time; then it helps the others.
+    """
     workers = max(counter.size // COUNTER, 1)
     for k in range(workers):
         of = (worker + k) % workers
-        task = tasks * of // workers + _fetch_add_at(counter, of * COUNTER, 1)
+        task = tasks * of // workers + fetch_add_at(counter, of * COUNTER, 1)
         if task < tasks * (of + 1) // workers:
             return task
     return tasks
@@ -228,7 +230,7 @@ _HALF, _ONE, _LOWEST, _HIGHEST = _F(0.5), _F(1.0), _F(-87.0), _F(88.0)
 def exp32(x):
     """exp in float32, argument clamped to [-87, 88], relative error below 2e-7; NaN stays NaN.
 
-    The Cephes polynomial, because a call into libm would keep LLVM from vectorising the loop around it.
+    The Cephes polynomial, because a call into libm would keep LLVM from vectorizing the loop around it.
     """
     clamped = min(max(x if x == x else _ONE, _LOWEST), _HIGHEST)  # a NaN has no integer part
     n = np.floor(clamped * _LOG2_E + _HALF)

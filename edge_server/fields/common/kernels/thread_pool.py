@@ -1,13 +1,13 @@
-"""A small pool of threads that run nogil kernels side by side, at low priority where others go first.
+"""A small pool of threads that run nogil kernels side by side, at a low priority if wanted.
 
 Not numba's own threading layers: those abort or serialise when several Python threads start parallel
 kernels, and here a page renders while the field trains.
 
-A kernel takes milliseconds or less, so where its threads wake up matters. Linux puts a thread that wakes on
-a core that is idle at that moment, and seldom moves it afterwards, least of all one of low priority. A
-caller that woke one worker a core would itself keep a core busy until it slept: two workers on one core,
-the other idle, in four calls of ten on two cores. So whoever computes wakes at most two others first, and
-the caller computes itself, unless it is to go before the workers.
+A kernel takes milliseconds or less, so it matters on which core its threads wake. Linux puts a waking thread
+on a core that is idle at that moment and seldom moves it afterwards, least of all at a low priority. A caller
+that woke one worker a core would itself keep a core busy until it slept: in four calls of ten on two cores,
+both workers shared one core. So each thread that computes wakes at most two others first, and the caller
+computes itself, unless its priority is higher than the workers'.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from edge_server.fields.common.kernels.work_queue import (
     NOTHING,
     NUMBER,
     WORK,
-    attend,
-    await_others,
-    looks,
-    make_board,
-    offer,
+    await_workers,
+    make_queue,
+    poll_for_job,
+    polls_before_sleep,
+    post_job,
 )
 
-# For who runs several processes side by side.
+# Environment variable: threads of a pool, for users who run several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
 
-SERVER_NICE = 5  # of what computes in a server that answers cameras meanwhile
+SERVER_NICE = 5  # of workers in a server that answers cameras meanwhile
 
 
 def cores() -> int:
-    """How many threads or processes may compute side by side here. ValueError where the environment's
-    FRESHFIELD_THREADS is no number."""
+    """How many threads or processes may compute side by side here. ValueError: FRESHFIELD_THREADS in the
+    environment is not a number."""
     given = os.environ.get(THREADS_VARIABLE, "")
     if given:
         if not given.isdigit():
@@ -62,24 +62,26 @@ class _Job:
     def __init__(self, kernel: Callable[..., Any], args: tuple[Any, ...], threads: int) -> None:
         self.kernel, self.args = kernel, args
         self.counter = np.zeros(COUNTER * threads, np.int64)
-        self.number = 0  # on the board, if it stands there
-        # 1 where a worker has it, and is done with it: worker 0 is who waits for the others.
+        self.number = 0  # in the queue, if it was posted there
+        # 1 for each worker that has taken it, and has finished it. Worker 0 waits for the others.
         self.taken, self.finished = bytearray(threads), bytearray(threads)
-        # Queues, not semaphores: an interrupt may leave those locked, being Python.
+        # Queues, not semaphores: those are Python code, which an interrupt may leave locked.
         self.done, self.over = SimpleQueue[None](), SimpleQueue[None]()
         self.ended = False
         self.error: BaseException | None = None
 
 
 class Pool:
-    """``threads`` workers. ``run(kernel, *args)`` calls ``kernel(counter, worker, *args)`` on each of them;
-    the kernel draws task numbers from ``counter`` until none are left (see ``kernels.intrinsics``).
+    """``run(kernel, *args)`` calls ``kernel(counter, worker, *args)`` on each worker; the kernel draws task
+    numbers from ``counter`` until none are left (see ``simd``).
 
-    Any number of Python threads may call ``run``: one job is done after the other.
-    threads: default, the environment's FRESHFIELD_THREADS, else the number of cores this process may use.
-    Results do not depend on it. nice: the workers' priority where the system allows it (Linux counts it per
-    thread), so that who ingests frames goes first. With 0, the caller's, a caller is worker 0 itself. Where
-    there is a core for each worker, they look for work on a ``board`` for a moment before they sleep.
+    Any number of Python threads may call ``run``: one job is done after the other. If there is a core for
+    each worker, workers poll for jobs for a moment before they sleep.
+
+    threads: number of workers; results do not depend on it. Default: the environment's FRESHFIELD_THREADS,
+        else the number of cores that this process may use.
+    nice: the workers' priority where the system allows it (Linux has one per thread), so that threads that
+        ingest frames go first. With 0, the caller's priority, the caller itself is worker 0.
     """
 
     def __init__(self, threads: int | None = None, nice: int = 0) -> None:
@@ -88,26 +90,26 @@ class Pool:
             raise ValueError(f"a pool needs at least one thread, not {self.threads}")
         self.nice = nice
         self._queues: list[SimpleQueue[_Job | None]] = [SimpleQueue() for _ in range(self.threads)]
-        self._seat = threading.Lock()  # held by whoever is worker 0
-        self._gate, self._closed = threading.Lock(), False
-        self._boards = 1 < self.threads <= _own_cores()
-        self._board, self._states = make_board(self.threads), np.zeros(COUNTER * self.threads, np.int64)
+        self._leading = threading.Lock()  # held by the thread that is worker 0
+        self._closing, self._closed = threading.Lock(), False
+        self._polls = 1 < self.threads <= _own_cores()
+        self._queue, self._states = make_queue(self.threads), np.zeros(COUNTER * self.threads, np.int64)
         self._number = 0
-        self._job: _Job | None = None  # that is being done
+        self._job: _Job | None = None  # the one in progress
         for worker in range(self.threads):
             name = f"field-worker-{worker}"
             threading.Thread(target=self._serve, args=(worker,), name=name, daemon=True).start()
 
     def run(self, kernel: Callable[..., Any], *args: Any) -> None:
-        """Run ``kernel`` on all workers and wait for them; raises what a worker raised. RuntimeError if the
+        """Run ``kernel`` on all workers and wait for them; raises what a worker raised. RuntimeError: the
         pool is closed."""
         job = _Job(kernel, args, self.threads)
         if self.nice == 0:
-            with self._seat:
+            with self._leading:
                 self._check_open()
                 self._lead(job)
         else:
-            with self._gate:
+            with self._closing:
                 self._check_open()
                 self._queues[0].put(job)
             try:
@@ -124,8 +126,8 @@ class Pool:
                 del error, job  # or its arrays would live in its traceback
 
     def close(self) -> None:
-        """End the workers once they have finished what was begun."""
-        with self._gate:
+        """End the workers once they have finished the jobs that were begun."""
+        with self._closing:
             self._closed = True
             self._queues[0].put(None)
 
@@ -134,22 +136,22 @@ class Pool:
             raise RuntimeError("the pool is closed")
 
     def _lead(self, job: _Job) -> None:
-        """What worker 0 does: its share, and see to it that the others do theirs. Who is interrupted waits
-        for them all the same, or the next one does: nobody writes to a job's arrays after that."""
+        """Worker 0: do its share and wait for the others. An interrupted caller waits for them as well, or
+        the next one does, so that no worker writes to a job's arrays afterwards."""
         self._finish_abandoned()
-        searching = looks() if self._boards else 0
-        if searching:
+        polls = polls_before_sleep() if self._polls else 0
+        if polls:
             self._number += 1
-            job.number, job.counter = self._number, self._board[COUNTERS:]
+            job.number, job.counter = self._number, self._queue[COUNTERS:]
         try:
             self._job = job
-            if searching:
-                offer(self._board, job.number)
+            if polls:
+                post_job(self._queue, job.number)
             self._work(job, 0)
-            if not searching:
+            if not polls:
                 for _ in range(self.threads - 1):
                     job.done.get()
-            elif not await_others(self._board, self.threads - 1, searching):
+            elif not await_workers(self._queue, self.threads - 1, polls):
                 job.done.get()
         except BaseException:
             self._finish_abandoned()
@@ -157,19 +159,19 @@ class Pool:
         self._job = None
 
     def _finish_abandoned(self) -> None:
-        """Wait for what the others do of a job whose caller was interrupted."""
+        """Wait for the workers of a job whose caller was interrupted."""
         job = self._job
         if job is None:
             return
-        if not self._boards or self._board[NUMBER] == job.number:  # else nobody was told of it
-            self._wake_others(0, job)  # who has it already takes it no more
+        if not self._polls or self._queue[NUMBER] == job.number:  # otherwise it was never posted
+            self._wake_others(0, job)  # a worker that has it does not take it again
             while not self._others_are_done(job):
                 time.sleep(1e-3)
         self._job = None
 
     def _others_are_done(self, job: _Job) -> bool:
-        if self._boards:
-            return bool(self._board[DONE] % ASLEEP == self.threads - 1)
+        if self._polls:
+            return bool(self._queue[DONE] % ASLEEP == self.threads - 1)
         return all(job.finished[1:])
 
     def _serve(self, worker: int) -> None:
@@ -177,14 +179,14 @@ class Pool:
         if worker == 0:
             while (job := self._queues[0].get()) is not None:
                 try:
-                    with self._seat:
+                    with self._leading:
                         self._lead(job)
                 except BaseException as error:  # of a kernel's compilation, say
                     job.error = job.error or error
                 job.ended = True
                 job.over.put(None)
                 del job  # or the last job's arrays would live until the next one comes
-            with self._seat:  # what a caller has begun goes before the end
+            with self._leading:  # finish what a caller has begun
                 self._wake_others(worker, None)
             return
         last, done = 0, SimpleQueue[None]()
@@ -192,22 +194,22 @@ class Pool:
             self._work(job, worker)
             last, done = job.number, job.done
             job.finished[worker] = 1
-            if not self._boards:
+            if not self._polls:
                 done.put(None)
             del job
         self._wake_others(worker, None)
 
     def _next(self, worker: int, last: int, done: SimpleQueue[None]) -> _Job | None:
-        """What this worker is to do next, None: to end. last: the number of what it has just done, whose
-        caller may sleep until there is something in ``done``; 0 at first."""
+        """The next job of this worker; None: end. last: the number of its last job, whose caller may sleep
+        until there is something in ``done``; 0 at first."""
         others = self.threads - 1
-        while self._boards and last > 0:
-            found = attend(self._board, self._states, worker, last, others, looks())
+        while self._polls and last > 0:
+            found = poll_for_job(self._queue, self._states, worker, last, others, polls_before_sleep())
             others = 0
             if found == NOTHING:
                 break
             if found == WORK:
-                job = self._job  # cannot be another one before this worker is done
+                job = self._job  # it stays until this worker is done
                 assert job is not None
                 job.taken[worker] = 1
                 return job
@@ -215,9 +217,9 @@ class Pool:
         return self._woken(worker)
 
     def _woken(self, worker: int) -> _Job | None:
-        """What a sleeping worker is woken for. It holds no job meanwhile, or its arrays would live on."""
+        """The job a sleeping worker is woken for. It holds no job meanwhile: its arrays would live on."""
         while (job := self._queues[worker].get()) is not None and job.taken[worker]:
-            del job  # it stood on the board, too
+            del job  # it was found by polling already
         if job is not None:
             job.taken[worker] = 1
         return job
@@ -254,7 +256,7 @@ _shared_lock = threading.Lock()
 
 
 def shared_pool(threads: int | None = None, nice: int = 0) -> Pool:
-    """The process's pool for these settings, made at the first call. All fields of a process share it."""
+    """The pool of this process for these settings, made at the first call and shared by all fields."""
     with _shared_lock:
         if (threads, nice) not in _shared:
             _shared[threads, nice] = Pool(threads, nice)

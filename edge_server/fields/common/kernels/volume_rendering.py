@@ -1,4 +1,4 @@
-"""Volume rendering along rays (thesis 3.20-3.22) and its gradient, with the regularisers that live there.
+"""Volume rendering along rays (thesis 3.20-3.22), its gradient, and regularizers of a ray's weights.
 
 Transmittance is the exponential of an exclusive cumulative sum of optical depths: its gradient is right
 where a sample is opaque, which that of a cumulative product is not.
@@ -18,22 +18,26 @@ from edge_server.fields.common.kernels.simd import exp32, is_finite
 RAW_LOW, RAW_HIGH = -12.0, 9.0
 OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance of 1e-4
 
-# Weight so much nearer or farther than a guide, as a share of its distance, is half as wrong as can be.
+# Distance of weight from a guide, as a share of the guide's, at which it costs half of the most.
 GUIDE_REACH = 0.04
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
-# A density beyond these was clamped, whatever the exponential's last bit: it has no gradient.
+# A density beyond these was clamped, whatever the exponential's last bit, so it has no gradient.
 _CLAMPED_LOW = np.float32(np.exp(RAW_LOW) * 1.00001)
 _CLAMPED_HIGH = np.float32(np.exp(RAW_HIGH) * 0.99999)
 
 
 class Weights(NamedTuple):
-    """Strengths of the regularisers, float32. distortion: mip-NeRF 360's, gathers a ray's weight in one
-    place. sparsity: on optical depth itself, empties what no picture needs. near: distance in scene units
-    below which gradients fall with the square of distance, against haze before the lens (0: off). guide: on
-    weight that is not where a ray's guide says, or nowhere (the robust estimator of Geman and McClure, so
-    that a wrong guide pulls no harder than a doubtful one)."""
+    """Strengths of the regularizers, float32.
+
+    distortion: mip-NeRF 360's loss, gathers a ray's weight in one place.
+    sparsity: on optical depth itself, empties what no picture needs.
+    near: distance in scene units below which gradients fall with the square of distance, against haze before
+        the lens; 0: off.
+    guide: on weight away from a ray's guide, or nowhere (Geman and McClure's robust estimator, so that a
+        wrong guide pulls no harder than a doubtful one).
+    """
 
     distortion: np.float32
     sparsity: np.float32
@@ -43,7 +47,7 @@ class Weights(NamedTuple):
 
 @part
 def harmonic(k, x, y, z):
-    """Real spherical harmonics 1 to 8 of a unit direction, float32; harmonic 0 is the colour itself."""
+    """Real spherical harmonics 1 to 8 of a unit direction, float32; harmonic 0 is the color itself."""
     if k == 1:
         return np.float32(0.4886025) * y
     if k == 2:
@@ -63,7 +67,7 @@ def harmonic(k, x, y, z):
 
 @part
 def activate(out, a, b):
-    """Both of the following."""
+    """``activate_density`` and ``activate_color``."""
     activate_density(out, a, b)
     activate_color(out, a, b)
 
@@ -78,7 +82,7 @@ def activate_density(out, a, b):
 
 @part
 def activate_color(out, a, b):
-    """Raw colours -> colours in [0, 1], in place, samples a to b of rows 1 to 3."""
+    """Raw colors -> colors in [0, 1], in place, samples a to b of rows 1 to 3."""
     for c in range(1, 4):
         row = out[c, a:b]
         for s in range(row.size):
@@ -86,8 +90,8 @@ def activate_color(out, a, b):
 
 
 @part
-def seen_samples(out, dts, first, end):
-    """How many samples of a ray there are until it is opaque: density in row 0 of out."""
+def samples_until_opaque(out, dts, first, end):
+    """How many samples of a ray there are until it is opaque. Density is in row 0 of out."""
     depth = _F0
     for s in range(first, end):
         depth += out[0, s] * dts[s]
@@ -98,7 +102,8 @@ def seen_samples(out, dts, first, end):
 
 @part
 def add_harmonics(out, harmonics, first, end, dx, dy, dz):
-    """Add the direction's share to the raw colours of samples first to end: rows 1 to 3 of out."""
+    """Add the harmonics of direction (dx, dy, dz) to the raw colors, rows 1 to 3 of out, of samples first to
+    end."""
     for k in range(1, harmonics):
         y = harmonic(k, dx, dy, dz)
         for c in range(3):
@@ -108,7 +113,7 @@ def add_harmonics(out, harmonics, first, end, dx, dy, dz):
 
 
 @part
-def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
+def add_harmonics_backward(d_out, harmonics, first, end, dx, dy, dz):
     """The gradient of ``add_harmonics``: rows 4 on from rows 1 to 3 of d_out."""
     for k in range(1, harmonics):
         y = harmonic(k, dx, dy, dz)
@@ -120,12 +125,13 @@ def spread_harmonics(d_out, harmonics, first, end, dx, dy, dz):
 
 @part
 def ray_loss(out, d_out, ts, dts, w, first, end, target, background, guide, weights):
-    """Squared colour error of one ray (3.22) and its gradient.
+    """Squared color error of one ray (3.22) and its gradient.
 
-    out: float32 (>= 4, N), activated density and colour of samples first to end. d_out: like out, rows 0
-    to 3 receive dLoss / draw. ts, dts: float32 (N,). w: float32 (N,), scratch. target, background: float32
-    (3,). guide: float32, the distance at which the ray ends as far as is known, 0: it is not. Returns the
-    colour error, or -1 for a ray that is not finite: its gradient is 0.
+    out: float32 (>= 4, N), activated density and color of samples first to end.
+    d_out: like out, rows 0 to 3 receive dLoss / draw. ts, dts: float32 (N,), distance and length.
+    w: float32 (N,), receives weights. target, background: float32 (3,).
+    guide: float32, distance at which the ray probably ends; 0: unknown.
+    Returns the color error, or -1 for a ray that is not finite: its gradient is 0.
     """
     depth, shade_r, shade_g, shade_b = _F0, _F0, _F0, _F0
     transmitted, weight, moment = _F1, _F0, _F0

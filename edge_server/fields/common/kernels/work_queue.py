@@ -1,15 +1,15 @@
-"""Where a pool's threads find work, and tell that it is done, without going to sleep between two kernels.
+"""How a pool's threads find a job, and report that it is done, without sleeping between two kernels.
 
-A thread that sleeps takes tens of microseconds to wake, and a kernel may be done in a hundred. So who has
-just computed looks at a board for a while before it sleeps, without the GIL; and who waits for others looks
-there, too. Python threads that want the GIL while another holds it sleep as well: therefore nobody answers
-a new job before its caller is inside a kernel, which gives the GIL up, and has drawn its first task; or has
-had time to.
+A thread that sleeps takes tens of microseconds to wake, and a kernel may be done in a hundred. So a thread
+that has finished polls the queue for a while, without the GIL, before it sleeps; so does a caller that waits
+for the others. Python threads that want the GIL while another one holds it sleep as well: therefore no worker
+answers a new job before its caller is inside a kernel, which releases the GIL, and has drawn its first task;
+or has had time to.
 
-The board tells of one job: its number (0: there was none yet), whether its caller waits, how many others are
-done, and what its kernel counts tasks with (``intrinsics.draw``). Who goes to sleep says so first and then
-looks once more for a new number; who offers a job writes its number, last of all, and then looks who sleeps:
-one of the two sees the other.
+The queue holds one job: its number (0: none yet), whether its caller waits, how many workers are done, and
+the counters from which its kernel draws tasks (``simd.draw``). A thread that goes to sleep says so first and
+then checks once more for a new number; a caller writes the number of its job, last of all, and then checks
+who sleeps: one of the two sees the other.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel
-from edge_server.fields.common.kernels.simd import COUNTER
+from edge_server.fields.common.kernels.simd import COUNTER, fetch_add_at
 
 # Words, each with a cache line of its own, of COUNTER words; so have the states of the workers, and tasks.
 NUMBER, WAITS, DONE, COUNTERS = 0, COUNTER, 2 * COUNTER, 3 * COUNTER
-NOTHING, WORK, RELEASE = 0, 1, 2
-ASLEEP = 1 << 32  # added to DONE by a caller that went to sleep
-SEARCH_S = 150e-6  # before a thread sleeps: as long as it takes to wake, a few times
-_TRIED = 500  # looks, to learn how long one takes: 50 to 100 ns on x86, where waiting is an instruction
+NOTHING, WORK, WAKE_CALLER = 0, 1, 2
+ASLEEP = 1 << 32  # added to DONE by a caller that goes to sleep
+POLL_S = 150e-6  # before a thread sleeps: a few times as long as it takes to wake
+_TRIED = 500  # polls, to learn how long one takes: 50 to 100 ns on x86, where waiting is an instruction
 _X86, _ARM = ("x86_64", "AMD64"), ("aarch64", "arm64")
 
 
-def make_board(threads: int) -> NDArray[np.int64]:
+def make_queue(threads: int) -> NDArray[np.int64]:
     """int64 (words,), aligned to cache lines."""
     words = COUNTERS + COUNTER * threads
     memory = np.zeros(words + COUNTER, np.int64)
@@ -48,7 +48,7 @@ def make_board(threads: int) -> NDArray[np.int64]:
 
 @intrinsic
 def _load(typingctx: Any, array: Any, index: Any) -> Any:
-    """An element of a contiguous int64 array, as it is at this moment."""
+    """An element of a contiguous int64 array, read atomically."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -59,22 +59,11 @@ def _load(typingctx: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def _swap(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write an element; returns what was there."""
+    """Write an element atomically; returns what was there."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
         return builder.atomic_rmw("xchg", builder.gep(data, [args[1]]), args[2], "seq_cst")
-
-    return types.int64(array, types.int64, types.int64), codegen
-
-
-@intrinsic
-def _add(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """Add to an element; returns what was there."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        return builder.atomic_rmw("add", builder.gep(data, [args[1]]), args[2], "seq_cst")
 
     return types.int64(array, types.int64, types.int64), codegen
 
@@ -97,63 +86,70 @@ def _pause(typingctx: Any) -> Any:
 
 
 @kernel
-def offer(board, number):
-    """Tell of a job; the last one is done. Who looks now, or goes to sleep after this, sees it. Returns its
-    number."""
-    for k in range(WAITS, board.size):
-        board[k] = 0
-    _swap(board, NUMBER, number)
+def post_job(queue, number):
+    """Announce a job, once the last one is done. A worker that polls now, or goes to sleep after this, sees
+    it. Returns the number."""
+    for k in range(WAITS, queue.size):
+        queue[k] = 0
+    _swap(queue, NUMBER, number)
     # On ARM a plain read may be done before a write that stands before it, but not before this one: else the
-    # caller could take for awake who has just gone to sleep.
-    return _load(board, NUMBER)
+    # caller could take a worker for awake that has just gone to sleep.
+    return _load(queue, NUMBER)
 
 
 @kernel
-def attend(board, states, worker, last, others, looks):
-    """What a worker does that has nothing to do, as its state says meanwhile (1, else 0): tell that the job
-    ``last`` is done, as one of ``others``, and look ``looks`` times for another. others: 0 if that was told
-    before. Returns whether there is WORK or NOTHING, or RELEASE: a caller sleeps and is to be woken first."""
+def poll_for_job(queue, states, worker, last, others, polls):
+    """Report that job ``last`` is done and poll ``polls`` times for another. The worker's state is 1
+    meanwhile, else 0.
+
+    others: how many workers have to report; 0: this one has reported before. Returns WORK or NOTHING, or
+    WAKE_CALLER: a caller sleeps and must be woken first.
+    """
     _swap(states, worker * COUNTER, 1)
-    if others > 0 and _add(board, DONE, 1) + 1 == others + ASLEEP:
+    if others > 0 and fetch_add_at(queue, DONE, 1) + 1 == others + ASLEEP:
         _swap(states, worker * COUNTER, 0)
-        return RELEASE
-    for _ in range(looks):
-        if _load(board, NUMBER) != last and (_load(board, COUNTERS) > 0 or _load(board, WAITS) > 0):
+        return WAKE_CALLER
+    for _ in range(polls):
+        if _load(queue, NUMBER) != last and (_load(queue, COUNTERS) > 0 or _load(queue, WAITS) > 0):
             _swap(states, worker * COUNTER, 0)
             return WORK
         _pause()
     _swap(states, worker * COUNTER, 0)
-    return WORK if _load(board, NUMBER) != last else NOTHING
+    return WORK if _load(queue, NUMBER) != last else NOTHING
 
 
 @kernel
-def await_others(board, others, looks):
-    """What a caller does that is done: look whether all others are, ``looks`` times. Returns 1 if they are;
-    else 0, and ``attend`` returns RELEASE to the last of them."""
-    _swap(board, WAITS, 1)
-    for _ in range(looks):
-        if _load(board, DONE) == others:
+def await_workers(queue, others, polls):
+    """Of a caller that is done: poll ``polls`` times whether all others are. Returns 1 if they are; else 0,
+    and ``poll_for_job`` returns WAKE_CALLER to the last of them."""
+    _swap(queue, WAITS, 1)
+    for _ in range(polls):
+        if _load(queue, DONE) == others:
             return 1
         _pause()
-    return 1 if _add(board, DONE, ASLEEP) == others else 0
+    return 1 if fetch_add_at(queue, DONE, ASLEEP) == others else 0
 
 
-def calls() -> list[tuple[Any, tuple[Any, ...]]]:
-    """The kernels above, with arguments such as a pool gives them: to be compiled ahead."""
-    board = make_board(1)
-    return [(offer, (board, 0)), (attend, (board, board, 0, 0, 0, 0)), (await_others, (board, 0, 0))]
+def kernel_calls() -> list[tuple[Any, tuple[Any, ...]]]:
+    """The kernels above with arguments of the types that a pool gives them, to be compiled ahead."""
+    queue = make_queue(1)
+    return [
+        (post_job, (queue, 0)),
+        (poll_for_job, (queue, queue, 0, 0, 0, 0)),
+        (await_workers, (queue, 0, 0)),
+    ]
 
 
 @cache
-def looks() -> int:
-    """How often a thread looks at a board before it sleeps, on this machine: for ``SEARCH_S``. Compiles the
-    kernels above, or loads them: afterwards they do not fail."""
-    for one, args in calls():
-        one(*args)
-    board, states, took_s = make_board(1), make_board(1), 1.0
+def polls_before_sleep() -> int:
+    """How often a thread polls before it sleeps, on this machine: for ``POLL_S``. Compiles or loads the
+    kernels above, which cannot fail afterwards."""
+    for function, args in kernel_calls():
+        function(*args)
+    queue, states, took_s = make_queue(1), make_queue(1), 1.0
     for _ in range(5):
         start = time.perf_counter()
-        attend(board, states, 0, 0, 0, _TRIED)
+        poll_for_job(queue, states, 0, 0, 0, _TRIED)
         took_s = min(took_s, time.perf_counter() - start)
-    # Looking ends with taking the GIL back, which other threads may hold: then it seems to be far slower.
-    return max(int(SEARCH_S / took_s * _TRIED), _TRIED) + 1
+    # Polling ends with taking the GIL back, which other threads may hold: then it seems to be far slower.
+    return max(int(POLL_S / took_s * _TRIED), _TRIED) + 1

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.radiance_model import is_a, query_back, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.rays import slab
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
@@ -331,12 +331,12 @@ def _query_color(encoding, levels, net, x, start, end, acts):
     return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, Proposed) else None
 
 
-@overload(query_back)
-def _query_back(encoding, net, acts, d_acts, n, d_params, d_features):
+@overload(query_backward)
+def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
     if not is_a(encoding, Proposed):
         return None
 
     def run(encoding, net, acts, d_acts, n, d_params, d_features):
-        query_back(_grid(encoding), net, acts, d_acts, n, d_params, d_features)
+        query_backward(_grid(encoding), net, acts, d_acts, n, d_params, d_features)
 
     return run

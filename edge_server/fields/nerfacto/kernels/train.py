@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.radiance_model import query_back, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import query_backward, query_color, query_density
 from edge_server.fields.common.kernels.rays import interval
 from edge_server.fields.common.kernels.simd import fetch_add, uniform
-from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, compare, draw
+from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, add_exposure_sums, draw_ray
 from edge_server.fields.common.kernels.volume_rendering import (
     activate_color,
     activate_density,
     add_harmonics,
+    add_harmonics_backward,
     ray_loss,
-    seen_samples,
-    spread_harmonics,
+    samples_until_opaque,
 )
 from edge_server.fields.nerfacto.kernels.proposal import deal, interlevel, place, propose, weigh
 
@@ -103,7 +103,7 @@ def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray
         end, drawn = n, rays
         while drawn < limit and end + 2 * plan.samples + 1 <= CHUNK:
             index = chunk * CHUNK_RAYS + drawn
-            view = draw(views, recipe, index, ray[drawn])
+            view = draw_ray(views, recipe, index, ray[drawn])
             ray[drawn, 9] = np.float32(view)
             o = views.origin[view]
             ox, oy, oz = np.float32(o[0]), np.float32(o[1]), np.float32(o[2])
@@ -133,7 +133,7 @@ def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray
         begin = n
         for r in range(rays, drawn):
             stop = ray_first[r + 1]
-            kept = seen_samples(out, dts, begin, stop)
+            kept = samples_until_opaque(out, dts, begin, stop)
             if n < begin:
                 keep(acts, begin, begin + kept, n)
                 keep(x, begin, begin + kept, n)
@@ -198,14 +198,14 @@ def train_proposed(counter, worker, views, recipe, plan, space, encoding, net, l
             interlevel(encoding, cell, depth, weight, group, p, q - p, w, group_of, a, b, plan, slope,
                        grad)  # fmt: skip
             if batch.exposure.shape[1] > 0:
-                compare(out, w, dts, a, b, ray[r], batch.exposure[chunk])
+                add_exposure_sums(out, w, dts, a, b, ray[r], batch.exposure[chunk])
             if recipe.harmonics > 1:
-                spread_harmonics(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
+                add_harmonics_backward(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
             if looks.shape[1] > 0:
                 view = np.int64(ray[r, 9])
                 spread_looks(out, d_out, row, looks[view], a, b, bins.looks[chunk, view])
         batch.d_params[chunk] = _F0
-        query_back(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
+        query_backward(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
         batch.columns[chunk], batch.samples[chunk], batch.rays[chunk] = n, n, rays
         batch.dropped[chunk], batch.loss[chunk] = dropped, loss
         bins.counts[chunk] = bin_first[rays]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.mlp import backward, forward
-from edge_server.fields.common.kernels.radiance_model import is_a, query_back, query_color, query_density
+from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
 
 CHANNELS = 8  # of a group; one 256-bit register
@@ -322,8 +322,8 @@ def _query_color(encoding, levels, net, x, start, end, acts):
     return run
 
 
-@overload(query_back)
-def _query_back(encoding, net, acts, d_acts, n, d_params, d_features):
+@overload(query_backward)
+def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
     if not is_a(encoding, Planes):
         return None
 

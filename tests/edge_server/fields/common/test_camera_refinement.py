@@ -1,21 +1,16 @@
-"""Exposure and pose errors of cameras: learnt where asked for, harmless where there are none, else absent."""
+"""Exposure and pose errors of cameras: learned if enabled, harmless where there are none, else absent."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.camera_refinement import Exposures, Poses
-from edge_server.fields.ngp.field import NgpField
-from edge_server.fields.tensorf.field import TensorfField
+from edge_server.fields.common.camera_refinement import Exposures, PoseCorrections
 from freshfield.geometry import so3_exp
-from tests.edge_server.fields.small import NGP, SEEN, TENSORF, score
-
-KINDS: list[tuple[Any, Any]] = [(NgpField, NGP), (TensorfField, TENSORF)]
+from tests.edge_server.fields.small import SEEN, score, small
 
 
 def _exposed(views: list[View]) -> tuple[list[View], np.ndarray]:
@@ -52,12 +47,12 @@ def _pixels_off(poses: list[np.ndarray]) -> float:
     return float(np.mean([np.linalg.norm(a - b, axis=1).mean() for a, b in pairs]))
 
 
-@pytest.mark.parametrize(("kind", "settings"), KINDS)
-def test_gains_are_found_and_the_held_out_view_gains(kind: Any, settings: Any) -> None:
+@pytest.mark.parametrize("name", ["ngp", "tensorf"])
+def test_gains_are_found_and_the_held_out_view_gains(name: str) -> None:
     views, gains = _exposed(SEEN)
     scores = {}
     for on in (False, True):
-        field = kind(replace(settings, exposure=on, background="#80b2e6", contracted=False))
+        field = small(name, exposure=on, background="#80b2e6", contracted=False)
         field.fit(views, Budget(steps=500))
         scores[on] = score(field)
     assert scores[True] > scores[False] + 1.0
@@ -69,7 +64,7 @@ def test_poses_are_improved_and_kept_within_their_bounds() -> None:
     views = _displaced(SEEN, 0.02, 1.5)
     scores = {}
     for on in (False, True):
-        field = NgpField(replace(NGP, refine_m=0.1 * on, refine_deg=4.0 * on))
+        field = small("ngp", refine_m=0.1 * on, refine_deg=4.0 * on)
         field.fit(views, Budget(steps=600))
         scores[on] = score(field)
     assert scores[True] > scores[False] + 0.5
@@ -77,28 +72,28 @@ def test_poses_are_improved_and_kept_within_their_bounds() -> None:
     before = _pixels_off([v.camera_to_world for v in views])
     after = _pixels_off([field._cameras.poses.pose(v) for v in views])
     assert before > 0.7 and after < 0.75 * before
-    tight = NgpField(replace(NGP, refine_m=1e-3, refine_deg=0.1))
+    tight = small("ngp", refine_m=1e-3, refine_deg=0.1)
     tight.fit(views, Budget(steps=200))
     assert tight._cameras.poses is not None
     for known in tight._cameras.poses.known.values():
         assert np.linalg.norm(known.shift_m) <= 1e-3 + 1e-12
-        assert np.linalg.norm(known.turn) <= np.deg2rad(0.1) + 1e-12
+        assert np.linalg.norm(known.rotation) <= np.deg2rad(0.1) + 1e-12
 
 
 def test_exact_poses_and_equal_exposures_are_not_harmed() -> None:
-    plain, both = NgpField(NGP), NgpField(replace(NGP, exposure=True, refine_m=0.05, refine_deg=2.0))
+    plain, both = small("ngp"), small("ngp", exposure=True, refine_m=0.05, refine_deg=2.0)
     for field in (plain, both):
         field.fit(SEEN, Budget(steps=400))
     assert score(both) > score(plain) - 0.3
 
 
 def test_both_repeat_themselves_and_resume_bit_for_bit() -> None:
-    settings = replace(TENSORF, exposure=True, refine_m=0.05, refine_deg=2.0)
+    refined = {"exposure": True, "refine_m": 0.05, "refine_deg": 2.0}
     views = _exposed(_displaced(SEEN, 0.02, 1.0))[0]
-    a, b = TensorfField(settings), TensorfField(replace(settings, threads=1))
+    a, b = small("tensorf", **refined), small("tensorf", threads=1, **refined)
     for field in (a, b):
         field.fit(views, Budget(steps=120))
-    c = TensorfField(settings)
+    c = small("tensorf", **refined)
     c.load_state(a.state())
     for field in (a, b, c):
         field.fit(views, Budget(steps=15))
@@ -111,7 +106,7 @@ def test_both_repeat_themselves_and_resume_bit_for_bit() -> None:
 
 
 def test_nothing_is_allocated_where_nothing_is_asked_for() -> None:
-    field = NgpField(NGP)
+    field = small("ngp")
     field.fit(SEEN, Budget(steps=2))
     assert field._cameras.exposures is None and field._cameras.poses is None
     assert field._batch.exposure.size == 0
@@ -124,7 +119,7 @@ def test_what_is_not_finite_or_says_nothing_changes_nothing() -> None:
     exposures.learn(["a", "b"], np.full((2, 3, 5), np.nan))
     exposures.learn(["a", "b"], np.full((2, 3, 5), 1e300))
     assert all(np.isfinite(pair).all() for pair in exposures.known.values())
-    poses, rng = Poses(0.1, 2.0), np.random.default_rng(0)
+    poses, rng = PoseCorrections(0.1, 2.0), np.random.default_rng(0)
     for value in (0.5, np.nan):
         poses.correct(
             SEEN[0], lambda pose, at, v=value: np.full((len(at), 3), v, np.float32), 0.01, rng, np.zeros(3)
@@ -133,8 +128,8 @@ def test_what_is_not_finite_or_says_nothing_changes_nothing() -> None:
 
 
 def test_a_camera_that_moved_starts_anew() -> None:
-    poses = Poses(0.1, 2.0)
+    poses = PoseCorrections(0.1, 2.0)
     poses.pose(SEEN[0])
-    poses.known[SEEN[0].camera].turn = np.array([0.01, 0.0, 0.0])
+    poses.known[SEEN[0].camera].rotation = np.array([0.01, 0.0, 0.0])
     moved = replace(SEEN[0], camera_to_world=SEEN[1].camera_to_world)
     np.testing.assert_allclose(poses.pose(moved), moved.camera_to_world)

@@ -11,11 +11,11 @@ from edge_server.experiments.scenes.multiview_still import synthetic
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import shared_pool
-from edge_server.fields.common.plane_sweep import GUIDE_RAYS, guide
+from edge_server.fields.common.plane_sweep import GUIDE_RAYS, depth_guide
 from edge_server.fields.common.scene_box import SceneBox, scene_box
-from edge_server.fields.common.supervision import leave_out, pack_views
+from edge_server.fields.common.supervision import pack_views, without_views
 from tests.edge_server.fields.scenes import ring, seen
-from tests.edge_server.fields.small import NGP, SEEN, cut_out, same_state, score, small
+from tests.edge_server.fields.small import SEEN, SMALL, cut_out, same_state, score, small
 
 GUIDED = ("ngp", "nerfacto", "tensorf")
 
@@ -26,7 +26,7 @@ def _packed(views: list[View]) -> tuple[Views, SceneBox]:
 
 
 def _guide(views: list[View], data: Views, box: SceneBox, threads: int = 2) -> np.ndarray:
-    return guide(NGP, shared_pool(threads), box, views, data)
+    return depth_guide(SMALL["ngp"], shared_pool(threads), box, views, data)
 
 
 @pytest.mark.parametrize("size", [48, 131, 301])
@@ -44,7 +44,7 @@ def test_depth_is_where_the_scene_is(size: int) -> None:
     assert told[there].mean() > 0.5, "most of what can be seen has a guide"
     assert told[~there].mean() < 0.01, "and next to none of the plain sky"
     wrong = np.abs(found - truth)[told & there] / truth[told & there]
-    # Before an area of one colour, every place that all see in that area agrees as well.
+    # Before an area of one color, every place that all see in that area agrees as well.
     assert np.median(wrong) < 0.05 and np.mean(wrong < 0.1) > 0.6
     middle = np.median(truth[told & there])
     assert np.median(wrong) < 0.5 * np.median(np.abs(middle / truth[told & there] - 1.0))
@@ -76,14 +76,14 @@ def test_two_views_have_none_and_refused_ones_no_say() -> None:
     assert _guide(SEEN[:2], two, where).size == 0
     refused = np.ones(len(SEEN), bool)
     refused[:2] = False
-    assert _guide(SEEN, leave_out(data, refused), box).size == 0
+    assert _guide(SEEN, without_views(data, refused), box).size == 0
     # What a refused picture shows changes nothing for the others.
     refused[:] = False
     refused[3] = True
     wrong = [*SEEN[:3], replace(SEEN[3], image=255 - SEEN[3].image), *SEEN[4:]]
     np.testing.assert_array_equal(
-        _guide(SEEN, leave_out(data, refused), box)[: data.first[3]],
-        _guide(wrong, leave_out(_packed(wrong)[0], refused), box)[: data.first[3]],
+        _guide(SEEN, without_views(data, refused), box)[: data.first[3]],
+        _guide(wrong, without_views(_packed(wrong)[0], refused), box)[: data.first[3]],
     )
 
 
@@ -106,16 +106,16 @@ def test_it_is_used_where_it_is_called_for() -> None:
     """A plain background or few cameras; elsewhere it would only take its time."""
     sky, room = small("ngp"), small("ngp")
     sky.fit(SEEN, Budget(steps=1))
-    assert sky._guiding() > 0.0
+    assert sky._present_guide_weight() > 0.0
     views = synthetic("room", cameras=13, size=32).training
     room.fit(views, Budget(steps=1))
-    assert room._guiding() == 0.0
+    assert room._present_guide_weight() == 0.0
     few = small("ngp")
     few.fit(views[::2], Budget(steps=1))
-    assert few._guiding() > 0.0
+    assert few._present_guide_weight() > 0.0
     never = small("ngp", depth_guide=0.0)
     never.fit(SEEN, Budget(steps=1))
-    assert never._guiding() == 0.0
+    assert never._present_guide_weight() == 0.0
 
 
 def test_pictures_of_several_sizes() -> None:
@@ -138,7 +138,7 @@ def test_no_sweep_where_none_is_called_for_or_the_budget_is_too_short(monkeypatc
         clock[0] += 0.4
         return np.zeros(0, np.float32)
 
-    monkeypatch.setattr("edge_server.fields.common.plane_sweep.guide", slow)
+    monkeypatch.setattr("edge_server.fields.common.plane_sweep.depth_guide", slow)
     room = small("ngp")
     room.fit(synthetic("room", cameras=13, size=32).training, Budget(steps=2))
     exposed = small("ngp", exposure=True)
@@ -169,8 +169,8 @@ def test_no_sweep_where_none_is_called_for_or_the_budget_is_too_short(monkeypatc
 def test_the_same_pictures_are_swept_once(monkeypatch) -> None:
     from edge_server.fields.common import plane_sweep
 
-    swept, guide_ = [], plane_sweep.guide
-    monkeypatch.setattr(plane_sweep, "guide", lambda *given: swept.append(1) or guide_(*given))
+    swept, guide_ = [], plane_sweep.depth_guide
+    monkeypatch.setattr(plane_sweep, "depth_guide", lambda *given: swept.append(1) or guide_(*given))
     field = small("ngp")
     for _ in range(3):
         field.fit(SEEN, Budget(steps=2))
@@ -183,7 +183,7 @@ def test_it_falls_to_nothing() -> None:
     field = small("ngp", guide_steps=4)
     weights = []
     for _ in range(6):
-        weights.append(field._guiding() if field.step else 0.1)
+        weights.append(field._present_guide_weight() if field.step else 0.1)
         field.fit(SEEN, Budget(steps=1))
     np.testing.assert_allclose(weights, [0.1, 0.075, 0.05, 0.025, 0.0, 0.0])
 

@@ -11,18 +11,13 @@ import pytest
 from edge_server.fields import Budget, View
 from edge_server.fields.common import supervision
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.supervision import CameraMemory, leave_out, remember
-from edge_server.fields.common.view_outliers import PATIENCE, refused, weights
-from edge_server.fields.common.view_store import Rig
-from edge_server.fields.nerfacto.field import NerfactoField
-from edge_server.fields.ngp.field import NgpField
+from edge_server.fields.common.supervision import CameraMemory, remember_views, without_views
+from edge_server.fields.common.view_outliers import MOST_REFUSALS, find_outliers, pixel_weights
+from edge_server.fields.common.view_store import ViewStore
 from edge_server.fields.ngp.settings import NgpSettings, make_settings
-from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.settings import make_settings as make_splat_settings
-from edge_server.fields.tensorf.field import TensorfField
-from edge_server.fields.voxel.field import VoxelField
 from tests.edge_server.fields.scenes import picture, psnr, ring
-from tests.edge_server.fields.small import NERFACTO, NGP, SPLAT, TENSORF, VOXEL
+from tests.edge_server.fields.small import SMALL, every_field, small
 
 MS = 1_000_000
 AGES_MS = (0, 50, 100, 200)
@@ -43,7 +38,7 @@ def _later(views: list[View], ages_ms: tuple[float, ...] = AGES_MS) -> list[View
 def _memory(*instants: list[View]) -> dict[str, CameraMemory]:
     memory: dict[str, CameraMemory] = {}
     for views in instants:
-        remember(memory, views)
+        remember_views(memory, views)
     return memory
 
 
@@ -53,16 +48,19 @@ def _settings(**options: float) -> NgpSettings:
 
 def test_off_is_nothing_at_all() -> None:
     now = _later(STILL)
-    assert weights(now, _memory(STILL, now), _settings()) is None
-    assert weights(now, _memory(STILL, now), _settings(mask_grow_px_s=50.0)) is None
-    assert weights([], {}, _settings(age_tau_ms=10.0)) is None
+    assert pixel_weights(now, _memory(STILL, now), _settings()) is None
+    assert pixel_weights(now, _memory(STILL, now), _settings(mask_grow_px_s=50.0)) is None
+    assert pixel_weights([], {}, _settings(age_tau_ms=10.0)) is None
     same_age = _later(STILL, (0, 0, 0, 0))
-    assert weights(same_age, _memory(STILL, same_age), _settings(age_tau_ms=9.0, mask_stale_ms=9.0)) is None
+    assert (
+        pixel_weights(same_age, _memory(STILL, same_age), _settings(age_tau_ms=9.0, mask_stale_ms=9.0))
+        is None
+    )
 
 
 def test_weights_fall_with_age_beside_the_newest() -> None:
     now = _later(STILL)
-    found = weights(now, _memory(now), _settings(age_tau_ms=100.0))
+    found = pixel_weights(now, _memory(now), _settings(age_tau_ms=100.0))
     assert found is not None
     for weight, view, age_ms in zip(found, now, AGES_MS):
         assert weight.dtype == np.float32 and weight.shape == view.image.shape[:2]
@@ -72,7 +70,7 @@ def test_weights_fall_with_age_beside_the_newest() -> None:
 def test_of_stale_views_only_what_stood_still_counts() -> None:
     now = _later(STILL)
     memory = _memory(STILL, now)
-    found = weights(now, memory, _settings(mask_stale_ms=60.0, age_tau_ms=100.0))
+    found = pixel_weights(now, memory, _settings(mask_stale_ms=60.0, age_tau_ms=100.0))
     assert found is not None
     for weight, view, age_ms in zip(found, now, AGES_MS):
         moved = memory[view.camera].moved
@@ -87,7 +85,7 @@ def test_masks_grow_with_age() -> None:
     memory = _memory(STILL, now)
     left = []
     for grow in (0.0, 10.0, 20.0, 1e6):
-        found = weights(now, memory, _settings(mask_stale_ms=60.0, mask_grow_px_s=grow))
+        found = pixel_weights(now, memory, _settings(mask_stale_ms=60.0, mask_grow_px_s=grow))
         assert found is not None
         left.append([int((w > 0).sum()) for w in found])
     moved = memory[now[2].camera].moved
@@ -101,7 +99,7 @@ def test_unknown_motion_is_not_masked() -> None:
     """One picture only, a camera that moved, a memory of another view: weighed by age alone."""
     now = _later(STILL)
     options = _settings(mask_stale_ms=60.0, age_tau_ms=100.0)
-    by_age = weights(now, {}, _settings(age_tau_ms=100.0))
+    by_age = pixel_weights(now, {}, _settings(age_tau_ms=100.0))
     shaken = []
     for view in STILL:
         pose = view.camera_to_world.copy()
@@ -110,14 +108,14 @@ def test_unknown_motion_is_not_masked() -> None:
     other = _memory(STILL, _later(STILL))  # equal views, but not these
     assert by_age is not None
     for memory in (_memory(now), _memory(shaken, now), other, {}):
-        found = weights(now, memory, options)
+        found = pixel_weights(now, memory, options)
         assert found is not None
         np.testing.assert_array_equal(found, by_age)
 
 
 def test_clocks_that_lie_do_no_harm() -> None:
     now = [replace(v, generated_ns=ns) for v, ns in zip(_later(STILL), (0, -(2**62), 2**62 - 1, 2**62 - 1))]
-    found = weights(now, _memory(STILL, now), _settings(age_tau_ms=1e-3, mask_stale_ms=1e-3))
+    found = pixel_weights(now, _memory(STILL, now), _settings(age_tau_ms=1e-3, mask_stale_ms=1e-3))
     assert found is not None and np.isfinite(found).all()
     assert [float(w.max()) for w in found] == [0.0, 0.0, 1.0, 1.0]
 
@@ -132,14 +130,16 @@ def test_options_are_checked(name: str, value: float) -> None:
 
 def test_every_representation_has_the_same_options() -> None:
     for name in ("age_tau_ms", "mask_stale_ms", "mask_grow_px_s", "refuse_beyond"):
-        kept = {(getattr(s, name), type(s).__dataclass_fields__[name].metadata["help"]) for _, s in FIELDS}
+        kept = {
+            (getattr(s, name), type(s).__dataclass_fields__[name].metadata["help"]) for s in SMALL.values()
+        }
         assert len(kept) == 1
 
 
 def _take_in(settings: Any, *instants: list[View]) -> Views:
-    rig = Rig(settings)
+    rig = ViewStore(settings)
     for views in instants:
-        data = rig.take_in(views).data
+        data = rig.add(views).data
     return data
 
 
@@ -154,22 +154,9 @@ def test_the_rig_packs_weights_only_where_asked() -> None:
     assert 0 < masked.changed.size < off.changed.size and (masked.weight[masked.changed] == 1.0).all()
 
 
-FIELDS: list[tuple[Any, Any]] = [
-    (NgpField, NGP),
-    (TensorfField, TENSORF),
-    (SplatField, SPLAT),
-    (VoxelField, VOXEL),
-    (NerfactoField, NERFACTO),
-]
-every = pytest.mark.parametrize(
-    ("kind", "settings"), FIELDS, ids=["ngp", "tensorf", "splat", "voxel", "nerfacto"]
-)
-
-
-@every
-def test_masked_pixels_teach_nothing(kind: Any, settings: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@every_field
+def test_masked_pixels_teach_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views whose moving pixels are noise: with the mask the field does not see the noise."""
-    options = replace(settings, mask_stale_ms=60.0, changed_share=0.5)
     rng = np.random.default_rng(5)
     old, before = ring(13, size=32), ring(13, size=32, ball_m=BALL)
     fresh = [replace(v, generated_ns=200 * MS) for v in before[::2]]
@@ -194,24 +181,24 @@ def test_masked_pixels_teach_nothing(kind: Any, settings: Any, monkeypatch: pyte
         for view in spoilt:
             inverted = masks[view.camera][..., None] & other
             stale.append(replace(view, image=np.where(inverted, 255 - view.image, view.image)))
-        field = kind(options)
+        field = small(name, mask_stale_ms=60.0, changed_share=0.5)
         field.fit(old, Budget(steps=20))
         field.fit(fresh + stale, Budget(steps=30))
         field.fit([replace(v, generated_ns=400 * MS) for v in on] + stale, Budget(steps=30))
         states.append(field.state())
-    learnt = [name for name in states[0] if not name.startswith("image_") and name != "meta"]
-    assert {"table", "density"} < set(learnt) or {"params", "velocity", "guest"} < set(learnt)
-    for name in learnt:
+    learned = [name for name in states[0] if not name.startswith("image_") and name != "meta"]
+    assert {"table", "density"} < set(learned) or {"params", "velocity", "guest"} < set(learned)
+    for name in learned:
         np.testing.assert_array_equal(states[0][name], states[1][name], err_msg=name)
 
 
-@every
-def test_weighted_fits_repeat_and_resume_bit_for_bit(kind: Any, settings: Any) -> None:
-    options = replace(settings, age_tau_ms=100.0, mask_stale_ms=60.0, mask_grow_px_s=20.0)
+@every_field
+def test_weighted_fits_repeat_and_resume_bit_for_bit(name: str) -> None:
+    options = {"age_tau_ms": 100.0, "mask_stale_ms": 60.0, "mask_grow_px_s": 20.0}
     ages = tuple(25.0 * k for k in range(13))
     still = [replace(v, generated_ns=0) for v in ring(13, size=32)]
     now = _later(still, ages)
-    one, two = kind(replace(options, threads=1)), kind(replace(options, threads=3))
+    one, two = small(name, threads=1, **options), small(name, threads=3, **options)
     one.fit(still, Budget(steps=15))
     one.fit(now, Budget(steps=10))
     middle = one.state()
@@ -239,7 +226,7 @@ def _shown(off: dict[str, float]) -> Any:
 def _refused(memory: dict[str, CameraMemory], off: dict[str, float], **more: Any) -> list[str]:
     views = [m.view for m in memory.values()]
     known: dict[str, Any] = {"beyond": 2.5, "settled": True, **more}
-    flags = refused(views, memory, pixels=_shown(off), **known)
+    flags = find_outliers(views, memory, render_points=_shown(off), **known)
     return [view.camera for view, flag in zip(views, flags) if flag]
 
 
@@ -248,22 +235,22 @@ def test_a_view_is_refused_where_others_agree_and_it_did() -> None:
     wrong = {"cam03": 0.5}
     assert _refused(memory, wrong) == [], "it never agreed: it may see what no other does"
     assert _refused(memory, {}) == []
-    assert {m.credit for m in memory.values()} == {PATIENCE}
+    assert {m.refusals_left for m in memory.values()} == {MOST_REFUSALS}
     assert _refused(memory, wrong, beyond=0.0) == []
     assert _refused(memory, wrong, settled=False) == []
     assert _refused(memory, {"cam03": 0.09}) == [], "little is wrong with it"
     assert _refused(memory, {f"cam{k:02d}": 0.5 for k in range(3)}) == [], "too many to be wrong"
     assert _refused(memory, {"cam03": float("nan")}) == ["cam03"]
-    assert memory["cam03"].credit == PATIENCE - 1
-    assert _refused(memory, {}) == [] and memory["cam03"].credit == PATIENCE
-    assert [_refused(memory, wrong) for _ in range(PATIENCE)] == [["cam03"]] * PATIENCE
+    assert memory["cam03"].refusals_left == MOST_REFUSALS - 1
+    assert _refused(memory, {}) == [] and memory["cam03"].refusals_left == MOST_REFUSALS
+    assert [_refused(memory, wrong) for _ in range(MOST_REFUSALS)] == [["cam03"]] * MOST_REFUSALS
     assert _refused(memory, wrong) == [], "the scene has changed, then"
 
 
 def test_views_agree_with_a_field_that_shows_half_of_them_exactly() -> None:
     memory = _memory(ring(8, size=32))
     small = {f"cam{k:02d}": 0.0 if k < 6 else 0.04 for k in range(8)}
-    assert _refused(memory, small) == [] and {m.credit for m in memory.values()} == {PATIENCE}
+    assert _refused(memory, small) == [] and {m.refusals_left for m in memory.values()} == {MOST_REFUSALS}
     assert _refused(memory, {**small, "cam07": 0.5}) == ["cam07"]
 
 
@@ -273,7 +260,7 @@ def test_a_camera_that_moves_is_not_doubted() -> None:
     _refused(memory, {})
     pose = views[3].camera_to_world.copy()
     pose[0, 3] += 0.5
-    remember(memory, [replace(views[3], camera_to_world=pose)])
+    remember_views(memory, [replace(views[3], camera_to_world=pose)])
     assert _refused(memory, {"cam03": 0.5}) == []
 
 
@@ -290,14 +277,12 @@ def test_what_moves_through_a_picture_is_no_reason_to_refuse_it() -> None:
         return image[row, column]
 
     views = [m.view for m in memory.values()]
-    assert not refused(views, memory, 2.5, True, lambda *of: list(map(pixels, *of))).any()
+    assert not find_outliers(views, memory, 2.5, True, lambda *of: list(map(pixels, *of))).any()
 
 
-@every
-def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_again(
-    kind: Any, settings: Any
-) -> None:
-    field = kind(settings)
+@every_field
+def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_again(name: str) -> None:
+    field = small(name)
     views = ring(13, size=32)
     for update in range(4):
         field.fit([replace(v, generated_ns=update * 100 * MS) for v in views], Budget(steps=40))
@@ -305,19 +290,23 @@ def test_a_refused_camera_is_named_and_pictures_that_are_known_are_not_judged_ag
     noise = np.random.default_rng(1).integers(0, 256, views[3].image.shape, dtype=np.uint8)
     wrong[3] = replace(wrong[3], image=noise)
     assert field.fit(wrong, Budget(steps=2)).refused == ("cam03",)
-    credit = field.rig.memory["cam03"].credit
-    assert credit < PATIENCE
+    credit = field.view_store.memory["cam03"].refusals_left
+    assert credit < MOST_REFUSALS
     again = field.fit(wrong, Budget(steps=2))
-    other = kind(settings)
+    other = small(name)
     other.load_state(field.state())
     resumed = other.fit(wrong, Budget(steps=2))
     assert again.refused == resumed.refused == ("cam03",)
-    assert field.rig.memory["cam03"].credit == other.rig.memory["cam03"].credit == credit
+    assert (
+        field.view_store.memory["cam03"].refusals_left
+        == other.view_store.memory["cam03"].refusals_left
+        == credit
+    )
     assert field.fit([replace(v, generated_ns=600 * MS) for v in views], Budget(steps=2)).refused == ()
 
 
 def test_cameras_whose_errors_are_learnt_are_not_refused() -> None:
-    field = NgpField(replace(NGP, exposure=True))
+    field = small("ngp", exposure=True)
     views = ring(13, size=32)
     field.fit(views, Budget(steps=150))
     dark = [replace(v, generated_ns=100 * MS) for v in views]
@@ -325,31 +314,31 @@ def test_cameras_whose_errors_are_learnt_are_not_refused() -> None:
     assert field.fit(dark, Budget(steps=2)).refused == ()
 
 
-@every
-def test_a_snapshot_is_of_the_box_the_field_has(kind: Any, settings: Any) -> None:
-    """Two cameras find one box, all of them another: what was learnt is void, what is shown too."""
-    field = kind(settings)
+@every_field
+def test_a_snapshot_is_of_the_box_the_field_has(name: str) -> None:
+    """Two cameras find one box, all of them another: what was learned is void, what is shown too."""
+    field = small(name)
     views, shift = ring(13, size=32), np.eye(4)
     shift[:3, 3] = 3.0
     field.fit([replace(v, camera_to_world=shift @ v.camera_to_world) for v in views[:2]], Budget(steps=5))
     old = field.snapshot()
     field.fit(views, Budget(steps=5))
-    assert field.rig.box != old.box, "the same box: nothing was tested"
-    assert field.snapshot().box == field.rig.box
+    assert field.view_store.box != old.box, "the same box: nothing was tested"
+    assert field.snapshot().box == field.view_store.box
 
 
 def test_three_views_cannot_outvote_one() -> None:
     memory = _memory(ring(3, size=32))
     assert _refused(memory, {}) == _refused(memory, {"cam01": 0.9}) == []
-    assert {m.credit for m in memory.values()} == {0}
+    assert {m.refusals_left for m in memory.values()} == {0}
 
 
 def test_views_that_are_left_out_keep_the_others_weights() -> None:
     now = _later(STILL)
     data = _take_in(_settings(age_tau_ms=100.0), STILL, now)
-    left = leave_out(data, np.array([False, True, False, False]))
+    left = without_views(data, np.array([False, True, False, False]))
     a, b = data.first[1], data.first[2]
     assert (left.weight[a:b] == 0).all() and not ((left.drawn >= a) & (left.drawn < b)).any()
     np.testing.assert_array_equal(np.delete(left.weight, slice(a, b)), np.delete(data.weight, slice(a, b)))
     assert len(left.drawn) == len(data.pixels) - (b - a) and not np.isin(left.changed, range(a, b)).any()
-    assert leave_out(data, np.zeros(4, np.bool_)) is data and (data.weight > 0).all()
+    assert without_views(data, np.zeros(4, np.bool_)) is data and (data.weight > 0).all()

@@ -13,9 +13,9 @@ from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import EFFORTS, NerfactoSettings, help_text, make_settings
 from edge_server.fields.registry import make_field
 from tests.edge_server.fields.common.test_camera_refinement import _displaced
+from tests.edge_server.fields.nerfacto.small import SMALL
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.fields.small import HELD, SEEN, score
-from tests.edge_server.fields.small import NERFACTO as SMALL
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ import torch
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.rays import COARSE, Space
-from edge_server.fields.common.kernels.train import Recipe
+from edge_server.fields.common.kernels.train import RaySampling
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, Weights
-from edge_server.fields.common.occupancy_grid import Occupancy
+from edge_server.fields.common.occupancy_grid import OccupancyGrid
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.kernels.proposal import (
     DARK,
@@ -307,11 +307,11 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
     field.fit(views, Budget(steps=30))
     # A thin fog: no ray becomes opaque, where one sample more or less would be a step in the loss.
     field._net.params[-field._net.widths[-1]] = -1.0
-    assert field.rig.box is not None
-    data = field._cameras.corrected(views, field.rig.take_in(views).data, field.rig.box)
-    recipe = Recipe(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), False)
+    assert field.view_store.box is not None
+    data = field._cameras.corrected(views, field.view_store.add(views).data, field.view_store.box)
+    recipe = RaySampling(np.uint64(3), 32, 3, 4, F(0.0), np.full(3, 0.5, F), False)
     weights = Weights(F(0.0), F(0.0), F(0.0))
-    space = Occupancy.for_box(replace(settings, min_views=0), field.rig.box).space(0.1)
+    space = OccupancyGrid.for_box(replace(settings, min_views=0), field.view_store.box).space(0.1)
     space.occupied[:], space.coarse[:] = 1, 1
 
     def loss() -> float:

@@ -9,8 +9,8 @@ import pytest
 
 from edge_server.fields import Budget
 from edge_server.fields.ngp.field import NgpField
+from tests.edge_server.fields.ngp.small import SMALL
 from tests.edge_server.fields.small import HELD, SEEN, same_state, score
-from tests.edge_server.fields.small import NGP as SMALL
 
 
 def test_a_smoothed_field_repeats_itself_and_is_smoother() -> None:

@@ -10,9 +10,9 @@ import pytest
 from edge_server.fields import Budget
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.torch_field import NgpTorchField, cuda_present
+from tests.edge_server.fields.ngp.small import SMALL
 from tests.edge_server.fields.scenes import psnr, ring
 from tests.edge_server.fields.small import HELD, SEEN
-from tests.edge_server.fields.small import NGP as SMALL
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -61,13 +61,13 @@ def test_stale_pixels_that_moved_are_not_drawn_and_old_ones_count_less() -> None
     after = [replace(v, generated_ns=k * 100 * ms) for k, v in enumerate(ring(5, size=24, ball_m=ball))]
     field = NgpTorchField(replace(SMALL, rays=2000, age_tau_ms=200.0, mask_stale_ms=150.0), "cpu")
     for views in (before, after):
-        data = field.rig.take_in(views).data
+        data = field.view_store.add(views).data
     o, _, target, _, weight = field._draw(data, np.random.default_rng(0))
     origins = data.origin.astype(np.float32)
     for k, view in enumerate(after):
         rows = np.flatnonzero((o.numpy() == origins[k]).all(axis=1))
         np.testing.assert_allclose(weight[rows].numpy(), np.exp(-100.0 * (4 - k) / 200.0), rtol=1e-5)
-        moved = field.rig.memory[view.camera].moved
+        moved = field.view_store.memory[view.camera].moved
         assert moved is not None and moved.any() and len(rows) > 50
         allowed = view.image[~moved] if k < 3 else view.image.reshape(-1, 3)
         colors = {tuple(c) for c in allowed.tolist()}

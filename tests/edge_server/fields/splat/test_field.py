@@ -23,7 +23,7 @@ from edge_server.fields.splat.motion import drift
 from edge_server.fields.splat.seeding import seeds
 from tests.edge_server.fields.scenes import mean_psnr, picture
 from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, same_state, score
-from tests.edge_server.fields.small import SPLAT as SMALL
+from tests.edge_server.fields.splat.small import SMALL
 
 
 def test_a_state_knows_the_views_it_was_fitted_to() -> None:
@@ -166,8 +166,8 @@ def test_what_moves_is_carried_along_and_on_to_the_present(late: bool) -> None:
             field.fit(_ball_at(t_ms, late), Budget(steps=30))
         cloud = field.cloud
         guests = (cloud.guest > 0) & (opacity(cloud.params) > 0.3)
-        assert field.rig.box is not None
-        found.append(np.median(cloud.velocity[guests] * field.rig.box.radius_m, axis=0))
+        assert field.view_store.box is not None
+        found.append(np.median(cloud.velocity[guests] * field.view_store.box.radius_m, axis=0))
         np.testing.assert_allclose(found[-1], SPEED, atol=0.4)
 
         def off(field: SplatField, present_ns: int | None) -> float:
@@ -259,7 +259,7 @@ def test_room_is_made_by_what_pictures_depend_on_least() -> None:
     """What is hidden goes before what is faint; of what has made no step, nothing."""
     field, hidden, unknown, count = SplatField(SMALL), 60, 5, 120
     field.fit(SEEN, Budget(steps=300))
-    box = field.rig.box
+    box = field.view_store.box
     assert box is not None
     inside = field.cloud.params[: hidden + unknown].copy()  # small, opaque, in the middle of the ball
     spread_m = np.random.default_rng(0).uniform(-0.1, 0.1, (len(inside), 3))

@@ -12,7 +12,7 @@ from edge_server.fields.tensorf.field import TensorfField
 from edge_server.fields.tensorf.settings import EFFORTS, help_text, make_settings
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.fields.small import HELD, SEEN
-from tests.edge_server.fields.small import TENSORF as SMALL
+from tests.edge_server.fields.tensorf.small import SMALL
 
 
 def test_upsampling_hardly_changes_the_picture() -> None:

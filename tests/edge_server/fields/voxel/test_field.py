@@ -14,7 +14,7 @@ from edge_server.fields.voxel.field import VoxelField
 from edge_server.fields.voxel.settings import EFFORTS, help_text, make_settings
 from tests.edge_server.fields.scenes import mean_psnr, psnr
 from tests.edge_server.fields.small import HELD, SEEN, same_state
-from tests.edge_server.fields.small import VOXEL as SMALL
+from tests.edge_server.fields.voxel.small import SMALL
 
 
 def test_a_long_fit_is_no_worse_than_a_short_one() -> None:
@@ -73,8 +73,8 @@ def test_a_state_of_another_shape_is_refused() -> None:
 def test_the_grid_is_as_fine_as_pixels_where_no_size_is_set() -> None:
     field = VoxelField(replace(SMALL, sizes=None, refine_at=(3, 6)))
     field.fit(SEEN, Budget(steps=8))
-    assert field.rig.box is not None
-    last = np.clip(field.rig.box.pixels_across, 64, 192)
+    assert field.view_store.box is not None
+    last = np.clip(field.view_store.box.pixels_across, 64, 192)
     assert 0 <= field._voxels.size - last < 32 and field._sizes[0] < field._sizes[1] < field._sizes[2]
     other = VoxelField(field.settings)
     other.load_state(field.state())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.rays import Views, interval
 from edge_server.fields.common.kernels.thread_pool import CallerPool
-from edge_server.fields.common.kernels.train import Recipe
+from edge_server.fields.common.kernels.train import RaySampling
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.voxel.kernels.rays import SEGMENT, Clearing, Voxels, spread, trace, train_rays
@@ -241,7 +241,7 @@ def _training(parts: int, rays: int, outline: float = 0.0, alpha: int | None = N
     gradient = np.zeros((parts, *voxels.table.shape), np.float32)
     dirty = np.zeros((parts, len(voxels.table) // SEGMENT), np.uint8)
     samples, dropped, loss = np.zeros(parts, np.int64), np.zeros(parts, np.int64), np.zeros(parts)
-    recipe = Recipe(np.uint64(77), rays, 1, 1, np.float32(0.0), BACK, False)
+    recipe = RaySampling(np.uint64(77), rays, 1, 1, np.float32(0.0), BACK, False)
     pool = CallerPool()
     pool.run(train_rays, data, recipe, _space(False), voxels, rays, np.float32(outline), make_trace(1),
              gradient, dirty, samples, dropped, loss)  # fmt: skip

@@ -1,4 +1,4 @@
-"""The optimiser: against torch's Adam, sparse, and deaf to what is not finite."""
+"""The optimizer: against torch's Adam, sparse, and deaf to what is not finite."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def test_centres_of_cells_are_those_of_contracted_space(contracted: bool) -> Non
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_views_of_a_cell_are_those_whose_picture_it_is_in(field: NgpField, contracted: bool) -> None:
-    box = field.rig.box
+    box = field.view_store.box
     assert box is not None
     near, cells = 1.1, 16  # of scene units: the nearest cells of each camera are too near
     views = pack_cameras(VIEWS, box)

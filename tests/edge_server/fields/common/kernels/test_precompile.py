@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.precompile import _Listing, _size, compile_ahead
+from edge_server.fields.common.kernels.precompile import _RecordingPool, _size, compile_ahead
 from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE, CallerPool, Pool
 from edge_server.fields.registry import field_names, make_field
 
@@ -41,7 +41,7 @@ def only_after(counter, worker, out):
     out[1] = np.float64(worker) + 1.0
 
 
-def tour(pool: Pool) -> None:
+def run_kernels(pool: Pool) -> None:
     values, out = np.full(3, 2.0, np.float32), np.zeros(2)
     pool.run(double, values)
     pool.run(total, values, out)
@@ -54,11 +54,11 @@ TOLD = """
 import sys
 from edge_server.fields.common.kernels import precompile
 from edge_server.fields.common.kernels.precompile import compile_ahead
-from tests.edge_server.fields.common.kernels.test_precompile import double, only_after, total, tour
+from tests.edge_server.fields.common.kernels.test_precompile import double, only_after, total, run_kernels
 if sys.argv[1:]:
     sys.executable = sys.argv[1]
     precompile.PATIENCE_S = 1.0
-compile_ahead(tour)
+compile_ahead(run_kernels)
 for k in (double, total, only_after):
     print("loaded" if k.stats.cache_hits else "compiled", len(k.signatures))
 """
@@ -150,6 +150,31 @@ for kind in sys.argv[1:]:
 """
 
 
+RENAMED = """
+from typing import NamedTuple
+from edge_server.fields.common.kernels.jit import kernel
+class {name}(NamedTuple):
+    x: float
+@kernel
+def one(pair):
+    return pair.x
+print(one({name}(2.0)))
+"""
+
+
+def test_code_for_a_type_that_was_renamed_is_compiled_anew(tmp_path: Path) -> None:
+    """numba reads the types of what it has stored before it asks whether the sources are still the same."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    environment["PYTHONPATH"] = os.pathsep.join((str(tmp_path), *filter(None, sys.path)))
+    for name in ("Old", "New"):
+        (tmp_path / "one.py").write_text(RENAMED.format(name=name))
+        done = subprocess.run(
+            [sys.executable, "-c", "import one"], env=environment, capture_output=True, text=True, timeout=60
+        )
+        assert done.stdout == "2.0\n", done.stderr
+    assert list((tmp_path / "cache").rglob("*.nbi")), "nothing was stored: nothing was tested"
+
+
 def test_what_is_inlined_counts() -> None:
     def own(kernel: Any) -> int:  # of what passes the arguments on, and of what it passes them to
         return len(kernel.py_func.__code__.co_code) + _size(kernel.py_func.__globals__["inside"].py_func)
@@ -172,10 +197,10 @@ class _Noting(CallerPool):
 
 @pytest.mark.parametrize("name", field_names())
 def test_every_field_lists_its_large_kernels_without_running_them(name: str) -> None:
-    field, listing, run = make_field(name), _Listing(), _Noting()
+    field, listing, run = make_field(name), _RecordingPool(), _Noting()
     with np.errstate(all="ignore"):
-        field._tour(listing)
-    field._tour(run)
+        field._run_kernels(listing)
+    field._run_kernels(run)
     listed = {kernel for kernel, _ in listing.calls}
     assert listed <= run.kernels, "compiled for nothing"
     wanted = {k for k in run.kernels if k.py_func.__name__.startswith(("train_", "render_"))}

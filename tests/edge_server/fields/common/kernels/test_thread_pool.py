@@ -17,7 +17,7 @@ from edge_server.fields.common.kernels.jit import FAST, SOURCES
 from edge_server.fields.common.kernels.mlp import forward
 from edge_server.fields.common.kernels.simd import COUNTER, draw, exp32, fetch_add, log32, uniform
 from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
-from edge_server.fields.common.kernels.work_queue import RELEASE, attend
+from edge_server.fields.common.kernels.work_queue import WAKE_CALLER, poll_for_job
 
 
 @njit(nogil=True)
@@ -316,12 +316,12 @@ def test_a_job_whose_caller_was_interrupted_before_anybody_heard_of_it_is_finish
 def test_a_job_that_was_never_told_of_is_not_done(many_cores, monkeypatch) -> None:
     pool, seen = Pool(2, nice=0), []
 
-    def interrupted(board, number):
+    def interrupted(queue, number):
         raise KeyboardInterrupt
 
     for _ in range(2):  # the first job and a later one
         with monkeypatch.context() as patch:
-            patch.setattr("edge_server.fields.common.kernels.thread_pool.offer", interrupted)
+            patch.setattr("edge_server.fields.common.kernels.thread_pool.post_job", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 pool.run(lambda counter, worker: seen.append("lost"))
         pool.run(lambda counter, worker: seen.append(worker))
@@ -334,8 +334,8 @@ def test_a_worker_that_wakes_a_caller_late_wakes_no_other(many_cores, monkeypatc
     pool, seen, late = Pool(2, nice=0), [], threading.Event()
 
     def attend_and_wait(*args):
-        found = attend(*args)
-        if found == RELEASE:
+        found = poll_for_job(*args)
+        if found == WAKE_CALLER:
             late.set()
             time.sleep(0.1)
         return found
@@ -350,7 +350,7 @@ def test_a_worker_that_wakes_a_caller_late_wakes_no_other(many_cores, monkeypatc
 
     pool.run(lambda counter, worker: None)
     with monkeypatch.context() as patch:
-        patch.setattr("edge_server.fields.common.kernels.thread_pool.attend", attend_and_wait)
+        patch.setattr("edge_server.fields.common.kernels.thread_pool.poll_for_job", attend_and_wait)
         _interrupted_after(0.1, lambda: pool.run(slow))
         assert late.wait(1.0)
         for k in range(1, 3):
@@ -388,7 +388,7 @@ def test_what_a_pool_itself_needs_fails_where_it_is_asked_for(many_cores, monkey
     for nice in (0, 5):
         pool, done = Pool(2, nice), np.zeros(8, np.int64)
         with monkeypatch.context() as patch:
-            patch.setattr("edge_server.fields.common.kernels.thread_pool.looks", full)
+            patch.setattr("edge_server.fields.common.kernels.thread_pool.polls_before_sleep", full)
             with pytest.raises(OSError, match="no space"):
                 pool.run(_count, done)
         pool.run(_count, done)

@@ -13,7 +13,7 @@ from torch import Tensor
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import CallerPool
-from edge_server.fields.common.kernels.train import Recipe, train_chunks
+from edge_server.fields.common.kernels.train import RaySampling, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, Weights
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.training_schedule import step_length
@@ -43,8 +43,8 @@ def _weights() -> list[NDArray[np.float32]]:
 
 
 def _packed(field: NgpField, weights: list[NDArray[np.float32]] | None) -> Views:
-    assert field.rig.box is not None
-    return pack_views(VIEWS, field.rig.box, field.rig.memory, weights)
+    assert field.view_store.box is not None
+    return pack_views(VIEWS, field.view_store.box, field.view_store.memory, weights)
 
 
 def _train(
@@ -52,7 +52,7 @@ def _train(
 ) -> tuple[float, NDArray[np.float32], int]:
     """Loss, the network's gradient and number of rays of one chunk of at most ``rays``; the occupancy grid
     takes everything to be ``over`` times as dense as it knows."""
-    recipe = Recipe(
+    recipe = RaySampling(
         key=np.uint64(7), chunk_rays=rays, levels=SETTINGS.levels, harmonics=1,
         changed_share=np.float32(0.5), background=np.full(3, 0.5, np.float32), random_background=False,
     )  # fmt: skip
@@ -65,7 +65,7 @@ def _train(
 
 
 def _oracle(field: NgpField, rays: int, weight: NDArray[np.float32], params: Tensor) -> tuple[Tensor, Tensor]:
-    """Colour error and loss of the samples that the last chunk took, for the network ``params``."""
+    """Color error and loss of the samples that the last chunk took, for the network ``params``."""
     batch, scratch = field._batch, field._scratch
     first, ray = scratch.ray_first[0], scratch.ray[0]
     column = scratch.column[0, : first[rays]]
@@ -101,7 +101,7 @@ def test_rays_are_whole_and_in_order(field: NgpField) -> None:
     first, column = scratch.ray_first[0, : rays + 1], scratch.column[0, : batch.columns[0]]
     assert batch.samples[0] == first[rays] <= batch.columns[0]
     assert sorted(column) == list(range(batch.columns[0]))  # each once, those nobody uses last
-    density = scratch.laid[0, 0]
+    density = scratch.by_ray[0, 0]
     for a, b in pairwise(first):
         t, length = scratch.line[0, :, column[a:b]].T
         assert (np.diff(t) > 0).all()
@@ -115,7 +115,7 @@ def test_no_ray_is_cut_off_where_the_grid_is_wrong(field: NgpField) -> None:
         first, column = field._scratch.ray_first[0], field._scratch.column[0]
         return [field._scratch.line[0, 0, column[a:b]] for a, b in pairwise(first[: rays + 1])]
 
-    whole = rays_of(0.0)  # nothing to be asked about: each in one piece
+    whole = rays_of(0.0)  # nothing to be asked about: each in one span
     assert sum(map(len, whole)) > 1500
     for over in (1.0, 5.0, 30.0):
         found = rays_of(over)

@@ -13,9 +13,9 @@ from edge_server.fields.common.kernels.volume_rendering import (
     Weights,
     activate,
     add_harmonics,
+    add_harmonics_backward,
     ray_loss,
-    seen_samples,
-    spread_harmonics,
+    samples_until_opaque,
 )
 from edge_server.fields.ngp import torch_model
 
@@ -42,7 +42,7 @@ def _kernel(raw, line, ray, weights, harmonics, guide=0.0):
     activate(out, 0, SAMPLES)
     error = ray_loss(out, d_out, line[0], line[1], line[2], 0, SAMPLES, ray[3:6], ray[6:9], np.float32(guide),
                      weights)  # fmt: skip
-    spread_harmonics(d_out, harmonics, 0, SAMPLES, *ray[:3])
+    add_harmonics_backward(d_out, harmonics, 0, SAMPLES, *ray[:3])
     return error, d_out
 
 
@@ -77,7 +77,7 @@ def test_weight_away_from_a_guide_costs_what_geman_and_mcclure_say(guide: float)
     weights = Weights(*np.float32([0.3, 0.05, 0.0, 0.7]))
     error, d_out = _kernel(raw, line, ray, weights, 1, guide)
     params, expected, loss = _oracle(raw, line, ray, 0.3, 0.05, 1)
-    assert error == pytest.approx(expected.item(), rel=1e-4)  # the guide is no colour
+    assert error == pytest.approx(expected.item(), rel=1e-4)  # the guide is no color
     sigma, _ = torch_model.shade(params, 1, torch.zeros(SAMPLES, 3, dtype=torch.float64))
     through = torch.exp(-torch.cumsum(sigma * torch.as_tensor(line[1], dtype=torch.float64), 0))
     before = torch.cat([torch.ones(1, dtype=torch.float64), through[:-1]])
@@ -116,10 +116,26 @@ def test_nothing_behind_an_opaque_sample_has_a_gradient() -> None:
     out = raw.copy()
     activate(out, 0, SAMPLES)
     assert out[0, 6] * line[1, 6] > OPAQUE_DEPTH
-    assert seen_samples(out, line[1], 0, SAMPLES) == 7
-    assert seen_samples(out, line[1], 7, SAMPLES) == SAMPLES - 7
+    assert samples_until_opaque(out, line[1], 0, SAMPLES) == 7
+    assert samples_until_opaque(out, line[1], 7, SAMPLES) == SAMPLES - 7
     _, d_out = _kernel(raw, line, ray, Weights(*np.float32([0.1, 0.1, 0])), 1)
     assert (d_out[:, 7:] == 0).all() and (d_out[1:4, 6] != 0).all()
+
+
+def test_a_ray_ends_where_a_ten_thousandth_of_the_light_is_left() -> None:
+    """Later, samples are evaluated for nothing; earlier, what is left out can be seen."""
+    raw, line, ray = _ray(5, 0.0)
+    line[1], raw[0] = 0.05, np.log(0.7 / 0.05)  # an optical depth of .7 a sample
+    out = raw.copy()
+    activate(out, 0, SAMPLES)
+    through = np.exp(-np.cumsum(out[0].astype(np.float64) * line[1]))
+    seen = samples_until_opaque(out, line[1], 0, SAMPLES)
+    assert through[seen - 1] < 1e-4 < through[seen - 2]
+    error, d_out = _kernel(raw, line, ray, Weights(*np.float32([0, 0, 0])), 1)
+    weight = np.concatenate([[1.0], through[:-1]]) - through
+    color = (weight * out[1:4]).sum(axis=1) + through[-1] * ray[6:9]
+    assert error == pytest.approx(float(np.square(color - ray[3:6]).sum()), abs=3e-4)
+    assert (d_out[0, seen:] == 0).all() and (d_out[0, :seen] != 0).all()
 
 
 def test_clamped_density_has_no_gradient() -> None:
@@ -139,7 +155,7 @@ def test_a_ray_that_is_not_finite_is_refused_whole(poison: float) -> None:
     error, d_out = _kernel(raw, line, ray, Weights(*np.float32([0.1, 0.1, 0])), 1)
     if np.isnan(poison):
         assert error == -1.0 and (d_out == 0).all()
-    else:  # an infinite raw colour is full colour, or refused: never silent corruption
+    else:  # an infinite raw color is full color, or refused: never silent corruption
         assert np.isfinite(d_out).all()
 
 
