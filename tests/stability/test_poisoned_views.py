@@ -22,11 +22,11 @@ from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
-from edge_server.fields.splat import field as splat
-from edge_server.fields.splat.densification import Cloud
+from edge_server.fields.splat import cpu_field as splat
+from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.motion import Moved
+from edge_server.fields.splat.motion import SceneChange
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.tensorf.field import TensorfField
 from edge_server.fields.tensorf.settings import TensorfSettings
@@ -303,10 +303,10 @@ def test_what_moved_beside_a_wrong_picture_is_not_known(monkeypatch: pytest.Monk
     """Neither a refused view nor the one after it has a say in what moves; the others always have."""
     said: list[list[bool]] = []
 
-    def renew(settings: Any, passes: Any, cloud: Any, seen: Moved, rng: Any) -> None:
+    def reseed(settings: Any, passes: Any, cloud: Any, seen: SceneChange, rng: Any) -> None:
         said.append([mask is not None for mask in seen.moved])
 
-    monkeypatch.setattr(splat, "renew", renew)
+    monkeypatch.setattr(splat, "reseed", reseed)
     _in_motion.__wrapped__(_noise)
     assert [s[BAD] for s in said[:10]] == [True] * 3 + [False] * 4 + [True] * 3
     assert all(s[k] for s in said[:10] for k in range(len(SEEN)) if k != BAD)
@@ -334,8 +334,8 @@ def test_what_only_a_refused_view_shows_is_kept(asked: bool) -> None:
     nowhere = params.copy()
     nowhere[:, :3] = field.rig.box.normalise(np.array([0.0, 0.0, -40.0]))  # under the feet of all
     field.cloud.keep(np.arange(len(field.cloud)) >= 8)
-    field.cloud.add(Cloud.of(params))
-    field.cloud.add(Cloud.of(nowhere))
+    field.cloud.add(GaussianCloud.new(params))
+    field.cloud.add(GaussianCloud.new(nowhere))
     for number in range(2, 10):
         update(number, *([_noise(away, number)] if asked else []))
     assert field.rig.memory["away"].credit == (PATIENCE - 8 if asked else PATIENCE)

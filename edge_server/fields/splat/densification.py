@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.training_schedule import BETA2
-from edge_server.fields.splat.kernels.optimizer_step import DEAD, Moments, bound_all
+from edge_server.fields.splat.kernels.optimizer_step import DEAD, OptimizerState, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import quaternion_to_matrix
@@ -18,7 +18,7 @@ SHARP_PX = 1.0  # what is about a pixel wide is doubled without shrinking
 
 
 @dataclass
-class Cloud:
+class GaussianCloud:
     """The Gaussians and all that is known of each: arrays of equal length, at most ``settings.gaussians``.
 
     velocity: (N, 3) scene units a second, 0 but for guests. guest: (N,), 0 for what belongs to the scene as
@@ -35,7 +35,7 @@ class Cloud:
     guest: NDArray[np.int32]
 
     @classmethod
-    def of(cls, params: NDArray[np.float32]) -> Cloud:
+    def new(cls, params: NDArray[np.float32]) -> GaussianCloud:
         """New Gaussians, without a history."""
         n = len(params)
         slope, looks, reach = (np.zeros(n, np.float32) for _ in range(3))
@@ -44,9 +44,9 @@ class Cloud:
         return cls(params, m, v, age, slope, looks, reach, velocity, guest)
 
     @classmethod
-    def empty(cls, settings: SplatSettings) -> Cloud:
+    def empty(cls, settings: SplatSettings) -> GaussianCloud:
         """None at all."""
-        return cls.of(np.zeros((0, BASE + 3 * (settings.harmonics - 1)), np.float32))
+        return cls.new(np.zeros((0, BASE + 3 * (settings.harmonics - 1)), np.float32))
 
     def __len__(self) -> int:
         return len(self.params)
@@ -55,21 +55,21 @@ class Cloud:
         """As the kernels read them."""
         return Gaussians(self.params, harmonics, self.velocity)
 
-    def moments(self) -> Moments:
+    def optimizer_state(self) -> OptimizerState:
         """As the kernels read them."""
-        return Moments(self.m, self.v, self.age, self.slope, self.looks, self.reach)
+        return OptimizerState(self.m, self.v, self.age, self.slope, self.looks, self.reach)
 
     def keep(self, which: NDArray[np.bool_]) -> None:
         """Remove the others."""
-        self._become({f.name: np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)})
+        self._replace({f.name: np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)})
 
-    def add(self, new: Cloud) -> None:
+    def add(self, new: GaussianCloud) -> None:
         """Append others."""
-        self._become({
+        self._replace({
             f.name: np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(self)
         })  # fmt: skip
 
-    def _become(self, arrays: dict[str, NDArray]) -> None:
+    def _replace(self, arrays: dict[str, NDArray]) -> None:
         # All at once: Ctrl-C in between would leave arrays of different lengths.
         self.__dict__.update(arrays)
 
@@ -85,7 +85,7 @@ def raw_opacity(alpha: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.log(alpha / (1.0 - alpha)).astype(np.float32)
 
 
-def pull_of_colour(cloud: Cloud) -> NDArray[np.float32]:
+def color_sensitivity(cloud: GaussianCloud) -> NDArray[np.float32]:
     """How much the pictures' errors depend on each Gaussian, float32 (N,), of a scale that only comparisons
     know: the mean square of the loss's gradient by its colour, which Adam keeps. That gradient is the sum,
     over the pixels where it shows, of its share in the pixel times the error there. Small, hidden and faint
@@ -97,16 +97,18 @@ def pull_of_colour(cloud: Cloud) -> NDArray[np.float32]:
     return np.where(cloud.age > 0, square, np.inf).astype(np.float32)
 
 
-def make_room(cloud: Cloud, count: int) -> None:
+def prune_least_sensitive(cloud: GaussianCloud, count: int) -> None:
     """Remove the ``count`` Gaussians on which the pictures' errors depend least. By opacity, all that is
     faint would go in time, and it is what edges are made of: -1.1 dB after 300 updates of ``room``."""
     if count > 0:
         keep = np.ones(len(cloud), bool)
-        keep[np.argsort(pull_of_colour(cloud), kind="stable")[:count]] = False
+        keep[np.argsort(color_sensitivity(cloud), kind="stable")[:count]] = False
         cloud.keep(keep)
 
 
-def grow_and_prune(cloud: Cloud, settings: SplatSettings, pixels: float, rng: np.random.Generator) -> None:
+def densify_and_prune(
+    cloud: GaussianCloud, settings: SplatSettings, pixels: float, rng: np.random.Generator
+) -> None:
     """Remove what no picture shows, then split the Gaussians whose place in the picture is pulled at most.
 
     pixels: of a picture's width. The two halves together let through as much light as the one did (Bulo et
@@ -129,7 +131,11 @@ def grow_and_prune(cloud: Cloud, settings: SplatSettings, pixels: float, rng: np
 
 
 def _split(
-    cloud: Cloud, chosen: NDArray[np.int64], pixels: float, settings: SplatSettings, rng: np.random.Generator
+    cloud: GaussianCloud,
+    chosen: NDArray[np.int64],
+    pixels: float,
+    settings: SplatSettings,
+    rng: np.random.Generator,
 ) -> None:
     one = cloud.params[chosen].copy()
     size = np.exp(one[:, SCALE : SCALE + 3])
@@ -143,11 +149,11 @@ def _split(
     two[:, :3] -= 0.5 * offset
     largest, thinnest = np.float32(settings.largest), np.float32(np.log(settings.aspect))
     for half in (one, two):
-        bound_all(half, largest, thinnest)
+        clamp_gaussians(half, largest, thinnest)
     cloud.params[chosen] = one
     cloud.m[chosen] = 0.0
     cloud.v[chosen] = 0.0
     cloud.age[chosen] = 0
-    halves = Cloud.of(two)
+    halves = GaussianCloud.new(two)
     halves.velocity, halves.guest = cloud.velocity[chosen], cloud.guest[chosen]
     cloud.add(halves)

@@ -17,13 +17,13 @@ from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.buffers import Passes
-from edge_server.fields.splat.densification import Cloud, make_room
-from edge_server.fields.splat.kernels.optimizer_step import pull
+from edge_server.fields.splat.buffers import RasterBuffers
+from edge_server.fields.splat.densification import GaussianCloud, prune_least_sensitive
+from edge_server.fields.splat.kernels.optimizer_step import position_gradients
 from edge_server.fields.splat.kernels.project import TILE, Gaussians
 from edge_server.fields.splat.kernels.rasterize import Loss, compare_tiles, train_tiles
-from edge_server.fields.splat.kernels.view_evidence import Verdicts, judge
-from edge_server.fields.splat.seeding import seeds
+from edge_server.fields.splat.kernels.view_evidence import Evidence, collect_evidence
+from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
 
 AGREE = 0.1  # a Gaussian whose colour is this near to the pixel's, channel by channel, may stay
@@ -35,7 +35,7 @@ SEEDS_A_PIXEL = 0.1
 
 LONGEST_S = 0.45  # after a longer pause, nothing is known of how things move: people turn
 FASTEST_M_PER_S = 8.0
-CARRY_VIEWS = 6  # a step
+TRACKING_VIEWS = 6  # a step
 LEFT = 4  # updates after which a guest that moves no more belongs to the scene
 # Carrying: bodies first, then their limbs. Cells in pixels at the scene's distance; the first step in metres
 # for each second since the last update.
@@ -45,7 +45,7 @@ _TO_VELOCITY = 0.7  # of a correction that is taken for a wrong velocity rather 
 
 
 @dataclass
-class Moved:
+class SceneChange:
     """One set of views and what changed in them.
 
     moved: for each view bool (H, W) or None, pixels of weight 0 left out; tiles: the same by tiles, uint8
@@ -63,23 +63,25 @@ class Moved:
     elapsed_s: float
     asked: int
 
-    def verdicts(
+    def evidence(
         self, pool: Pool, gaussians: Gaussians, allowed: NDArray[np.float32] | None = None
-    ) -> Verdicts:
-        """What the pictures say of each Gaussian. allowed: see ``judge``; none: nothing is ever wrong."""
+    ) -> Evidence:
+        """What the pictures say of each Gaussian. allowed: see ``collect_evidence``; none: nothing is ever wrong."""
         count, data = len(gaussians.params), self.data
-        found = Verdicts.room(count)
+        found = Evidence.zeros(count)
         marks = np.zeros(int(data.first[-1]), np.uint8)
         for mask, first in zip(self.moved, data.first):
             if mask is not None:
                 marks[first : first + mask.size] = mask.reshape(-1)
         if allowed is None:
             allowed = np.full(count, np.inf, np.float32)
-        pool.run(judge, self.cams, data, marks, gaussians, allowed, found)
+        pool.run(collect_evidence, self.cams, data, marks, gaussians, allowed, found)
         return found
 
 
-def trusted_moves(moved: Sequence[NDArray[np.bool_] | None], data: Views) -> list[NDArray[np.bool_] | None]:
+def weighted_changes(
+    moved: Sequence[NDArray[np.bool_] | None], data: Views
+) -> list[NDArray[np.bool_] | None]:
     """``moved`` without pixels of weight 0; None for views of which nothing is left."""
     if data.weight.size == 0:
         return list(moved)
@@ -99,21 +101,21 @@ def changed_tiles(moved: Sequence[NDArray[np.bool_] | None]) -> list[NDArray[np.
         if mask is None or not 0.0 < mask.mean() < MOST:
             masks.append(None)
             continue
-        masks.append(_by_tiles(mask))
+        masks.append(_tile_mask(mask))
     return masks
 
 
-def silent_tiles(data: Views) -> list[NDArray[np.uint8] | None]:
+def unweighted_tiles(data: Views) -> list[NDArray[np.uint8] | None]:
     """For each view the tiles with pixels of weight 0, uint8 (tiles,), or None where there are none."""
     masks: list[NDArray[np.uint8] | None] = [None] * len(data.size)
     if data.weight.size:
         for k, ((w, h), first) in enumerate(zip(data.size, data.first)):
             silent = data.weight[first : first + w * h].reshape(h, w) == 0
-            masks[k] = _by_tiles(silent) if silent.any() else None
+            masks[k] = _tile_mask(silent) if silent.any() else None
     return masks
 
 
-def _by_tiles(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _tile_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     h, w = mask.shape
     rows, columns = -(-h // TILE), -(-w // TILE)
     whole = np.zeros((rows * TILE, columns * TILE), np.uint8)
@@ -122,7 +124,7 @@ def _by_tiles(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return tiles
 
 
-def drift(cloud: Cloud, elapsed_s: float, moves: bool) -> None:
+def extrapolate(cloud: GaussianCloud, elapsed_s: float, moves: bool) -> None:
     """Let every guest go on as it went, or back if the newest view is an older one; after a long pause, or
     where no camera sees anything move, none."""
     if not moves or not abs(elapsed_s) <= LONGEST_S:
@@ -130,8 +132,8 @@ def drift(cloud: Cloud, elapsed_s: float, moves: bool) -> None:
     cloud.params[:, :3] += cloud.velocity * np.float32(elapsed_s)
 
 
-def carry(
-    settings: SplatSettings, passes: Passes, cloud: Cloud, seen: Moved, steps: int
+def track(
+    settings: SplatSettings, raster: RasterBuffers, cloud: GaussianCloud, seen: SceneChange, steps: int
 ) -> Iterator[tuple[float, int, int]]:
     """Move the guests together until the pictures agree: first as whole bodies, then in smaller parts. Their
     velocities follow. Yields (squared error, pixels, pairs) of each of ``steps`` steps at most.
@@ -144,9 +146,9 @@ def carry(
         return
     loss = Loss(False, np.float32(0.0), seen.background, False, np.uint64(0))
     # Of the cloud, only what shows in the tiles that changed.
-    passes.look(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
+    raster.project_and_bin(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
                 [seen.tiles[k] for k in slots], differentiate=False)  # fmt: skip
-    shows = np.asarray((passes.lists.own_count[: len(slots), : len(cloud)] > 0).any(axis=0))
+    shows = np.asarray((raster.lists.own_count[: len(slots), : len(cloud)] > 0).any(axis=0))
     shows[guests] = True
     some, theirs = np.flatnonzero(shows), guests
     guests = np.searchsorted(some, theirs).astype(np.int64)
@@ -157,23 +159,23 @@ def carry(
     fastest = FASTEST_M_PER_S / seen.box.radius_m
     for level, (cell_px, step_m_per_s) in enumerate(zip(CELLS_PX, STEPS_M_PER_S)):
         step = step_m_per_s * seen.elapsed_s / seen.box.radius_m
-        cell = _cells(place[guests], cell_px * pixel)
+        cell = _grid_cells(place[guests], cell_px * pixel)
         count = int(cell.max()) + 1
         m, v = np.zeros((count, 3)), np.zeros(count)
         for k in range((steps + 1 - level) // 2):
-            turn = (steps - k) * CARRY_VIEWS + level  # other views each time
-            some_slots = [slots[(turn + j) % len(slots)] for j in range(min(CARRY_VIEWS, len(slots)))]
+            turn = (steps - k) * TRACKING_VIEWS + level  # other views each time
+            some_slots = [slots[(turn + j) % len(slots)] for j in range(min(TRACKING_VIEWS, len(slots)))]
             picked, cams = np.array(some_slots, np.int64), np.ascontiguousarray(seen.cams[some_slots])
-            passes.look(cams, gaussians, [seen.tiles[k] for k in some_slots])
-            tasks = passes.tasks()
+            raster.project_and_bin(cams, gaussians, [seen.tiles[k] for k in some_slots])
+            tasks = raster.tasks()
             losses = np.zeros((len(tasks), 3))
-            passes.pool.run(
-                train_tiles, seen.data, picked, tasks, passes.columns, passes.projected, passes.lists, loss,
-                passes.memory, passes.kept, passes.sums, losses,
+            raster.pool.run(
+                train_tiles, seen.data, picked, tasks, raster.columns, raster.projected, raster.lists, loss,
+                raster.memory, raster.saved, raster.sums, losses,
             )  # fmt: skip
-            passes.pool.run(
-                pull, cams, gaussians, guests, passes.projected, passes.lists.own_first,
-                passes.lists.own_count, passes.sums, slope,
+            raster.pool.run(
+                position_gradients, cams, gaussians, guests, raster.projected, raster.lists.own_first,
+                raster.lists.own_count, raster.sums, slope,
             )  # fmt: skip
             total = np.stack([np.bincount(cell, slope[:, a], count) for a in range(3)], axis=-1)
             m, v = 0.6 * m + 0.4 * total, 0.8 * v + 0.2 * (total**2).sum(axis=1)
@@ -187,12 +189,12 @@ def carry(
             yield (
                 float(losses[:, 1].sum()),
                 TILE * TILE * len(tasks),
-                int(passes.lists.needed[: len(cams)].sum()),
+                int(raster.lists.needed[: len(cams)].sum()),
             )
 
 
-def leave_behind(
-    settings: SplatSettings, pool: Pool, cloud: Cloud, seen: Moved, before: NDArray[np.float32]
+def release_left_behind(
+    settings: SplatSettings, pool: Pool, cloud: GaussianCloud, seen: SceneChange, before: NDArray[np.float32]
 ) -> None:
     """Guests that agree better with the pictures where they were (before: (N, 3)) stay there, as a part
     of the scene: the body went on without them."""
@@ -202,15 +204,19 @@ def leave_behind(
     moving = Gaussians(cloud.params[guests], settings.harmonics, cloud.velocity[guests])
     still = Gaussians(moving.params.copy(), settings.harmonics, np.zeros_like(moving.velocity))
     still.params[:, :3] = before[guests]
-    here, there = (seen.verdicts(pool, gaussians).off for gaussians in (moving, still))
+    here, there = (seen.evidence(pool, gaussians).off for gaussians in (moving, still))
     stay = guests[there + np.float32(STAYS) < here]
     cloud.params[stay, :3] = before[stay]
     cloud.velocity[stay] = 0.0
     cloud.guest[stay] = 0
 
 
-def renew(
-    settings: SplatSettings, passes: Passes, cloud: Cloud, seen: Moved, rng: np.random.Generator
+def reseed(
+    settings: SplatSettings,
+    raster: RasterBuffers,
+    cloud: GaussianCloud,
+    seen: SceneChange,
+    rng: np.random.Generator,
 ) -> None:
     """Remove the Gaussians in the hull of what changed that do not agree with it, and begin new ones where
     pictures are still wrong.
@@ -222,35 +228,35 @@ def renew(
     views = seen.views
     needed = min(2, seen.asked)
     if sum(mask is not None for mask in seen.moved) < needed:
-        _age(cloud, np.zeros(len(cloud), bool))
+        _age_guests(cloud, np.zeros(len(cloud), bool))
         return  # what one camera alone sees change may be that camera
-    hull, disagrees = _hull(settings, passes.pool, cloud, seen)
-    _age(cloud, hull)
+    hull, disagrees = _visual_hull(settings, raster.pool, cloud, seen)
+    _age_guests(cloud, hull)
     cloud.keep(~(hull & disagrees))
-    off = _still_wrong(settings, passes, cloud, seen)
+    off = _unexplained(settings, raster, cloud, seen)
     pixels = sum(int(m.sum()) for m in off if m is not None)
     count = min(int(settings.reseed * settings.gaussians), int(SEEDS_A_PIXEL * pixels))
-    new = Cloud.of(
-        seeds(settings, passes.pool, seen.box, views, off, seen.data.weight, count, rng, seen.moved)
+    new = GaussianCloud.new(
+        seed_gaussians(settings, raster.pool, seen.box, views, off, seen.data.weight, count, rng, seen.moved)
     )
-    new.keep(_hull(settings, passes.pool, new, seen)[0])
+    new.keep(_visual_hull(settings, raster.pool, new, seen)[0])
     new.guest[:] = 1
-    _pass_on(cloud, new, CELLS_PX[0] * seen.box.pixel_m / seen.box.radius_m)
-    make_room(cloud, len(cloud) + len(new) - settings.gaussians)
+    _inherit_velocity(cloud, new, CELLS_PX[0] * seen.box.pixel_m / seen.box.radius_m)
+    prune_least_sensitive(cloud, len(cloud) + len(new) - settings.gaussians)
     cloud.add(new)
 
 
-def _hull(
-    settings: SplatSettings, pool: Pool, cloud: Cloud, seen: Moved
+def _visual_hull(
+    settings: SplatSettings, pool: Pool, cloud: GaussianCloud, seen: SceneChange
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which Gaussians lie in the hull of what changed, and which of them disagree with it: bool (N,) each."""
     allowed = np.where(cloud.guest > 0, AGREE_GUEST, AGREE).astype(np.float32)
-    found = seen.verdicts(pool, cloud.gaussians(settings.harmonics), allowed)
+    found = seen.evidence(pool, cloud.gaussians(settings.harmonics), allowed)
     hull = (found.marked >= min(2, seen.asked)) & (2 * found.marked >= found.sees)
     return hull, 2 * found.wrong >= found.marked
 
 
-def _age(cloud: Cloud, hull: NDArray[np.bool_]) -> None:
+def _age_guests(cloud: GaussianCloud, hull: NDArray[np.bool_]) -> None:
     guest = cloud.guest > 0
     cloud.guest[guest & hull] = 1
     rests = guest & ~hull
@@ -259,12 +265,12 @@ def _age(cloud: Cloud, hull: NDArray[np.bool_]) -> None:
     cloud.guest[cloud.guest > LEFT] = 0
 
 
-def _pass_on(cloud: Cloud, new: Cloud, size: float) -> None:
+def _inherit_velocity(cloud: GaussianCloud, new: GaussianCloud, size: float) -> None:
     """New guests move as the old ones around them do."""
     guests = np.flatnonzero(cloud.guest)
     if guests.size == 0 or len(new) == 0:
         return
-    cell = _cells(np.concatenate([cloud.params[guests, :3], new.params[:, :3]]), size)
+    cell = _grid_cells(np.concatenate([cloud.params[guests, :3], new.params[:, :3]]), size)
     count = int(cell.max()) + 1
     old = cell[: guests.size]
     number = np.maximum(np.bincount(old, minlength=count), 1)
@@ -273,7 +279,7 @@ def _pass_on(cloud: Cloud, new: Cloud, size: float) -> None:
         new.velocity[:, a] = mean[cell[guests.size :]]
 
 
-def _cells(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
+def _grid_cells(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
     """The number (N,), from 0, of the cube of that size each point (N, 3) lies in."""
     index = np.floor(points / size).clip(-1000, 1000).astype(np.int64) + 1000
     cell: NDArray[np.int64] = np.unique((index[:, 0] * 2001 + index[:, 1]) * 2001 + index[:, 2],
@@ -281,8 +287,8 @@ def _cells(points: NDArray[np.float32], size: float) -> NDArray[np.int64]:
     return cell.reshape(-1)
 
 
-def _still_wrong(
-    settings: SplatSettings, passes: Passes, cloud: Cloud, seen: Moved
+def _unexplained(
+    settings: SplatSettings, raster: RasterBuffers, cloud: GaussianCloud, seen: SceneChange
 ) -> list[NDArray[np.bool_] | None]:
     """Of the pixels that changed, those that the cloud does not show as they are now: where a body has left,
     what is behind it is known already."""
@@ -290,13 +296,13 @@ def _still_wrong(
     off = list(seen.moved)  # where nearly everything changed, all of it is wrong
     if not slots:
         return off
-    passes.look(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
+    raster.project_and_bin(np.ascontiguousarray(seen.cams[slots]), cloud.gaussians(settings.harmonics),
                 [seen.tiles[k] for k in slots], differentiate=False)  # fmt: skip
-    data, tasks = seen.data, passes.tasks()
+    data, tasks = seen.data, raster.tasks()
     error = np.zeros(int(data.first[-1]), np.float32)
-    passes.pool.run(
-        compare_tiles, data, np.array(slots, np.int64), tasks, passes.columns, passes.projected, passes.lists,
-        seen.background, passes.memory, passes.kept, error,
+    raster.pool.run(
+        compare_tiles, data, np.array(slots, np.int64), tasks, raster.columns, raster.projected, raster.lists,
+        seen.background, raster.memory, raster.saved, error,
     )  # fmt: skip
     for k in slots:
         mask = seen.moved[k]

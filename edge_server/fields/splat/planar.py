@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.thread_pool import Pool
-from edge_server.fields.splat.buffers import Passes
-from edge_server.fields.splat.densification import Cloud
+from edge_server.fields.splat.buffers import RasterBuffers
+from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.kernels.project import ORIGIN, QUATERNION, SCALE, SIZE, Gaussians
-from edge_server.fields.splat.kernels.rasterize_planes import render_planes, tell_normals
+from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalise, quaternion_to_matrix
 
@@ -24,12 +24,12 @@ SURE_OPACITY = 0.7  # of a pixel whose depth has a normal to teach
 JUMP = 0.05  # of the depth, between neighbours, from which on it is an edge
 
 
-def planes_of(gaussians: Gaussians, camera: NDArray[np.float32]) -> NDArray[np.float32]:
+def gaussian_planes(gaussians: Gaussians, camera: NDArray[np.float32]) -> NDArray[np.float32]:
     """float32 (N, 4): unit normal of each Gaussian's flattest side in camera axes, turned to the camera, and
     the plane's distance along it (negative), scene units. camera: a row of ``camera_rows``."""
     p = gaussians.params
     turn = camera[:ORIGIN].reshape(3, 3).astype(np.float64)
-    normal = normals_of(p) @ turn.T
+    normal = gaussian_normals(p) @ turn.T
     middle = (p[:, :3].astype(np.float64) - camera[ORIGIN : ORIGIN + 3]) @ turn.T
     distance = (normal * middle).sum(axis=1, keepdims=True)
     planes = np.concatenate([normal, distance], axis=1)
@@ -37,14 +37,14 @@ def planes_of(gaussians: Gaussians, camera: NDArray[np.float32]) -> NDArray[np.f
     return planes.astype(np.float32)
 
 
-def normals_of(params: NDArray[np.float32]) -> NDArray[np.float64]:
+def gaussian_normals(params: NDArray[np.float32]) -> NDArray[np.float64]:
     """The axis (N, 3) of every Gaussian along which it is smallest, scene axes."""
-    turn = quaternion_to_matrix(directed(params))
+    turn = quaternion_to_matrix(unit_quaternions(params))
     least = np.argmin(params[:, SCALE : SCALE + 3], axis=1)
     return np.take_along_axis(turn, least[:, None, None], axis=2)[:, :, 0]
 
 
-def directed(params: NDArray[np.float32]) -> NDArray[np.float64]:
+def unit_quaternions(params: NDArray[np.float32]) -> NDArray[np.float64]:
     """Unit quaternions (N, 4) of Gaussians; one without a direction turns nothing, as when it is rendered."""
     given = params[:, QUATERNION : QUATERNION + 4].astype(np.float64)
     sound = np.isfinite(given).all(axis=1) & (np.abs(given).max(axis=1, initial=0.0) > 0.0)
@@ -52,7 +52,7 @@ def directed(params: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def plane_depth(
-    passes: Passes,
+    raster: RasterBuffers,
     pool: Pool,
     gaussians: Gaussians,
     camera: NDArray[np.float32],
@@ -60,12 +60,12 @@ def plane_depth(
     slot: int = 0,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth (H, W) along the rays, scene units, 0 where the plane is seen too flat, and opacity (H, W), of
-    a camera that ``passes`` has looked through last as ``slot``."""
+    a camera that ``raster`` has looked through last as ``slot``."""
     width, height = int(camera[SIZE]), int(camera[SIZE + 1])
     out = np.zeros((height, width, 5), np.float32)
     pool.run(
-        render_planes, slot, int(passes.columns[slot]), int(passes.rows[slot]), width, height,
-        passes.projected, passes.lists, planes_of(gaussians, camera), passes.memory, passes.kept, out,
+        render_planes, slot, int(raster.columns[slot]), int(raster.rows[slot]), width, height,
+        raster.projected, raster.lists, gaussian_planes(gaussians, camera), raster.memory, raster.saved, out,
     )  # fmt: skip
     rays = lens.rays()
     along = (out[..., :3] * rays).sum(axis=-1)
@@ -75,7 +75,7 @@ def plane_depth(
     return np.where(depth > 0, depth, 0.0).astype(np.float32), opacity.astype(np.float32)
 
 
-def flatten(cloud: Cloud, settings: SplatSettings) -> None:
+def flatten(cloud: GaussianCloud, settings: SplatSettings) -> None:
     """A step of the pull on each Gaussian's smallest axis: a loss that is linear in its logarithm."""
     scale = cloud.params[:, SCALE : SCALE + 3]
     rows, least = np.arange(len(scale)), np.argmin(scale, axis=1)
@@ -86,39 +86,41 @@ def flatten(cloud: Cloud, settings: SplatSettings) -> None:
 
 
 def align(
-    cloud: Cloud,
+    cloud: GaussianCloud,
     settings: SplatSettings,
-    passes: Passes,
+    raster: RasterBuffers,
     pool: Pool,
     camera: NDArray[np.float32],
     lens: Pinhole,
 ) -> None:
-    """Turn the Gaussians that ``camera`` (slot 0 of ``passes``, all of it) sees towards the normals of the
+    """Turn the Gaussians that ``camera`` (slot 0 of ``raster``, all of it) sees towards the normals of the
     depth that they show together."""
     gaussians = cloud.gaussians(settings.harmonics)
-    depth, opacity = plane_depth(passes, pool, gaussians, camera, lens)
+    depth, opacity = plane_depth(raster, pool, gaussians, camera, lens)
     height, width = depth.shape
-    told = np.zeros((passes.lists.pair.shape[1], 4), np.float32)
+    normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
     pool.run(
-        tell_normals, 0, int(passes.columns[0]), int(passes.rows[0]), width, height, passes.projected,
-        passes.lists, depth_normals(depth, opacity, lens), passes.memory, passes.kept, told,
+        accumulate_normals, 0, int(raster.columns[0]), int(raster.rows[0]), width, height, raster.projected,
+        raster.lists, depth_normals(depth, opacity, lens), raster.memory, raster.saved, normal_sums,
     )  # fmt: skip
-    first, count = passes.lists.own_first[0, : len(cloud)], passes.lists.own_count[0, : len(cloud)]
+    first, count = raster.lists.own_first[0, : len(cloud)], raster.lists.own_count[0, : len(cloud)]
     which = np.flatnonzero(count > 0)
-    sums = np.concatenate([np.zeros((1, 4)), np.cumsum(told.astype(np.float64), axis=0)])
+    sums = np.concatenate([np.zeros((1, 4)), np.cumsum(normal_sums.astype(np.float64), axis=0)])
     said = sums[first[which] + count[which]] - sums[first[which]]
     heard = said[:, 3] > 1e-3
     which, said = which[heard], said[heard]
     if not len(which):
         return
     wanted = said[:, :3] / said[:, 3:] @ camera[:ORIGIN].reshape(3, 3).astype(np.float64)
-    normal = normals_of(cloud.params[which])
+    normal = gaussian_normals(cloud.params[which])
     # A normal and its opposite are one plane.
     wanted *= np.where((wanted * normal).sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
     turn = 0.5 * settings.align * np.cross(normal, wanted)
     step = np.concatenate([np.ones((len(turn), 1)), turn], axis=1)
     part = slice(QUATERNION, QUATERNION + 4)
-    cloud.params[which, part] = quaternion_normalise(quaternion_multiply(step, directed(cloud.params[which])))
+    cloud.params[which, part] = quaternion_normalise(
+        quaternion_multiply(step, unit_quaternions(cloud.params[which]))
+    )
 
 
 def depth_normals(

@@ -13,14 +13,14 @@ from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.plane_sweep import empty_color, score, shows, sweep
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import asked_views, pack_cameras
-from edge_server.fields.splat.kernels.optimizer_step import bound_all
+from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.settings import SplatSettings
 
 _CANDIDATES = 4  # rays a Gaussian: those without a surface are left out
 
 
-def seeds(
+def seed_gaussians(
     settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
     masks: Sequence[NDArray[np.bool_] | None] | None, weight: NDArray[np.float32], count: int,
     rng: np.random.Generator, moved: Sequence[NDArray[np.bool_] | None] | None = None,
@@ -63,7 +63,7 @@ def seeds(
         params[mine, SCALE : SCALE + 3] = np.log(size)[:, None]
     params[:, QUATERNION] = 1.0
     params[:, OPACITY] = np.log(settings.seed_opacity / (1.0 - settings.seed_opacity))
-    bound_all(params, np.float32(settings.largest), np.float32(np.log(settings.aspect)))
+    clamp_gaussians(params, np.float32(settings.largest), np.float32(np.log(settings.aspect)))
     return params
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.buffers import Passes, camera_rows, ray_lengths
+from edge_server.fields.splat.buffers import RasterBuffers, camera_rows, ray_lengths
 from edge_server.fields.splat.kernels.project import TILE, Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_points, render_tiles
 from freshfield.geometry import Pinhole
@@ -22,7 +22,7 @@ SOLID = 0.5  # opacity from which on a pixel shows a surface
 @dataclass(frozen=True)
 class SplatSnapshot:
     """Gaussians and cameras of one instant. Nothing in it is written after it is made. ahead_s: by how much
-    that instant is later than the newest view. passes: buffers to render pixels with, if one thread alone
+    that instant is later than the newest view. raster: buffers to render pixels with, if one thread alone
     uses this. planar: the Gaussians are flat, so that planes tell their depth (``render_surface``)."""
 
     box: SceneBox
@@ -32,30 +32,30 @@ class SplatSnapshot:
     pool: Pool
     step: int
     ahead_s: float = 0.0
-    passes: Passes | None = None
+    raster: RasterBuffers | None = None
     planar: bool = False
 
     def render_surface(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture, with the depth at which rays meet the Gaussians' planes (``splat_planar``)."""
         from edge_server.fields.splat.planar import plane_depth  # numba compiles it where it is asked for
 
-        picture, passes = self.render(camera_to_world, intrinsics), Passes(self.pool)
+        picture, raster = self.render(camera_to_world, intrinsics), RasterBuffers(self.pool)
         cams = camera_rows([camera_to_world], [intrinsics], self.box)
-        passes.look(cams, self.gaussians, [None], differentiate=False)
-        depth, opacity = plane_depth(passes, self.pool, self.gaussians, cams[0], intrinsics)
+        raster.project_and_bin(cams, self.gaussians, [None], differentiate=False)
+        depth, opacity = plane_depth(raster, self.pool, self.gaussians, cams[0], intrinsics)
         return Rendering(picture.color, depth * np.float32(self.box.radius_m), opacity)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """The picture a camera at this pose would take."""
         w, h = intrinsics.width, intrinsics.height
-        passes = Passes(self.pool)
+        raster = RasterBuffers(self.pool)
         cams = camera_rows([camera_to_world], [intrinsics], self.box)
-        passes.look(cams, self.gaussians, [None], differentiate=False)
+        raster.project_and_bin(cams, self.gaussians, [None], differentiate=False)
         color, depth = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
         opacity = np.empty((h, w), np.float32)
         self.pool.run(
-            render_tiles, int(passes.columns[0]), int(passes.rows[0]), w, h, passes.projected, passes.lists,
-            self.background, passes.memory, passes.kept, color, depth, opacity,
+            render_tiles, int(raster.columns[0]), int(raster.rows[0]), w, h, raster.projected, raster.lists,
+            self.background, raster.memory, raster.saved, color, depth, opacity,
         )  # fmt: skip
         depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
         return Rendering(color, depth, opacity)
@@ -65,7 +65,7 @@ class SplatSnapshot:
     ) -> list[NDArray[np.float32]]:
         """What is seen of each view at image points (N, 2) within its picture: colours (N, 3). All at once:
         most of the work is to project the Gaussians, and views share it out among the cores."""
-        passes = self.passes or Passes(self.pool)
+        raster = self.raster or RasterBuffers(self.pool)
         cams = camera_rows([v.camera_to_world for v in views], [v.intrinsics for v in views], self.box)
         wanted = []
         for view, where in zip(views, points):
@@ -73,13 +73,13 @@ class SplatSnapshot:
             tiles = np.zeros((-(-lens.height // TILE), -(-lens.width // TILE)), np.uint8)
             tiles[tuple((where[:, ::-1] // TILE).astype(np.int64).T)] = 1
             wanted.append(tiles.reshape(-1))
-        passes.look(cams, self.gaussians, wanted, differentiate=False)
+        raster.project_and_bin(cams, self.gaussians, wanted, differentiate=False)
         counts = [len(where) for where in points]
         slots = np.repeat(np.arange(len(views)), counts)
         color = np.empty((len(slots), 3), np.float32)
         self.pool.run(
-            render_points, passes.columns, slots, np.concatenate(points).astype(np.float32), passes.projected,
-            passes.lists, self.background, color,
+            render_points, raster.columns, slots, np.concatenate(points).astype(np.float32), raster.projected,
+            raster.lists, self.background, color,
         )  # fmt: skip
         return np.split(color, np.cumsum(counts)[:-1])
 

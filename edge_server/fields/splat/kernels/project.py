@@ -20,10 +20,22 @@ from edge_server.fields.common.kernels.volume_rendering import harmonic
 POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
 BASE = 14
 # Columns of a projected Gaussian.
-MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, HALF_HEIGHT, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 12
+MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, DEPTH, RADIUS, HALF_HEIGHT, PROJECTED = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    9,
+    10,
+    11,
+    12,
+)
 # Columns of what a Gaussian reaches: tiles x0, x1, y0, y1 (x1 <= x0: none); and which of them, bit by bit,
-# x fastest, the first 64 (from there on, all of them); and the depth as ``deal`` sorts by it.
-FIRST_64, ORDER, REACHED = 4, 6, 7
+# x fastest, the first 64 (from there on, all of them); and the depth as ``bin_tiles`` sorts by it.
+TILE_BITS, DEPTH_KEY, FOOTPRINT = 4, 6, 7
 # Columns of a camera.
 ORIGIN, LENS, LIMITS, NEAR, SIZE, TIME, CAMERA = 9, 12, 20, 24, 25, 27, 28
 
@@ -32,11 +44,14 @@ BLOCK = 128  # Gaussians a task
 
 # The bits of a positive float32 sort as the number does. From .01 to 1e5 scene units the upper 23 of them
 # take 380 thousand values: what is nearer to another than 6e-5 of its depth may come before or after it.
-ORDER_BITS = 20
-_NEAREST, _UPPER = np.int32(0x3C23D70A), np.int32(9)  # the bits of .01; lower bits that are left out
+DEPTH_BITS = 20
+_NEAREST_BITS, _DROPPED_BITS = (
+    np.int32(0x3C23D70A),
+    np.int32(9),
+)  # the bits of .01; lower bits that are left out
 
 LOW_PASS = 0.3  # of a pixel squared: nothing is sharper than a pixel
-ALPHA_LEAST = 1.0 / 255.0  # a Gaussian ends where it adds less than this
+ALPHA_MIN = 1.0 / 255.0  # a Gaussian ends where it adds less than this
 # Bounds of raw parameters, applied forward; where they bind the gradient is 0.
 SCALE_LOW, SCALE_HIGH = -12.0, 4.0
 RAW_OPACITY = 12.0
@@ -62,7 +77,7 @@ class Gaussians(NamedTuple):
 
 
 @part
-def held(cams, b):
+def load_camera(cams, b):
     """Camera b's columns as a tuple of CAMERA numbers. A loop that writes to arrays then need not read the
     camera again for every Gaussian, which would keep LLVM from vectorising it; and no row of an array is
     made an array of its own, whose owners the threads would count."""
@@ -75,9 +90,9 @@ def held(cams, b):
 
 
 @part
-def bent(cam, x, y):
+def distort(cam, x, y):
     """Distorted normalised coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
-    its derivatives xxx, xxy, xyy, yyy. cam: ``held``."""
+    its derivatives xxx, xxy, xyy, yyy. cam: ``load_camera``."""
     k1, k2, p1, p2 = cam[LENS + 4], cam[LENS + 5], cam[LENS + 6], cam[LENS + 7]
     six, eight = np.float32(6.0), np.float32(8.0)
     r2 = x * x + y * y
@@ -118,23 +133,23 @@ def rotation(w, x, y, z):
 
 
 @part
-def held_scale(raw):
+def clamped_scale(raw):
     """A length, of its raw parameter."""
     return exp32(min(max(raw, np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
 
 
 @part
 def camera_point(cam, params, velocity, i):
-    """Gaussian i in the axes of camera ``held``, where it is when that looks."""
+    """Gaussian i in the axes of camera ``load_camera``, where it is when that looks."""
     t = cam[TIME]
     x = params[i, 0] + t * velocity[i, 0] - cam[ORIGIN]
     y = params[i, 1] + t * velocity[i, 1] - cam[ORIGIN + 1]
     z = params[i, 2] + t * velocity[i, 2] - cam[ORIGIN + 2]
-    return turned(cam, x, y, z)
+    return rotate_to_camera(cam, x, y, z)
 
 
 @part
-def turned(cam, x, y, z):
+def rotate_to_camera(cam, x, y, z):
     """A vector of world axes in those of the camera."""
     return (
         cam[0] * x + cam[1] * y + cam[2] * z,
@@ -144,14 +159,14 @@ def turned(cam, x, y, z):
 
 
 @part
-def flattener(cam, x, y, z):
+def projection_terms(cam, x, y, z):
     """What takes world axes to pixels at a camera point: mean (u, v), the rows of J W (2 x 3), and what its
     gradient needs. The ratios x / z and y / z are held to 1.3 of the field of view, where J is taken."""
     inverse = _F1 / z
     a, c = x * inverse, y * inverse
     ta = min(max(a, cam[LIMITS]), cam[LIMITS + 1])
     tc = min(max(c, cam[LIMITS + 2]), cam[LIMITS + 3])
-    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = bent(cam, ta, tc)
+    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = distort(cam, ta, tc)
     # Beyond the limits the lens goes on straight: its polynomial folds back into the picture out there.
     u += dxx * (a - ta) + dxy * (c - tc)
     v += dxy * (a - ta) + dyy * (c - tc)
@@ -159,7 +174,7 @@ def flattener(cam, x, y, z):
 
 
 @part
-def times(cam, j0, j1, j2):
+def rotate_to_world(cam, j0, j1, j2):
     """A row of camera axes -> of world axes."""
     return (
         j0 * cam[0] + j1 * cam[3] + j2 * cam[6],
@@ -169,7 +184,7 @@ def times(cam, j0, j1, j2):
 
 
 @part
-def _unfold(gaussians, base, count, s):
+def _load_block(gaussians, base, count, s):
     """Gaussians base, ..., base + count - 1 as no camera has seen them yet, to the rows of ``s``: place,
     velocity, the axes of the ellipsoid times their lengths, opacity, and how far the Gaussian reaches, in
     standard deviations squared (0: nowhere)."""
@@ -187,35 +202,41 @@ def _unfold(gaussians, base, count, s):
             s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
         )
         r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(w, x, y, z)
-        s0, s1, s2 = held_scale(s[_S + j]), held_scale(s[_S + BLOCK + j]), held_scale(s[_S + 2 * BLOCK + j])
+        s0, s1, s2 = (
+            clamped_scale(s[_S + j]),
+            clamped_scale(s[_S + BLOCK + j]),
+            clamped_scale(s[_S + 2 * BLOCK + j]),
+        )
         s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j] = r0 * s0, r1 * s1, r2 * s2
         s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j] = r3 * s0, r4 * s1, r5 * s2
         s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j] = r6 * s0, r7 * s1, r8 * s2
         raw = s[_ALPHA + j]
         alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY)), np.float32(RAW_OPACITY))))
-        shows = is_finite(raw) & (alpha > np.float32(ALPHA_LEAST))
+        shows = is_finite(raw) & (alpha > np.float32(ALPHA_MIN))
         s[_ALPHA + j] = alpha
-        s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_LEAST)) if shows else _F0
+        s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_MIN)) if shows else _F0
 
 
 @part
-def _flatten(cam, s):
-    """What camera ``held`` sees of the Gaussians in the rows of ``s``: mean, depth and covariance in the
+def _project_block(cam, s):
+    """What camera ``load_camera`` sees of the Gaussians in the rows of ``s``: mean, depth and covariance in the
     picture, and the edges of what each reaches in tiles, LEFT > RIGHT where it is not in the picture."""
     fx, fy, width, height = cam[LENS], cam[LENS + 1], cam[SIZE], cam[SIZE + 1]
     low, over, t = np.float32(LOW_PASS), np.float32(1.0 / TILE), cam[TIME]
     for j in range(BLOCK):
-        x, y, z = turned(
+        x, y, z = rotate_to_camera(
             cam,
             s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
             s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
             s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
         )
         shows = (z > cam[NEAR]) & (z < np.float32(FAR)) & (s[_REACH + j] > _F0)
-        _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = flattener(cam, x, y, z if shows else _F1)
+        _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = projection_terms(
+            cam, x, y, z if shows else _F1
+        )
         gx, gy = fx * inverse, fy * inverse
-        t0, t1, t2 = times(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
-        t3, t4, t5 = times(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
+        t0, t1, t2 = rotate_to_world(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
+        t3, t4, t5 = rotate_to_world(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
         m0, m1, m2 = s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j]
         m3, m4, m5 = s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j]
         m6, m7, m8 = s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j]
@@ -241,7 +262,7 @@ def _flatten(cam, s):
 
 
 @part
-def _touched(px, py, a, b, c, reach, x0, x1, y0, y1):
+def _touched_tiles(px, py, a, b, c, reach, x0, x1, y0, y1):
     """Which tiles of a box an ellipse has pixels in, as bits: those in whose nearest point to its middle
     a dx^2 + 2 b dx dy + c dy^2 is no more than ``reach``. A box is twice as large as a slanting needle's
     ellipse, and every tile of its costs as much as one that it touches."""
@@ -271,12 +292,12 @@ def _touched(px, py, a, b, c, reach, x0, x1, y0, y1):
 
 
 @part
-def _write(cam, gaussians, i, s, j, row, edges):
-    """Fill row (PROJECTED,) and edges (REACHED,) from lane j of ``s``. conic: the inverse of the picture
+def _write_projected(cam, gaussians, i, s, j, row, edges):
+    """Fill row (PROJECTED,) and edges (FOOTPRINT,) from lane j of ``s``. conic: the inverse of the picture
     covariance, upper triangle."""
     params, harmonics = gaussians.params, gaussians.harmonics
-    row[MX], row[MY], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
-    row[QA], row[QB], row[QC] = s[_A + j], s[_B + j], s[_C + j]
+    row[MEAN_X], row[MEAN_Y], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
+    row[CONIC_A], row[CONIC_B], row[CONIC_C] = s[_A + j], s[_B + j], s[_C + j]
     row[ALPHA], row[RADIUS], row[HALF_HEIGHT] = s[_ALPHA + j], s[_WIDE + j], s[_HIGH + j]
     for k in range(3):
         row[RED + k] = params[i, COLOR + k]
@@ -292,18 +313,27 @@ def _write(cam, gaussians, i, s, j, row, edges):
     if is_finite(row[RED] + row[RED + 1] + row[RED + 2]):
         edges[0], edges[1] = np.int32(s[_LEFT + j]), np.int32(s[_RIGHT + j]) + 1
         edges[2], edges[3] = np.int32(s[_TOP + j]), np.int32(s[_BOTTOM + j]) + 1
-        bits = _touched(
-            row[MX], row[MY], row[QA], row[QB], row[QC], s[_REACH + j], edges[0], edges[1], edges[2], edges[3]
+        bits = _touched_tiles(
+            row[MEAN_X],
+            row[MEAN_Y],
+            row[CONIC_A],
+            row[CONIC_B],
+            row[CONIC_C],
+            s[_REACH + j],
+            edges[0],
+            edges[1],
+            edges[2],
+            edges[3],
         )
-        far = (bits_of_float(row[DEPTH]) - _NEAREST) >> _UPPER
-        edges[ORDER] = min(max(far, np.int32(0)), np.int32((1 << ORDER_BITS) - 1))
-        edges[FIRST_64] = np.int32(bits & np.uint64(0xFFFFFFFF))
-        edges[FIRST_64 + 1] = np.int32(bits >> np.uint64(32))
+        far = (bits_of_float(row[DEPTH]) - _NEAREST_BITS) >> _DROPPED_BITS
+        edges[DEPTH_KEY] = min(max(far, np.int32(0)), np.int32((1 << DEPTH_BITS) - 1))
+        edges[TILE_BITS] = np.int32(bits & np.uint64(0xFFFFFFFF))
+        edges[TILE_BITS + 1] = np.int32(bits >> np.uint64(32))
 
 
 @kernel
 def project(counter, worker, cams, gaussians, count, projected, tiles):
-    """Fill projected: float32 (B, >= count, PROJECTED), and tiles: int32 (B, >= count, REACHED). Tasks are
+    """Fill projected: float32 (B, >= count, PROJECTED), and tiles: int32 (B, >= count, FOOTPRINT). Tasks are
     blocks of Gaussians, each for all the cameras (float32 (B, CAMERA)): what no camera changes is worked out
     once."""
     s = np.zeros(_ROWS * BLOCK, np.float32)
@@ -312,13 +342,13 @@ def project(counter, worker, cams, gaussians, count, projected, tiles):
         if base >= count:
             return
         here = min(BLOCK, count - base)
-        _unfold(gaussians, base, here, s)
+        _load_block(gaussians, base, here, s)
         for b in range(cams.shape[0]):
-            cam = held(cams, b)
-            _flatten(cam, s)
+            cam = load_camera(cams, b)
+            _project_block(cam, s)
             for j in range(here):
                 i = base + j
                 edges = tiles[b, i]
                 edges[0] = edges[1] = edges[2] = edges[3] = 0
                 if s[_LEFT + j] <= s[_RIGHT + j]:
-                    _write(cam, gaussians, i, s, j, projected[b, i], edges)
+                    _write_projected(cam, gaussians, i, s, j, projected[b, i], edges)

@@ -2,7 +2,7 @@
 back.
 
 A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with offsets that
-are constants, which is what lets LLVM vectorise it without tests for overlap; the Gaussians are laid down
+are constants, which is what lets LLVM vectorise it without tests for overlap; the Gaussians are composited down
 strip by strip, in ``splat_strips``.
 """
 
@@ -16,31 +16,31 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw, exp32, fetch_add, is_finite, uniform
 from edge_server.fields.splat.kernels.composite import (
-    ALPHA_MOST,
-    KEPT,
+    ALPHA_MAX,
     PIXELS,
+    SAVED,
     STOP,
     STRIP,
     STRIPS,
     SUMS,
-    lay,
-    lift,
-    sort_into_strips,
+    bin_strips,
+    composite,
+    composite_backward,
 )
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
-    ALPHA_LEAST,
-    MX,
-    MY,
-    QA,
-    QB,
-    QC,
+    ALPHA_MIN,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    MEAN_X,
+    MEAN_Y,
     RED,
     TILE,
 )
 
-# Rows of a tile's memory: light, colour and depth, in ``lay``'s order; what the loss makes of each colour,
-# and what lies behind, in ``lift``'s.
+# Rows of a tile's memory: light, colour and depth, in ``composite``'s order; what the loss makes of each colour,
+# and what lies behind, in ``composite_backward``'s.
 _T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
 _ER, _EG, _EB, _BEHIND = (n * PIXELS for n in range(5, 9))
 ROWS = 9
@@ -63,7 +63,7 @@ class Loss(NamedTuple):
 
 
 @part
-def begin_tile(s):
+def clear_tile(s):
     """All light, no colour."""
     for k in range(PIXELS):
         s[_T + k] = _F1
@@ -71,8 +71,8 @@ def begin_tile(s):
 
 
 @part
-def room(lists):
-    """Scratch of ``sort_into_strips`` for the longest list: who and count."""
+def strip_scratch(lists):
+    """Scratch of ``bin_strips`` for the longest list: strip_pairs and count."""
     longest = np.int64(1)
     for b in range(lists.longest.shape[0]):
         for r in range(lists.longest.shape[1]):
@@ -81,19 +81,19 @@ def room(lists):
 
 
 @part
-def lay_tile(s, lists, b, t, x0, y0, projected, who, count, store):
-    """Lay all Gaussians of tile t of camera slot b over the tile memory ``s``; nothing is kept of them."""
-    begin_tile(s)
-    sort_into_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, who, count)
+def composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store):
+    """Lay all Gaussians of tile t of camera slot b over the tile memory ``s``; nothing is saved of them."""
+    clear_tile(s)
+    bin_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, strip_pairs, count)
     for n in range(STRIPS):
-        lay(
-            who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+        composite(
+            strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
             _T + n * STRIP, store, 0,
         )  # fmt: skip
 
 
 @part
-def dissimilarity(s, row, error_row, target, count, weight):
+def add_dssim(s, row, error_row, target, count, weight):
     """Add the gradient of weight * count * (1 - SSIM) / 2 between a colour row of ``s`` and target (PIXELS,)
     over their first ``count`` pixels that lie in the picture; returns that loss."""
     n = _F1 / np.float32(count)
@@ -122,7 +122,7 @@ def dissimilarity(s, row, error_row, target, count, weight):
 
 
 @part
-def _target(views, view, x0, y0, loss, task, target, back):
+def _load_target(views, view, x0, y0, loss, task, target, back):
     """Fill target (3, PIXELS), -1 outside the picture; back (3,). Returns how many pixels are inside."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
     for c in range(3):
@@ -145,7 +145,7 @@ def _target(views, view, x0, y0, loss, task, target, back):
 
 
 @part
-def _trust(views, view, x0, y0, target, share):
+def _load_weights(views, view, x0, y0, target, share):
     """Fill share (PIXELS,) with the pixels' weights; those of none count as outside the picture, -1 in
     target. Returns how many are left, and their mean weight."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
@@ -163,7 +163,7 @@ def _trust(views, view, x0, y0, target, share):
 
 
 @part
-def _weigh(s, target, share, absolute):
+def _apply_weights(s, target, share, absolute):
     """Multiply the error rows of ``s`` by the pixels' shares; returns loss and squared error, so weighed."""
     total, square = _F0, _F0
     for c in range(3):
@@ -176,38 +176,38 @@ def _weigh(s, target, share, absolute):
 
 
 @kernel
-def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, kept,
+def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, saved,
                 sums, losses):  # fmt: skip
     """Render, compare, differentiate. views: ``rays.Views``; picked: int64 (B,), the view of each camera
-    slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), kept: float32
-    (W, longest * STRIPS * KEPT), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written.
+    slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), saved: float32
+    (W, longest * STRIPS * SAVED), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written.
     losses: float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not
     finite.
 
     With ``views.weight``, a pixel's loss is multiplied by its own, that of a tile's SSIM by their mean over
     the pixels that have any; the others are not part of the window."""
-    s, store = memory[worker], kept[worker]
+    s, store = memory[worker], saved[worker]
     weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
     target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
-    (who, count), laid = room(lists), np.empty(STRIPS, np.int64)
+    (strip_pairs, count), composited = strip_scratch(lists), np.empty(STRIPS, np.int64)
     while True:
         task = draw(counter, worker, tasks.shape[0])
         if task >= tasks.shape[0]:
             return
         b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
         x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
-        inside, dssim = _target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
+        inside, dssim = _load_target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
         if weighed:
-            inside, mean = _trust(views, picked[b], x0, y0, target, share)
+            inside, mean = _load_weights(views, picked[b], x0, y0, target, share)
             dssim *= mean
-        begin_tile(s)
+        clear_tile(s)
         begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
-        size = (end - begin) * KEPT
-        sort_into_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, who, count)
+        size = (end - begin) * SAVED
+        bin_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, strip_pairs, count)
         for n in range(STRIPS):
-            laid[n] = lay(
-                who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
-                _T + n * STRIP, store[n * size : (n + 1) * size], KEPT,
+            composited[n] = composite(
+                strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+                _T + n * STRIP, store[n * size : (n + 1) * size], SAVED,
             )  # fmt: skip
         total, square = _F0, _F0
         for c in range(3):
@@ -220,10 +220,10 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
                 sign = _F1 if e > _F0 else (-_F1 if e < _F0 else _F0)
                 s[_ER + c * PIXELS + k] = sign if loss.absolute else _F2 * e
         if weighed:
-            total, square = _weigh(s, target, share, loss.absolute)
+            total, square = _apply_weights(s, target, share, loss.absolute)
         if dssim > _F0:
             for c in range(3):
-                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], inside, dssim)
+                total += add_dssim(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], inside, dssim)
         finite = is_finite(total)
         losses[task, 0], losses[task, 1] = total if finite else 0.0, square if finite else 0.0
         losses[task, 2] = 0.0 if finite else 1.0
@@ -236,24 +236,24 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
         for k in range(PIXELS):
             s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
         for n in range(STRIPS):
-            lift(
-                who[n], laid[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+            composite_backward(
+                strip_pairs[n], composited[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
                 _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
             )  # fmt: skip
 
 
 @kernel
-def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, kept,
+def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, saved,
                  color, depth, opacity):  # fmt: skip
     """The picture of camera slot 0. color: float32 (H, W, 3), depth (z) and opacity (H, W), all written."""
-    s, store = memory[worker], kept[worker]
-    who, count = room(lists)
+    s, store = memory[worker], saved[worker]
+    strip_pairs, count = strip_scratch(lists)
     while True:
         t = fetch_add(counter, 1)
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        lay_tile(s, lists, 0, t, x0, y0, projected, who, count, store)
+        composite_tile(s, lists, 0, t, x0, y0, projected, strip_pairs, count, store)
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x >= width or y >= height:
@@ -273,7 +273,7 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
 def render_points(counter, worker, columns, slots, points, projected, lists, background, color):
     """The same at image points, float32 (N, 2), of which the tiles are wanted: some of them cost much less
     than their tiles. color: float32 (N, 3), depth and opacity (N,), all written. Tasks are runs of 16."""
-    most, least, stop = np.float32(ALPHA_MOST), np.float32(ALPHA_LEAST), np.float32(STOP)
+    most, least, stop = np.float32(ALPHA_MAX), np.float32(ALPHA_MIN), np.float32(STOP)
     while True:
         base = fetch_add(counter, 1) * 16
         if base >= points.shape[0]:
@@ -286,8 +286,8 @@ def render_points(counter, worker, columns, slots, points, projected, lists, bac
             left = _F1
             for j in range(lists.first[v, t], lists.first[v, t + 1]):
                 row = projected[v, lists.owner[v, lists.pair[v, j]]]
-                dx, dy = x - row[MX], y - row[MY]
-                power = -_HALF * (row[QA] * dx * dx + row[QC] * dy * dy) - row[QB] * dx * dy
+                dx, dy = x - row[MEAN_X], y - row[MEAN_Y]
+                power = -_HALF * (row[CONIC_A] * dx * dx + row[CONIC_C] * dy * dy) - row[CONIC_B] * dx * dy
                 a = min(row[ALPHA] * exp32(power), most)
                 if a >= least:
                     w = a * left
@@ -304,13 +304,13 @@ def render_points(counter, worker, columns, slots, points, projected, lists, bac
 
 @kernel
 def compare_tiles(
-    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, kept, error
+    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, error
 ):
     """How far off each pixel is: error, float32 (P,), the largest difference of a channel, written for the
     pixels of the tasks' tiles. picked: int64 (B,), the view of each camera slot. tasks: int32 (M, 2), slot
     and tile."""
-    s, store = memory[worker], kept[worker]
-    who, count = room(lists)
+    s, store = memory[worker], saved[worker]
+    strip_pairs, count = strip_scratch(lists)
     while True:
         task = fetch_add(counter, 1)
         if task >= tasks.shape[0]:
@@ -319,7 +319,7 @@ def compare_tiles(
         x0, y0, v = TILE * (t % columns[b]), TILE * (t // columns[b]), picked[b]
         width, height, first = views.size[v, 0], views.size[v, 1], views.first[v]
         transparent = views.pixels.shape[1] == 4
-        lay_tile(s, lists, b, t, x0, y0, projected, who, count, store)
+        composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store)
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x >= width or y >= height:

@@ -31,21 +31,21 @@ def constant(*numbers: float) -> ir.Constant:
     return ir.Constant(_VECTOR, [float(n) for n in (numbers * LANES if len(numbers) == 1 else numbers)])
 
 
-class Wide:
+class Vector:
     """16 lanes: ``+ - *`` and ``/`` with another or with a number, in all lanes at once."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         self.builder, self.value = builder, value
 
     @classmethod
-    def load(cls, builder: Any, pointer: Any) -> Wide:
+    def load(cls, builder: Any, pointer: Any) -> Vector:
         """The 16 numbers from a float pointer on."""
         value = builder.load(builder.bitcast(pointer, _VECTOR.as_pointer()))
         value.align = 4
         return cls(builder, value)
 
     @classmethod
-    def spread(cls, builder: Any, number: Any) -> Wide:
+    def broadcast(cls, builder: Any, number: Any) -> Vector:
         """A float in all lanes."""
         undefined = ir.Constant(_VECTOR, ir.Undefined)
         first = builder.insert_element(undefined, number, ir.IntType(32)(0))
@@ -55,67 +55,67 @@ class Wide:
         """To the 16 numbers from a float pointer on."""
         self.builder.store(self.value, self.builder.bitcast(pointer, _VECTOR.as_pointer())).align = 4
 
-    def _with(self, operation: str, other: Wide | float) -> Wide:
-        operand = other.value if isinstance(other, Wide) else constant(other)
-        return Wide(self.builder, getattr(self.builder, operation)(self.value, operand, flags=_FLAGS))
+    def _binary(self, operation: str, other: Vector | float) -> Vector:
+        operand = other.value if isinstance(other, Vector) else constant(other)
+        return Vector(self.builder, getattr(self.builder, operation)(self.value, operand, flags=_FLAGS))
 
-    def __add__(self, other: Wide | float) -> Wide:
-        return self._with("fadd", other)
+    def __add__(self, other: Vector | float) -> Vector:
+        return self._binary("fadd", other)
 
-    def __sub__(self, other: Wide | float) -> Wide:
-        return self._with("fsub", other)
+    def __sub__(self, other: Vector | float) -> Vector:
+        return self._binary("fsub", other)
 
-    def __mul__(self, other: Wide | float) -> Wide:
-        return self._with("fmul", other)
+    def __mul__(self, other: Vector | float) -> Vector:
+        return self._binary("fmul", other)
 
-    def __truediv__(self, other: Wide | float) -> Wide:
-        return self._with("fdiv", other)
+    def __truediv__(self, other: Vector | float) -> Vector:
+        return self._binary("fdiv", other)
 
-    def rest(self) -> Wide:
+    def one_minus(self) -> Vector:
         """1 - this."""
-        return Wide(self.builder, constant(1.0)) - self
+        return Vector(self.builder, constant(1.0)) - self
 
-    def at_least(self, bound: float) -> Any:
+    def greater_equal(self, bound: float) -> Any:
         """In which lanes it is a number no less than ``bound``: a mask."""
         return self.builder.fcmp_ordered(">=", self.value, constant(bound))
 
-    def below(self, bound: float) -> Any:
+    def less(self, bound: float) -> Any:
         """In which lanes it is a number less than ``bound``."""
         return self.builder.fcmp_ordered("<", self.value, constant(bound))
 
-    def where(self, mask: Any, other: Wide | float = 0.0) -> Wide:
+    def where(self, mask: Any, other: Vector | float = 0.0) -> Vector:
         """This where the mask holds, ``other`` elsewhere."""
-        operand = other.value if isinstance(other, Wide) else constant(other)
-        return Wide(self.builder, self.builder.select(mask, self.value, operand))
+        operand = other.value if isinstance(other, Vector) else constant(other)
+        return Vector(self.builder, self.builder.select(mask, self.value, operand))
 
-    def most(self, bound: float) -> Wide:
+    def minimum(self, bound: float) -> Vector:
         """The lesser of this and ``bound``; ``bound`` where this is not a number."""
-        return self.where(self.below(bound), bound)
+        return self.where(self.less(bound), bound)
 
-    def least(self, bound: float) -> Wide:
+    def maximum(self, bound: float) -> Vector:
         """The greater of this and ``bound``; ``bound`` where this is not a number."""
-        return self.where(self.at_least(bound), bound)
+        return self.where(self.greater_equal(bound), bound)
 
-    def finite(self) -> Any:
+    def is_finite(self) -> Any:
         """In which lanes it is a number, and not infinite."""
-        return self.builder.fcmp_ordered("<=", self._called("fabs", self.value), constant(3.4e38))
+        return self.builder.fcmp_ordered("<=", self._llvm("fabs", self.value), constant(3.4e38))
 
-    def root(self) -> Wide:
+    def sqrt(self) -> Vector:
         """The square root."""
-        return Wide(self.builder, self._called("sqrt", self.value))
+        return Vector(self.builder, self._llvm("sqrt", self.value))
 
-    def _called(self, name: str, value: Any) -> Any:
+    def _llvm(self, name: str, value: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
         called = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.v{LANES}f32")
         return self.builder.call(called, [value])
 
-    def power_of_2(self) -> Wide:
+    def exp2(self) -> Vector:
         """2 to this, which is taken to be 0 where it is more and -64 where it is less or not a number;
         relative error below 3e-7."""
         builder = self.builder
-        clamped = self.least(_LEAST_POWER).most(0.0)
-        nearest = self._called("rint", clamped.value)
-        whole = Wide(builder, nearest)
+        clamped = self.maximum(_LEAST_POWER).minimum(0.0)
+        nearest = self._llvm("rint", clamped.value)
+        whole = Vector(builder, nearest)
         left = clamped - whole
         power = left * _POWER[0] + _POWER[1]
         for coefficient in _POWER[2:]:
@@ -123,28 +123,28 @@ class Wide:
         # The exponent of a float32 begins at bit 23.
         moved = builder.shl(builder.fptosi(nearest, _INTEGERS), ir.Constant(_INTEGERS, [23] * LANES))
         raised = builder.add(builder.bitcast(power.value, _INTEGERS), moved)
-        return Wide(builder, builder.bitcast(raised, _VECTOR))
+        return Vector(builder, builder.bitcast(raised, _VECTOR))
 
 
-def contiguous(*kinds: Any) -> None:
+def require_contiguous(*kinds: Any) -> None:
     """Refuse to compile for anything but contiguous arrays: pointers know of no strides."""
     for kind in kinds:
         if not (isinstance(kind, types.Array) and kind.layout == "C"):
             raise TypingError(f"vectors take contiguous arrays, not {kind}")
 
 
-def both(builder: Any, a: Any, b: Any) -> Any:
+def mask_and(builder: Any, a: Any, b: Any) -> Any:
     """Where two masks hold."""
     return builder.and_(a, b)
 
 
-def anywhere(builder: Any, mask: Any) -> Any:
+def any_lane(builder: Any, mask: Any) -> Any:
     """Whether a mask holds in any lane."""
     bits = ir.IntType(LANES)
     return builder.icmp_unsigned("!=", builder.bitcast(mask, bits), bits(0))
 
 
-def sum_of(wide: Wide) -> Any:
+def lane_sum(wide: Vector) -> Any:
     """The sum of the lanes, a float."""
     builder, value, lanes = wide.builder, wide.value, LANES
     while lanes > 1:
@@ -161,7 +161,7 @@ def sum_of(wide: Wide) -> Any:
     return builder.extract_element(value, ir.IntType(32)(0))
 
 
-def eight_sums(wides: Sequence[Wide]) -> Any:
+def eight_lane_sums(wides: Sequence[Vector]) -> Any:
     """The sums of the lanes of eight, as a vector of eight floats: a third of what they take one by one."""
     builder = wides[0].builder
     values = [w.value for w in wides]

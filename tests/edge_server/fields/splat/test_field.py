@@ -16,11 +16,11 @@ from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.splat.buffers import camera_rows
-from edge_server.fields.splat.densification import Cloud, make_room, opacity
+from edge_server.fields.splat.densification import GaussianCloud, opacity, prune_least_sensitive
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.motion import drift
-from edge_server.fields.splat.seeding import seeds
+from edge_server.fields.splat.motion import extrapolate
+from edge_server.fields.splat.seeding import seed_gaussians
 from tests.edge_server.fields.scenes import mean_psnr, picture
 from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, same_state, score
 from tests.edge_server.fields.small import SPLAT as SMALL
@@ -50,10 +50,10 @@ def test_nothing_begins_at_pixels_without_weight() -> None:
     for other in (False, True):  # pictures that have no say may show anything
         views = [replace(v, image=255 - v.image) if other and k % 2 == 0 else v for k, v in enumerate(SEEN)]
         share = np.concatenate([w.ravel() for w in weight])
-        found.append(seeds(SMALL, pool, box, views, None, share, 300, rng(1)))
+        found.append(seed_gaussians(SMALL, pool, box, views, None, share, 300, rng(1)))
     assert len(found[0]) > 100
     np.testing.assert_array_equal(found[0], found[1])
-    assert len(seeds(SMALL, pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
+    assert len(seed_gaussians(SMALL, pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -217,9 +217,9 @@ def test_time_that_stands_still_or_goes_back_does_not_fling_anything() -> None:
     before = field.cloud.params[:, :3].copy()
     velocity = field.cloud.velocity.copy()
     assert np.abs(velocity).max() > 0
-    drift(field.cloud, 0.0, moves=True)
+    extrapolate(field.cloud, 0.0, moves=True)
     np.testing.assert_array_equal(field.cloud.params[:, :3], before)
-    drift(field.cloud, -0.1, moves=True)
+    extrapolate(field.cloud, -0.1, moves=True)
     np.testing.assert_allclose(field.cloud.params[:, :3], before - 0.1 * velocity, atol=1e-6)
     np.testing.assert_array_equal(field.cloud.velocity, velocity)
     field.fit(_ball_at(200), Budget(steps=5))
@@ -242,7 +242,13 @@ for module in (plane_sweep, view_evidence, project, rasterize, bin_tiles, optimi
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-1000:]
     counts = dict(line.split() for line in done.stdout.splitlines())
-    assert {"judge", "pull", "compare_tiles", "render_points", "train_tiles"} <= counts.keys()
+    assert {
+        "collect_evidence",
+        "position_gradients",
+        "compare_tiles",
+        "render_points",
+        "train_tiles",
+    } <= counts.keys()
     assert set(counts.values()) == {"1"}, counts
 
 
@@ -266,12 +272,12 @@ def test_room_is_made_by_what_pictures_depend_on_least() -> None:
     inside[:, :3] = box.normalise(np.array([0.0, 0.0, 0.5]) + spread_m)
     inside[:, SCALE:QUATERNION], inside[:, OPACITY] = np.log(0.03), 4.0
     field.cloud.keep(np.arange(len(field.cloud)) < SMALL.gaussians - 200)
-    field.cloud.add(Cloud.of(inside[:hidden]))
+    field.cloud.add(GaussianCloud.new(inside[:hidden]))
     field.fit(SEEN, Budget(steps=12))  # less than lies between two prunings
-    field.cloud.add(Cloud.of(inside[hidden:]))
+    field.cloud.add(GaussianCloud.new(inside[hidden:]))
     state, known, n = field.state(), mean_psnr(field, SEEN), len(field.cloud)
 
-    def without(room: Callable[[Cloud], None]) -> tuple[float, np.ndarray]:
+    def without(room: Callable[[GaussianCloud], None]) -> tuple[float, np.ndarray]:
         """The score afterwards, and which are left."""
         other = SplatField(SMALL)
         other.load_state(state)
@@ -279,13 +285,13 @@ def test_room_is_made_by_what_pictures_depend_on_least() -> None:
         room(other.cloud)
         return mean_psnr(other, SEEN), np.isin(np.arange(n), other.cloud.slope)
 
-    lowered, left = without(lambda cloud: make_room(cloud, count))
+    lowered, left = without(lambda cloud: prune_least_sensitive(cloud, count))
     assert left.sum() == n - count
     assert left[-unknown:].all() and left[-unknown - hidden : -unknown].mean() < 0.5
     faint = np.argsort(opacity(field.cloud.params), kind="stable")[:count]
     by_opacity, _ = without(lambda cloud: cloud.keep(~np.isin(np.arange(n), faint)))
     assert lowered > known - 0.1 and lowered > by_opacity, (known, lowered, by_opacity)
-    assert without(lambda cloud: make_room(cloud, -3))[1].all()
+    assert without(lambda cloud: prune_least_sensitive(cloud, -3))[1].all()
 
 
 @pytest.mark.parametrize("options", [

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
 from edge_server.fields.splat.kernels.project import (
-    ALPHA_LEAST,
+    ALPHA_MIN,
     COLOR,
     LENS,
     LIMITS,
@@ -26,7 +26,7 @@ from edge_server.fields.splat.kernels.project import (
     SCALE_HIGH,
     SCALE_LOW,
 )
-from edge_server.fields.splat.kernels.rasterize import ALPHA_MOST, STOP
+from edge_server.fields.splat.kernels.rasterize import ALPHA_MAX, STOP
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,8 @@ def composite(flat: Flat, width: int, height: int, background: Tensor) -> tuple[
             continue
         offset = pixel - flat.mean[i]
         power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, inverse[i], offset)
-        alpha = (flat.alpha[i] * power.exp()).clamp(max=ALPHA_MOST)
-        alpha = torch.where((alpha >= ALPHA_LEAST) & (light >= STOP), alpha, torch.zeros_like(alpha))
+        alpha = (flat.alpha[i] * power.exp()).clamp(max=ALPHA_MAX)
+        alpha = torch.where((alpha >= ALPHA_MIN) & (light >= STOP), alpha, torch.zeros_like(alpha))
         weight = alpha * light
         color = color + weight[..., None] * flat.color[i]
         depth = depth + weight * flat.depth[i]

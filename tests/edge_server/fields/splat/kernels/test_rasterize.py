@@ -13,17 +13,22 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import CallerPool, Pool
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat import buffers
-from edge_server.fields.splat.buffers import Passes, camera_rows
-from edge_server.fields.splat.kernels.optimizer_step import Moments, Rule, pull, update
+from edge_server.fields.splat.buffers import RasterBuffers, camera_rows
+from edge_server.fields.splat.kernels.optimizer_step import (
+    AdamParameters,
+    OptimizerState,
+    adam_step,
+    position_gradients,
+)
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, TILE, Gaussians
 from edge_server.fields.splat.kernels.rasterize import (
     Loss,
+    add_dssim,
     compare_tiles,
-    dissimilarity,
     render_tiles,
     train_tiles,
 )
-from edge_server.fields.splat.kernels.view_evidence import Verdicts, judge
+from edge_server.fields.splat.kernels.view_evidence import Evidence, collect_evidence
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
@@ -54,13 +59,13 @@ def _camera(lens: Pinhole = LENS, eye: tuple[float, float, float] = (1.0, -2.5, 
 
 
 def _render(params: np.ndarray, cam: np.ndarray, harmonics: int = 1, threads: int = 1) -> list[np.ndarray]:
-    passes = Passes(CallerPool() if threads == 1 else Pool(threads, 0))
-    passes.look(cam, _still(params, harmonics), [None], differentiate=False)
+    raster = RasterBuffers(CallerPool() if threads == 1 else Pool(threads, 0))
+    raster.project_and_bin(cam, _still(params, harmonics), [None], differentiate=False)
     w, h = LENS.width, LENS.height
     out = [np.full((h, w, 3), 7, np.float32), np.full((h, w), 7, np.float32), np.full((h, w), 7, np.float32)]
-    passes.pool.run(
-        render_tiles, int(passes.columns[0]), int(passes.rows[0]), w, h, passes.projected, passes.lists, BACK,
-        passes.memory, passes.kept, *out,
+    raster.pool.run(
+        render_tiles, int(raster.columns[0]), int(raster.rows[0]), w, h, raster.projected, raster.lists, BACK,
+        raster.memory, raster.saved, *out,
     )  # fmt: skip
     return out
 
@@ -110,28 +115,28 @@ def _gradient(
 ) -> tuple[float, np.ndarray]:  # fmt: skip
     """Loss and its gradient: Adam's first moment after one step with beta1 = 0."""
     pool = CallerPool()
-    passes = Passes(pool)
+    raster = RasterBuffers(pool)
     gaussians = _still(params.copy(), harmonics)
-    passes.look(cam, gaussians, [None])
-    total = int(passes.columns[0] * passes.rows[0])
+    raster.project_and_bin(cam, gaussians, [None])
+    total = int(raster.columns[0] * raster.rows[0])
     tasks = np.array([(0, t) for t in range(total)], np.int32)
     losses = np.zeros((total, 3))
     loss = Loss(absolute, np.float32(dssim), BACK, False, np.uint64(1))
     pool.run(
-        train_tiles, _views(target, weight), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
-        passes.lists, loss, passes.memory, passes.kept, passes.sums, losses,
+        train_tiles, _views(target, weight), np.zeros(1, np.int64), tasks, raster.columns, raster.projected,
+        raster.lists, loss, raster.memory, raster.saved, raster.sums, losses,
     )  # fmt: skip
     n = len(params)
     flat = [np.zeros(n, np.float32) for _ in range(3)]
-    moments = Moments(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
-    rule = Rule(
+    moments = OptimizerState(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
+    rule = AdamParameters(
         np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32),
         *(np.float32(v) for v in (0.0, 0.9, 1e-8, 0.0, 4.0, 5.0)),
     )  # fmt: skip
     dropped = np.zeros(n, np.int64)
     pool.run(
-        update, cam, gaussians, n, passes.projected, passes.lists.own_first, passes.lists.own_count,
-        passes.sums, moments, rule, dropped,
+        adam_step, cam, gaussians, n, raster.projected, raster.lists.own_first, raster.lists.own_count,
+        raster.sums, moments, rule, dropped,
     )  # fmt: skip
     assert losses[:, 2].sum() == 0 and dropped.sum() == 0
     return float(losses[:, 0].sum()), moments.m
@@ -252,7 +257,7 @@ def test_dissimilarity_equals_its_definition() -> None:
     loss = 0.7 * 56 * (1 - ssim) / 2
     loss.backward()
     memory[448:512] = 0.0
-    value = dissimilarity(memory, 192, 448, target, 56, np.float32(0.7))
+    value = add_dssim(memory, 192, 448, target, 56, np.float32(0.7))
     assert value == pytest.approx(loss.item(), rel=1e-4) and x.grad is not None
     np.testing.assert_allclose(memory[448 : 448 + 56], x.grad.numpy(), atol=1e-4)
     assert (memory[448 + 56 : 512] == 0).all()
@@ -339,9 +344,9 @@ def test_lists_are_front_to_back_whatever_the_thread_count() -> None:
     params, cam = _cloud(200, seed=4), np.concatenate([_camera(), _camera(BENT, (-2.0, 1.5, 0.5))])
     found = []
     for pool in (CallerPool(), Pool(3, 0)):
-        passes = Passes(pool)
-        passes.look(cam, _still(params, 1), [None, None])
-        found.append(passes)
+        raster = RasterBuffers(pool)
+        raster.project_and_bin(cam, _still(params, 1), [None, None])
+        found.append(raster)
     for b in range(2):
         lists = found[0].lists
         for t in range(int(found[0].columns[b] * found[0].rows[b])):
@@ -362,21 +367,21 @@ def test_a_tile_lists_the_gaussians_that_have_a_pixel_in_it_and_hardly_another(l
     lens = Pinhole(150, 110, 160.0, 160.0, 74.0, 57.0)
     params = _cloud(300, seed=6)
     params[:, SCALE:QUATERNION] = np.log([0.01, 0.02, longest])
-    passes = Passes(CallerPool())
-    passes.look(_camera(lens), _still(params, 1), [None])
-    lists, columns = passes.lists, int(passes.columns[0])
-    total = columns * int(passes.rows[0])
+    raster = RasterBuffers(CallerPool())
+    raster.project_and_bin(_camera(lens), _still(params, 1), [None])
+    lists, columns = raster.lists, int(raster.columns[0])
+    total = columns * int(raster.rows[0])
     listed = np.zeros((len(params), total), bool)
     for t in range(total):
         listed[lists.owner[0, lists.pair[0, lists.first[0, t] : lists.first[0, t + 1]]], t] = True
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     tile = (y // TILE).astype(int) * columns + (x // TILE).astype(int)
     touched, over_64 = np.zeros_like(listed), np.zeros(len(params), bool)
-    for i in np.flatnonzero(passes.tiles[0, : len(params), 1] > 0):
-        mx, my, a, b, c, alpha = passes.projected[0, i, :6].astype(np.float64)
+    for i in np.flatnonzero(raster.tiles[0, : len(params), 1] > 0):
+        mx, my, a, b, c, alpha = raster.projected[0, i, :6].astype(np.float64)
         power = -0.5 * (a * (x - mx) ** 2 + c * (y - my) ** 2) - b * (x - mx) * (y - my)
         touched[i, np.unique(tile[alpha * np.exp(power) >= 1.0 / 255.0])] = True
-        x0, x1, y0, y1 = passes.tiles[0, i, :4]
+        x0, x1, y0, y1 = raster.tiles[0, i, :4]
         over_64[i] = (x1 - x0) * (y1 - y0) > 64
     assert touched.sum() > 1000 and not (touched & ~listed).any()
     assert over_64.any() == (longest > 1.0)
@@ -397,10 +402,10 @@ def test_lists_do_not_depend_on_how_many_bands_there_are(longest: float, share: 
     wanted = (np.random.default_rng(2).random(total[0]) < share).astype(np.uint8)
     found = []
     for threads in (1, 2, 3, 5, 9):
-        passes = Passes(Pool(threads, 0))
+        raster = RasterBuffers(Pool(threads, 0))
         cams = np.concatenate([_camera(lens) for lens in lenses])
-        passes.look(cams, _still(params, 1), [wanted if share < 1.0 else None, None])
-        lists, made = passes.lists, []
+        raster.project_and_bin(cams, _still(params, 1), [wanted if share < 1.0 else None, None])
+        lists, made = raster.lists, []
         for b, tiles in enumerate(total):
             first, pairs = lists.first[b, : tiles + 1], int(lists.needed[b])
             own_first, own_count = lists.own_first[b, :count], lists.own_count[b, :count]
@@ -421,14 +426,14 @@ def test_gaussians_beyond_what_memory_is_for_are_left_out_and_nothing_else(monke
     params = _cloud(600, seed=6)
     params[:, SCALE:QUATERNION] = np.log(0.3)
     total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
-    everything = Passes(CallerPool())
-    everything.look(_camera(), _still(params, 1), [None])
+    everything = RasterBuffers(CallerPool())
+    everything.project_and_bin(_camera(), _still(params, 1), [None])
     whole = everything.lists.own_count[0, :600].astype(np.int64)
-    monkeypatch.setattr(buffers, "PAIRS_MOST", 2500)
+    monkeypatch.setattr(buffers, "MAX_PAIRS", 2500)
     for threads in (1, 3):
-        passes = Passes(Pool(threads, 0))
-        passes.look(_camera(), _still(params, 1), [None])
-        lists, made = passes.lists, 0
+        raster = RasterBuffers(Pool(threads, 0))
+        raster.project_and_bin(_camera(), _still(params, 1), [None])
+        lists, made = raster.lists, 0
         room, listed = lists.pair.shape[1], int(lists.first[0, total])
         assert lists.needed[0] == whole.sum() > room >= listed == lists.own_count[0, :600].sum() > 2000
         for i, pairs in enumerate(whole):
@@ -439,13 +444,13 @@ def test_gaussians_beyond_what_memory_is_for_are_left_out_and_nothing_else(monke
 
 
 def test_tiles_that_are_not_wanted_get_no_pairs() -> None:
-    passes, cam = Passes(CallerPool()), _camera()
+    raster, cam = RasterBuffers(CallerPool()), _camera()
     total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
     wanted = np.zeros(total, np.uint8)
     wanted[4] = 1
-    passes.look(cam, _still(_cloud(50), 1), [wanted])
-    lengths = np.diff(passes.lists.first[0, : total + 1])
-    assert lengths[4] > 0 and lengths.sum() == lengths[4] == passes.lists.needed[0]
+    raster.project_and_bin(cam, _still(_cloud(50), 1), [wanted])
+    lengths = np.diff(raster.lists.first[0, : total + 1])
+    assert lengths[4] > 0 and lengths.sum() == lengths[4] == raster.lists.needed[0]
 
 
 def test_a_camera_sees_what_moves_where_it_was_when_its_picture_was_taken() -> None:
@@ -453,28 +458,28 @@ def test_a_camera_sees_what_moves_where_it_was_when_its_picture_was_taken() -> N
     late = camera_rows([look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))], [LENS], BOX, [-0.25])
     there = params.copy()
     there[:, :3] -= np.float32(0.25) * velocity
-    passes = [Passes(CallerPool()) for _ in range(2)]
-    passes[0].look(late, Gaussians(params, 1, velocity), [None])
-    passes[1].look(_camera(), _still(there, 1), [None])
-    np.testing.assert_allclose(passes[0].projected, passes[1].projected, rtol=1e-4, atol=1e-4)
+    raster = [RasterBuffers(CallerPool()) for _ in range(2)]
+    raster[0].project_and_bin(late, Gaussians(params, 1, velocity), [None])
+    raster[1].project_and_bin(_camera(), _still(there, 1), [None])
+    np.testing.assert_allclose(raster[0].projected, raster[1].projected, rtol=1e-4, atol=1e-4)
 
 
 def test_the_pull_on_a_place_is_the_gradient_by_position() -> None:
     params, cam, target = _cloud(9, seed=2), _camera(), _target()
     _, gradient = _gradient(params, cam, target)
-    passes, some = Passes(CallerPool()), np.array([7, 1, 4], np.int64)
+    raster, some = RasterBuffers(CallerPool()), np.array([7, 1, 4], np.int64)
     gaussians = _still(params, 1)
-    passes.look(cam, gaussians, [None])
-    tasks = np.array([(0, t) for t in range(int(passes.columns[0] * passes.rows[0]))], np.int32)
-    passes.pool.run(
-        train_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
-        passes.lists, Loss(False, np.float32(0), BACK, False, np.uint64(1)), passes.memory, passes.kept,
-        passes.sums, np.zeros((len(tasks), 3)),
+    raster.project_and_bin(cam, gaussians, [None])
+    tasks = np.array([(0, t) for t in range(int(raster.columns[0] * raster.rows[0]))], np.int32)
+    raster.pool.run(
+        train_tiles, _views(target), np.zeros(1, np.int64), tasks, raster.columns, raster.projected,
+        raster.lists, Loss(False, np.float32(0), BACK, False, np.uint64(1)), raster.memory, raster.saved,
+        raster.sums, np.zeros((len(tasks), 3)),
     )  # fmt: skip
     slope = np.full((3, 3), 7, np.float32)
-    passes.pool.run(
-        pull, cam, gaussians, some, passes.projected, passes.lists.own_first, passes.lists.own_count,
-        passes.sums, slope,
+    raster.pool.run(
+        position_gradients, cam, gaussians, some, raster.projected, raster.lists.own_first, raster.lists.own_count,
+        raster.sums, slope,
     )  # fmt: skip
     np.testing.assert_allclose(slope, gradient[some, :3], rtol=1e-5, atol=1e-6)
 
@@ -514,14 +519,14 @@ def test_no_parameter_poisons_single_pixels(value: float) -> None:
 def test_compared_pixels_are_as_far_off_as_the_rendering_is() -> None:
     params, cam, target = _cloud(20, seed=4), _camera(), _target()
     color = _render(params, cam)[0]
-    passes = Passes(CallerPool())
+    raster = RasterBuffers(CallerPool())
     columns = -(-LENS.width // TILE)
-    passes.look(cam, _still(params, 1), [None], differentiate=False)
+    raster.project_and_bin(cam, _still(params, 1), [None], differentiate=False)
     tasks = np.array([(0, 0), (0, columns + 1)], np.int32)
     error = np.full(LENS.width * LENS.height, -1, np.float32)
-    passes.pool.run(
-        compare_tiles, _views(target), np.zeros(1, np.int64), tasks, passes.columns, passes.projected,
-        passes.lists, BACK, passes.memory, passes.kept, error,
+    raster.pool.run(
+        compare_tiles, _views(target), np.zeros(1, np.int64), tasks, raster.columns, raster.projected,
+        raster.lists, BACK, raster.memory, raster.saved, error,
     )  # fmt: skip
     error = error.reshape(LENS.height, LENS.width)
     wanted = np.abs(color - target / 255.0).max(axis=2)
@@ -549,8 +554,8 @@ def test_verdicts_are_what_pixel_after_pixel_says(lens: Pinhole, channels: int) 
     params, velocity = _cloud(200, seed=3), rng.normal(size=(200, 3)).astype(np.float32)
     params[7, 0], params[8, BASE - 1] = np.nan, np.inf
     allowed = rng.uniform(0.1, 0.9, 200).astype(np.float32)
-    found = Verdicts.room(200)
-    CallerPool().run(judge, cams, data, marks, Gaussians(params, 1, velocity), allowed, found)
+    found = Evidence.zeros(200)
+    CallerPool().run(collect_evidence, cams, data, marks, Gaussians(params, 1, velocity), allowed, found)
     for i in range(200):
         sees = marked = wrong = 0
         off = []
