@@ -204,7 +204,7 @@ def release_left_behind(
     moving = Gaussians(cloud.params[guests], settings.harmonics, cloud.velocity[guests])
     still = Gaussians(moving.params.copy(), settings.harmonics, np.zeros_like(moving.velocity))
     still.params[:, :3] = before[guests]
-    here, there = (seen.evidence(pool, gaussians).off for gaussians in (moving, still))
+    here, there = (seen.evidence(pool, gaussians).error for gaussians in (moving, still))
     stay = guests[there + np.float32(STAYS) < here]
     cloud.params[stay, :3] = before[stay]
     cloud.velocity[stay] = 0.0
@@ -252,8 +252,8 @@ def _visual_hull(
     """Which Gaussians lie in the hull of what changed, and which of them disagree with it: bool (N,) each."""
     allowed = np.where(cloud.guest > 0, AGREE_GUEST, AGREE).astype(np.float32)
     found = seen.evidence(pool, cloud.gaussians(settings.harmonics), allowed)
-    hull = (found.marked >= min(2, seen.asked)) & (2 * found.marked >= found.sees)
-    return hull, 2 * found.wrong >= found.marked
+    hull = (found.changed >= min(2, seen.asked)) & (2 * found.changed >= found.seen)
+    return hull, 2 * found.contradicted >= found.changed
 
 
 def _age_guests(cloud: GaussianCloud, hull: NDArray[np.bool_]) -> None:

@@ -1,5 +1,4 @@
-"""Which Gaussians a tile sees, front to back: sorted by depth, then binned out to tiles, in bands of them side
-by side."""
+"""Tile intersection (gsplat's ``isect_tiles``): each tile's list of Gaussians, sorted front to back."""
 
 from __future__ import annotations
 
@@ -12,22 +11,24 @@ from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import count_bits, draw, lowest_bit
 from edge_server.fields.splat.kernels.project import DEPTH_BITS, DEPTH_KEY, TILE_BITS
 
-# Two raster sort.
-RADIX_BITS = DEPTH_BITS // 2
+RADIX_BITS = DEPTH_BITS // 2  # the sort takes two passes
 RADIX = 1 << RADIX_BITS
 
 
 class TileLists(NamedTuple):
-    """A pair is a Gaussian and a tile it touches; those of one Gaussian follow each other. B cameras,
-    T tiles at most, N Gaussians, P pairs, W bands at most.
+    """Pairs of a Gaussian and a tile that it touches. The pairs of a Gaussian have consecutive numbers.
+    B cameras, at most T tiles, N Gaussians, at most P pairs, at most W bands.
 
-    wanted: uint8 (B, T), tiles that are looked at. first: int32 (B, T + 1) into ``pair``: int32 (B, P),
-    the tile's pairs front to back. owner: int32 (B, P), a pair's Gaussian. own_first, own_count: int32
-    (B, N), a Gaussian's pairs. needed: int64 (B,), pairs there are (more than P: Gaussians that did not fit
-    in any more, in the order of their numbers, were left out with all their pairs). longest: int64 (B, W),
-    the longest list of a tile of each band. Scratch of each worker, which costs more to get and give back
-    than to use: keys: uint32 (workers, 2, N + 1), order: int32 (workers, 2, N + 1), begins: int32
-    (workers, N), binned: int32 (workers, 2, P).
+    wanted: uint8 (B, T), 1 for tiles to process.
+    first: int32 (B, T + 1), where each tile's list begins in ``pair``.
+    pair: int32 (B, P), pair numbers, tile by tile, front to back.
+    owner: int32 (B, P), the Gaussian of each pair.
+    own_first, own_count: int32 (B, N), the first pair of each Gaussian, and how many it has.
+    needed: int64 (B,), pairs in total. Where that is more than P, the Gaussians that no longer fit, in the
+        order of their numbers, are left out with all their pairs.
+    longest: int64 (B, W), length of the longest tile list in each band.
+    keys, order: uint32 and int32 (workers, 2, N + 1); begins: int32 (workers, N); binned: int32
+        (workers, 2, P): scratch of each worker, kept because allocating it costs more than using it.
     """
 
     wanted: NDArray[np.uint8]
@@ -46,7 +47,7 @@ class TileLists(NamedTuple):
 
 @part
 def _sort(keys, order, n):
-    """Stable radix sort of order[0, :n] by keys[0, :n] in two raster; ends in row 0."""
+    """Stable radix sort of order[0, :n] by keys[0, :n]; the result is in row 0."""
     counts = np.zeros((2, RADIX + 1), np.int64)
     for k in range(n):
         key = keys[0, k]
@@ -70,28 +71,28 @@ def _sort(keys, order, n):
 
 @part
 def _tile_bits(tiles, b, i):
-    """The columns TILE_BITS of a Gaussian, as one number."""
+    """The two TILE_BITS columns of a Gaussian as one 64-bit number."""
     low, high = np.uint64(np.uint32(tiles[b, i, TILE_BITS])), np.uint64(np.uint32(tiles[b, i, TILE_BITS + 1]))
     return low | (high << np.uint64(32))
 
 
 @part
 def _low_bits(bits, n):
-    """The lowest n of 64 bits, 0 <= n; the others are 0."""
+    """``bits`` with all but the lowest n (n >= 0) cleared."""
     mask = (np.uint64(1) << np.uint64(n & 63)) - np.uint64(1)
     return bits & (mask if n < 64 else ~np.uint64(0))
 
 
 @part
 def _touches_tile(bits, n):
-    """1 if a Gaussian reaches the n-th tile of its box, else 0."""
+    """1 if a Gaussian touches the n-th tile of its bounding box, else 0."""
     return np.int64((bits >> np.uint64(min(n, 63))) & np.uint64(1)) if n < 64 else 1
 
 
 @part
 def _count_tiles(bits, n, x0, x1, begin, end, across, wanted):
-    """How many tiles of rows begin, ..., end - 1 a Gaussian reaches that are wanted, one by one. n: the
-    number in its box of the first tile there."""
+    """Count the wanted tiles that a Gaussian touches in rows begin, ..., end - 1. n: index, within its
+    bounding box, of the first of these tiles."""
     hits = 0
     for ty in range(begin, end):
         for tx in range(x0, x1):
@@ -102,10 +103,16 @@ def _count_tiles(bits, n, x0, x1, begin, end, across, wanted):
 
 @kernel
 def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
-    """Tasks are bands: each camera's rows of tiles, columns and rows int64 (B,) tiles across and down, are
-    divided among ``bands`` tasks. Each goes through all Gaussians, so that it knows without being told where
-    its lists begin, and sorts and deals out what reaches its own tiles. The lists do not depend on how many
-    bands there are. See ``TileLists``."""
+    """Fill ``lists``. A task is a band: some of a camera's rows of tiles. Each band visits all Gaussians, so
+    that it knows where its lists begin, and sorts those that touch its tiles. The lists do not depend on the
+    number of bands.
+
+    columns, rows: int64 (B,), tiles across and down.
+    bands: tasks a camera.
+    count: number of Gaussians.
+    tiles: int32 (B, N, FOOTPRINT), see ``project``.
+    lists: ``TileLists``, written.
+    """
     while True:
         task = draw(counter, worker, columns.size * bands)
         b, band = task // bands, task % bands
@@ -121,7 +128,7 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
         whole = asked == across * down
         keys, order, begins, binned = (
             lists.keys[worker], lists.order[worker], lists.begins[worker], lists.binned[worker])  # fmt: skip
-        # Where each Gaussian's pairs begin every band knows; each writes it down for some.
+        # Every band computes where each Gaussian's pairs begin; each band stores a share of the Gaussians.
         low, high = count * band // bands, count * (band + 1) // bands
         n = made = needed = above = mine = 0
         for i in range(count):
@@ -132,7 +139,7 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
                 pairs = count_bits(_low_bits(bits, size))
                 before = count_bits(_low_bits(bits, (begin - y0) * width))
                 here = count_bits(_low_bits(bits, (end - y0) * width)) - before
-            else:  # what lies elsewhere need not be sorted
+            else:  # Gaussians outside the wanted tiles are not sorted
                 before = _count_tiles(bits, 0, x0, x1, y0, begin, across, wanted)
                 here = _count_tiles(bits, (begin - y0) * width, x0, x1, begin, end, across, wanted)
                 pairs = (
@@ -147,14 +154,14 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
             made += pairs
             above += before
             mine += here
-            # Written in any case: a branch here would be guessed wrong too often.
+            # Written unconditionally: a branch here would be mispredicted too often.
             keys[0, n], order[0, n] = tiles[b, i, DEPTH_KEY], i
             n += np.int64(here > 0)
         _sort(keys, order, n)
         end = begins[high] if high < count else made
         for i in range(low, high):
             p, pairs = begins[i], own_count[i]
-            if p + 4 <= end:  # written in any case, and again by the next one
+            if p + 4 <= end:  # written unconditionally; the next Gaussian overwrites the excess
                 owner[p] = owner[p + 1] = owner[p + 2] = owner[p + 3] = i
                 p += 4
             for q in range(p, begins[i] + pairs):

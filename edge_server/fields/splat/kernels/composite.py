@@ -1,7 +1,8 @@
-"""A tile's Gaussians, front to back (thesis 3.20 with alphas in place of densities) and back, strip by strip.
+"""Alpha compositing (thesis 3.20 with alphas in place of densities) and its gradient, strip by strip.
 
-A strip is two rows of a tile, 16 pixels: a register. Its light and colours stay in registers while all its
-Gaussians pass; a Gaussian that is on a tile's list reaches half of its strips, and only those see it.
+A strip is two rows of a tile: 16 pixels, one vector register. Its transmittance and colors stay in registers
+while its Gaussians are composited. A Gaussian of a tile's list reaches half of the strips on average; the
+others skip it. "Light" is transmittance: the share of light that still passes.
 """
 
 from __future__ import annotations
@@ -40,36 +41,35 @@ from edge_server.fields.splat.kernels.simd_vectors import (
     require_contiguous,
 )
 
-# One constant in mask_and raster: no Gaussian hides everything, and one that would has no gradient.
-ALPHA_MAX = 0.99
-STOP = 1e-4  # of the light: what lies behind is not seen
-SUMS = 9
+ALPHA_MAX = 0.99  # in both passes: no Gaussian hides everything, and a clamped alpha has no gradient
+STOP = 1e-4  # transmittance below which compositing stops
+SUMS = 9  # sums that the backward pass gathers a pair: see ``project_backward``
 
 STRIPS = 4
 STRIP = LANES  # pixels
 PIXELS = TILE * TILE
-SAVED = 2 * STRIP  # floats saved of a Gaussian in a strip between the raster: alphas, and the light before it
+SAVED = 2 * STRIP  # floats a Gaussian and strip that the forward pass saves: alphas, and light before them
 
 _I64 = ir.IntType(64)
-_TO_2 = -0.5 / np.log(2.0)  # of a Gaussian's quadratic form: to the power of 2 instead of e
+_TO_2 = -0.5 / np.log(2.0)  # exp(-form / 2) = 2^(form * _TO_2)
 _F0, _HALF = np.float32(0.0), np.float32(0.5)
 _LAST, _SLACK = np.float32(TILE - 1), np.float32(1e-3)  # pixels
 
 
 @part
 def bin_strips(lists, b, begin, end, projected, y0, strip_pairs, count):
-    """Which pairs of a tile's list lists.pair[b, begin:end] reach which strip. strip_pairs: int32 (STRIPS, N),
-    written: the pairs, front to back; count: int64 (STRIPS,), how many."""
+    """Split a tile's list lists.pair[b, begin:end] into one list a strip, front to back. y0: the tile's
+    first row of pixels. strip_pairs: int32 (STRIPS, N) and count: int64 (STRIPS,), both written."""
     n0 = n1 = n2 = n3 = 0
     for j in range(begin, end):
         p = lists.pair[b, j]
         i = lists.owner[b, p]
         middle = projected[b, i, MEAN_Y] - np.float32(y0) - _HALF
         reach = projected[b, i, HALF_HEIGHT] + _SLACK
-        # Rows from 0 to 7; the ends are inside by the way the tile's list was made.
+        # Clamped to rows 0..7: the list has only Gaussians that reach the tile.
         top = np.int64(min(max(np.ceil(middle - reach), _F0), _LAST)) >> 1
         bottom = np.int64(min(max(middle + reach, _F0), _LAST)) >> 1
-        # Written in any case: a branch here would be guessed wrong too often.
+        # Written unconditionally: a branch here would be mispredicted too often.
         strip_pairs[0, n0], strip_pairs[1, n1], strip_pairs[2, n2], strip_pairs[3, n3] = p, p, p, p
         n0 += np.int64(top == 0)
         n1 += np.int64((top <= 1) & (bottom >= 1))
@@ -79,67 +79,69 @@ def bin_strips(lists, b, begin, end, projected, y0, strip_pairs, count):
 
 
 class _StripBuilder:
-    """What mask_and raster need: a strip's pixels, and pointers into arrays."""
+    """Emits the code that both passes share: pointers into arrays, and a strip's pixels."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, args: Any) -> None:
         self.context, self.builder = context, builder
         self.kinds, self.args = signature.args, args
 
     def data(self, n: int) -> Any:
-        """Of an argument that is an array."""
+        """The data pointer of array argument n."""
         return self.context.make_array(self.kinds[n])(self.context, self.builder, self.args[n]).data
 
     def at(self, data: Any, *numbers: Any) -> Any:
-        """A pointer to the element that lies the sum of the numbers further on."""
+        """A pointer to the element at the sum of ``numbers``."""
         place = self.builder.gep(data, [numbers[0]])
         for n in numbers[1:]:
             place = self.builder.gep(place, [n if not isinstance(n, int) else _I64(n)])
         return place
 
-    def variables(self, wides: list[Vector]) -> list[Any]:
-        """What changes in a loop; LLVM keeps them in registers."""
-        found = [cgutils.alloca_once(self.builder, w.value.type) for w in wides]
-        self.set(found, wides)
+    def variables(self, vectors: list[Vector]) -> list[Any]:
+        """Loop-carried variables, which LLVM keeps in registers."""
+        found = [cgutils.alloca_once(self.builder, w.value.type) for w in vectors]
+        self.set(found, vectors)
         return found
 
     def get(self, variables: list[Any]) -> list[Vector]:
         return [Vector(self.builder, self.builder.load(v)) for v in variables]
 
-    def set(self, variables: list[Any], wides: list[Vector]) -> None:
-        for variable, wide in zip(variables, wides, strict=True):
-            self.builder.store(wide.value, variable)
+    def set(self, variables: list[Any], vectors: list[Vector]) -> None:
+        for variable, vector in zip(variables, vectors, strict=True):
+            self.builder.store(vector.value, variable)
 
     def pixels(self, x0: Any, y0: Any) -> tuple[Vector, Vector]:
-        """Their middles."""
+        """x and y of the centers of the strip's pixels."""
         across = Vector(self.builder, constant(*(k % TILE + 0.5 for k in range(STRIP))))
         down = Vector(self.builder, constant(*(k // TILE + 0.5 for k in range(STRIP))))
         return across + Vector.broadcast(self.builder, x0), down + Vector.broadcast(self.builder, y0)
 
     def number(self, data: Any, n: Any) -> Any:
-        """The n-th of int32, as int64."""
+        """Element n of int32 ``data``, as int64."""
         return self.builder.sext(self.builder.load(self.at(data, n)), _I64)
 
     def row(self, rows: Any, owners: Any, pair: Any) -> Any:
-        """Where a pair's projected Gaussian lies."""
+        """A pointer to the projected Gaussian of a pair."""
         return self.at(rows, self.builder.mul(self.number(owners, pair), _I64(PROJECTED)))
 
     def columns(self, row: Any, *which: int) -> list[Vector]:
-        """Of a projected Gaussian."""
+        """Columns of a projected Gaussian, each broadcast to all lanes."""
         return [Vector.broadcast(self.builder, self.builder.load(self.at(row, _I64(k)))) for k in which]
 
 
 @intrinsic
-def composite(typingctx: Any, strip_pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any, tile: Any,
-        first: Any, saved: Any, step: Any) -> Any:  # fmt: skip
-    """Lay the Gaussians of the pairs strip_pairs[:count] (int32; owner[pair], int32, is a row of projected, float32
-    (N, PROJECTED)) one behind the other over the strip whose first pixel's corner is (x0, y0), float32. tile:
-    float32 rows of PIXELS, of which lane ``first`` and the 15 after it are the strip's: light, red, green,
-    blue, depth, read and written. Alphas and the light before each Gaussian go to saved[step * n:], 2 * STRIP
-    floats.
+def composite(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any,
+              tile: Any, first: Any, saved: Any, step: Any) -> Any:  # fmt: skip
+    """Composite a strip's Gaussians front to back. Returns how many were composited before ``STOP``.
 
-    Returns how many were composited before it was dark.
+    pairs: int32, pair numbers, of which the first ``count`` are used.
+    owner: int32, the Gaussian of each pair.
+    projected: float32 (N, PROJECTED).
+    x0, y0: float32, corner of the strip's first pixel.
+    tile: float32 rows of PIXELS: light, red, green, blue, depth; read and written.
+    first: the strip's first column in these rows.
+    saved: float32, written: at step * n the alphas of the n-th Gaussian and the light before it (SAVED).
     """
-    require_contiguous(strip_pairs, owner, projected, tile, saved)
+    require_contiguous(pairs, owner, projected, tile, saved)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         strip = _StripBuilder(context, builder, signature, args)
@@ -167,21 +169,24 @@ def composite(typingctx: Any, strip_pairs: Any, count: Any, owner: Any, projecte
             with builder.if_then(builder.not_(any_lane(builder, light.greater_equal(STOP))), likely=False):
                 builder.store(builder.add(loop.index, _I64(1)), composited)
                 loop.do_break()
-        for place, wide in zip(places, strip.get(state), strict=True):
-            wide.store(place)
+        for place, vector in zip(places, strip.get(state), strict=True):
+            vector.store(place)
         return builder.load(composited)
 
     f32, i64 = types.float32, types.int64
-    return i64(strip_pairs, i64, owner, projected, f32, f32, tile, i64, saved, i64), codegen
+    return i64(pairs, i64, owner, projected, f32, f32, tile, i64, saved, i64), codegen
 
 
 @intrinsic
-def composite_backward(typingctx: Any, strip_pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any, slopes: Any,
-         first: Any, saved: Any, sums: Any) -> Any:  # fmt: skip
-    """The gradient of ``composite``, back to front. slopes: float32 rows of PIXELS: d loss / d red, green and blue,
-    and what the pixel's colour behind all Gaussians has to do with it. Added to the pairs' sums, float32
-    (P, SUMS); see ``splat_back.back``."""
-    require_contiguous(strip_pairs, owner, projected, slopes, saved, sums)
+def composite_backward(typingctx: Any, pairs: Any, count: Any, owner: Any, projected: Any, x0: Any, y0: Any,
+                       slopes: Any, first: Any, saved: Any, sums: Any) -> Any:  # fmt: skip
+    """The gradient of ``composite``, back to front; arguments as there.
+
+    slopes: float32 rows of PIXELS: d loss / d red, green and blue, and the background's share of the pixel's
+        color times these.
+    sums: float32 (P, SUMS), added to: see ``project_backward``.
+    """
+    require_contiguous(pairs, owner, projected, slopes, saved, sums)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         strip = _StripBuilder(context, builder, signature, args)
@@ -216,4 +221,4 @@ def composite_backward(typingctx: Any, strip_pairs: Any, count: Any, owner: Any,
         return context.get_dummy_value()
 
     f32, i64 = types.float32, types.int64
-    return types.void(strip_pairs, i64, owner, projected, f32, f32, slopes, i64, saved, sums), codegen
+    return types.void(pairs, i64, owner, projected, f32, f32, slopes, i64, saved, sums), codegen

@@ -1,4 +1,4 @@
-"""One optimiser step of the Gaussians: their pairs' gradients gathered in a fixed order, then Adam."""
+"""The optimizer step: each Gaussian gathers its pairs' gradients in a fixed order, then an Adam step."""
 
 from __future__ import annotations
 
@@ -39,19 +39,22 @@ from edge_server.fields.splat.kernels.simd_vectors import LANES, Vector, mask_an
 
 GRADIENT_LIMIT = 1e6
 OPACITY_LIMIT = 9.0  # raw: 1.2e-4 to .99988
-COLOR_LOW, COLOR_HIGH = -0.5, 1.5  # a Gaussian's own colour may leave [0, 1] a little: pictures are clamped
+COLOR_LOW, COLOR_HIGH = -0.5, 1.5  # a Gaussian's color may leave [0, 1] a little: rendered ones are clamped
 POSITION_LIMIT = 100.0  # scene units
-DEAD = -9.0  # raw opacity of a Gaussian that was not finite: it is not seen, and soon pruned
+DEAD = -9.0  # raw opacity given to a Gaussian that was not finite: invisible, and soon pruned
 
 _F0, _F1, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 
 
 class OptimizerState(NamedTuple):
-    """Adam's, and what densification goes by; N Gaussians, P parameters.
+    """Adam's moments and the statistics that densification uses; N Gaussians, P parameters.
 
-    m, v: float32 (N, P). age: int32 (N,), steps each has made. slope: float32 (N,), sum of the picture
-    gradients' lengths; looks: float32 (N,), how many; reach: float32 (N,), the largest standard deviation in
-    a picture as a share of its width."""
+    m, v: float32 (N, P), first and second moments.
+    age: int32 (N,), steps that each Gaussian has made.
+    slope: float32 (N,), sum of the lengths of the gradients by the projected mean.
+    looks: float32 (N,), how many gradients that is.
+    reach: float32 (N,), largest projected standard deviation, as a share of the image's width.
+    """
 
     m: NDArray[np.float32]
     v: NDArray[np.float32]
@@ -62,9 +65,15 @@ class OptimizerState(NamedTuple):
 
 
 class AdamParameters(NamedTuple):
-    """One step's rule. rates: float32 (P,). corrections: float32 (A, 3) by age, the last row for all higher
-    ones: Adam's two 1 / (1 - beta^t), and the share of the rates that is left. fade: pull on opacity, in loss
-    per unit of opacity. largest: scale limit in scene units; thinnest: logarithm of the largest aspect."""
+    """Parameters of one step.
+
+    rates: float32 (P,), learning rates.
+    corrections: float32 (A, 3) by age, the last row for all higher ages: Adam's two bias corrections
+        1 / (1 - beta^t), and the share of the rates that is left.
+    fade: penalty on opacity, loss per unit of opacity.
+    largest: largest scale, scene units.
+    thinnest: logarithm of the largest ratio of longest to shortest axis.
+    """
 
     rates: NDArray[np.float32]
     corrections: NDArray[np.float32]
@@ -78,7 +87,7 @@ class AdamParameters(NamedTuple):
 
 @part
 def clamp_gaussian(params, i, largest, thinnest):
-    """Hold Gaussian i to what it may be: finite, not a needle, not a giant."""
+    """Clamp Gaussian i to its bounds: finite, not a needle, not a giant."""
     row = params[i]
     total = _F0
     for k in range(row.size):
@@ -120,8 +129,8 @@ def clamp_gaussians(params, largest, thinnest):
 
 @part
 def _gather_gradients(base, here, touched, params, moments, rule, s, g):
-    """What ``_adam`` needs of a block, parameter by parameter, a Gaussian's side by side, to thirds of g:
-    gradient (NaN: leave it), rate, Adam's second correction. Returns how many gradients are not finite."""
+    """Write a block's gradients (NaN: leave the parameter as it is), rates and second bias corrections to the
+    thirds of ``g``, a Gaussian's parameters side by side. Returns how many gradients are not finite."""
     width = params.shape[1]
     third, lost = BLOCK * width, 0
     for j in range(here):
@@ -149,8 +158,7 @@ def _gather_gradients(base, here, touched, params, moments, rule, s, g):
 @intrinsic
 def _adam_vectors(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: Any, first: Any, vectors: Any,
                   beta1: Any, beta2: Any, epsilon: Any) -> Any:  # fmt: skip
-    """``_adam`` for the first ``vectors`` times LANES of its parameters."""
-
+    """``_adam`` for the first ``vectors`` * LANES of its parameters."""
     require_contiguous(g, params, m, v)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -188,14 +196,14 @@ def _adam_vectors(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: An
 
 @part
 def _adam(first, size, params, moments, rule, g):
-    """A step of Adam for parameters first, ..., first + size - 1, all Gaussians' in one line; g: see
-    ``_gather_gradients``. Over a whole block at once: a Gaussian's fourteen do not fill a register."""
+    """An Adam step for parameters first, ..., first + size - 1 of the flattened arrays; g: see
+    ``_gather_gradients``. A block at once: the fourteen parameters of one Gaussian do not fill a register."""
     third, limit, width = g.size // 3, np.float32(GRADIENT_LIMIT), params.shape[1]
     vectors = size // LANES
     _adam_vectors(
         g, third, params, moments.m, moments.v, first, vectors, rule.beta1, rule.beta2, rule.epsilon
     )
-    for k in range(vectors * LANES, size):  # of the last block
+    for k in range(vectors * LANES, size):  # the remainder, in the last block only
         i, column, d = (first + k) // width, (first + k) % width, g[k]
         if is_finite(d):
             d = min(max(d, -limit), limit)
@@ -208,11 +216,15 @@ def _adam(first, size, params, moments, rule, g):
 
 
 @kernel
-def adam_step(counter, worker, cams, gaussians, count, projected, own_first, own_count, pair_sums, moments, rule,
-           dropped):  # fmt: skip
-    """Tasks are blocks of Gaussians. dropped: int64 (blocks,), written: gradients that were not finite.
+def adam_step(counter, worker, cams, gaussians, count, projected, own_first, own_count, pair_sums, moments,
+              rule, dropped):  # fmt: skip
+    """An Adam step of all Gaussians that have pairs; the others and their moments stay as they are. Tasks
+    are blocks of Gaussians.
 
-    A Gaussian that no pair of this step belongs to stays as it is, its moments too.
+    cams: float32 (B, CAMERA), the cameras of this step.
+    projected, own_first, own_count, pair_sums: see ``project``, ``TileLists``, ``composite_backward``.
+    moments: ``OptimizerState``, updated. rule: ``AdamParameters``.
+    dropped: int64 (blocks,), written: gradients that were not finite.
     """
     params = gaussians.params
     width = params.shape[1]
@@ -252,10 +264,9 @@ def adam_step(counter, worker, cams, gaussians, count, projected, own_first, own
 
 
 @kernel
-def position_gradients(
-    counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums, slope
-):
-    """The gradient by position alone of Gaussians ``which`` (int64 (M,)), to slope: float32 (M, 3)."""
+def position_gradients(counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums,
+                       slope):  # fmt: skip
+    """Write the gradient by position of Gaussians ``which``, int64 (M,), to slope: float32 (M, 3)."""
     s, ids = block_scratch(gaussians.params.shape[1]), np.empty(BLOCK, np.int64)
     while True:
         base = fetch_add(counter, 1) * BLOCK

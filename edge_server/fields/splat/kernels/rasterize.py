@@ -1,9 +1,8 @@
-"""Compositing a tile's Gaussians (thesis 3.20 with alphas in place of densities), losses of its pixels, and
-back.
+"""Rasterization of tiles (gsplat's ``rasterize_to_pixels``), the losses of their pixels, and the gradients.
 
-A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with offsets that
-are constants, which is what lets LLVM vectorise it without tests for overlap; the Gaussians are composited down
-strip by strip, in ``splat_strips``.
+A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with constant
+offsets, which lets LLVM vectorize it without tests for overlap. ``composite`` adds the Gaussians strip by
+strip (thesis 3.20 with alphas in place of densities).
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ from edge_server.fields.splat.kernels.project import (
     TILE,
 )
 
-# Rows of a tile's memory: light, colour and depth, in ``composite``'s order; what the loss makes of each colour,
-# and what lies behind, in ``composite_backward``'s.
+# Rows of a tile's memory: light, color and depth, in the order of ``composite``; the loss's gradient by each
+# color, and the background's term, in the order of ``composite_backward``.
 _T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
 _ER, _EG, _EB, _BEHIND = (n * PIXELS for n in range(5, 9))
 ROWS = 9
@@ -51,9 +50,13 @@ _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # of SSIM
 
 
 class Loss(NamedTuple):
-    """What is minimised, per pixel and summed. absolute: L1 rather than squared errors. dssim: weight of
-    (1 - SSIM) / 2 over the tile as one window. background: float32 (3,); random: another one for each tile,
-    from stream ``key``."""
+    """The loss, summed over pixels.
+
+    absolute: absolute (L1) rather than squared errors.
+    dssim: weight of (1 - SSIM) / 2, with the tile as one window.
+    background: float32 (3,).
+    random: use a random background for each tile, from stream ``key``, instead.
+    """
 
     absolute: bool
     dssim: np.float32
@@ -64,7 +67,7 @@ class Loss(NamedTuple):
 
 @part
 def clear_tile(s):
-    """All light, no colour."""
+    """Reset the tile memory ``s``: full light, no color."""
     for k in range(PIXELS):
         s[_T + k] = _F1
         s[_R + k] = s[_G + k] = s[_B + k] = s[_Z + k] = _F0
@@ -72,7 +75,7 @@ def clear_tile(s):
 
 @part
 def strip_scratch(lists):
-    """Scratch of ``bin_strips`` for the longest list: strip_pairs and count."""
+    """Arrays for ``bin_strips`` that fit the longest tile list: strip_pairs and count."""
     longest = np.int64(1)
     for b in range(lists.longest.shape[0]):
         for r in range(lists.longest.shape[1]):
@@ -82,7 +85,7 @@ def strip_scratch(lists):
 
 @part
 def composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store):
-    """Lay all Gaussians of tile t of camera slot b over the tile memory ``s``; nothing is saved of them."""
+    """Composite tile t of camera slot b into the tile memory ``s``, forward only."""
     clear_tile(s)
     bin_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, strip_pairs, count)
     for n in range(STRIPS):
@@ -94,8 +97,8 @@ def composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store)
 
 @part
 def add_dssim(s, row, error_row, target, count, weight):
-    """Add the gradient of weight * count * (1 - SSIM) / 2 between a colour row of ``s`` and target (PIXELS,)
-    over their first ``count`` pixels that lie in the picture; returns that loss."""
+    """Return the loss weight * count * (1 - SSIM) / 2 between the color row at ``row`` of ``s`` and target
+    (PIXELS,), over the ``count`` pixels where target is not negative; add its gradient at ``error_row``."""
     n = _F1 / np.float32(count)
     mx = my = xx = yy = xy = _F0
     for k in range(PIXELS):
@@ -123,7 +126,8 @@ def add_dssim(s, row, error_row, target, count, weight):
 
 @part
 def _load_target(views, view, x0, y0, loss, task, target, back):
-    """Fill target (3, PIXELS), -1 outside the picture; back (3,). Returns how many pixels are inside."""
+    """Fill target (3, PIXELS), -1 outside the image, and the background, back (3,). Returns how many pixels
+    are inside."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
     for c in range(3):
         back[c] = loss.background[c]
@@ -146,8 +150,8 @@ def _load_target(views, view, x0, y0, loss, task, target, back):
 
 @part
 def _load_weights(views, view, x0, y0, target, share):
-    """Fill share (PIXELS,) with the pixels' weights; those of none count as outside the picture, -1 in
-    target. Returns how many are left, and their mean weight."""
+    """Fill share (PIXELS,) with the pixels' weights, and treat pixels of weight 0 as outside the image: -1 in
+    target. Returns how many pixels are left, and their mean weight."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
     count, total = 0, _F0
     for k in range(PIXELS):
@@ -164,7 +168,7 @@ def _load_weights(views, view, x0, y0, target, share):
 
 @part
 def _apply_weights(s, target, share, absolute):
-    """Multiply the error rows of ``s`` by the pixels' shares; returns loss and squared error, so weighed."""
+    """Multiply the error rows of ``s`` by the pixels' weights; returns weighted loss and squared error."""
     total, square = _F0, _F0
     for c in range(3):
         for k in range(PIXELS):
@@ -178,14 +182,18 @@ def _apply_weights(s, target, share, absolute):
 @kernel
 def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, saved,
                 sums, losses):  # fmt: skip
-    """Render, compare, differentiate. views: ``rays.Views``; picked: int64 (B,), the view of each camera
-    slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), saved: float32
-    (W, longest * STRIPS * SAVED), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written.
-    losses: float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not
-    finite.
+    """Render tiles, compare them with the views, and backpropagate to the pairs.
 
-    With ``views.weight``, a pixel's loss is multiplied by its own, that of a tile's SSIM by their mean over
-    the pixels that have any; the others are not part of the window."""
+    With ``views.weight``, each pixel's loss is multiplied by its weight and the tile's SSIM loss by the mean
+    of the positive weights; pixels of weight 0 are not part of the SSIM window.
+
+    views: ``rays.Views``.
+    picked: int64 (B,), the view of each camera slot.
+    tasks: int32 (M, 2), slot and tile.
+    memory, saved: float32 (W, ROWS * PIXELS) and (W, longest * STRIPS * SAVED), scratch of each worker.
+    sums: float32 (B, P, SUMS), written for the pairs of the tasks' tiles.
+    losses: float64 (M, 3), written: loss, squared color error, 1 if the tile is left out as not finite.
+    """
     s, store = memory[worker], saved[worker]
     weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
     target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
@@ -206,8 +214,8 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
         bin_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, strip_pairs, count)
         for n in range(STRIPS):
             composited[n] = composite(
-                strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
-                _T + n * STRIP, store[n * size : (n + 1) * size], SAVED,
+                strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0),
+                np.float32(y0 + 2 * n), s, _T + n * STRIP, store[n * size : (n + 1) * size], SAVED,
             )  # fmt: skip
         total, square = _F0, _F0
         for c in range(3):
@@ -237,15 +245,16 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
             s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
         for n in range(STRIPS):
             composite_backward(
-                strip_pairs[n], composited[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
-                _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
+                strip_pairs[n], composited[n], lists.owner[b], projected[b], np.float32(x0),
+                np.float32(y0 + 2 * n), s, _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
             )  # fmt: skip
 
 
 @kernel
 def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, saved,
                  color, depth, opacity):  # fmt: skip
-    """The picture of camera slot 0. color: float32 (H, W, 3), depth (z) and opacity (H, W), all written."""
+    """Render camera slot 0. Tasks are tiles. color: float32 (H, W, 3), depth (z): (H, W), opacity: (H, W),
+    all written."""
     s, store = memory[worker], saved[worker]
     strip_pairs, count = strip_scratch(lists)
     while True:
@@ -271,8 +280,12 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
 
 @kernel
 def render_points(counter, worker, columns, slots, points, projected, lists, background, color):
-    """The same at image points, float32 (N, 2), of which the tiles are wanted: some of them cost much less
-    than their tiles. color: float32 (N, 3), depth and opacity (N,), all written. Tasks are runs of 16."""
+    """Render single image points, which costs much less than their tiles. Tasks are runs of 16 points.
+
+    slots: int64 (N,), the camera slot of each point.
+    points: float32 (N, 2), image points in tiles that are wanted.
+    color: float32 (N, 3), written.
+    """
     most, least, stop = np.float32(ALPHA_MAX), np.float32(ALPHA_MIN), np.float32(STOP)
     while True:
         base = fetch_add(counter, 1) * 16
@@ -306,9 +319,12 @@ def render_points(counter, worker, columns, slots, points, projected, lists, bac
 def compare_tiles(
     counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, error
 ):
-    """How far off each pixel is: error, float32 (P,), the largest difference of a channel, written for the
-    pixels of the tasks' tiles. picked: int64 (B,), the view of each camera slot. tasks: int32 (M, 2), slot
-    and tile."""
+    """Write each pixel's color error, the largest difference of a channel, for the tiles of ``tasks``.
+
+    picked: int64 (B,), the view of each camera slot.
+    tasks: int32 (M, 2), slot and tile.
+    error: float32 (P,), all pixels of ``views``.
+    """
     s, store = memory[worker], saved[worker]
     strip_pairs, count = strip_scratch(lists)
     while True:

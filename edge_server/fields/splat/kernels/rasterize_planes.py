@@ -1,8 +1,7 @@
-"""Gaussians as small planes: normal and distance maps, and what each Gaussian is normal_sums of the normals it
-shows.
+"""Gaussians as small planes: maps of normal and distance, and the mean normal that each Gaussian shows.
 
 After PGSR (Chen et al. 2024): a pixel's depth is where its ray meets the blended plane, not the blend of the
-Gaussians' middles, which lies behind or before the surface wherever a flat Gaussian is seen at an angle.
+Gaussians' centers, which lies behind or before the surface wherever a flat Gaussian is seen at an angle.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from edge_server.fields.splat.kernels.composite import PIXELS, STOP, STRIP, STRI
 from edge_server.fields.splat.kernels.project import TILE
 from edge_server.fields.splat.kernels.rasterize import _T, clear_tile, strip_scratch
 
-CHECK_EVERY = 8  # Gaussians are composited one by one before it is looked again whether light is left
+CHECK_EVERY = 8  # Gaussians composited between two tests whether any light is left
 _F0 = np.float32(0.0)
 
 
 @part
 def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
-    """Lay the j-th Gaussian of strip n alone: its alphas and the light before it are in ``store`` then.
-    False, and nothing is composited, if it was seen to be dark; it is looked every CHECK_EVERY Gaussians."""
+    """Composite the j-th Gaussian of strip n alone; ``store`` then has its alphas and the light before it.
+    Returns False, and composites nothing, if no light was left at the last test."""
     first = _T + n * STRIP
     if j % CHECK_EVERY == 0:
         most = _F0
@@ -31,8 +30,8 @@ def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
         if most < np.float32(STOP):
             return False
     composite(
-        strip_pairs[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0), np.float32(y0 + 2 * n), s,
-        first, store, 0,
+        strip_pairs[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
+        np.float32(y0 + 2 * n), s, first, store, 0,
     )  # fmt: skip
     return True
 
@@ -41,9 +40,11 @@ def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
 def render_planes(
     counter, worker, slot, columns, rows, width, height, projected, lists, planes, memory, saved, out
 ):
-    """Blended planes of camera slot ``slot``. planes: float32 (N, 4), each Gaussian's unit normal in camera
-    axes and its distance from the camera along it. out: float32 (H, W, 5), written: normal and distance, each
-    summed with the weights of the colours, and opacity. Tasks are tiles."""
+    """Blend the Gaussians' planes with the weights of their colors. Tasks are tiles of camera ``slot``.
+
+    planes: float32 (N, 4), unit normal in camera axes, and the plane's distance from the camera along it.
+    out: float32 (H, W, 5), written: blended normal, blended distance, opacity.
+    """
     s, store = memory[worker], saved[worker]
     strip_pairs, count = strip_scratch(lists)
     sums = np.empty((4, PIXELS), np.float32)
@@ -77,9 +78,11 @@ def render_planes(
 def accumulate_normals(
     counter, worker, slot, columns, rows, width, height, projected, lists, normals, memory, saved, normal_sums
 ):
-    """What the pixels' normals (float32 (H, W, 4): unit vectors in camera axes, and how sure each is) say to
-    the Gaussians: normal_sums, float32 (P, 4), written for every pair of the slot: the normals times the weight that
-    the Gaussian has in the pixel, and the sum of these weights. Tasks are tiles."""
+    """Sum the pixels' normals over each pair, with the Gaussian's weight in the pixel. Tasks are tiles.
+
+    normals: float32 (H, W, 4), unit vectors in camera axes, and the confidence in each.
+    normal_sums: float32 (P, 4), written for every pair of ``slot``: weighted normals, and the weights' sum.
+    """
     s, store = memory[worker], saved[worker]
     strip_pairs, count = strip_scratch(lists)
     while True:

@@ -573,7 +573,7 @@ def test_verdicts_are_what_pixel_after_pixel_says(lens: Pinhole, channels: int) 
                 marked += marks[pixel]
                 cut = channels == 4 and pixels[pixel, 3] < 128
                 wrong += marks[pixel] * (apart > allowed[i] or cut)
-        said = (found.sees[i], found.marked[i], found.wrong[i])
+        said = (found.seen[i], found.changed[i], found.contradicted[i])
         assert said == (sees, marked, wrong), f"Gaussian {i}"
-        assert found.off[i] == pytest.approx(np.mean(off) if off else 0.0, abs=1e-5)
-    assert found.sees.max() == 3 and 0 < found.wrong.sum() < found.marked.sum() < found.sees.sum()
+        assert found.error[i] == pytest.approx(np.mean(off) if off else 0.0, abs=1e-5)
+    assert found.seen.max() == 3 and 0 < found.contradicted.sum() < found.changed.sum() < found.seen.sum()
