@@ -1,4 +1,4 @@
-"""What the kernels of the Gaussian field work on: cameras as rows, and buffers that grow as needed."""
+"""What the kernels of the Gaussian field work on: cameras as rows, and buffers that grow with the scene."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from edge_server.fields.splat.kernels.rasterize import ROWS
 from freshfield.geometry import Pinhole
 
 MIN_NEAR = 0.01  # scene units
-MAX_PAIRS = 1 << 22  # a camera: what does not fit in is left out rather than memory exhausted
-_BORDER = 17
+MAX_PAIRS = 1 << 22  # pairs a camera: further Gaussians are left out, so that memory is bounded
+_BORDER = 17  # points on each edge of an image
 
 
 @lru_cache(maxsize=1024)
 def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
-    """1.3 times what the camera sees: lowest and highest x / z, y / z of rays through the picture's edge."""
+    """1.3 times the field of view: lowest and highest x / z, then y / z, of rays through the image's edge."""
     u, v = np.linspace(0.0, camera.width, _BORDER), np.linspace(0.0, camera.height, _BORDER)
     edge = np.concatenate([
         np.stack(np.broadcast_arrays(u, y), axis=-1) for y in (0.0, float(camera.height))
@@ -52,7 +52,7 @@ def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
 
 @lru_cache(maxsize=8)
 def ray_lengths(camera: Pinhole) -> NDArray[np.float32]:
-    """float32 (H, W): length of each pixel's ray per unit of depth along the optical axis."""
+    """float32 (H, W): length of each pixel's ray per unit of depth along the optical axis (z)."""
     return (1.0 / np.maximum(camera.rays()[..., 2], 1e-6)).astype(np.float32)
 
 
@@ -62,8 +62,11 @@ def camera_rows(
     box: SceneBox,
     times_s: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
-    """Cameras in scene units as the kernels read them, float32 (B, CAMERA). times_s: when each picture was
-    taken, from the instant the Gaussians stand for (none: at that instant)."""
+    """Cameras in scene units as the kernels read them, float32 (B, CAMERA).
+
+    poses, lenses: camera-to-world (4, 4) in meters, and intrinsics, of each camera.
+    times_s: when each image was taken, from the instant of the Gaussians' parameters; None: at that instant.
+    """
     rows = np.zeros((len(poses), CAMERA), np.float32)
     for row, pose, lens in zip(rows, poses, lenses):
         pose = np.asarray(pose, dtype=np.float64)
@@ -79,7 +82,7 @@ def camera_rows(
 
 
 class RasterBuffers:
-    """Projection and tile lists of several cameras at once."""
+    """Projected Gaussians and tile lists of several cameras, and the memory in which workers rasterize."""
 
     def __init__(self, pool: Pool) -> None:
         self.pool = pool
@@ -90,12 +93,12 @@ class RasterBuffers:
         self.sums = np.zeros((0, 0, SUMS), np.float32)
         self.columns = self.rows = np.zeros(0, np.int64)
         self._lists: TileLists | None = None
-        self._whole: tuple[list[int], NDArray[np.int32]] | None = None  # tasks where all tiles are wanted
+        self._whole: tuple[list[int], NDArray[np.int32]] | None = None  # cached tasks of whole images
         self._all_wanted = False
 
     @property
     def lists(self) -> TileLists:
-        """The lists made by the last ``look``."""
+        """The tile lists of the last ``project_and_bin``."""
         assert self._lists is not None
         return self._lists
 
@@ -103,7 +106,12 @@ class RasterBuffers:
         self, cams: NDArray[np.float32], gaussians: Gaussians, wanted: Sequence[NDArray[np.uint8] | None],
         differentiate: bool = True,
     ) -> None:  # fmt: skip
-        """Project and bin_tiles out. wanted: for each camera uint8 (tiles,), or None for all of them."""
+        """Project the Gaussians into the cameras, and list them by tile.
+
+        cams: float32 (B, CAMERA), see ``camera_rows``.
+        wanted: for each camera uint8 (tiles,), 1 for tiles to list, or None for all tiles.
+        differentiate: whether to make room for gradients.
+        """
         count, slots = len(gaussians.params), len(cams)
         sizes = cams[:, SIZE : SIZE + 2].astype(np.int64)
         self.columns, self.rows = (-(-sizes[:, k] // TILE) for k in (0, 1))
@@ -132,7 +140,7 @@ class RasterBuffers:
             self.sums = np.zeros((*self.lists.pair.shape, SUMS), np.float32)
 
     def tasks(self) -> NDArray[np.int32]:
-        """Slot and tile, int32 (M, 2), of all tiles that were wanted by the last ``look``."""
+        """Camera slot and tile, int32 (M, 2), of all tiles wanted by the last ``project_and_bin``."""
         totals = (self.columns * self.rows).tolist()
         if self._all_wanted and self._whole is not None and self._whole[0] == totals:
             return self._whole[1]

@@ -1,19 +1,18 @@
 """3D Gaussian splatting on CPUs (Kerbl et al. 2023): tile kernels in numba, forward and backward.
 
-One step: the Gaussians are projected into a few cameras (``kernels.splat_project``), dealt out to tiles
-front to back (``kernels.splat_tiles``), tiles are rendered, compared and differentiated side by side
-(``kernels.splat_raster``, strip by strip in ``kernels.splat_strips``), and every Gaussian gathers the
-gradients of its tiles in a fixed order, leads them back through the projection (``kernels.splat_back``) and
-makes an Adam step (``kernels.splat_update``). Every now and then Gaussians are split and pruned.
+One step: the Gaussians are projected into a few cameras (``kernels.project``) and listed by tile, front to
+back (``kernels.bin_tiles``); tiles are rendered, compared and differentiated in parallel
+(``kernels.rasterize``, strip by strip in ``kernels.composite``); every Gaussian gathers the gradients of its
+tiles in a fixed order, backpropagates them through the projection (``kernels.project_backward``) and makes an
+Adam step (``kernels.optimizer_step``). From time to time Gaussians are split and pruned (``densification``).
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget, FitReport, Rendering, View
 from edge_server.fields.common.fair_lock import Turn
-from edge_server.fields.common.field_state import all_or_nothing, unpack_meta
+from edge_server.fields.common.field_state import all_or_nothing, pack, unpack_meta
 from edge_server.fields.common.kernels.precompile import compile_ahead
 from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
 from edge_server.fields.common.scene_box import NOWHERE
@@ -50,32 +49,32 @@ from edge_server.fields.splat.snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole
 
 _AGES = 4096  # steps after which Adam's bias correction no longer matters
-MAX_AHEAD_S = 0.3  # no farther ahead is a movement carried on: people turn
-TRACKING_SHARE = 0.35  # of an update, at most, that carries along what moved: the rest learns
-CHANGED_SLOTS = 4  # pictures whose changed tiles one step looks at, at most
+MAX_AHEAD_S = 0.3  # motion is extrapolated no farther than this: people turn
+TRACKING_SHARE = 0.35  # largest share of an update that tracks what moved
+CHANGED_SLOTS = 4  # largest number of views whose changed tiles one step trains on
 
 
 class SplatField:
-    """A cloud of Gaussians that learns while it is used. See ``fields.Field`` for the protocol.
+    """Gaussians that learn while they are in use. See ``fields.Field`` for the protocol.
 
-    ``fit`` belongs to one thread; ``render``, ``snapshot`` and ``points`` may be called from others
-    meanwhile: they wait for the end of the present step, some milliseconds.
+    Call ``fit`` from one thread only. Other threads may call ``render``, ``snapshot`` and ``points``
+    meanwhile: these wait for the end of the current step, a few milliseconds.
     """
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
         self.settings = settings or SplatSettings()
         self.pool = pool or shared_pool(self.settings.threads, self.settings.nice)
         age = np.maximum(np.arange(_AGES), 1)
-        calm = np.maximum(np.minimum(self.settings.settle_after / age, 1.0), self.settings.rate_settled)
-        corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), calm], axis=-1)
+        decay = np.maximum(np.minimum(self.settings.settle_after / age, 1.0), self.settings.rate_settled)
+        corrections = np.stack([1.0 / (1.0 - BETA1**age), 1.0 / (1.0 - BETA2**age), decay], axis=-1)
         self._corrections = corrections.astype(np.float32)
         self._turn = Turn()
         self.now = time.perf_counter  # the clock of budgets in seconds
-        self._now_ns: int | None = None  # the instant that the Gaussians stand for
+        self._now_ns: int | None = None  # the instant of the Gaussians' parameters
         self._snapshot: SplatSnapshot | None = None
-        self._given: tuple[View, ...] = ()  # the last fit's views, known again after ``load_state``
-        self._refused: set[str] = set()  # cameras whose newest view is left out
-        self._unsure: set[str] = set()  # cameras whose newest view followed one that was
+        self._given: tuple[View, ...] = ()  # views of the last fit; they survive ``load_state``
+        self._refused: set[str] = set()  # cameras whose newest view is refused
+        self._unsure: set[str] = set()  # cameras whose newest view follows a refused one
         self.reset()
 
     # --- the protocol -------------------------------------------------------------------------
@@ -88,11 +87,11 @@ class SplatField:
             self._clear_gaussians()
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Train on ``views`` from the present Gaussians. Raises ValueError for a view that cannot be one.
+        """Train the current Gaussians on ``views``. ValueError: a view is invalid.
 
-        In a budget in seconds, no step begins that would end too late as steps usually go. New pictures are
-        taken in first, however short it is, and Gaussians begin anew where something moved. Learning rates
-        fall over the budget, so every fit ends with a settled field.
+        New views are ingested first, however short the budget is, and Gaussians are seeded where something
+        moved. With a budget in seconds, no step begins that would end too late if it took the usual time.
+        Learning rates decay over the budget, so that every fit ends with a settled field.
         """
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
@@ -100,9 +99,9 @@ class SplatField:
         rays = samples = dropped = 0
         losses: deque[float] = deque(maxlen=32)
         with self._turn.mine():
-            motion = self._ingest(views)
-        if motion is not None:
-            rays, samples = self._follow_motion(motion, pace, self._tracking_steps(budget))
+            change = self._ingest(views)
+        if change is not None:
+            rays, samples = self._follow_motion(change, pace, self._tracking_steps(budget))
         while (progress := pace.begin(self._step_time)) is not None:
             with self._turn.mine():
                 loss, seen, pairs, lost = self._one_step(progress)
@@ -115,16 +114,16 @@ class SplatField:
         return FitReport(pace.steps, pace.seconds(), loss, rays, samples, dropped=dropped, refused=refused)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """The picture of a camera, from the present Gaussians."""
+        """Render the current Gaussians from a camera."""
         return self.snapshot().render(camera_to_world, intrinsics)
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Surface points in world metres and their colours; none before the first fit."""
+        """Surface points in world meters and their colors; none before the first fit."""
         return self.snapshot().points(count)
 
     def snapshot(self, present_ns: int | None = None) -> SplatSnapshot:
-        """A copy that renders from any thread and never changes. present_ns: what moves is shown where
-        it will be then, if it goes on as it went."""
+        """An immutable copy that renders from any thread. present_ns: the instant to which moving Gaussians
+        are extrapolated."""
         with self._turn.mine():
             now_ns = self._now_ns
             ahead_s = 0.0 if present_ns is None or now_ns is None else (present_ns - now_ns) / 1e9
@@ -140,10 +139,10 @@ class SplatField:
             return known
 
     def _live(self) -> SplatSnapshot:
-        """A renderer of the living arrays, for whoever has the turn."""
+        """A snapshot of the arrays in use, not copied, for a thread that holds the lock."""
         return SplatSnapshot(
             box=self.rig.box or NOWHERE,
-            gaussians=self.cloud.gaussians(self.settings.harmonics),
+            gaussians=self.cloud.gaussians(),
             background=self.rig.background(),
             cameras=self.rig.views,
             pool=self.pool,
@@ -153,45 +152,43 @@ class SplatField:
         )
 
     def warm_up(self) -> float:
-        """Compile (or load from numba's cache) every kernel before it is needed; returns the seconds taken.
+        """Compile every kernel, or load it from numba's cache, ahead of its use; returns the seconds taken.
 
-        Works on small fields of its own, in the calling thread and at its priority: the workers' low one
-        would make compiling on a busy machine take minutes. This field's state is not touched.
+        Works on small fields of its own, without touching this one, in the calling thread and at its
+        priority: at the workers' low priority, compiling on a busy machine would take minutes.
         """
         return compile_ahead(self._tour)
 
     def _tour(self, pool: Pool) -> None:
-        """Go through every kernel once."""
+        """Run every kernel once."""
         tiny = replace(self.settings, gaussians=64, start=8, min_views=1, seed_cells=8, contracted=False)
         camera = Pinhole.from_fov(32, 32, 60.0)
         pose = np.eye(4)
         pose[2, 3] = -3.0
         for channels in (3, 4):
             field = SplatField(tiny, pool)
-            for k in range(3):  # something moves: it is found, then carried along
+            for k in range(3):  # something moves: it is found, then tracked
                 image = np.full((32, 32, channels), 128, np.uint8)
                 image[8:16, 8 + 2 * k : 16 + 2 * k, :3] = 255
                 field.fit([View("warm-up", image, pose, camera, k * 10**8)], Budget(steps=8))
             field.render(pose, camera)
-            field._live().colors_at(field.rig.views, [np.full((1, 2), 0.5)])  # as ``trust`` asks
+            field._live().colors_at(field.rig.views, [np.full((1, 2), 0.5)])  # as the outlier test does
 
     # --- state --------------------------------------------------------------------------------
 
     def state(self) -> Arrays:
-        """Everything needed to go on bit for bit: Gaussians, moments, cameras, counters."""
+        """Everything needed to resume bit for bit: Gaussians, moments, cameras, counters."""
         with self._turn.mine():
-            meta = {
-                "version": 1, "field": "splat", "settings": asdict(self.settings), "step": self.step,
-                "grown": self._grown, "dropped": self.dropped,
+            counters = {
+                "step": self.step, "grown": self._grown, "dropped": self.dropped,
                 "now_ns": self._now_ns, "given": [v.camera for v in self._given],
-                "refused": sorted(self._refused), "unsure": sorted(self._unsure), **self.rig.meta(),
+                "refused": sorted(self._refused), "unsure": sorted(self._unsure),
             }  # fmt: skip
             cloud = {f.name: getattr(self.cloud, f.name) for f in fields(self.cloud)}
-            both = {"meta": np.array(json.dumps(meta)), **cloud, **self.rig.arrays()}
-            return {name: np.array(array) for name, array in both.items()}
+            return pack("splat", self.settings, self.rig, counters, cloud)
 
     def load_state(self, state: Arrays) -> None:
-        """Go on where ``state`` was taken. ValueError where it is not a state of a field of this shape."""
+        """Resume from ``state``. ValueError: it is not a state of a field of this shape."""
         with self._turn.mine(), all_or_nothing(self):
             meta, cloud = _unpack(self.settings, state)
             self.rig = Rig(self.settings)
@@ -224,12 +221,12 @@ class SplatField:
         return np.random.default_rng(np.random.SeedSequence([self.settings.seed, self.step, purpose]))
 
     def _ingest(self, views: Sequence[View]) -> SceneChange | None:
-        """Learn of new pictures; begin a cloud. Returns what they show to have moved, if anything."""
-        motion = None
+        """Ingest new views; seed the Gaussians if there are none. Returns what changed, if anything moved."""
+        change = None
         if not same_views(views, self._views):
             memory = self.rig.memory
             news = {v.camera for v in views if v.camera not in memory or memory[v.camera].view is not v}
-            known = _equal(views, self._given)  # decoded once more, or the first after ``load_state``
+            known = _equal(views, self._given)  # decoded again, or the first views after ``load_state``
             intake = self.rig.take_in(views)
             if intake.new_box:
                 self._clear_gaussians()
@@ -246,7 +243,7 @@ class SplatField:
                 extrapolate(self.cloud, elapsed_s, any(memory[v.camera].moved is not None for v in views))
                 self._refuse_outliers(views, news)
             data = self._data = leave_out(intake.data, np.array([v.camera in self._refused for v in views]))
-            self._asked = asked_views(data) or list(range(len(views)))  # of none, all teach nothing
+            self._asked = asked_views(data) or list(range(len(views)))  # all, where every weight is 0
             moved = weighted_changes(
                 [None if v.camera in self._unsure else memory[v.camera].moved for v in views], data
             )
@@ -254,15 +251,15 @@ class SplatField:
             self._views, self._given, self._epoch = tuple(views), tuple(views), -1
             fresh = any(v.camera in news for k, v in enumerate(views) if k in self._asked)
             if len(self.cloud) and fresh and not known and any(m is not None for m in moved):
-                motion = SceneChange(self.rig.box, views, data, moved, self._changed, self._cams,
+                change = SceneChange(self.rig.box, views, data, moved, self._changed, self._cams,
                                self.rig.background(), elapsed_s, len(self._asked))  # fmt: skip
         if len(self.cloud) == 0:
             self._seed()
         self._snapshot = None
-        return motion
+        return change
 
     def _tracking_steps(self, budget: Budget) -> int:
-        """Steps that carry along what moved: all that are set, or a share of a short budget."""
+        """How many steps track motion: ``follow``, or fewer in a short budget."""
         most = self.settings.follow
         if budget.steps is not None:
             return min(most, int(TRACKING_SHARE * budget.steps))
@@ -271,35 +268,35 @@ class SplatField:
         return min(most, int(TRACKING_SHARE * budget.seconds / usual_s)) if usual_s else most
 
     def _refuse_outliers(self, views: Sequence[View], news: set[str]) -> None:
-        """Refuse the views that contradict what is known. What a camera's next one seems to show to have
-        moved is beside a picture that was wrong, so that is not known."""
+        """Refuse the views that contradict the field. The next view of such a camera says nothing about
+        motion, because it would be compared with a wrong one."""
         self._unsure = (self._unsure - news) | (self._refused & news)
         flags = self.rig.refused(views, self.step, self._live().colors_at)
         given = {v.camera for v in views}
         self._refused = (self._refused - given) | {v.camera for v, flag in zip(views, flags) if flag}
 
-    def _follow_motion(self, motion: SceneChange, pace: Pace, carries: int) -> tuple[int, int]:
-        """Carry along what moved, and begin anew where that does not do; returns pixels and pairs."""
+    def _follow_motion(self, change: SceneChange, pace: Pace, steps: int) -> tuple[int, int]:
+        """Track what moved, then reseed where that is not enough; returns pixels and pairs."""
         s, rays, samples = self.settings, 0, 0
         with self._turn.mine():
-            going = track(s, self._tracking_raster, self.cloud, motion, carries)
+            tracking = track(self._tracking_raster, self.cloud, change, steps)
         while pace.begin(self._tracking_time, then_s=self._reseed_time.seconds) is not None:
             with self._turn.mine():
-                done = next(going, None)
+                done = next(tracking, None)
             if done is None:
                 break
-            rays, samples = rays + done[1], samples + done[2]
+            rays, samples = rays + done[0], samples + done[1]
             pace.end()
         began = pace.seconds()
         with self._turn.mine():
-            release_left_behind(s, self.pool, self.cloud, motion, self._before)
-            reseed(s, self._tracking_raster, self.cloud, motion, self._rng(2))
+            release_left_behind(self.pool, self.cloud, change, self._before)
+            reseed(s, self._tracking_raster, self.cloud, change, self._rng(2))
             self._snapshot = None
         self._reseed_time.took(pace.seconds() - began)
         return rays, samples
 
     def _choose_tiles(self, key: np.uint64) -> tuple[NDArray[np.int64], list[NDArray[np.uint8] | None]]:
-        """The views of this step, whose random bits ``key`` are, and which of their tiles."""
+        """The views of this step, and which of their tiles (None: all). key: random bits of the step."""
         s, n = self.settings, len(self._asked)
         slots = min(s.views_a_step, n)
         first = self.step * s.views_a_step
@@ -325,14 +322,14 @@ class SplatField:
         return picked, wanted
 
     def _one_step(self, progress: float) -> tuple[float, int, int, int]:
-        """One optimiser step; returns its mean squared error, pixels, pairs of a Gaussian and a tile, and
-        how many tiles and gradients were not finite. progress: of the fit, in [0, 1]."""
+        """One optimizer step at ``progress`` of the fit, in [0, 1]; returns the mean squared error, pixels,
+        pairs of a Gaussian and a tile, and how many tiles and gradients were not finite."""
         s, box = self.settings, self.rig.box
         assert box is not None
         key = step_key(s.seed, self.step)
         picked, wanted = self._choose_tiles(key)
         cams, cloud = np.ascontiguousarray(self._cams[picked]), self.cloud
-        gaussians = cloud.gaussians(s.harmonics)
+        gaussians = cloud.gaussians()
         raster = self._raster
         raster.project_and_bin(cams, gaussians, wanted)
         tasks = raster.tasks()
@@ -351,7 +348,8 @@ class SplatField:
         dropped = np.zeros(-(-len(cloud) // BLOCK) + 1, np.int64)
         self.pool.run(
             adam_step, cams, gaussians, len(cloud), raster.projected, raster.lists.own_first,
-            raster.lists.own_count, raster.sums, cloud.optimizer_state(), self._adam_parameters(progress), dropped,
+            raster.lists.own_count, raster.sums, cloud.optimizer_state(), self._adam_parameters(progress),
+            dropped,
         )  # fmt: skip
         if s.planar:
             self._planar_step(int(picked[0]))
@@ -364,20 +362,18 @@ class SplatField:
         return square / (3 * pixels), pixels, pairs, int(broken) + int(dropped.sum())
 
     def _planar_step(self, view: int) -> None:
-        """The part of a step that is for surfaces; view: which to take normals from."""
+        """Flatten the Gaussians, and align them with the normals that ``view`` shows."""
         from edge_server.fields.splat.planar import align, flatten
 
         s = self.settings
         flatten(self.cloud, s)
         if s.align and self.step % s.align_every == 0:
             camera = np.ascontiguousarray(self._cams[[view]])
-            self._render_raster.project_and_bin(
-                camera, self.cloud.gaussians(s.harmonics), [None], differentiate=False
-            )
-            align(self.cloud, s, self._render_raster, self.pool, camera[0], self._views[view].intrinsics)
+            self._render_raster.project_and_bin(camera, self.cloud.gaussians(), [None], differentiate=False)
+            align(self.cloud, s, self._render_raster, camera[0], self._views[view].intrinsics)
 
     def _finish_step(self) -> None:
-        """A step is made: grow and prune when it is time, after a look at every view at least."""
+        """Count a step; densify when it is time, but not before every view has had a step."""
         s = self.settings
         self.step += 1
         if self.step - self._grown >= max(s.densify_every, -(-len(self._asked) // s.views_a_step)):
@@ -398,25 +394,24 @@ class SplatField:
             beta2=np.float32(BETA2),
             epsilon=np.float32(s.epsilon),
             fade=np.float32(s.fade),
-            largest=np.float32(s.largest),
-            thinnest=np.float32(np.log(s.aspect)),
+            largest=s.scale_bounds[0],
+            thinnest=s.scale_bounds[1],
         )
 
     def _grow(self) -> None:
         s = self.settings
-        self._protect_unobserved()
+        self._protect_unsupervised()
         densify_and_prune(self.cloud, s, float(self._data.size[:, 0].mean()), self._rng(5))
         if s.opacity_reset and self.step // s.opacity_reset != self._grown // s.opacity_reset:
-            # To a tenth: what pictures need grows back, what they do not is pruned (Kerbl et al. 5.2).
+            # To a tenth: what the views need recovers, the rest is pruned (Kerbl et al. 5.2).
             self.cloud.params[:, OPACITY] = np.minimum(self.cloud.params[:, OPACITY], np.float32(-2.2))
         self._grown = self.step
-        if len(self.cloud) == 0:  # everything faded away: begin again rather than never
+        if len(self.cloud) == 0:  # everything was pruned: start again
             self._seed()
 
-    def _protect_unobserved(self) -> None:
-        """What shows in tiles with pixels of weight 0, or in the last picture of a camera that is not among
-        the views now, counts as seen: that no picture needed it means nothing while those that may are not
-        asked."""
+    def _protect_unsupervised(self) -> None:
+        """Count as seen what is visible in tiles with pixels of weight 0, or in the last view of a camera
+        without a current view: that a Gaussian has no gradient there does not mean that it is not needed."""
         cloud, box = self.cloud, self.rig.box
         assert box is not None
         tiles = unweighted_tiles(self._data)
@@ -430,14 +425,12 @@ class SplatField:
             camera_rows([v.camera_to_world for v in others], [v.intrinsics for v in others], box),
         ])  # fmt: skip
         wanted = [tiles[k] for k in slots] + [None] * len(others)
-        self._render_raster.project_and_bin(
-            cams, cloud.gaussians(self.settings.harmonics), wanted, differentiate=False
-        )
+        self._render_raster.project_and_bin(cams, cloud.gaussians(), wanted, differentiate=False)
         shows = (self._render_raster.lists.own_count[: len(cams), : len(cloud)] > 0).any(axis=0)
         cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
 
     def _seed(self) -> None:
-        """First Gaussians, from the views at hand."""
+        """Seed the first Gaussians from the current views."""
         assert self.rig.box is not None
         s = self.settings
         first, weight = min(s.start, s.gaussians), self._data.weight
@@ -446,15 +439,14 @@ class SplatField:
         )
 
     def _repair(self) -> None:
-        """Bring back what is not finite; such Gaussians become invisible and are pruned."""
-        s = self.settings
-        clamp_gaussians(self.cloud.params, np.float32(s.largest), np.float32(np.log(s.aspect)))
+        """Replace what is not finite; such Gaussians become invisible and are pruned."""
+        clamp_gaussians(self.cloud.params, *self.settings.scale_bounds)
         for array in (self.cloud.m, self.cloud.v):
             np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], GaussianCloud]:
-    """The facts and the Gaussians in ``state``; ValueError unless a field with ``settings`` made them."""
+    """The metadata and the Gaussians in ``state``. ValueError: they do not fit ``settings``."""
     meta = unpack_meta(settings, state, "splat", ("harmonics",))
     empty = GaussianCloud.empty(settings)
     count = len(state["params"]) if "params" in state else 0
@@ -471,6 +463,7 @@ def _unpack(settings: SplatSettings, state: Arrays) -> tuple[dict[str, Any], Gau
 
 
 def _equal(a: Sequence[View], b: Sequence[View]) -> bool:
+    """Whether two sets of views have the same content."""
     return len(a) == len(b) and all(
         x is y
         or (x.camera == y.camera and x.shows_ns == y.shows_ns and x.intrinsics == y.intrinsics

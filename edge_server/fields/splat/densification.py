@@ -56,9 +56,10 @@ class GaussianCloud:
     def __len__(self) -> int:
         return len(self.params)
 
-    def gaussians(self, harmonics: int) -> Gaussians:
-        """The arrays that are projected, not copied."""
-        return Gaussians(self.params, harmonics, self.velocity)
+    def gaussians(self, which: slice | NDArray[np.int64] = slice(None)) -> Gaussians:
+        """The arrays that are projected: of all Gaussians and not copied, or copies for some."""
+        harmonics = (self.params.shape[1] - BASE) // 3 + 1
+        return Gaussians(self.params[which], harmonics, self.velocity[which])
 
     def optimizer_state(self) -> OptimizerState:
         """The arrays that a step updates beside ``params``, not copied."""

@@ -1,9 +1,9 @@
-"""The Gaussian field with gsplat's CUDA rasteriser (Ye et al. 2024): ``pip install "freshfield[cuda]"``.
+"""The Gaussian field with gsplat's CUDA rasterizer (Ye et al. 2024): ``pip install "freshfield[cuda]"``.
 
-Everything but the step's gradient is ``SplatField``'s: seeds, growth, motion, state, and the pictures of
-snapshots, which the CPU kernels render. Gaussians stay in host memory and are copied for each step, which
-costs little beside a rasterisation. Its code around the rasteriser is tested on CPUs with the torch oracle
-in gsplat's place; with gsplat itself, on a GPU, it has not been run.
+Only the gradient of a step is computed here; ``SplatField`` does the rest: seeding, densification, motion,
+state, and snapshots, which the CPU kernels render. Gaussians stay in host memory and are copied a step, at
+little cost beside a rasterization. The code around the rasterizer is tested on CPUs with the torch
+oracle in place of gsplat; with gsplat itself, on a GPU, it has not been run.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 class GsplatField(SplatField):
     """``SplatField`` whose gradients come from ``rasterize``: gsplat's ``rasterization``, or one like it.
 
-    Whole pictures, pinhole cameras and squared or absolute errors only. Not deterministic to the last bit:
-    gsplat adds gradients up in the order its threads come.
+    Whole images, pinhole cameras and squared or absolute errors only. Not deterministic to the last bit:
+    gsplat adds up gradients in whatever order its threads finish.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class GsplatField(SplatField):
         return square / (3 * max(pixels, 1)), pixels, int(drawn.sum()), lost
 
     def _residuals(self, params: Tensor, k: int) -> tuple[Tensor, dict[str, Any]]:
-        """Differences (H, W, 3) of view k from what is rendered, and what gsplat tells of it."""
+        """Rendered minus true colors (H, W, 3) of view k, and gsplat's ``info``."""
         view, cam = self._views[k], torch.tensor(self._cams[k], device=self._device)
         lens = view.intrinsics
         pose = torch.eye(4, device=self._device)
@@ -104,9 +104,9 @@ class GsplatField(SplatField):
         )
         direction = torch.nn.functional.normalize(params[:, :3] - cam[ORIGIN:LENS], dim=-1)
         count = self.settings.harmonics
-        shares = params[:, COLOR + 3 :].view(len(params), count - 1, 3)
-        shades = params[:, COLOR : COLOR + 3]
-        shades = shades + (shares * harmonics_of(count, direction)[..., None]).sum(dim=1)
+        coefficients = params[:, COLOR + 3 :].view(len(params), count - 1, 3)
+        colors = params[:, COLOR : COLOR + 3]
+        colors = colors + (coefficients * harmonics_of(count, direction)[..., None]).sum(dim=1)
         back = torch.tensor(self.rig.background(), device=self._device)
         if self.settings.background == "random":
             back = torch.tensor(self._rng(6).random(3), dtype=torch.float32, device=self._device)
@@ -115,7 +115,7 @@ class GsplatField(SplatField):
             quats=params[:, QUATERNION:OPACITY],
             scales=params[:, SCALE:QUATERNION].clamp(SCALE_LOW, SCALE_HIGH).exp(),
             opacities=params[:, OPACITY].clamp(-RAW_OPACITY, RAW_OPACITY).sigmoid(),
-            colors=shades,
+            colors=colors,
             viewmats=pose[None],
             Ks=camera[None],
             width=lens.width,
@@ -131,7 +131,7 @@ class GsplatField(SplatField):
         return color[0] - target, info
 
     def _weight(self, k: int) -> Tensor:
-        """The weights of view k's pixels, (H, W, 1), or one 1 for all."""
+        """The weights of view k's pixels, (H, W, 1), or (1,) where all are 1."""
         weight, first = self._data.weight, self._data.first
         if weight.size == 0:
             return torch.ones(1, device=self._device)
@@ -140,20 +140,20 @@ class GsplatField(SplatField):
         return torch.tensor(share, device=self._device)
 
     def _record_statistics(self, info: dict[str, Any], width: float) -> Tensor:
-        """Keep what growth goes by; returns which Gaussians were drawn, (N,)."""
+        """Record the statistics for densification; returns which Gaussians were drawn, (N,)."""
         radii = info["radii"][0]
-        radii = radii.amax(dim=-1) if radii.ndim == 2 else radii  # newer versions give one for each axis
+        radii = radii.amax(dim=-1) if radii.ndim == 2 else radii  # newer versions have one for each axis
         drawn = radii > 0
-        pull = info["means2d"].grad
-        if pull is not None:
-            self.cloud.slope += (pull[0].norm(dim=-1) * width * drawn).cpu().numpy()
+        gradient = info["means2d"].grad
+        if gradient is not None:
+            self.cloud.slope += (gradient[0].norm(dim=-1) * width * drawn).cpu().numpy()
         self.cloud.looks += drawn.float().cpu().numpy()
         # gsplat's radius is three standard deviations.
         np.maximum(self.cloud.reach, (radii.float() / (3.0 * width)).cpu().numpy(), out=self.cloud.reach)
         return drawn.float()
 
     def _adam(self, g: NDArray[np.float32], drawn: NDArray[np.bool_], progress: float) -> None:
-        """``kernels.splat_update``'s rule, in numpy."""
+        """The rule of ``kernels.optimizer_step``, in numpy."""
         rule, cloud = self._adam_parameters(progress), self.cloud
         g = np.clip(np.nan_to_num(g, nan=0.0), -GRADIENT_LIMIT, GRADIENT_LIMIT)
         if rule.fade > 0:

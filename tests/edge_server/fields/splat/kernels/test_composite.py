@@ -7,9 +7,7 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.thread_pool import CallerPool
-from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.buffers import RasterBuffers, camera_rows
+from edge_server.fields.splat.buffers import camera_rows
 from edge_server.fields.splat.kernels.composite import (
     PIXELS,
     SAVED,
@@ -36,11 +34,10 @@ from edge_server.fields.splat.kernels.project import (
     RED,
     SCALE,
     TILE,
-    Gaussians,
 )
 from freshfield.geometry import Pinhole, look_at
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned
 
-BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
 LENS = Pinhole(48, 40, 50.0, 50.0, 24.0, 20.0)
 
 
@@ -50,14 +47,14 @@ def _sorted(lists, t, projected, y0, strip_pairs, count):
 
 
 @njit
-def _laid(strip_pairs, count, owner, projected, tile, saved):
+def _composite(strip_pairs, count, owner, projected, tile, saved):
     return composite(
         strip_pairs, count, owner, projected, np.float32(0.0), np.float32(0.0), tile, 0, saved, SAVED
     )
 
 
 @njit
-def _lifted(strip_pairs, count, owner, projected, slopes, saved, sums):
+def _composite_backward(strip_pairs, count, owner, projected, slopes, saved, sums):
     composite_backward(
         strip_pairs, count, owner, projected, np.float32(0.0), np.float32(0.0), slopes, 0, saved, sums
     )
@@ -84,8 +81,7 @@ def test_every_strip_that_has_a_pixel_of_a_gaussian_lists_it_once_and_in_order()
     params[:, SCALE:QUATERNION] = np.log(rng.uniform(0.01, 0.25, (150, 3)))
     params[:, OPACITY] = rng.uniform(-4.0, 4.0, 150)
     cam = camera_rows([look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))], [LENS], BOX)
-    raster = RasterBuffers(CallerPool())
-    raster.project_and_bin(cam, Gaussians(params, 1, np.zeros((150, 3), np.float32)), [None])
+    raster = binned(cam, params)
     lists = raster.lists
     longest, listed, needed = int(lists.longest[0].max()), 0, 0
     assert longest > 20
@@ -110,11 +106,11 @@ def test_every_strip_that_has_a_pixel_of_a_gaussian_lists_it_once_and_in_order()
     assert needed <= listed < 1.3 * needed  # a box round an ellipse, not the whole tile
 
 
-def test_nothing_is_laid_where_it_is_dark() -> None:
+def test_nothing_is_composite_where_it_is_dark() -> None:
     opaque = np.stack([_row(0.98, (0.0, 0.0, 0.0))] * 8)
     tile, saved = _dark_tile(), np.full(8 * SAVED, 7.0, np.float32)
     strip_pairs = np.arange(8, dtype=np.int32)
-    laid = _laid(strip_pairs, 8, strip_pairs, opaque, tile, saved)
+    laid = _composite(strip_pairs, 8, strip_pairs, opaque, tile, saved)
     assert laid == 3  # a fiftieth of the light raster each: 8e-6 is left
     assert (tile[:STRIP] < STOP).all() and (tile[STRIP:PIXELS] == 1.0).all()
     assert (saved[3 * SAVED :] == 7.0).all()
@@ -122,16 +118,16 @@ def test_nothing_is_laid_where_it_is_dark() -> None:
     # One by one they make the same picture, to the last bit: what comes after is laid, and changes nothing.
     again = _dark_tile()
     for k in range(8):
-        _laid(strip_pairs[k : k + 1], 1, strip_pairs, opaque, again, saved)
+        _composite(strip_pairs[k : k + 1], 1, strip_pairs, opaque, again, saved)
     np.testing.assert_array_equal(tile, again)
 
 
 def test_what_is_hidden_has_no_gradient() -> None:
     rows = np.stack([_row(0.999, (0.0, 0.0, 0.0))] * 5)
     strip_pairs, tile, saved = np.arange(5, dtype=np.int32), _dark_tile(), np.zeros(5 * SAVED, np.float32)
-    laid = _laid(strip_pairs, 5, strip_pairs, rows, tile, saved)
+    laid = _composite(strip_pairs, 5, strip_pairs, rows, tile, saved)
     slopes, sums = np.ones(4 * PIXELS, np.float32), np.zeros((5, SUMS), np.float32)
-    _lifted(strip_pairs, laid, strip_pairs, rows, slopes, saved, sums)
+    _composite_backward(strip_pairs, laid, strip_pairs, rows, slopes, saved, sums)
     assert (sums[:laid, 6:] > 0.0).all() and (sums[laid:] == 0.0).all()
     assert (sums[:laid, :6] == 0.0).all()  # as opaque as they can be: no gradient of their opacity
 
@@ -142,11 +138,11 @@ def test_a_broken_row_leaves_light_and_the_others_sums_finite(column: int, broke
     rows = np.stack([_row(0.6), _row(0.7), _row(0.5)])
     rows[1, column] = broken
     strip_pairs, tile, saved = np.arange(3, dtype=np.int32), _dark_tile(), np.zeros(3 * SAVED, np.float32)
-    laid = _laid(strip_pairs, 3, strip_pairs, rows, tile, saved)
+    laid = _composite(strip_pairs, 3, strip_pairs, rows, tile, saved)
     assert laid == 3 and np.isfinite(tile).all()
     assert (tile[:PIXELS] >= 0.0).all() and (tile[:PIXELS] <= 1.0).all()
     slopes, sums = np.ones(4 * PIXELS, np.float32), np.zeros((3, SUMS), np.float32)
-    _lifted(strip_pairs, laid, strip_pairs, rows, slopes, saved, sums)
+    _composite_backward(strip_pairs, laid, strip_pairs, rows, slopes, saved, sums)
     assert np.isfinite(sums[[0, 2]]).all()
 
 

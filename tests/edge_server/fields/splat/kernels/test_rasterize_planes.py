@@ -65,6 +65,15 @@ def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
     return raster, gaussians, cams[0]
 
 
+def blended(raster: RasterBuffers, planes: np.ndarray) -> np.ndarray:
+    out = np.zeros((24, 24, 5), np.float32)
+    POOL.run(
+        render_planes, 0, 3, 3, 24, 24, raster.projected, raster.lists, planes, raster.memory,
+        raster.saved, out,
+    )  # fmt: skip
+    return out
+
+
 def tilted(angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -74,7 +83,7 @@ def tilted(angle: float) -> np.ndarray:
 def test_the_depth_of_a_plane_is_where_the_rays_meet_it(angle):
     tilt = tilted(angle)
     raster, gaussians, camera = looked(flat(400, tilt))
-    depth, opacity = plane_depth(raster, POOL, gaussians, camera, LENS)
+    depth, opacity = plane_depth(raster, gaussians, camera, LENS)
     origin, rays = world_rays(LENS, POSE)
     exact = -(origin @ tilt[:, 2]) / (rays @ tilt[:, 2])
     solid = opacity > 0.9
@@ -88,21 +97,7 @@ def test_the_kernel_blends_as_a_loop_over_pixels_does():
     params[:, :3] += rng.normal(0, 0.2, (40, 3))
     raster, gaussians, camera = looked(params)
     planes = gaussian_planes(gaussians, camera)
-    out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(
-        render_planes,
-        0,
-        3,
-        3,
-        24,
-        24,
-        raster.projected,
-        raster.lists,
-        planes,
-        raster.memory,
-        raster.saved,
-        out,
-    )
+    out = blended(raster, planes)
     lists = raster.lists
     for y, x in [(3, 5), (12, 12), (20, 9)]:
         tile, left, total = (y // 8) * 3 + x // 8, 1.0, np.zeros(5)
@@ -125,14 +120,10 @@ def test_what_pixels_tell_adds_up_to_what_they_show():
     normals[..., 3] = 1.0
     normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
     POOL.run(
-        accumulate_normals, 0, 3, 3, 24, 24, raster.projected, raster.lists, normals, raster.memory, raster.saved,
-        normal_sums,
+        accumulate_normals, 0, 3, 3, 24, 24, raster.projected, raster.lists, normals, raster.memory,
+        raster.saved, normal_sums,
     )  # fmt: skip
-    out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(
-        render_planes, 0, 3, 3, 24, 24, raster.projected, raster.lists, gaussian_planes(gaussians, camera),
-        raster.memory, raster.saved, out,
-    )  # fmt: skip
+    out = blended(raster, gaussian_planes(gaussians, camera))
     pairs = int(raster.lists.needed[0])
     np.testing.assert_allclose(normal_sums[:pairs, 3].sum(), out[..., 4].sum(), rtol=1e-4)
     np.testing.assert_allclose(
@@ -155,7 +146,7 @@ def test_gaussians_turn_to_the_surface_they_show_and_get_flat():
     for _ in range(12):
         flatten(cloud, settings)
         raster, _, camera = looked(cloud.params)
-        align(cloud, settings, raster, POOL, camera, LENS)
+        align(cloud, settings, raster, camera, LENS)
         off.append(_degrees(cloud, tilt))
     assert off[-1] < 0.4 * off[0]
     scale = cloud.params[:, SCALE : SCALE + 3]
@@ -190,14 +181,14 @@ def test_hard_cases_stay_finite():
     params[1, SCALE : SCALE + 3] = -11.0
     params[2, :3] = POSE[:3, 3]  # in the camera
     raster, gaussians, camera = looked(params)
-    depth, opacity = plane_depth(raster, POOL, gaussians, camera, LENS)
+    depth, opacity = plane_depth(raster, gaussians, camera, LENS)
     assert np.isfinite(depth).all() and np.isfinite(opacity).all()
     cloud = GaussianCloud.new(params.copy())
-    align(cloud, SplatSettings(align=1.0), raster, POOL, camera, LENS)
+    align(cloud, SplatSettings(align=1.0), raster, camera, LENS)
     flatten(cloud, SplatSettings(flatten=1.0))
     assert np.isfinite(cloud.params).all()
     empty, gaussians, camera = looked(params[:0])
-    depth, opacity = plane_depth(empty, POOL, gaussians, camera, LENS)
+    depth, opacity = plane_depth(empty, gaussians, camera, LENS)
     assert not depth.any() and not opacity.any()
 
 
