@@ -260,8 +260,8 @@ def _floors_of_splat(
     """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
 
     gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; strips: in which these change a
-    pixel. Operations count as if that were all there is: what ``project`` and ``adam_step`` do is mostly to move
-    numbers so that they lie side by side, and ``bin_tiles`` to sort."""
+    pixel. Operations count as if that were all there is: what ``project`` and ``adam_step`` do is mostly to
+    move numbers so that they lie side by side, and ``bin_tiles`` to sort."""
     operations, divisions_ms = limits["operations_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
     copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
     parameters = BASE

@@ -29,7 +29,7 @@ def _spread(u):
 
 @part
 def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
-    """Where camera ``load_camera`` sees each cell of a row (its places: float32 (3, cells)): the pixel's number,
+    """Where camera ``cam`` sees each cell of a row (its places: float32 (3, cells)): the pixel's number,
     ``nowhere`` if it is not in the picture, to pixels: int32 (cells,)."""
     for k in range(pixels.size):
         x, y, z = row[0, k] - cam[ORIGIN], row[1, k] - cam[ORIGIN + 1], row[2, k] - cam[ORIGIN + 2]

@@ -146,7 +146,7 @@ def project_backward(cam, s):
         s[at + BLOCK] += d1 if seen & (raw1 > low) & (raw1 < high) else _F0
         s[at + 2 * BLOCK] += d2 if seen & (raw2 > low) & (raw2 < high) else _F0
         a0, a1, a2, b0, b1, b2 = a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2
-        # rotation: T^T dU, then the quaternion and its normalisation
+        # rotation: T^T dU, then the quaternion and its normalization
         d0, d1, d2 = t0 * a0 + t3 * b0, t0 * a1 + t3 * b1, t0 * a2 + t3 * b2
         d3, d4, d5 = t1 * a0 + t4 * b0, t1 * a1 + t4 * b1, t1 * a2 + t4 * b2
         d6, d7, d8 = t2 * a0 + t5 * b0, t2 * a1 + t5 * b1, t2 * a2 + t5 * b2

@@ -1,4 +1,4 @@
-"""The CUDA field's own code, with the torch oracle in the place of gsplat; no GPU is needed."""
+"""The gsplat field's own code, with the torch oracle in place of gsplat; needs no GPU."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def rasterize(
     *, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor,
     Ks: Tensor, width: int, height: int, near_plane: float, backgrounds: Tensor, packed: bool,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
-    """What gsplat's ``rasterization`` promises, for one camera, from the oracle's parts."""
+    """gsplat's ``rasterization`` for one camera, made of the oracle's parts."""
     assert not packed and len(viewmats) == len(Ks) == len(backgrounds) == 1
     view, k = viewmats[0], Ks[0]
     x, y, z = (means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
@@ -84,7 +84,7 @@ def test_it_grows_saves_and_resumes_on_the_cpu() -> None:
     np.testing.assert_array_equal(a, b)
 
 
-def test_what_it_cannot_do_is_said() -> None:
+def test_unsupported_cameras_and_losses_are_refused() -> None:
     bent = replace(VIEWS[0].intrinsics, distortion=(0.01, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="pinhole cameras only"):
         GsplatField(TINY, rasterize, "cpu").fit([replace(VIEWS[0], intrinsics=bent)], Budget(steps=1))
