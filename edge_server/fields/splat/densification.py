@@ -41,7 +41,6 @@ class GaussianCloud:
 
     @classmethod
     def new(cls, params: NDArray[np.float32]) -> GaussianCloud:
-        """New Gaussians with these parameters."""
         n = len(params)
         slope, looks, reach = (np.zeros(n, np.float32) for _ in range(3))
         age, guest, velocity = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros((n, 3), np.float32)
@@ -50,7 +49,6 @@ class GaussianCloud:
 
     @classmethod
     def empty(cls, settings: SplatSettings) -> GaussianCloud:
-        """No Gaussians."""
         return cls.new(np.zeros((0, BASE + 3 * (settings.harmonics - 1)), np.float32))
 
     def __len__(self) -> int:
@@ -70,7 +68,6 @@ class GaussianCloud:
         self._replace({f.name: np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)})
 
     def add(self, new: GaussianCloud) -> None:
-        """Append other Gaussians."""
         self._replace({
             f.name: np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(self)
         })  # fmt: skip

@@ -110,7 +110,7 @@ class _StripBuilder:
             self.builder.store(vector.value, variable)
 
     def pixels(self, x0: Any, y0: Any) -> tuple[Vector, Vector]:
-        """x and y of the centers of the strip's pixels."""
+        """Their centers, x and y."""
         across = Vector(self.builder, constant(*(k % TILE + 0.5 for k in range(STRIP))))
         down = Vector(self.builder, constant(*(k // TILE + 0.5 for k in range(STRIP))))
         return across + Vector.broadcast(self.builder, x0), down + Vector.broadcast(self.builder, y0)

@@ -122,7 +122,6 @@ def clamp_gaussian(params, i, largest, thinnest):
 
 @kernel
 def clamp_gaussians(params, largest, thinnest):
-    """``clamp_gaussian`` for every Gaussian."""
     for i in range(params.shape[0]):
         clamp_gaussian(params, i, largest, thinnest)
 

@@ -321,10 +321,7 @@ def compare_tiles(
 ):
     """Write each pixel's color error, the largest difference of a channel, for the tiles of ``tasks``.
 
-    picked: int64 (B,), the view of each camera slot.
-    tasks: int32 (M, 2), slot and tile.
-    error: float32 (P,), all pixels of ``views``.
-    """
+    error: float32 (P,), for all pixels of ``views``; other arguments as in ``train_tiles``."""
     s, store = memory[worker], saved[worker]
     strip_pairs, count = strip_scratch(lists)
     while True:

@@ -52,7 +52,6 @@ class Vector:
         return cls(builder, builder.shuffle_vector(first, undefined, ir.Constant(_INTEGERS, [0] * LANES)))
 
     def store(self, pointer: Any) -> None:
-        """Store the 16 numbers at a float pointer."""
         self.builder.store(self.value, self.builder.bitcast(pointer, _VECTOR.as_pointer())).align = 4
 
     def _binary(self, operation: str, other: Vector | float) -> Vector:
@@ -72,7 +71,6 @@ class Vector:
         return self._binary("fdiv", other)
 
     def one_minus(self) -> Vector:
-        """1 - this."""
         return Vector(self.builder, constant(1.0)) - self
 
     def greater_equal(self, bound: float) -> Any:
@@ -132,12 +130,10 @@ def require_contiguous(*kinds: Any) -> None:
 
 
 def mask_and(builder: Any, a: Any, b: Any) -> Any:
-    """The lanes that are set in both masks."""
     return builder.and_(a, b)
 
 
 def any_lane(builder: Any, mask: Any) -> Any:
-    """Whether a mask is set in any lane."""
     bits = ir.IntType(LANES)
     return builder.icmp_unsigned("!=", builder.bitcast(mask, bits), bits(0))
 

@@ -42,7 +42,6 @@ class Evidence(NamedTuple):
 
     @classmethod
     def zeros(cls, count: int) -> Evidence:
-        """Of ``count`` Gaussians, to be written."""
         return cls(*(np.zeros(count, np.int32) for _ in range(3)), np.zeros(count, np.float32))
 
 
