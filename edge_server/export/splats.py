@@ -25,7 +25,7 @@ from edge_server.fields.splat.kernels.project import (
     SCALE_LOW,
     Gaussians,
 )
-from edge_server.fields.splat.planar import directed
+from edge_server.fields.splat.planar import unit_quaternions
 
 Y0 = 0.28209479177387814
 # Signs of harmonics 1 to 8: Kerbl et al. negate those of odd order.
@@ -57,7 +57,7 @@ def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
             np.clip(p[:, SCALE:QUATERNION], SCALE_LOW, SCALE_HIGH) + np.log(box.radius_m),
         ),
     }
-    turn = directed(gaussians.params)
+    turn = unit_quaternions(gaussians.params)
     columns |= {f"rot_{k}": turn[:, k] for k in range(4)}
     table = np.zeros(len(p), dtype=[(name, "<f4") for name in columns])
     for name, values in columns.items():

@@ -8,7 +8,7 @@ the youngest views say where things are, the others what stands around them. Wha
 bit for bit.
 
 A freshened view says which instant it shows (``View.carried_to_ns``), and fields go by that: the splat's own
-tracking (``fields.splat_motion``) takes it as seen then and does not move it on a second time, and
+tracking (``fields.splat.motion``) takes it as seen then and does not move it on a second time, and
 ``age_tau_ms`` and ``mask_stale_ms`` do not doubt it for an age that it no longer has. Capture times, and so
 all ages that are reported, stay as they were.
 """

@@ -116,7 +116,7 @@ def test_giants_everywhere_cost_bounded_memory() -> None:
     field.fit(VIEWS, Budget(steps=60))
     healthy(field, VIEWS)
     tiles = (24 // 8) ** 2
-    assert field._passes.lists.pair.shape[1] <= 4 * max(TINY.gaussians, tiles * TINY.gaussians)
+    assert field._raster.lists.pair.shape[1] <= 4 * max(TINY.gaussians, tiles * TINY.gaussians)
 
 
 def test_a_thousand_updates_do_not_drift_or_grow() -> None:

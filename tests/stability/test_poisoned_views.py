@@ -18,11 +18,11 @@ from camera_node.synthetic import make_scene
 from edge_server.fields import Budget, View
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.view_outliers import MOST_REFUSALS
-from edge_server.fields.splat import field as splat
-from edge_server.fields.splat.densification import Cloud
+from edge_server.fields.splat import cpu_field as splat
+from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.motion import Moved
+from edge_server.fields.splat.motion import SceneChange
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import picture, psnr, ring
 from tests.edge_server.fields.small import CLASSES, NAMES, POISONED, every_field
@@ -272,10 +272,10 @@ def test_what_moved_beside_a_wrong_picture_is_not_known(monkeypatch: pytest.Monk
     """Neither a refused view nor the one after it has a say in what moves; the others always have."""
     said: list[list[bool]] = []
 
-    def renew(settings: Any, passes: Any, cloud: Any, seen: Moved, rng: Any) -> None:
+    def reseed(settings: Any, passes: Any, cloud: Any, seen: SceneChange, rng: Any) -> None:
         said.append([mask is not None for mask in seen.moved])
 
-    monkeypatch.setattr(splat, "renew", renew)
+    monkeypatch.setattr(splat, "reseed", reseed)
     _in_motion.__wrapped__(_noise)
     assert [s[BAD] for s in said[:10]] == [True] * 3 + [False] * 4 + [True] * 3
     assert all(s[k] for s in said[:10] for k in range(len(SEEN)) if k != BAD)
@@ -303,8 +303,8 @@ def test_what_only_a_refused_view_shows_is_kept(asked: bool) -> None:
     nowhere = params.copy()
     nowhere[:, :3] = field.view_store.box.normalise(np.array([0.0, 0.0, -40.0]))  # under the feet of all
     field.cloud.keep(np.arange(len(field.cloud)) >= 8)
-    field.cloud.add(Cloud.of(params))
-    field.cloud.add(Cloud.of(nowhere))
+    field.cloud.add(GaussianCloud.new(params))
+    field.cloud.add(GaussianCloud.new(nowhere))
     for number in range(2, 10):
         update(number, *([_noise(away, number)] if asked else []))
     assert field.view_store.memory["away"].refusals_left == (MOST_REFUSALS - 8 if asked else MOST_REFUSALS)

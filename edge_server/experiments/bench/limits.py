@@ -40,8 +40,8 @@ from edge_server.fields.common.training_schedule import active_levels
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
 from edge_server.fields.splat.field import SplatField
-from edge_server.fields.splat.kernels.composite import KEPT, STRIP, STRIPS, SUMS
-from edge_server.fields.splat.kernels.project import BASE, HALF_HEIGHT, MY, TILE
+from edge_server.fields.splat.kernels.composite import SAVED, STRIP, STRIPS, SUMS
+from edge_server.fields.splat.kernels.project import BASE, HALF_HEIGHT, MEAN_Y, TILE
 from edge_server.fields.splat.settings import SplatSettings
 
 TABLES_MB = (1, 4, 64)
@@ -196,14 +196,14 @@ def _counted(field: SplatField) -> tuple[int, int, int, int]:
     """Of a field's last step, of one picture: Gaussians, those in the picture, pairs of one with a tile, and
     the strips that pairs which changed a pixel reach: the others are hidden. Some of these strips may have
     been dark already, so that the floor is a little high where much is hidden."""
-    passes, count = field._passes, len(field.cloud)
-    lists, pairs = passes.lists, int(passes.lists.needed[0])
-    used = (passes.sums[0, :pairs] != 0.0).any(axis=-1)
-    rows = passes.projected[0, lists.owner[0, :pairs][used]]
+    raster, count = field._raster, len(field.cloud)
+    lists, pairs = raster.lists, int(raster.lists.needed[0])
+    used = (raster.sums[0, :pairs] != 0.0).any(axis=-1)
+    rows = raster.projected[0, lists.owner[0, :pairs][used]]
     row = np.zeros(pairs, np.int64)  # of tiles, of each pair
-    lengths = np.diff(lists.first[0, : int(passes.columns[0] * passes.rows[0]) + 1])
-    row[lists.pair[0, :pairs]] = np.repeat(np.arange(len(lengths)) // passes.columns[0], lengths)
-    middle = rows[:, MY] - TILE * row[used] - 0.5
+    lengths = np.diff(lists.first[0, : int(raster.columns[0] * raster.rows[0]) + 1])
+    row[lists.pair[0, :pairs]] = np.repeat(np.arange(len(lengths)) // raster.columns[0], lengths)
+    middle = rows[:, MEAN_Y] - TILE * row[used] - 0.5
     top, bottom = (
         np.clip(edge, 0, TILE - 1).astype(np.int64) * STRIPS // TILE
         for edge in (np.ceil(middle - rows[:, HALF_HEIGHT]), middle + rows[:, HALF_HEIGHT])
@@ -260,8 +260,8 @@ def _floors_of_splat(
     """For the four kernels of a step, milliseconds at the machine's limits of what one picture asks for.
 
     gaussians: in the cloud; seen: in the picture; pairs: of one with a tile; strips: in which these change a
-    pixel. Operations count as if that were all there is: what ``project`` and ``update`` do is mostly to move
-    numbers so that they lie side by side, and ``deal`` to sort."""
+    pixel. Operations count as if that were all there is: what ``project`` and ``adam_step`` do is mostly to
+    move numbers so that they lie side by side, and ``bin_tiles`` to sort."""
     operations, divisions_ms = limits["operations_g_per_s"] * 1e6, limits["divisions_g_per_s"] * 1e6
     copied, added = limits["copies_gb_per_s"] * 1e6, limits[f"adds_{TABLES_MB[0]}mb_m_per_s"] * 1e3
     parameters = BASE
@@ -269,11 +269,11 @@ def _floors_of_splat(
         "train_tiles": {
             "arithmetic": strips * STRIP * (LAYING + LIFTING) / operations,
             "divisions": strips * STRIP / divisions_ms,
-            "copies": strips * KEPT * 4 / copied,  # written once, read once
+            "copies": strips * SAVED * 4 / copied,  # written once, read once
         },
         "project": {"arithmetic": gaussians * PROJECTING / operations},
-        "deal": {"moves": (seen * SORTING + pairs * DEALING) / added},
-        "update": {
+        "bin_tiles": {"moves": (seen * SORTING + pairs * DEALING) / added},
+        "adam_step": {
             "arithmetic": (seen * UPDATING + pairs * SUMS) / operations,
             "divisions": seen * 2 * parameters / divisions_ms,  # roots take as long
             "copies": pairs * SUMS * 4 / 2 / copied,

@@ -1,4 +1,4 @@
-"""What the kernels of the Gaussian field work on: cameras as rows, and buffers that grow as needed."""
+"""What the kernels of the Gaussian field work on: cameras as rows, and buffers that grow with the scene."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
-from edge_server.fields.splat.kernels.bin_tiles import Lists, deal
-from edge_server.fields.splat.kernels.composite import KEPT, PIXELS, STRIPS, SUMS
+from edge_server.fields.splat.kernels.bin_tiles import TileLists, bin_tiles
+from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SUMS
 from edge_server.fields.splat.kernels.project import (
     CAMERA,
+    FOOTPRINT,
     LENS,
     LIMITS,
     NEAR,
     ORIGIN,
     PROJECTED,
-    REACHED,
     SIZE,
     TILE,
     TIME,
@@ -30,14 +30,14 @@ from edge_server.fields.splat.kernels.project import (
 from edge_server.fields.splat.kernels.rasterize import ROWS
 from freshfield.geometry import Pinhole
 
-NEAR_LEAST = 0.01  # scene units
-PAIRS_MOST = 1 << 22  # a camera: what does not fit in is left out rather than memory exhausted
-_BORDER = 17
+MIN_NEAR = 0.01  # scene units
+MAX_PAIRS = 1 << 22  # pairs a camera: further Gaussians are left out, so that memory is bounded
+_BORDER = 17  # points on each edge of an image
 
 
 @lru_cache(maxsize=1024)
 def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
-    """1.3 times what the camera sees: lowest and highest x / z, y / z of rays through the picture's edge."""
+    """1.3 times the field of view: lowest and highest x / z, then y / z, of rays through the image's edge."""
     u, v = np.linspace(0.0, camera.width, _BORDER), np.linspace(0.0, camera.height, _BORDER)
     edge = np.concatenate([
         np.stack(np.broadcast_arrays(u, y), axis=-1) for y in (0.0, float(camera.height))
@@ -52,7 +52,7 @@ def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
 
 @lru_cache(maxsize=8)
 def ray_lengths(camera: Pinhole) -> NDArray[np.float32]:
-    """float32 (H, W): length of each pixel's ray per unit of depth along the optical axis."""
+    """float32 (H, W): length of each pixel's ray per unit of depth along the optical axis (z)."""
     return (1.0 / np.maximum(camera.rays()[..., 2], 1e-6)).astype(np.float32)
 
 
@@ -62,8 +62,11 @@ def camera_rows(
     box: SceneBox,
     times_s: Sequence[float] | None = None,
 ) -> NDArray[np.float32]:
-    """Cameras in scene units as the kernels read them, float32 (B, CAMERA). times_s: when each picture was
-    taken, from the instant the Gaussians stand for (none: at that instant)."""
+    """Cameras in scene units as the kernels read them, float32 (B, CAMERA).
+
+    poses, lenses: camera-to-world (4, 4) in meters, and intrinsics, of each camera.
+    times_s: when each image was taken, from the instant of the Gaussians' parameters; None: at that instant.
+    """
     rows = np.zeros((len(poses), CAMERA), np.float32)
     for row, pose, lens in zip(rows, poses, lenses):
         pose = np.asarray(pose, dtype=np.float64)
@@ -71,68 +74,73 @@ def camera_rows(
         row[ORIGIN:LENS] = box.normalise(pose[:3, 3])
         row[LENS:LIMITS] = lens_row(lens)
         row[LIMITS:NEAR] = _limits(lens)
-        row[NEAR] = max(NEAR_LEAST, box.near_m / box.radius_m)
+        row[NEAR] = max(MIN_NEAR, box.near_m / box.radius_m)
         row[SIZE], row[SIZE + 1] = lens.width, lens.height
     if times_s is not None:
         rows[:, TIME] = times_s
     return rows
 
 
-class Passes:
-    """Projection and tile lists of several cameras at once."""
+class RasterBuffers:
+    """Projected Gaussians and tile lists of several cameras, and the memory in which workers rasterize."""
 
     def __init__(self, pool: Pool) -> None:
         self.pool = pool
         self.projected = np.zeros((0, 0, PROJECTED), np.float32)
-        self.tiles = np.zeros((0, 0, REACHED), np.int32)
+        self.tiles = np.zeros((0, 0, FOOTPRINT), np.int32)
         self.memory = np.zeros((pool.threads, ROWS * PIXELS), np.float32)
-        self.kept = np.zeros((pool.threads, KEPT), np.float32)
+        self.saved = np.zeros((pool.threads, SAVED), np.float32)
         self.sums = np.zeros((0, 0, SUMS), np.float32)
         self.columns = self.rows = np.zeros(0, np.int64)
-        self._lists: Lists | None = None
-        self._whole: tuple[list[int], NDArray[np.int32]] | None = None  # tasks where all tiles are wanted
+        self._lists: TileLists | None = None
+        self._whole: tuple[list[int], NDArray[np.int32]] | None = None  # cached tasks of whole images
         self._all_wanted = False
 
     @property
-    def lists(self) -> Lists:
-        """The lists made by the last ``look``."""
+    def lists(self) -> TileLists:
+        """The tile lists of the last ``project_and_bin``."""
         assert self._lists is not None
         return self._lists
 
-    def look(
+    def project_and_bin(
         self, cams: NDArray[np.float32], gaussians: Gaussians, wanted: Sequence[NDArray[np.uint8] | None],
         differentiate: bool = True,
     ) -> None:  # fmt: skip
-        """Project and deal out. wanted: for each camera uint8 (tiles,), or None for all of them."""
+        """Project the Gaussians into the cameras, and list them by tile.
+
+        cams: float32 (B, CAMERA), see ``camera_rows``.
+        wanted: for each camera uint8 (tiles,), 1 for tiles to list, or None for all tiles.
+        differentiate: whether to make room for gradients.
+        """
         count, slots = len(gaussians.params), len(cams)
         sizes = cams[:, SIZE : SIZE + 2].astype(np.int64)
         self.columns, self.rows = (-(-sizes[:, k] // TILE) for k in (0, 1))
         tiles = int((self.columns * self.rows).max())
-        self._make_room(slots, count, tiles)
+        self._allocate(slots, count, tiles)
         self._all_wanted = all(mask is None for mask in wanted)
         for b, mask in enumerate(wanted):
             total = int(self.columns[b] * self.rows[b])
             self.lists.wanted[b, :total] = 1 if mask is None else mask
         self.pool.run(project, cams, gaussians, count, self.projected, self.tiles)
-        self._deal(count)
-        pairs = min(int(self.lists.needed[:slots].max(initial=0)), PAIRS_MOST)
+        self._bin(count)
+        pairs = min(int(self.lists.needed[:slots].max(initial=0)), MAX_PAIRS)
         if pairs > self.lists.pair.shape[1]:
-            room = min(pairs + pairs // 4, PAIRS_MOST)
+            room = min(pairs + pairs // 4, MAX_PAIRS)
             self._lists = self.lists._replace(
                 pair=np.zeros((self.lists.pair.shape[0], room), np.int32),
                 owner=np.zeros((self.lists.pair.shape[0], room), np.int32),
-                dealt=np.zeros((self.pool.threads, 2, room), np.int32),
+                binned=np.zeros((self.pool.threads, 2, room), np.int32),
             )
-            self._deal(count)
+            self._bin(count)
         longest = max(int(self.lists.longest[:slots].max(initial=0)), 1)
-        length = longest * STRIPS * KEPT if differentiate else KEPT
-        if self.kept.shape[1] < length:
-            self.kept = np.zeros((self.pool.threads, length + length // 4), np.float32)
+        length = longest * STRIPS * SAVED if differentiate else SAVED
+        if self.saved.shape[1] < length:
+            self.saved = np.zeros((self.pool.threads, length + length // 4), np.float32)
         if differentiate and self.sums.shape[:2] != self.lists.pair.shape:
             self.sums = np.zeros((*self.lists.pair.shape, SUMS), np.float32)
 
     def tasks(self) -> NDArray[np.int32]:
-        """Slot and tile, int32 (M, 2), of all tiles that were wanted by the last ``look``."""
+        """Camera slot and tile, int32 (M, 2), of all tiles wanted by the last ``project_and_bin``."""
         totals = (self.columns * self.rows).tolist()
         if self._all_wanted and self._whole is not None and self._whole[0] == totals:
             return self._whole[1]
@@ -143,11 +151,11 @@ class Passes:
             self._whole = (totals, tasks)
         return tasks
 
-    def _deal(self, count: int) -> None:
+    def _bin(self, count: int) -> None:
         bands = max(self.pool.threads // len(self.columns), 1)
-        self.pool.run(deal, self.columns, self.rows, bands, count, self.tiles, self.lists)
+        self.pool.run(bin_tiles, self.columns, self.rows, bands, count, self.tiles, self.lists)
 
-    def _make_room(self, slots: int, count: int, tiles: int) -> None:
+    def _allocate(self, slots: int, count: int, tiles: int) -> None:
         if (
             self._lists is not None
             and self.projected.shape[0] >= slots
@@ -160,8 +168,8 @@ class Passes:
         tiles = max(tiles, 0 if self._lists is None else self._lists.wanted.shape[1])
         pairs = max(4 * room, 1024, 0 if self._lists is None else self._lists.pair.shape[1])
         self.projected = np.zeros((slots, room, PROJECTED), np.float32)
-        self.tiles = np.zeros((slots, room, REACHED), np.int32)
-        self._lists = Lists(
+        self.tiles = np.zeros((slots, room, FOOTPRINT), np.int32)
+        self._lists = TileLists(
             wanted=np.zeros((slots, tiles), np.uint8),
             first=np.zeros((slots, tiles + 1), np.int32),
             pair=np.zeros((slots, pairs), np.int32),
@@ -173,5 +181,5 @@ class Passes:
             keys=np.zeros((threads, 2, room + 1), np.uint32),
             order=np.zeros((threads, 2, room + 1), np.int32),
             begins=np.zeros((threads, room), np.int32),
-            dealt=np.zeros((threads, 2, pairs), np.int32),
+            binned=np.zeros((threads, 2, pairs), np.int32),
         )

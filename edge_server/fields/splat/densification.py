@@ -1,4 +1,4 @@
-"""How Gaussians come and go: split where pictures pull at them, removed where they add nothing."""
+"""The Gaussians and their adaptive density control (Kerbl et al. 2023): which are split, which are pruned."""
 
 from __future__ import annotations
 
@@ -8,21 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.training_schedule import BETA2
-from edge_server.fields.splat.kernels.optimizer_step import DEAD, Moments, bound_all
+from edge_server.fields.splat.kernels.optimizer_step import DEAD, OptimizerState, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import quaternion_to_matrix
 
-SHRINK = 1.6  # of both halves of a split Gaussian (Kerbl et al.)
-SHARP_PX = 1.0  # what is about a pixel wide is doubled without shrinking
+SHRINK = 1.6  # divides the scales of both halves of a split Gaussian (Kerbl et al.)
+SHARP_PX = 1.0  # Gaussians about this wide in the image are cloned without shrinking
 
 
 @dataclass
-class Cloud:
-    """The Gaussians and all that is known of each: arrays of equal length, at most ``settings.gaussians``.
+class GaussianCloud:
+    """The Gaussians and what is stored with each: arrays of equal length N <= ``settings.gaussians``. Their
+    names are keys of checkpoints.
 
-    velocity: (N, 3) scene units a second, 0 but for guests. guest: (N,), 0 for what belongs to the scene as
-    it stands; else 1 more than the updates since the Gaussian, begun where something moved, last moved."""
+    params: (N, P), see ``kernels.project``.
+    m, v, age, slope, looks, reach: see ``OptimizerState``.
+    velocity: (N, 3), scene units a second, 0 for static Gaussians.
+    guest: (N,), 0 for static Gaussians. Those seeded where something moved ("guests", see ``motion``) have 1
+        plus the number of updates since they last moved.
+    """
 
     params: NDArray[np.float32]
     m: NDArray[np.float32]
@@ -35,8 +40,7 @@ class Cloud:
     guest: NDArray[np.int32]
 
     @classmethod
-    def of(cls, params: NDArray[np.float32]) -> Cloud:
-        """New Gaussians, without a history."""
+    def new(cls, params: NDArray[np.float32]) -> GaussianCloud:
         n = len(params)
         slope, looks, reach = (np.zeros(n, np.float32) for _ in range(3))
         age, guest, velocity = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros((n, 3), np.float32)
@@ -44,38 +48,37 @@ class Cloud:
         return cls(params, m, v, age, slope, looks, reach, velocity, guest)
 
     @classmethod
-    def empty(cls, settings: SplatSettings) -> Cloud:
-        """None at all."""
-        return cls.of(np.zeros((0, BASE + 3 * (settings.harmonics - 1)), np.float32))
+    def empty(cls, settings: SplatSettings) -> GaussianCloud:
+        return cls.new(np.zeros((0, BASE + 3 * (settings.harmonics - 1)), np.float32))
 
     def __len__(self) -> int:
         return len(self.params)
 
-    def gaussians(self, harmonics: int) -> Gaussians:
-        """As the kernels read them."""
-        return Gaussians(self.params, harmonics, self.velocity)
+    def gaussians(self, which: slice | NDArray[np.int64] = slice(None)) -> Gaussians:
+        """The arrays that are projected: of all Gaussians and not copied, or copies for some."""
+        harmonics = (self.params.shape[1] - BASE) // 3 + 1
+        return Gaussians(self.params[which], harmonics, self.velocity[which])
 
-    def moments(self) -> Moments:
-        """As the kernels read them."""
-        return Moments(self.m, self.v, self.age, self.slope, self.looks, self.reach)
+    def optimizer_state(self) -> OptimizerState:
+        """The arrays that a step updates beside ``params``, not copied."""
+        return OptimizerState(self.m, self.v, self.age, self.slope, self.looks, self.reach)
 
     def keep(self, which: NDArray[np.bool_]) -> None:
-        """Remove the others."""
-        self._become({f.name: np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)})
+        """Remove the Gaussians where ``which``, bool (N,), is false."""
+        self._replace({f.name: np.ascontiguousarray(getattr(self, f.name)[which]) for f in fields(self)})
 
-    def add(self, new: Cloud) -> None:
-        """Append others."""
-        self._become({
+    def add(self, new: GaussianCloud) -> None:
+        self._replace({
             f.name: np.concatenate([getattr(self, f.name), getattr(new, f.name)]) for f in fields(self)
         })  # fmt: skip
 
-    def _become(self, arrays: dict[str, NDArray]) -> None:
+    def _replace(self, arrays: dict[str, NDArray]) -> None:
         # All at once: Ctrl-C in between would leave arrays of different lengths.
         self.__dict__.update(arrays)
 
 
 def opacity(params: NDArray[np.float32]) -> NDArray[np.float32]:
-    """In [0, 1], (N,)."""
+    """Opacities (N,) in [0, 1]."""
     return (1.0 / (1.0 + np.exp(-params[:, OPACITY]))).astype(np.float32)
 
 
@@ -85,43 +88,47 @@ def raw_opacity(alpha: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.log(alpha / (1.0 - alpha)).astype(np.float32)
 
 
-def pull_of_colour(cloud: Cloud) -> NDArray[np.float32]:
-    """How much the pictures' errors depend on each Gaussian, float32 (N,), of a scale that only comparisons
-    know: the mean square of the loss's gradient by its colour, which Adam keeps. That gradient is the sum,
-    over the pixels where it shows, of its share in the pixel times the error there. Small, hidden and faint
-    ones have little of it, and so has what is shown without any error: there are more than enough there, and
-    when there no longer are, errors and gradients come back. Infinite for those that have made no step:
-    nothing is known of them.
-    """
+def color_sensitivity(cloud: GaussianCloud) -> NDArray[np.float32]:
+    """How much the loss depends on each Gaussian, float32 (N,), on an arbitrary scale: Adam's mean square of
+    the gradient by color. That gradient sums, over the pixels a Gaussian covers, its weight in the pixel
+    times the error there. It is small for small, hidden and faint Gaussians, and where the error is small:
+    there are enough Gaussians there, and once there are not, error and gradient return. Infinite for
+    Gaussians that have made no step."""
     square = cloud.v[:, COLOR:BASE].sum(axis=1) / (1.0 - BETA2 ** np.maximum(cloud.age, 1))
     return np.where(cloud.age > 0, square, np.inf).astype(np.float32)
 
 
-def make_room(cloud: Cloud, count: int) -> None:
-    """Remove the ``count`` Gaussians on which the pictures' errors depend least. By opacity, all that is
-    faint would go in time, and it is what edges are made of: -1.1 dB after 300 updates of ``room``."""
+def prune_least_sensitive(cloud: GaussianCloud, count: int) -> None:
+    """Remove the ``count`` Gaussians of least ``color_sensitivity``. Pruning by opacity instead would remove
+    all faint Gaussians in time, and edges are made of them: -1.1 dB after 300 updates of ``room``."""
     if count > 0:
         keep = np.ones(len(cloud), bool)
-        keep[np.argsort(pull_of_colour(cloud), kind="stable")[:count]] = False
+        keep[np.argsort(color_sensitivity(cloud), kind="stable")[:count]] = False
         cloud.keep(keep)
 
 
-def grow_and_prune(cloud: Cloud, settings: SplatSettings, pixels: float, rng: np.random.Generator) -> None:
-    """Remove what no picture shows, then split the Gaussians whose place in the picture is pulled at most.
+def densify_and_prune(
+    cloud: GaussianCloud, settings: SplatSettings, pixels: float, rng: np.random.Generator
+) -> None:
+    """Remove faint Gaussians and those that no view shows, then split those with the largest gradient by the
+    projected mean.
 
-    pixels: of a picture's width. The two halves together let through as much light as the one did (Bulo et
-    al. 2024): without that, every split would darken what lies behind.
+    The two halves together transmit as much light as the one did (Bulo et al. 2024): otherwise every split
+    would darken what lies behind.
+
+    pixels: width of the images.
+    rng: draws where the halves go.
     """
     seen = cloud.looks > 0
     cloud.keep(seen & (opacity(cloud.params) >= settings.prune) & (cloud.params[:, OPACITY] > DEAD + 1e-3))
     n = len(cloud)
     want = min(settings.gaussians - n, int(np.ceil(settings.grow * n)))
     if want > 0 and n > 0:
-        pull = cloud.slope / np.maximum(cloud.looks, 1.0)
-        pull = np.where(cloud.reach > settings.widest, np.inf, pull)
-        # Stable, so that equal ones are taken in one order on every machine.
-        chosen = np.sort(np.argsort(-pull, kind="stable")[:want])
-        chosen = chosen[pull[chosen] > 0]
+        slope = cloud.slope / np.maximum(cloud.looks, 1.0)
+        slope = np.where(cloud.reach > settings.widest, np.inf, slope)
+        # Stable, so that ties are broken alike on every machine.
+        chosen = np.sort(np.argsort(-slope, kind="stable")[:want])
+        chosen = chosen[slope[chosen] > 0]
         _split(cloud, chosen, pixels, settings, rng)
     cloud.slope[:] = 0.0
     cloud.looks[:] = 0.0
@@ -129,25 +136,28 @@ def grow_and_prune(cloud: Cloud, settings: SplatSettings, pixels: float, rng: np
 
 
 def _split(
-    cloud: Cloud, chosen: NDArray[np.int64], pixels: float, settings: SplatSettings, rng: np.random.Generator
+    cloud: GaussianCloud,
+    chosen: NDArray[np.int64],
+    pixels: float,
+    settings: SplatSettings,
+    rng: np.random.Generator,
 ) -> None:
     one = cloud.params[chosen].copy()
     size = np.exp(one[:, SCALE : SCALE + 3])
-    turn = quaternion_to_matrix(one[:, QUATERNION : QUATERNION + 4])
-    offset = np.einsum("nij,nj->ni", turn, rng.standard_normal((len(chosen), 3)) * size)
+    rotation = quaternion_to_matrix(one[:, QUATERNION : QUATERNION + 4])
+    offset = np.einsum("nij,nj->ni", rotation, rng.standard_normal((len(chosen), 3)) * size)
     wide = cloud.reach[chosen] * pixels > SHARP_PX
     one[:, SCALE : SCALE + 3] -= np.where(wide, np.log(SHRINK), 0.0)[:, None]
     one[:, OPACITY] = raw_opacity(1.0 - np.sqrt(1.0 - opacity(one)))
     two = one.copy()
     one[:, :3] += 0.5 * offset
     two[:, :3] -= 0.5 * offset
-    largest, thinnest = np.float32(settings.largest), np.float32(np.log(settings.aspect))
     for half in (one, two):
-        bound_all(half, largest, thinnest)
+        clamp_gaussians(half, *settings.scale_bounds)
     cloud.params[chosen] = one
     cloud.m[chosen] = 0.0
     cloud.v[chosen] = 0.0
     cloud.age[chosen] = 0
-    halves = Cloud.of(two)
+    halves = GaussianCloud.new(two)
     halves.velocity, halves.guest = cloud.velocity[chosen], cloud.guest[chosen]
     cloud.add(halves)

@@ -1,9 +1,9 @@
-"""The Gaussian field with gsplat's CUDA rasteriser (Ye et al. 2024): ``pip install "freshfield[cuda]"``.
+"""The Gaussian field with gsplat's CUDA rasterizer (Ye et al. 2024): ``pip install "freshfield[cuda]"``.
 
-Everything but the step's gradient is ``SplatField``'s: seeds, growth, motion, state, and the pictures of
-snapshots, which the CPU kernels render. Gaussians stay in host memory and are copied for each step, which
-costs little beside a rasterisation. Its code around the rasteriser is tested on CPUs with the torch oracle
-in gsplat's place; with gsplat itself, on a GPU, it has not been run.
+Only the gradient of a step is computed here; ``SplatField`` does the rest: seeding, densification, motion,
+state, and snapshots, which the CPU kernels render. Gaussians stay in host memory and are copied a step, at
+little cost beside a rasterization. The code around the rasterizer is tested on CPUs with the torch
+oracle in place of gsplat; with gsplat itself, on a GPU, it has not been run.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from edge_server.fields import View
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.training_schedule import step_key
 from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
-from edge_server.fields.splat.field import SplatField
-from edge_server.fields.splat.kernels.optimizer_step import GRADIENT_LIMIT, bound_all
+from edge_server.fields.splat.cpu_field import SplatField
+from edge_server.fields.splat.kernels.optimizer_step import GRADIENT_LIMIT, clamp_gaussians
 from edge_server.fields.splat.kernels.project import (
     COLOR,
     LENS,
@@ -36,44 +36,44 @@ from edge_server.fields.splat.kernels.project import (
     SIZE,
     TIME,
 )
-from edge_server.fields.splat.motion import Moved
+from edge_server.fields.splat.motion import SceneChange
 from edge_server.fields.splat.settings import SplatSettings
 
-Rasterise = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+Rasterize = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
-class SplatCudaField(SplatField):
-    """``SplatField`` whose gradients come from ``rasterise``: gsplat's ``rasterization``, or one like it.
+class GsplatField(SplatField):
+    """``SplatField`` whose gradients come from ``rasterize``: gsplat's ``rasterization``, or one like it.
 
-    Whole pictures, pinhole cameras and squared or absolute errors only. Not deterministic to the last bit:
-    gsplat adds gradients up in the order its threads come.
+    Whole images, pinhole cameras and squared or absolute errors only. Not deterministic to the last bit:
+    gsplat adds up gradients in whatever order its threads finish.
     """
 
     def __init__(
-        self, settings: SplatSettings, rasterise: Rasterise, device: str = "cuda", pool: Pool | None = None
+        self, settings: SplatSettings, rasterize: Rasterize, device: str = "cuda", pool: Pool | None = None
     ) -> None:
         if settings.dssim:
             raise ValueError("splat: dssim needs device cpu; device cuda has loss mse or l1 alone")
         super().__init__(settings, pool)
-        self._rasterise, self._device = rasterise, torch.device(device)
+        self._rasterize, self._device = rasterize, torch.device(device)
 
-    def _take_in(self, views: Sequence[View]) -> Moved | None:
+    def _ingest(self, views: Sequence[View]) -> SceneChange | None:
         for view in views:
             if view.intrinsics.distorted:
                 raise ValueError(
                     f"camera {view.camera}: device cuda takes pinhole cameras only; undistort its images, "
                     "or use device cpu, which renders through the lens"
                 )
-        return super()._take_in(views)
+        return super()._ingest(views)
 
     def _one_step(self, progress: float) -> tuple[float, int, int, int]:
         s, cloud = self.settings, self.cloud
-        picked, _ = self._choose(step_key(s.seed, self.step))
+        picked, _ = self._choose_tiles(step_key(s.seed, self.step))
         params = torch.tensor(cloud.params, device=self._device, requires_grad=True)
         pixels, square, lost = 0, 0.0, 0
         drawn = torch.zeros(len(cloud), device=self._device)
         for k in picked.tolist():
-            error, info = self._errors(params, k)
+            error, info = self._residuals(params, k)
             weight = self._weight(k)
             loss = (weight * (error.abs() if s.loss == "l1" else error.square())).sum()
             if not bool(torch.isfinite(loss)):
@@ -83,17 +83,17 @@ class SplatCudaField(SplatField):
                 info["means2d"].retain_grad()
             if loss.requires_grad:
                 loss.backward()
-            drawn += self._note(info, float(self._cams[k, SIZE]))
+            drawn += self._record_statistics(info, float(self._cams[k, SIZE]))
             pixels += error.shape[0] * error.shape[1]
             square += float((weight * error.detach().square()).sum())
         gradient = np.zeros_like(cloud.params) if params.grad is None else params.grad.cpu().numpy()
         lost += int((~np.isfinite(gradient)).sum())
         self._adam(np.nan_to_num(gradient, posinf=0.0, neginf=0.0), drawn.cpu().numpy() > 0, progress)
-        self._count_step()
+        self._finish_step()
         return square / (3 * max(pixels, 1)), pixels, int(drawn.sum()), lost
 
-    def _errors(self, params: Tensor, k: int) -> tuple[Tensor, dict[str, Any]]:
-        """Differences (H, W, 3) of view k from what is rendered, and what gsplat tells of it."""
+    def _residuals(self, params: Tensor, k: int) -> tuple[Tensor, dict[str, Any]]:
+        """Rendered minus true colors (H, W, 3) of view k, and gsplat's ``info``."""
         view, cam = self._views[k], torch.tensor(self._cams[k], device=self._device)
         lens = view.intrinsics
         pose = torch.eye(4, device=self._device)
@@ -104,18 +104,18 @@ class SplatCudaField(SplatField):
         )
         direction = torch.nn.functional.normalize(params[:, :3] - cam[ORIGIN:LENS], dim=-1)
         count = self.settings.harmonics
-        shares = params[:, COLOR + 3 :].view(len(params), count - 1, 3)
-        shades = params[:, COLOR : COLOR + 3]
-        shades = shades + (shares * harmonics_of(count, direction)[..., None]).sum(dim=1)
+        coefficients = params[:, COLOR + 3 :].view(len(params), count - 1, 3)
+        colors = params[:, COLOR : COLOR + 3]
+        colors = colors + (coefficients * harmonics_of(count, direction)[..., None]).sum(dim=1)
         back = torch.tensor(self.view_store.background(), device=self._device)
         if self.settings.background == "random":
             back = torch.tensor(self._rng(6).random(3), dtype=torch.float32, device=self._device)
-        color, _, info = self._rasterise(
+        color, _, info = self._rasterize(
             means=params[:, :3] + float(cam[TIME]) * torch.tensor(self.cloud.velocity, device=self._device),
             quats=params[:, QUATERNION:OPACITY],
             scales=params[:, SCALE:QUATERNION].clamp(SCALE_LOW, SCALE_HIGH).exp(),
             opacities=params[:, OPACITY].clamp(-RAW_OPACITY, RAW_OPACITY).sigmoid(),
-            colors=shades,
+            colors=colors,
             viewmats=pose[None],
             Ks=camera[None],
             width=lens.width,
@@ -131,7 +131,7 @@ class SplatCudaField(SplatField):
         return color[0] - target, info
 
     def _weight(self, k: int) -> Tensor:
-        """The weights of view k's pixels, (H, W, 1), or one 1 for all."""
+        """The weights of view k's pixels, (H, W, 1), or (1,) where all are 1."""
         weight, first = self._data.weight, self._data.first
         if weight.size == 0:
             return torch.ones(1, device=self._device)
@@ -139,22 +139,22 @@ class SplatCudaField(SplatField):
         share = weight[first[k] : first[k + 1]].reshape(height, width, 1)
         return torch.tensor(share, device=self._device)
 
-    def _note(self, info: dict[str, Any], width: float) -> Tensor:
-        """Keep what growth goes by; returns which Gaussians were drawn, (N,)."""
+    def _record_statistics(self, info: dict[str, Any], width: float) -> Tensor:
+        """Record the statistics for densification; returns which Gaussians were drawn, (N,)."""
         radii = info["radii"][0]
-        radii = radii.amax(dim=-1) if radii.ndim == 2 else radii  # newer versions give one for each axis
+        radii = radii.amax(dim=-1) if radii.ndim == 2 else radii  # newer versions have one for each axis
         drawn = radii > 0
-        pull = info["means2d"].grad
-        if pull is not None:
-            self.cloud.slope += (pull[0].norm(dim=-1) * width * drawn).cpu().numpy()
+        gradient = info["means2d"].grad
+        if gradient is not None:
+            self.cloud.slope += (gradient[0].norm(dim=-1) * width * drawn).cpu().numpy()
         self.cloud.looks += drawn.float().cpu().numpy()
         # gsplat's radius is three standard deviations.
         np.maximum(self.cloud.reach, (radii.float() / (3.0 * width)).cpu().numpy(), out=self.cloud.reach)
         return drawn.float()
 
     def _adam(self, g: NDArray[np.float32], drawn: NDArray[np.bool_], progress: float) -> None:
-        """``kernels.splat_update``'s rule, in numpy."""
-        rule, cloud = self._rule(progress), self.cloud
+        """The rule of ``kernels.optimizer_step``, in numpy."""
+        rule, cloud = self._adam_parameters(progress), self.cloud
         g = np.clip(np.nan_to_num(g, nan=0.0), -GRADIENT_LIMIT, GRADIENT_LIMIT)
         if rule.fade > 0:
             alpha = 1.0 / (1.0 + np.exp(-cloud.params[:, OPACITY]))
@@ -169,7 +169,7 @@ class SplatCudaField(SplatField):
         )
         step[:, :SCALE] *= np.maximum(np.abs(cloud.params[drawn, :3]).max(axis=1), 1.0)[:, None]
         cloud.params[drawn] -= step
-        bound_all(cloud.params, rule.largest, rule.thinnest)
+        clamp_gaussians(cloud.params, rule.largest, rule.thinnest)
 
 
 def make_cuda(settings: SplatSettings) -> SplatField:
@@ -182,4 +182,4 @@ def make_cuda(settings: SplatSettings) -> SplatField:
         raise ValueError(
             'splat: device cuda needs gsplat: pip install "freshfield[cuda]", or use device cpu'
         ) from None
-    return SplatCudaField(settings, rasterization)
+    return GsplatField(settings, rasterization)

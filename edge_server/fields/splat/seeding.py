@@ -1,4 +1,4 @@
-"""First Gaussians without structure-from-motion: pixels placed where the cameras agree on their colour."""
+"""First Gaussians without structure from motion: pixels placed where the cameras agree on their color."""
 
 from __future__ import annotations
 
@@ -13,24 +13,29 @@ from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.plane_sweep import empty_color, foreground_mask, score_grid, sweep_depths
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
-from edge_server.fields.splat.kernels.optimizer_step import bound_all
+from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.settings import SplatSettings
 
-_CANDIDATES = 4  # rays a Gaussian: those without a surface are left out
+_CANDIDATES = 4  # rays tried for each Gaussian: those that meet no surface are discarded
 
 
-def seeds(
+def seed_gaussians(
     settings: SplatSettings, pool: Pool, box: SceneBox, views: Sequence[View],
     masks: Sequence[NDArray[np.bool_] | None] | None, weight: NDArray[np.float32], count: int,
     rng: np.random.Generator, moved: Sequence[NDArray[np.bool_] | None] | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """Parameters of up to ``count`` new Gaussians, float32 (N, P). masks: for each view bool (H, W), where
-    they may begin (None in the list: nowhere); no list at all: anywhere. weight: ``Views.weight``, pixels of
-    none have no say. moved: bool (H, W) each: only places that most cameras see move are looked at."""
+    """Parameters of up to ``count`` new Gaussians, float32 (N, P).
+
+    masks: for each view bool (H, W), the pixels from which Gaussians may start, or None for no pixels; None
+        instead of the list: all pixels of all views.
+    weight: ``Views.weight``; pixels of weight 0 are ignored.
+    rng: draws the pixels.
+    moved: for each view bool (H, W), or None; if given, only places where most cameras see motion count.
+    """
     width = BASE + 3 * (settings.harmonics - 1)
     data = pack_cameras(views, box)._replace(weight=weight)
-    where = _pixels(settings, views, data, masks)
+    where = _candidate_pixels(settings, views, data, masks)
     if count <= 0 or where.size == 0:
         return np.zeros((0, width), np.float32)
     drawn = rng.choice(where, min(_CANDIDATES * count, where.size), replace=False)
@@ -50,7 +55,7 @@ def seeds(
     if found.size == 0:
         return params
     focal = data.lens[:, 0]
-    # Several views see each place: the spacing in space is that of all their rays together.
+    # Several views see each place: the spacing in space is that of the rays of all of them.
     spacing = np.sqrt(where.size / found.size / min(max(len(views) / 3.0, 1.0), 6.0))
     view_of, local, distance = view_of[found], local[found], distance[found]
     for v in np.unique(view_of):
@@ -63,15 +68,15 @@ def seeds(
         params[mine, SCALE : SCALE + 3] = np.log(size)[:, None]
     params[:, QUATERNION] = 1.0
     params[:, OPACITY] = np.log(settings.seed_opacity / (1.0 - settings.seed_opacity))
-    bound_all(params, np.float32(settings.largest), np.float32(np.log(settings.aspect)))
+    clamp_gaussians(params, *settings.scale_bounds)
     return params
 
 
-def _pixels(
+def _candidate_pixels(
     settings: SplatSettings, views: Sequence[View], data: Views,
     masks: Sequence[NDArray[np.bool_] | None] | None,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Numbers of the pixels that show something, over all views."""
+    """Indices, over all views, of the pixels that do not show plain background."""
     plain = empty_color(settings, [views[k] for k in supervising_views(data)])
     parts = [np.zeros(0, np.int64)]
     for k, view in enumerate(views):

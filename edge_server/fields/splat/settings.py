@@ -1,4 +1,4 @@
-"""Settings of the Gaussian field: one dataclass whose texts become help and error messages."""
+"""Settings of the Gaussian field: one dataclass whose texts become help."""
 
 from __future__ import annotations
 
@@ -6,57 +6,59 @@ import re
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
+
 from edge_server.fields.common.trainer_settings import COMMON_BOUNDS, MOST_THREADS, copy_option
 from edge_server.fields.common.trainer_settings import option as _option
 
 
 @dataclass(frozen=True)
 class SplatSettings:
-    """What can be chosen about a ``SplatField``. Lengths in metres; None means: found from the cameras."""
+    """The options of a ``SplatField``. Lengths in meters; None means: found from the cameras."""
 
-    gaussians: int = _option(8192, "Gaussians at most")
-    start: int = _option(4096, "Gaussians at first, at most ``gaussians``")
-    harmonics: int = _option(1, "view dependence of colour: 1 (none), 4 or 9 spherical harmonics")
-    views_a_step: int = _option(1, "pictures a step draws tiles from")
-    tile_share: float = _option(1.0, "share of each of those pictures' tiles that a step looks at")
+    gaussians: int = _option(8192, "largest number of Gaussians")
+    start: int = _option(4096, "number of Gaussians at the start, at most ``gaussians``")
+    harmonics: int = _option(1, "view dependence of color: 1 (none), 4 or 9 spherical harmonics")
+    views_a_step: int = _option(1, "views that a step trains on")
+    tile_share: float = _option(1.0, "share of these views' tiles that a step trains on")
     loss: str = _option("mse", "mse or l1")
     dssim: float = _option(0.0, "weight of (1 - SSIM) / 2, tile by tile (Kerbl et al.: 0.2 beside l1)")
-    seed_cells: int = _option(64, "cells a side of the grid that finds first positions; 0: random ones")
-    seed_scale: float = _option(0.5, "first size of Gaussians, in distances to their neighbours")
+    seed_cells: int = _option(64, "cells a side of the grid that finds first positions; 0: random positions")
+    seed_scale: float = _option(0.5, "first scale of Gaussians, in distances to their neighbors")
     seed_opacity: float = _option(0.3, "opacity of new Gaussians")
-    centre_m: tuple[float, float, float] | None = _option(None, "centre of the scene's box")
+    centre_m: tuple[float, float, float] | None = _option(None, "center of the scene's box")
     radius_m: float | None = _option(None, "half the side of the scene's box")
-    near_m: float | None = _option(None, "nothing is seen nearer to a camera than this")
+    near_m: float | None = _option(None, "near plane: nothing closer to a camera is rendered")
     contracted: bool | None = _option(None, "whether the scene goes on beyond its box (rooms, outdoors)")
-    background: str = _option("auto", "auto (plain, or the mean colour), white, black, random, or '#rrggbb'")
+    background: str = _option("auto", "auto (plain, or the mean color), white, black, random, or '#rrggbb'")
     min_views: int = _option(2, "no Gaussian starts where fewer cameras than this look")
     rate_position: float = _option(0.4, "learning rate of positions at the start of a fit, in pixels")
-    rate_scale: float = _option(0.08, "of the logarithms of sizes")
-    rate_rotation: float = _option(0.02, "of quaternions")
-    rate_opacity: float = _option(0.15, "of opacities before the sigmoid")
-    rate_color: float = _option(0.02, "of colours; a tenth of it for harmonics")
+    rate_scale: float = _option(0.08, "learning rate of the logarithms of scales")
+    rate_rotation: float = _option(0.02, "learning rate of quaternions")
+    rate_opacity: float = _option(0.15, "learning rate of opacities before the sigmoid")
+    rate_color: float = _option(0.02, "learning rate of colors; a tenth of it for harmonics")
     rate_end: float = _option(0.1, "share of the learning rates that is left at the end of a fit")
     settle_after: float = _option(300.0, "steps of a Gaussian at full rates; then they fall as 1 / steps")
-    rate_settled: float = _option(0.1, "share of the rates that a Gaussian keeps for good")
+    rate_settled: float = _option(0.1, "share of the rates below which they do not fall")
     epsilon: float = _option(1e-3, "Adam's epsilon, on gradients summed over pixels")
-    fade: float = _option(0.0, "pull on opacities: empties what no picture needs")
-    densify_every: int = _option(50, "steps between growth and pruning, at least one pass over all views")
-    grow: float = _option(0.15, "share of Gaussians that are split at once, steepest picture gradient first")
-    prune: float = _option(0.02, "Gaussians of less opacity are removed")
+    fade: float = _option(0.0, "penalty on opacity: removes Gaussians that no view needs")
+    densify_every: int = _option(50, "steps between densifications, at least one pass over all views")
+    grow: float = _option(0.15, "share of Gaussians split by a densification, largest gradient first")
+    prune: float = _option(0.02, "opacity below which Gaussians are removed")
     opacity_reset: int = _option(0, "steps after which opacities are lowered to a tenth; 0: never")
     largest: float = _option(0.5, "largest standard deviation in scene units (half the box's side is 1)")
-    widest: float = _option(0.2, "Gaussians wider than this share of a picture are split first")
-    aspect: float = _option(20.0, "longest to shortest axis at most")
-    changed_share: float = _option(0.25, "steps that look only at tiles that changed since the last view")
-    follow: int = _option(8, "steps at the start of an update that carry along what moves; 0: none")
-    reseed: float = _option(0.25, "of ``gaussians``, how many are made anew where something moved, at most")
+    widest: float = _option(0.2, "share of an image's width above which Gaussians are split first")
+    aspect: float = _option(20.0, "largest ratio of longest to shortest axis")
+    changed_share: float = _option(0.25, "share of steps that train only on tiles that changed")
+    follow: int = _option(8, "steps at the start of an update that track moving Gaussians; 0: none")
+    reseed: float = _option(0.25, "largest share of ``gaussians`` that is seeded anew where something moved")
     flatten: float = _option(
-        0.0, "pull on each Gaussian's smallest size, in its logarithm a step, for surfaces (.02); 0: none"
+        0.0, "decrease a step of each Gaussian's smallest log scale, for surfaces (.02); 0: none"
     )
     align: float = _option(
-        0.0, "share by which Gaussians turn to the normals of the depth they show, for surfaces (.3); 0: none"
+        0.0, "share by which Gaussians turn to the normals of the rendered depth, for surfaces (.3); 0: none"
     )
-    align_every: int = _option(5, "steps between two turns of ``align``")
+    align_every: int = _option(5, "steps between two alignments")
     age_tau_ms: float = copy_option("age_tau_ms")
     mask_stale_ms: float = copy_option("mask_stale_ms")
     mask_grow_px_s: float = copy_option("mask_grow_px_s")
@@ -94,7 +96,7 @@ class SplatSettings:
         named = self.background in ("auto", "white", "black", "random")
         if not named and not re.fullmatch("#[0-9a-fA-F]{6}", self.background):
             raise ValueError(
-                "splat: background must be auto, white, black, random or a colour like '#80c0ff', "
+                "splat: background must be auto, white, black, random or a color like '#80c0ff', "
                 f"not {self.background!r}"
             )
         for name in ("radius_m", "near_m"):
@@ -103,8 +105,13 @@ class SplatSettings:
 
     @property
     def planar(self) -> bool:
-        """Whether Gaussians are made to lie on surfaces, so that their planes tell the depth."""
+        """Whether Gaussians are made flat, so that depth is rendered from their planes."""
         return self.flatten > 0.0 or self.align > 0.0
+
+    @property
+    def scale_bounds(self) -> tuple[np.float32, np.float32]:
+        """``largest``, and the logarithm of ``aspect``, as ``kernels.optimizer_step`` takes them."""
+        return np.float32(self.largest), np.float32(np.log(self.aspect))
 
 
 EFFORTS: dict[str, dict[str, Any]] = {
@@ -115,8 +122,12 @@ EFFORTS: dict[str, dict[str, Any]] = {
 
 
 def make_settings(options: dict[str, Any], seed: int = 0) -> SplatSettings:
-    """Settings from plain options (a scenario's ``field`` section). ``effort`` (low, medium, high) chooses
-    a preset that the other options override. ValueError names an unknown option and lists the valid ones."""
+    """Settings from plain options (a scenario's ``field`` section).
+
+    options: ``effort`` (low, medium, high) names a preset that the other options override.
+
+    ValueError: an unknown option (the valid ones are listed), or a wrong value.
+    """
     options = dict(options)
     effort = options.pop("effort", "medium")
     if effort not in EFFORTS:
@@ -131,5 +142,5 @@ def make_settings(options: dict[str, Any], seed: int = 0) -> SplatSettings:
 
 
 def help_text() -> dict[str, str]:
-    """Option name -> what it means, for command lines and documentation."""
+    """Help text of each option, for command lines and documentation."""
     return {f.name: f.metadata["help"] for f in fields(SplatSettings)}

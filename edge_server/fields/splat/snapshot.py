@@ -1,4 +1,4 @@
-"""An immutable copy of a Gaussian field: renders from any thread while the field itself trains on."""
+"""An immutable copy of a Gaussian field, which renders from any thread while the field trains on."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.buffers import Passes, camera_rows, ray_lengths
+from edge_server.fields.splat.buffers import RasterBuffers, camera_rows, ray_lengths
 from edge_server.fields.splat.kernels.project import TILE, Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_points, render_tiles
 from freshfield.geometry import Pinhole
 
-SOLID = 0.5  # opacity from which on a pixel shows a surface
+SOLID = 0.5  # opacity above which a pixel shows a surface
 
 
 @dataclass(frozen=True)
 class SplatSnapshot:
-    """Gaussians and cameras of one instant. Nothing in it is written after it is made. ahead_s: by how much
-    that instant is later than the newest view. passes: buffers to render pixels with, if one thread alone
-    uses this. planar: the Gaussians are flat, so that planes tell their depth (``render_surface``)."""
+    """Gaussians and cameras of one instant, never written after construction.
+
+    ahead_s: how much later that instant is than the newest view.
+    raster: buffers for ``colors_at``, where only one thread uses the snapshot; None: new ones a call.
+    planar: the Gaussians are flat, so ``render_surface`` renders depth from their planes.
+    """
 
     box: SceneBox
     gaussians: Gaussians
@@ -32,40 +35,43 @@ class SplatSnapshot:
     pool: Pool
     step: int
     ahead_s: float = 0.0
-    passes: Passes | None = None
+    raster: RasterBuffers | None = None
     planar: bool = False
 
     def render_surface(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """The picture, with the depth at which rays meet the Gaussians' planes (``splat_planar``)."""
-        from edge_server.fields.splat.planar import plane_depth  # numba compiles it where it is asked for
+        """As ``render``, with the depth at which rays meet the Gaussians' planes (see ``planar``)."""
+        from edge_server.fields.splat.planar import plane_depth  # compiled only where it is used
 
-        picture, passes = self.render(camera_to_world, intrinsics), Passes(self.pool)
-        cams = camera_rows([camera_to_world], [intrinsics], self.box)
-        passes.look(cams, self.gaussians, [None], differentiate=False)
-        depth, opacity = plane_depth(passes, self.pool, self.gaussians, cams[0], intrinsics)
-        return Rendering(picture.color, depth * np.float32(self.box.radius_m), opacity)
+        image = self.render(camera_to_world, intrinsics)
+        raster, cams = self._project(camera_to_world, intrinsics)
+        depth, opacity = plane_depth(raster, self.gaussians, cams[0], intrinsics)
+        return Rendering(image.color, depth * np.float32(self.box.radius_m), opacity)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
-        """The picture a camera at this pose would take."""
+        """Render a camera. camera_to_world: (4, 4), meters. Depth is in meters along each ray."""
         w, h = intrinsics.width, intrinsics.height
-        passes = Passes(self.pool)
-        cams = camera_rows([camera_to_world], [intrinsics], self.box)
-        passes.look(cams, self.gaussians, [None], differentiate=False)
+        raster, _ = self._project(camera_to_world, intrinsics)
         color, depth = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
         opacity = np.empty((h, w), np.float32)
         self.pool.run(
-            render_tiles, int(passes.columns[0]), int(passes.rows[0]), w, h, passes.projected, passes.lists,
-            self.background, passes.memory, passes.kept, color, depth, opacity,
+            render_tiles, int(raster.columns[0]), int(raster.rows[0]), w, h, raster.projected, raster.lists,
+            self.background, raster.memory, raster.saved, color, depth, opacity,
         )  # fmt: skip
         depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
         return Rendering(color, depth, opacity)
 
+    def _project(self, pose: NDArray[np.float64], lens: Pinhole) -> tuple[RasterBuffers, NDArray[np.float32]]:
+        """Fresh buffers with the Gaussians that one camera sees, and that camera's rows."""
+        raster, cams = RasterBuffers(self.pool), camera_rows([pose], [lens], self.box)
+        raster.project_and_bin(cams, self.gaussians, [None], differentiate=False)
+        return raster, cams
+
     def colors_at(
         self, views: Sequence[View], points: Sequence[NDArray[np.float64]]
     ) -> list[NDArray[np.float32]]:
-        """What is seen of each view at image points (N, 2) within its picture: colours (N, 3). All at once:
-        most of the work is to project the Gaussians, and views share it out among the cores."""
-        passes = self.passes or Passes(self.pool)
+        """Rendered colors (N, 3) at image points (N, 2) of each view. All views at once, because most of the
+        work is the projection of the Gaussians, which then runs on all cores."""
+        raster = self.raster or RasterBuffers(self.pool)
         cams = camera_rows([v.camera_to_world for v in views], [v.intrinsics for v in views], self.box)
         wanted = []
         for view, where in zip(views, points):
@@ -73,19 +79,19 @@ class SplatSnapshot:
             tiles = np.zeros((-(-lens.height // TILE), -(-lens.width // TILE)), np.uint8)
             tiles[tuple((where[:, ::-1] // TILE).astype(np.int64).T)] = 1
             wanted.append(tiles.reshape(-1))
-        passes.look(cams, self.gaussians, wanted, differentiate=False)
+        raster.project_and_bin(cams, self.gaussians, wanted, differentiate=False)
         counts = [len(where) for where in points]
         slots = np.repeat(np.arange(len(views)), counts)
         color = np.empty((len(slots), 3), np.float32)
         self.pool.run(
-            render_points, passes.columns, slots, np.concatenate(points).astype(np.float32), passes.projected,
-            passes.lists, self.background, color,
+            render_points, raster.columns, slots, np.concatenate(points).astype(np.float32), raster.projected,
+            raster.lists, self.background, color,
         )  # fmt: skip
         return np.split(color, np.cumsum(counts)[:-1])
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras see a
-        surface: their pictures are rendered small and lifted by their depth."""
+        """Up to ``count`` surface points (N, 3) in world meters and their colors (N, 3): the known cameras
+        are rendered small, and the solid pixels unprojected by their depth."""
         positions, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
         if len(self.gaussians.params):
             share = max(count // max(len(self.cameras), 1), 1)

@@ -8,7 +8,7 @@ import numpy as np
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.rays import HORIZON, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.kernels.project import LENS, NEAR, ORIGIN, bent, held
+from edge_server.fields.splat.kernels.project import LENS, NEAR, ORIGIN, distort, load_camera
 
 MOST_VIEWS = 32  # that vote
 NOT_SEEN = -2.0
@@ -31,7 +31,7 @@ def _spread(u):
 def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
     """Which pixel shows each cell of a row: pixels, int32 (cells,), receives its number, or ``nowhere``.
 
-    cam: of ``held``. first: the picture's first pixel. row: float32 (3, cells), the cells' centers.
+    cam: of ``load_camera``. first: the picture's first pixel. row: float32 (3, cells), the cells' centers.
     """
     for k in range(pixels.size):
         x, y, z = row[0, k] - cam[ORIGIN], row[1, k] - cam[ORIGIN + 1], row[2, k] - cam[ORIGIN + 2]
@@ -39,7 +39,7 @@ def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
         over = _F1 / (depth if depth > cam[NEAR] else _F1)
         a, b = (cam[0] * x + cam[1] * y + cam[2] * z) * over, (cam[3] * x + cam[4] * y + cam[5] * z) * over
         sees = (depth > cam[NEAR]) & (abs(a) < np.float32(4.0)) & (abs(b) < np.float32(4.0))
-        through = bent(cam, a, b)
+        through = distort(cam, a, b)
         px, py = cam[LENS] * through[0] + cam[LENS + 2], cam[LENS + 1] * through[1] + cam[LENS + 3]
         sees = sees & (px >= _F0) & (py >= _F0) & (px < width) & (py < height)
         column, line = np.int32(px if sees else _F0), np.int32(py if sees else _F0)
@@ -61,7 +61,7 @@ def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden)
         tally[k] = 0
     for v in range(total):
         width, height, seen = np.int32(size[v, 0]), np.int32(size[v, 1]), pixels[v]
-        _pixels_of_row(held(cams, v), np.int32(first[v]), width, height, np.int32(nowhere), row, seen)
+        _pixels_of_row(load_camera(cams, v), np.int32(first[v]), width, height, np.int32(nowhere), row, seen)
         if flags.size == 0:
             continue
         few = 0

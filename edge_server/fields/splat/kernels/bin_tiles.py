@@ -1,5 +1,4 @@
-"""Which Gaussians a tile sees, front to back: sorted by depth, then dealt out to tiles, in bands of them side
-by side."""
+"""Tile intersection (gsplat's ``isect_tiles``): each tile's list of Gaussians, sorted front to back."""
 
 from __future__ import annotations
 
@@ -10,24 +9,26 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import count_bits, draw, lowest_bit
-from edge_server.fields.splat.kernels.project import FIRST_64, ORDER, ORDER_BITS
+from edge_server.fields.splat.kernels.project import DEPTH_BITS, DEPTH_KEY, TILE_BITS
 
-# Two passes sort.
-RADIX_BITS = ORDER_BITS // 2
+RADIX_BITS = DEPTH_BITS // 2  # the sort takes two passes
 RADIX = 1 << RADIX_BITS
 
 
-class Lists(NamedTuple):
-    """A pair is a Gaussian and a tile it touches; those of one Gaussian follow each other. B cameras,
-    T tiles at most, N Gaussians, P pairs, W bands at most.
+class TileLists(NamedTuple):
+    """Pairs of a Gaussian and a tile that it touches. The pairs of a Gaussian have consecutive numbers.
+    B cameras, at most T tiles, N Gaussians, at most P pairs, at most W bands.
 
-    wanted: uint8 (B, T), tiles that are looked at. first: int32 (B, T + 1) into ``pair``: int32 (B, P),
-    the tile's pairs front to back. owner: int32 (B, P), a pair's Gaussian. own_first, own_count: int32
-    (B, N), a Gaussian's pairs. needed: int64 (B,), pairs there are (more than P: Gaussians that did not fit
-    in any more, in the order of their numbers, were left out with all their pairs). longest: int64 (B, W),
-    the longest list of a tile of each band. Scratch of each worker, which costs more to get and give back
-    than to use: keys: uint32 (workers, 2, N + 1), order: int32 (workers, 2, N + 1), begins: int32
-    (workers, N), dealt: int32 (workers, 2, P).
+    wanted: uint8 (B, T), 1 for tiles to process.
+    first: int32 (B, T + 1), where each tile's list begins in ``pair``.
+    pair: int32 (B, P), pair numbers, tile by tile, front to back.
+    owner: int32 (B, P), the Gaussian of each pair.
+    own_first, own_count: int32 (B, N), the first pair of each Gaussian, and how many it has.
+    needed: int64 (B,), pairs in total. Where that is more than P, the Gaussians that no longer fit, in the
+        order of their numbers, are left out with all their pairs.
+    longest: int64 (B, W), length of the longest tile list in each band.
+    keys, order: uint32 and int32 (workers, 2, N + 1); begins: int32 (workers, N); binned: int32
+        (workers, 2, P): scratch of each worker, kept because allocating it costs more than using it.
     """
 
     wanted: NDArray[np.uint8]
@@ -41,12 +42,12 @@ class Lists(NamedTuple):
     keys: NDArray[np.uint32]
     order: NDArray[np.int32]
     begins: NDArray[np.int32]
-    dealt: NDArray[np.int32]
+    binned: NDArray[np.int32]
 
 
 @part
 def _sort(keys, order, n):
-    """Stable radix sort of order[0, :n] by keys[0, :n] in two passes; ends in row 0."""
+    """Stable radix sort of order[0, :n] by keys[0, :n]; the result is in row 0."""
     counts = np.zeros((2, RADIX + 1), np.int64)
     for k in range(n):
         key = keys[0, k]
@@ -69,43 +70,49 @@ def _sort(keys, order, n):
 
 
 @part
-def _bits(tiles, b, i):
-    """The columns FIRST_64 of a Gaussian, as one number."""
-    low, high = np.uint64(np.uint32(tiles[b, i, FIRST_64])), np.uint64(np.uint32(tiles[b, i, FIRST_64 + 1]))
+def _tile_bits(tiles, b, i):
+    """The two TILE_BITS columns of a Gaussian as one 64-bit number."""
+    low, high = np.uint64(np.uint32(tiles[b, i, TILE_BITS])), np.uint64(np.uint32(tiles[b, i, TILE_BITS + 1]))
     return low | (high << np.uint64(32))
 
 
 @part
-def _lowest(bits, n):
-    """The lowest n of 64 bits, 0 <= n; the others are 0."""
+def _low_bits(bits, n):
+    """``bits`` with all but the lowest n (n >= 0) cleared."""
     mask = (np.uint64(1) << np.uint64(n & 63)) - np.uint64(1)
     return bits & (mask if n < 64 else ~np.uint64(0))
 
 
 @part
-def _reaches(bits, n):
-    """1 if a Gaussian reaches the n-th tile of its box, else 0."""
+def _touches_tile(bits, n):
+    """1 if a Gaussian touches the n-th tile of its bounding box, else 0."""
     return np.int64((bits >> np.uint64(min(n, 63))) & np.uint64(1)) if n < 64 else 1
 
 
 @part
-def _counted(bits, n, x0, x1, begin, end, across, wanted):
-    """How many tiles of rows begin, ..., end - 1 a Gaussian reaches that are wanted, one by one. n: the
-    number in its box of the first tile there."""
+def _count_tiles(bits, n, x0, x1, begin, end, across, wanted):
+    """Count the wanted tiles that a Gaussian touches in rows begin, ..., end - 1. n: index, within its
+    bounding box, of the first of these tiles."""
     hits = 0
     for ty in range(begin, end):
         for tx in range(x0, x1):
-            hits += np.int64(wanted[ty * across + tx]) * _reaches(bits, n)
+            hits += np.int64(wanted[ty * across + tx]) * _touches_tile(bits, n)
             n += 1
     return hits
 
 
 @kernel
-def deal(counter, worker, columns, rows, bands, count, tiles, lists):
-    """Tasks are bands: each camera's rows of tiles, columns and rows int64 (B,) tiles across and down, are
-    divided among ``bands`` tasks. Each goes through all Gaussians, so that it knows without being told where
-    its lists begin, and sorts and deals out what reaches its own tiles. The lists do not depend on how many
-    bands there are. See ``Lists``."""
+def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
+    """Fill ``lists``. A task is a band: some of a camera's rows of tiles. Each band visits all Gaussians, so
+    that it knows where its lists begin, and sorts those that touch its tiles. The lists do not depend on the
+    number of bands.
+
+    columns, rows: int64 (B,), tiles across and down.
+    bands: tasks a camera.
+    count: number of Gaussians.
+    tiles: int32 (B, N, FOOTPRINT), see ``project``.
+    lists: ``TileLists``, written.
+    """
     while True:
         task = draw(counter, worker, columns.size * bands)
         b, band = task // bands, task % bands
@@ -119,23 +126,25 @@ def deal(counter, worker, columns, rows, bands, count, tiles, lists):
         for t in range(across * down):
             asked += np.int64(wanted[t])
         whole = asked == across * down
-        keys, order, begins, dealt = (
-            lists.keys[worker], lists.order[worker], lists.begins[worker], lists.dealt[worker])  # fmt: skip
-        # Where each Gaussian's pairs begin every band knows; each writes it down for some.
+        keys, order, begins, binned = (
+            lists.keys[worker], lists.order[worker], lists.begins[worker], lists.binned[worker])  # fmt: skip
+        # Every band computes where each Gaussian's pairs begin; each band stores a share of the Gaussians.
         low, high = count * band // bands, count * (band + 1) // bands
         n = made = needed = above = mine = 0
         for i in range(count):
             x0, x1, y0, y1 = tiles[b, i, 0], tiles[b, i, 1], tiles[b, i, 2], tiles[b, i, 3]
-            bits, width, size = _bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
+            bits, width, size = _tile_bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
             begin, end = min(max(y0, top), y1), min(max(y0, bottom), y1)
             if whole & (size <= 64):
-                pairs = count_bits(_lowest(bits, size))
-                before = count_bits(_lowest(bits, (begin - y0) * width))
-                here = count_bits(_lowest(bits, (end - y0) * width)) - before
-            else:  # what lies elsewhere need not be sorted
-                before = _counted(bits, 0, x0, x1, y0, begin, across, wanted)
-                here = _counted(bits, (begin - y0) * width, x0, x1, begin, end, across, wanted)
-                pairs = before + here + _counted(bits, (end - y0) * width, x0, x1, end, y1, across, wanted)
+                pairs = count_bits(_low_bits(bits, size))
+                before = count_bits(_low_bits(bits, (begin - y0) * width))
+                here = count_bits(_low_bits(bits, (end - y0) * width)) - before
+            else:  # Gaussians outside the wanted tiles are not sorted
+                before = _count_tiles(bits, 0, x0, x1, y0, begin, across, wanted)
+                here = _count_tiles(bits, (begin - y0) * width, x0, x1, begin, end, across, wanted)
+                pairs = (
+                    before + here + _count_tiles(bits, (end - y0) * width, x0, x1, end, y1, across, wanted)
+                )
             needed += pairs
             if made + pairs > room:
                 pairs = before = here = 0
@@ -145,14 +154,14 @@ def deal(counter, worker, columns, rows, bands, count, tiles, lists):
             made += pairs
             above += before
             mine += here
-            # Written in any case: a branch here would be guessed wrong too often.
-            keys[0, n], order[0, n] = tiles[b, i, ORDER], i
+            # Written unconditionally: a branch here would be mispredicted too often.
+            keys[0, n], order[0, n] = tiles[b, i, DEPTH_KEY], i
             n += np.int64(here > 0)
         _sort(keys, order, n)
         end = begins[high] if high < count else made
         for i in range(low, high):
             p, pairs = begins[i], own_count[i]
-            if p + 4 <= end:  # written in any case, and again by the next one
+            if p + 4 <= end:  # written unconditionally; the next Gaussian overwrites the excess
                 owner[p] = owner[p + 1] = owner[p + 2] = owner[p + 3] = i
                 p += 4
             for q in range(p, begins[i] + pairs):
@@ -163,30 +172,30 @@ def deal(counter, worker, columns, rows, bands, count, tiles, lists):
         for k in range(n):
             i = order[0, k]
             x0, x1, y0, y1 = tiles[b, i, 0], tiles[b, i, 1], tiles[b, i, 2], tiles[b, i, 3]
-            bits, width, size = _bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
+            bits, width, size = _tile_bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
             begin, end, p = min(max(y0, top), y1), min(max(y0, bottom), y1), np.int64(begins[i])
             if whole & (size <= 64):
                 skipped = (begin - y0) * width
-                left = _lowest(bits, (end - y0) * width)
-                p += count_bits(_lowest(bits, skipped))
+                left = _low_bits(bits, (end - y0) * width)
+                p += count_bits(_low_bits(bits, skipped))
                 left = (left >> np.uint64(skipped)) if skipped < 64 else np.uint64(0)
                 corner, over, scale = begin * across + x0 - t0, across - width, 4096 // width + 1
                 while left != np.uint64(0):
                     bit = lowest_bit(left)
                     left &= left - np.uint64(1)
                     t = corner + bit + ((bit * scale) >> 12) * over
-                    dealt[0, made], dealt[1, made] = p, t
+                    binned[0, made], binned[1, made] = p, t
                     cursor[t + 1] += 1
                     made += 1
                     p += 1
             else:
-                p += _counted(bits, 0, x0, x1, y0, begin, across, wanted)
+                p += _count_tiles(bits, 0, x0, x1, y0, begin, across, wanted)
                 bit = (begin - y0) * width
                 for ty in range(begin, end):
                     for tx in range(x0, x1):
                         t = ty * across + tx
-                        if wanted[t] * _reaches(bits, bit) > 0:
-                            dealt[0, made], dealt[1, made] = p, t - t0
+                        if wanted[t] * _touches_tile(bits, bit) > 0:
+                            binned[0, made], binned[1, made] = p, t - t0
                             cursor[t - t0 + 1] += 1
                             made += 1
                             p += 1
@@ -201,6 +210,6 @@ def deal(counter, worker, columns, rows, bands, count, tiles, lists):
             first[t0 + t + 1] = above + cursor[t + 1]
         lists.longest[b, band] = longest
         for k in range(mine):
-            t = dealt[1, k]
-            pair[above + cursor[t]] = dealt[0, k]
+            t = binned[1, k]
+            pair[above + cursor[t]] = binned[0, k]
             cursor[t] += 1

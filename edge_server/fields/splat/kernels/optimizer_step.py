@@ -1,4 +1,4 @@
-"""One optimiser step of the Gaussians: their pairs' gradients gathered in a fixed order, then Adam."""
+"""The optimizer step: each Gaussian gathers its pairs' gradients in a fixed order, then an Adam step."""
 
 from __future__ import annotations
 
@@ -23,35 +23,38 @@ from edge_server.fields.splat.kernels.project import (
     RADIUS,
     SCALE,
     SIZE,
-    held,
+    load_camera,
 )
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,
     SEEN,
     SLOPE,
-    back,
-    begin_block,
-    scratch,
-    take_sums,
-    tint_back,
+    block_scratch,
+    gather_sums,
+    harmonics_backward,
+    load_block,
+    project_backward,
 )
-from edge_server.fields.splat.kernels.simd_vectors import LANES, Wide, both, contiguous
+from edge_server.fields.splat.kernels.simd_vectors import LANES, Vector, mask_and, require_contiguous
 
 GRADIENT_LIMIT = 1e6
 OPACITY_LIMIT = 9.0  # raw: 1.2e-4 to .99988
-COLOR_LOW, COLOR_HIGH = -0.5, 1.5  # a Gaussian's own colour may leave [0, 1] a little: pictures are clamped
+COLOR_LOW, COLOR_HIGH = -0.5, 1.5  # a Gaussian's color may leave [0, 1] a little: rendered ones are clamped
 POSITION_LIMIT = 100.0  # scene units
-DEAD = -9.0  # raw opacity of a Gaussian that was not finite: it is not seen, and soon pruned
+DEAD = -9.0  # raw opacity given to a Gaussian that was not finite: invisible, and soon pruned
 
 _F0, _F1, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 
 
-class Moments(NamedTuple):
-    """Adam's, and what densification goes by; N Gaussians, P parameters.
+class OptimizerState(NamedTuple):
+    """Adam's moments and the statistics that densification uses; N Gaussians, P parameters.
 
-    m, v: float32 (N, P). age: int32 (N,), steps each has made. slope: float32 (N,), sum of the picture
-    gradients' lengths; looks: float32 (N,), how many; reach: float32 (N,), the largest standard deviation in
-    a picture as a share of its width."""
+    m, v: float32 (N, P), first and second moments.
+    age: int32 (N,), steps that each Gaussian has made.
+    slope: float32 (N,), sum of the lengths of the gradients by the projected mean.
+    looks: float32 (N,), how many gradients that is.
+    reach: float32 (N,), largest projected standard deviation, as a share of the image's width.
+    """
 
     m: NDArray[np.float32]
     v: NDArray[np.float32]
@@ -61,10 +64,16 @@ class Moments(NamedTuple):
     reach: NDArray[np.float32]
 
 
-class Rule(NamedTuple):
-    """One step's rule. rates: float32 (P,). corrections: float32 (A, 3) by age, the last row for all higher
-    ones: Adam's two 1 / (1 - beta^t), and the share of the rates that is left. fade: pull on opacity, in loss
-    per unit of opacity. largest: scale limit in scene units; thinnest: logarithm of the largest aspect."""
+class AdamParameters(NamedTuple):
+    """Parameters of one step.
+
+    rates: float32 (P,), learning rates.
+    corrections: float32 (A, 3) by age, the last row for all higher ages: Adam's two bias corrections
+        1 / (1 - beta^t), and the share of the rates that is left.
+    fade: penalty on opacity, loss per unit of opacity.
+    largest: largest scale, scene units.
+    thinnest: logarithm of the largest ratio of longest to shortest axis.
+    """
 
     rates: NDArray[np.float32]
     corrections: NDArray[np.float32]
@@ -77,8 +86,8 @@ class Rule(NamedTuple):
 
 
 @part
-def bound(params, i, largest, thinnest):
-    """Hold Gaussian i to what it may be: finite, not a needle, not a giant."""
+def clamp_gaussian(params, i, largest, thinnest):
+    """Clamp Gaussian i to its bounds: finite, not a needle, not a giant."""
     row = params[i]
     total = _F0
     for k in range(row.size):
@@ -112,16 +121,15 @@ def bound(params, i, largest, thinnest):
 
 
 @kernel
-def bound_all(params, largest, thinnest):
-    """``bound`` for every Gaussian."""
+def clamp_gaussians(params, largest, thinnest):
     for i in range(params.shape[0]):
-        bound(params, i, largest, thinnest)
+        clamp_gaussian(params, i, largest, thinnest)
 
 
 @part
-def _prepare(base, here, touched, params, moments, rule, s, g):
-    """What ``_descend`` needs of a block, parameter by parameter, a Gaussian's side by side, to thirds of g:
-    gradient (NaN: leave it), rate, Adam's second correction. Returns how many gradients are not finite."""
+def _gather_gradients(base, here, touched, params, moments, rule, s, g):
+    """Write a block's gradients (NaN: leave the parameter as it is), rates and second bias corrections to the
+    thirds of ``g``, a Gaussian's parameters side by side. Returns how many gradients are not finite."""
     width = params.shape[1]
     third, lost = BLOCK * width, 0
     for j in range(here):
@@ -147,11 +155,10 @@ def _prepare(base, here, touched, params, moments, rule, s, g):
 
 
 @intrinsic
-def _descend_wide(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: Any, first: Any, vectors: Any,
+def _adam_vectors(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: Any, first: Any, vectors: Any,
                   beta1: Any, beta2: Any, epsilon: Any) -> Any:  # fmt: skip
-    """``_descend`` for the first ``vectors`` times LANES of its parameters."""
-
-    contiguous(g, params, m, v)
+    """``_adam`` for the first ``vectors`` * LANES of its parameters."""
+    require_contiguous(g, params, m, v)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         g_data, params_data, m_data, v_data = (
@@ -159,23 +166,23 @@ def _descend_wide(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: An
         )
         _, third, _, _, _, first, vectors, *numbers = args
         i64 = ir.IntType(64)
-        beta1, beta2, epsilon = (Wide.spread(builder, number) for number in numbers)
+        beta1, beta2, epsilon = (Vector.broadcast(builder, number) for number in numbers)
         with cgutils.for_range(builder, vectors) as loop:
             k = builder.mul(loop.index, i64(LANES))
             here = builder.add(first, k)
             places = [builder.gep(data, [here]) for data in (params_data, m_data, v_data)]
-            old, old_m, old_v = (Wide.load(builder, place) for place in places)
+            old, old_m, old_v = (Vector.load(builder, place) for place in places)
             given, rate, second = (
-                Wide.load(builder, builder.gep(builder.gep(g_data, [builder.mul(third, i64(n))]), [k]))
+                Vector.load(builder, builder.gep(builder.gep(g_data, [builder.mul(third, i64(n))]), [k]))
                 for n in range(3)
             )
-            d = given.least(-GRADIENT_LIMIT).most(GRADIENT_LIMIT)
-            new_m = beta1 * old_m + beta1.rest() * d
-            new_v = beta2 * old_v + beta2.rest() * d * d
-            sound = both(builder, new_m.finite(), new_v.finite())
+            d = given.maximum(-GRADIENT_LIMIT).minimum(GRADIENT_LIMIT)
+            new_m = beta1 * old_m + beta1.one_minus() * d
+            new_v = beta2 * old_v + beta2.one_minus() * d * d
+            sound = mask_and(builder, new_m.is_finite(), new_v.is_finite())
             new_m, new_v = new_m.where(sound), new_v.where(sound)
-            step = rate * new_m / ((new_v * second).root() + epsilon)
-            moves = given.finite()
+            step = rate * new_m / ((new_v * second).sqrt() + epsilon)
+            moves = given.is_finite()
             for place, new, before in zip(
                 places, (old - step, new_m, new_v), (old, old_m, old_v), strict=True
             ):
@@ -187,15 +194,15 @@ def _descend_wide(typingctx: Any, g: Any, third: Any, params: Any, m: Any, v: An
 
 
 @part
-def _descend(first, size, params, moments, rule, g):
-    """A step of Adam for parameters first, ..., first + size - 1, all Gaussians' in one line; g: see
-    ``_prepare``. Over a whole block at once: a Gaussian's fourteen do not fill a register."""
+def _adam(first, size, params, moments, rule, g):
+    """An Adam step for parameters first, ..., first + size - 1 of the flattened arrays; g: see
+    ``_gather_gradients``. A block at once: the fourteen parameters of one Gaussian do not fill a register."""
     third, limit, width = g.size // 3, np.float32(GRADIENT_LIMIT), params.shape[1]
     vectors = size // LANES
-    _descend_wide(
+    _adam_vectors(
         g, third, params, moments.m, moments.v, first, vectors, rule.beta1, rule.beta2, rule.epsilon
     )
-    for k in range(vectors * LANES, size):  # of the last block
+    for k in range(vectors * LANES, size):  # the remainder, in the last block only
         i, column, d = (first + k) // width, (first + k) % width, g[k]
         if is_finite(d):
             d = min(max(d, -limit), limit)
@@ -208,15 +215,19 @@ def _descend(first, size, params, moments, rule, g):
 
 
 @kernel
-def update(counter, worker, cams, gaussians, count, projected, own_first, own_count, pair_sums, moments, rule,
-           dropped):  # fmt: skip
-    """Tasks are blocks of Gaussians. dropped: int64 (blocks,), written: gradients that were not finite.
+def adam_step(counter, worker, cams, gaussians, count, projected, own_first, own_count, pair_sums, moments,
+              rule, dropped):  # fmt: skip
+    """An Adam step of all Gaussians that have pairs; the others and their moments stay as they are. Tasks
+    are blocks of Gaussians.
 
-    A Gaussian that no pair of this step belongs to stays as it is, its moments too.
+    cams: float32 (B, CAMERA), the cameras of this step.
+    projected, own_first, own_count, pair_sums: see ``project``, ``TileLists``, ``composite_backward``.
+    moments: ``OptimizerState``, updated. rule: ``AdamParameters``.
+    dropped: int64 (blocks,), written: gradients that were not finite.
     """
     params = gaussians.params
     width = params.shape[1]
-    s, ids, touched = scratch(width), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.bool_)
+    s, ids, touched = block_scratch(width), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.bool_)
     g = np.empty(3 * width * BLOCK, np.float32)
     blocks = (count + BLOCK - 1) // BLOCK
     while True:
@@ -227,13 +238,13 @@ def update(counter, worker, cams, gaussians, count, projected, own_first, own_co
         here = min(BLOCK, count - base)
         for j in range(here):
             ids[j], touched[j] = base + j, False
-        begin_block(gaussians, ids, here, s)
+        load_block(gaussians, ids, here, s)
         for b in range(cams.shape[0]):
-            if take_sums(b, ids, here, projected, own_first, own_count, pair_sums, s) == 0:
+            if gather_sums(b, ids, here, projected, own_first, own_count, pair_sums, s) == 0:
                 continue
-            cam = held(cams, b)
-            back(cam, s)
-            tint_back(cam, gaussians, ids, here, s)
+            cam = load_camera(cams, b)
+            project_backward(cam, s)
+            harmonics_backward(cam, gaussians, ids, here, s)
             for j in range(here):
                 i, slope = base + j, s[SLOPE + j]
                 if s[SEEN + j] == _F0:
@@ -243,18 +254,19 @@ def update(counter, worker, cams, gaussians, count, projected, own_first, own_co
                     moments.slope[i] += slope * cam[SIZE]
                     moments.looks[i] += _F1
                 moments.reach[i] = max(moments.reach[i], projected[b, i, RADIUS] / cam[SIZE])
-        lost = _prepare(base, here, touched, params, moments, rule, s, g)
-        _descend(base * width, here * width, params, moments, rule, g)
+        lost = _gather_gradients(base, here, touched, params, moments, rule, s, g)
+        _adam(base * width, here * width, params, moments, rule, g)
         for j in range(here):
             if touched[j]:
-                bound(params, base + j, rule.largest, rule.thinnest)
+                clamp_gaussian(params, base + j, rule.largest, rule.thinnest)
         dropped[block] = lost
 
 
 @kernel
-def pull(counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums, slope):
-    """The gradient by position alone of Gaussians ``which`` (int64 (M,)), to slope: float32 (M, 3)."""
-    s, ids = scratch(gaussians.params.shape[1]), np.empty(BLOCK, np.int64)
+def position_gradients(counter, worker, cams, gaussians, which, projected, own_first, own_count, pair_sums,
+                       slope):  # fmt: skip
+    """Write the gradient by position of Gaussians ``which``, int64 (M,), to slope: float32 (M, 3)."""
+    s, ids = block_scratch(gaussians.params.shape[1]), np.empty(BLOCK, np.int64)
     while True:
         base = fetch_add(counter, 1) * BLOCK
         if base >= which.size:
@@ -262,12 +274,12 @@ def pull(counter, worker, cams, gaussians, which, projected, own_first, own_coun
         here = min(BLOCK, which.size - base)
         for j in range(here):
             ids[j] = which[base + j]
-        begin_block(gaussians, ids, here, s)
+        load_block(gaussians, ids, here, s)
         for b in range(cams.shape[0]):
-            if take_sums(b, ids, here, projected, own_first, own_count, pair_sums, s) > 0:
-                cam = held(cams, b)
-                back(cam, s)
-                tint_back(cam, gaussians, ids, here, s)
+            if gather_sums(b, ids, here, projected, own_first, own_count, pair_sums, s) > 0:
+                cam = load_camera(cams, b)
+                project_backward(cam, s)
+                harmonics_backward(cam, gaussians, ids, here, s)
         for j in range(here):
             for k in range(3):
                 d = s[GRADIENT + k * BLOCK + j]

@@ -1,8 +1,8 @@
-"""From a Gaussian in space to one in the picture (Kerbl et al. 2023, after Zwicker et al. 2001).
+"""Projection of Gaussians to the image plane (Kerbl et al. 2023, after Zwicker et al. 2001).
 
-Everything is in scene units and float32. A lens with distortion is part of the projection: the mean is
-distorted, and the Jacobian that flattens the covariance is that of the distorted projection, so pictures
-need no undistortion at intake and any camera can be rendered.
+Everything is in scene units and float32. Lens distortion is part of the projection: the mean is distorted,
+and the covariance is projected by the Jacobian of the distorted projection. Images therefore need no
+undistortion at intake, and any camera can be rendered.
 """
 
 from __future__ import annotations
@@ -16,34 +16,39 @@ from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import bits_of_float, draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 
-# Columns of a Gaussian's parameters; from COLOR + 3 on, three for each further spherical harmonic.
+# Columns of a Gaussian's parameters; from BASE on, three for each further spherical harmonic.
 POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
 BASE = 14
 # Columns of a projected Gaussian.
-MX, MY, QA, QB, QC, ALPHA, RED, DEPTH, RADIUS, HALF_HEIGHT, PROJECTED = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11, 12
-# Columns of what a Gaussian reaches: tiles x0, x1, y0, y1 (x1 <= x0: none); and which of them, bit by bit,
-# x fastest, the first 64 (from there on, all of them); and the depth as ``deal`` sorts by it.
-FIRST_64, ORDER, REACHED = 4, 6, 7
+MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, DEPTH = 0, 1, 2, 3, 4, 5, 6, 9
+RADIUS, HALF_HEIGHT, PROJECTED = 10, 11, 12
+# Columns of a Gaussian's footprint: the box of tiles x0, x1, y0, y1 (x1 <= x0: empty); a bit for each of its
+# first 64 tiles, x fastest, set where the Gaussian touches the tile (it is taken to touch the tiles beyond
+# these); the depth as a sort key for ``bin_tiles``.
+TILE_BITS, DEPTH_KEY, FOOTPRINT = 4, 6, 7
 # Columns of a camera.
 ORIGIN, LENS, LIMITS, NEAR, SIZE, TIME, CAMERA = 9, 12, 20, 24, 25, 27, 28
 
 TILE = 8  # pixels a side
 BLOCK = 128  # Gaussians a task
 
-# The bits of a positive float32 sort as the number does. From .01 to 1e5 scene units the upper 23 of them
-# take 380 thousand values: what is nearer to another than 6e-5 of its depth may come before or after it.
-ORDER_BITS = 20
-_NEAREST, _UPPER = np.int32(0x3C23D70A), np.int32(9)  # the bits of .01; lower bits that are left out
+# The bits of positive float32 sort as the numbers do. From .01 to 1e5 scene units their upper 23 bits take
+# 380 thousand values: the order of Gaussians whose depths differ by less than a share of 6e-5 is arbitrary.
+DEPTH_BITS = 20
+_NEAREST_BITS, _DROPPED_BITS = (
+    np.int32(0x3C23D70A),
+    np.int32(9),
+)  # the bits of .01; lower bits that are left out
 
-LOW_PASS = 0.3  # of a pixel squared: nothing is sharper than a pixel
-ALPHA_LEAST = 1.0 / 255.0  # a Gaussian ends where it adds less than this
-# Bounds of raw parameters, applied forward; where they bind the gradient is 0.
+LOW_PASS = 0.3  # pixels squared, added to projected variances: nothing is sharper than a pixel
+ALPHA_MIN = 1.0 / 255.0  # a Gaussian ends where its alpha is below this
+# Bounds of raw parameters, applied in the forward pass; the gradient is 0 where they bind.
 SCALE_LOW, SCALE_HIGH = -12.0, 4.0
 RAW_OPACITY = 12.0
 FAR = 1e5  # scene units: beyond it float32 squares lose their meaning
-_NO_DIRECTION = 1e-20  # squared length of a quaternion that has none
+_NO_DIRECTION = 1e-20  # squared length below which a quaternion has no direction
 
-# Rows of BLOCK numbers in which a block of Gaussians is projected side by side.
+# Rows of BLOCK numbers, in which a block of Gaussians is projected side by side.
 _X, _VX, _M, _ALPHA, _REACH, _Q, _S = (n * BLOCK for n in (0, 3, 6, 15, 16, 17, 21))
 _PX, _PY, _PZ, _A, _B, _C, _WIDE, _HIGH, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLOCK for n in range(17, 29))
 _ROWS = 29
@@ -52,9 +57,13 @@ _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.flo
 
 
 class Gaussians(NamedTuple):
-    """params: float32 (N, BASE + 3 (harmonics - 1)). harmonics: 1, 4 or 9. velocity: float32 (N, 3), scene
-    units a second: a camera whose column TIME is t (seconds from the instant of ``params``) sees a Gaussian
-    where it was then."""
+    """The Gaussians as the kernels read them.
+
+    params: float32 (N, BASE + 3 (harmonics - 1)).
+    harmonics: spherical harmonics of the color: 1, 4 or 9.
+    velocity: float32 (N, 3), scene units a second. A camera whose column TIME is t, in seconds from the
+        instant of ``params``, sees a Gaussian where it was then.
+    """
 
     params: NDArray[np.float32]
     harmonics: int
@@ -62,10 +71,10 @@ class Gaussians(NamedTuple):
 
 
 @part
-def held(cams, b):
-    """Camera b's columns as a tuple of CAMERA numbers. A loop that writes to arrays then need not read the
-    camera again for every Gaussian, which would keep LLVM from vectorising it; and no row of an array is
-    made an array of its own, whose owners the threads would count."""
+def load_camera(cams, b):
+    """Camera b's columns as a tuple of CAMERA numbers. From a tuple, a loop that writes to arrays need not
+    read the camera again for every Gaussian, which would keep LLVM from vectorizing it; and no array object
+    is made of the row, whose references the threads would count."""
     return (
         cams[b, 0], cams[b, 1], cams[b, 2], cams[b, 3], cams[b, 4], cams[b, 5], cams[b, 6],
         cams[b, 7], cams[b, 8], cams[b, 9], cams[b, 10], cams[b, 11], cams[b, 12], cams[b, 13],
@@ -75,9 +84,9 @@ def held(cams, b):
 
 
 @part
-def bent(cam, x, y):
-    """Distorted normalised coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
-    its derivatives xxx, xxy, xyy, yyy. cam: ``held``."""
+def distort(cam, x, y):
+    """Distorted normalized coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
+    its derivatives xxx, xxy, xyy, yyy. cam: see ``load_camera``."""
     k1, k2, p1, p2 = cam[LENS + 4], cam[LENS + 5], cam[LENS + 6], cam[LENS + 7]
     six, eight = np.float32(6.0), np.float32(8.0)
     r2 = x * x + y * y
@@ -97,7 +106,7 @@ def bent(cam, x, y):
 
 @part
 def unit_quaternion(w, x, y, z):
-    """The quaternion's direction and 1 / length; (1, 0, 0, 0) and 0 where it has none."""
+    """The normalized quaternion and 1 / length; (1, 0, 0, 0) and 0 for one without a direction."""
     square = w * w + x * x + y * y + z * z
     has = (square > np.float32(_NO_DIRECTION)) & (square < np.float32(1e20))
     inverse = _F1 / np.sqrt(square if has else _F1)
@@ -109,7 +118,7 @@ def unit_quaternion(w, x, y, z):
 
 @part
 def rotation(w, x, y, z):
-    """The matrix of a unit quaternion, row by row."""
+    """The rotation matrix of a unit quaternion, row by row."""
     return (
         _F1 - _F2 * (y * y + z * z), _F2 * (x * y - w * z), _F2 * (x * z + w * y),
         _F2 * (x * y + w * z), _F1 - _F2 * (x * x + z * z), _F2 * (y * z - w * x),
@@ -118,24 +127,24 @@ def rotation(w, x, y, z):
 
 
 @part
-def held_scale(raw):
-    """A length, of its raw parameter."""
+def exp_scale(raw):
+    """The scale of a raw parameter, which is clamped first."""
     return exp32(min(max(raw, np.float32(SCALE_LOW)), np.float32(SCALE_HIGH)))
 
 
 @part
 def camera_point(cam, params, velocity, i):
-    """Gaussian i in the axes of camera ``held``, where it is when that looks."""
+    """The center of Gaussian i in camera axes, at the camera's time. cam: see ``load_camera``."""
     t = cam[TIME]
     x = params[i, 0] + t * velocity[i, 0] - cam[ORIGIN]
     y = params[i, 1] + t * velocity[i, 1] - cam[ORIGIN + 1]
     z = params[i, 2] + t * velocity[i, 2] - cam[ORIGIN + 2]
-    return turned(cam, x, y, z)
+    return rotate_to_camera(cam, x, y, z)
 
 
 @part
-def turned(cam, x, y, z):
-    """A vector of world axes in those of the camera."""
+def rotate_to_camera(cam, x, y, z):
+    """A vector in world axes -> in camera axes."""
     return (
         cam[0] * x + cam[1] * y + cam[2] * z,
         cam[3] * x + cam[4] * y + cam[5] * z,
@@ -144,23 +153,24 @@ def turned(cam, x, y, z):
 
 
 @part
-def flattener(cam, x, y, z):
-    """What takes world axes to pixels at a camera point: mean (u, v), the rows of J W (2 x 3), and what its
-    gradient needs. The ratios x / z and y / z are held to 1.3 of the field of view, where J is taken."""
+def lens_terms(cam, x, y, z):
+    """The projection of a camera point through the lens, and what the Jacobian J and its gradient need:
+    x / z, y / z, both clamped, projected u, v, the lens's first and second derivatives, 1 / z. J is taken at
+    the ratios clamped to 1.3 times the field of view."""
     inverse = _F1 / z
     a, c = x * inverse, y * inverse
     ta = min(max(a, cam[LIMITS]), cam[LIMITS + 1])
     tc = min(max(c, cam[LIMITS + 2]), cam[LIMITS + 3])
-    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = bent(cam, ta, tc)
-    # Beyond the limits the lens goes on straight: its polynomial folds back into the picture out there.
+    u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy = distort(cam, ta, tc)
+    # Beyond the limits the lens is linear: its polynomial would fold back into the image out there.
     u += dxx * (a - ta) + dxy * (c - tc)
     v += dxy * (a - ta) + dyy * (c - tc)
     return a, c, ta, tc, u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse
 
 
 @part
-def times(cam, j0, j1, j2):
-    """A row of camera axes -> of world axes."""
+def rotate_to_world(cam, j0, j1, j2):
+    """A row vector in camera axes -> in world axes."""
     return (
         j0 * cam[0] + j1 * cam[3] + j2 * cam[6],
         j0 * cam[1] + j1 * cam[4] + j2 * cam[7],
@@ -169,10 +179,10 @@ def times(cam, j0, j1, j2):
 
 
 @part
-def _unfold(gaussians, base, count, s):
-    """Gaussians base, ..., base + count - 1 as no camera has seen them yet, to the rows of ``s``: place,
-    velocity, the axes of the ellipsoid times their lengths, opacity, and how far the Gaussian reaches, in
-    standard deviations squared (0: nowhere)."""
+def _load_block(gaussians, base, count, s):
+    """Load what is the same for all cameras of Gaussians base, ..., base + count - 1 into the rows of ``s``:
+    position, velocity, axes of the ellipsoid times their lengths, opacity, and the Gaussian's extent in
+    standard deviations squared (0: invisible)."""
     params, velocity = gaussians.params, gaussians.velocity
     for j in range(count):
         i = base + j
@@ -187,35 +197,35 @@ def _unfold(gaussians, base, count, s):
             s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
         )
         r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(w, x, y, z)
-        s0, s1, s2 = held_scale(s[_S + j]), held_scale(s[_S + BLOCK + j]), held_scale(s[_S + 2 * BLOCK + j])
+        s0, s1, s2 = exp_scale(s[_S + j]), exp_scale(s[_S + BLOCK + j]), exp_scale(s[_S + 2 * BLOCK + j])
         s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j] = r0 * s0, r1 * s1, r2 * s2
         s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j] = r3 * s0, r4 * s1, r5 * s2
         s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j] = r6 * s0, r7 * s1, r8 * s2
         raw = s[_ALPHA + j]
         alpha = _F1 / (_F1 + exp32(-min(max(raw, np.float32(-RAW_OPACITY)), np.float32(RAW_OPACITY))))
-        shows = is_finite(raw) & (alpha > np.float32(ALPHA_LEAST))
+        shows = is_finite(raw) & (alpha > np.float32(ALPHA_MIN))
         s[_ALPHA + j] = alpha
-        s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_LEAST)) if shows else _F0
+        s[_REACH + j] = _F2 * log32(alpha * np.float32(1.0 / ALPHA_MIN)) if shows else _F0
 
 
 @part
-def _flatten(cam, s):
-    """What camera ``held`` sees of the Gaussians in the rows of ``s``: mean, depth and covariance in the
-    picture, and the edges of what each reaches in tiles, LEFT > RIGHT where it is not in the picture."""
+def _project_block(cam, s):
+    """Project the Gaussians in the rows of ``s`` into a camera: mean, depth, conic, and the edges of the box
+    they cover, in tiles (LEFT > RIGHT: not in the image). cam: see ``load_camera``."""
     fx, fy, width, height = cam[LENS], cam[LENS + 1], cam[SIZE], cam[SIZE + 1]
     low, over, t = np.float32(LOW_PASS), np.float32(1.0 / TILE), cam[TIME]
     for j in range(BLOCK):
-        x, y, z = turned(
+        x, y, z = rotate_to_camera(
             cam,
             s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
             s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
             s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
         )
         shows = (z > cam[NEAR]) & (z < np.float32(FAR)) & (s[_REACH + j] > _F0)
-        _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = flattener(cam, x, y, z if shows else _F1)
+        _, _, ta, tc, u, v, dxx, dxy, dyy, _, _, _, _, inverse = lens_terms(cam, x, y, z if shows else _F1)
         gx, gy = fx * inverse, fy * inverse
-        t0, t1, t2 = times(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
-        t3, t4, t5 = times(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
+        t0, t1, t2 = rotate_to_world(cam, gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc))
+        t3, t4, t5 = rotate_to_world(cam, gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc))
         m0, m1, m2 = s[_M + j], s[_M + BLOCK + j], s[_M + 2 * BLOCK + j]
         m3, m4, m5 = s[_M + 3 * BLOCK + j], s[_M + 4 * BLOCK + j], s[_M + 5 * BLOCK + j]
         m6, m7, m8 = s[_M + 6 * BLOCK + j], s[_M + 7 * BLOCK + j], s[_M + 8 * BLOCK + j]
@@ -241,15 +251,15 @@ def _flatten(cam, s):
 
 
 @part
-def _touched(px, py, a, b, c, reach, x0, x1, y0, y1):
-    """Which tiles of a box an ellipse has pixels in, as bits: those in whose nearest point to its middle
-    a dx^2 + 2 b dx dy + c dy^2 is no more than ``reach``. A box is twice as large as a slanting needle's
-    ellipse, and every tile of its costs as much as one that it touches."""
+def _touched_tiles(px, py, a, b, c, reach, x0, x1, y0, y1):
+    """Bits of the tiles of a box that an ellipse touches: those in which a dx^2 + 2 b dx dy + c dy^2 is at
+    most ``reach`` somewhere. The box of a slanting needle is twice as large as its ellipse, and a tile that
+    the ellipse misses would cost as much as one that it touches."""
     bits, bit = np.uint64(0), np.uint64(0)
     most = reach * np.float32(1.001) + np.float32(1e-3)
     slope_x, slope_y = -b / a, -b / c
     for ty in range(y0, y1):
-        # From the middle to the centres of the tile's outermost pixels.
+        # From the mean to the centers of the tile's outermost pixels.
         low_y = np.float32(TILE * ty) + _HALF - py
         high_y = low_y + np.float32(TILE - 1)
         dy = max(low_y, min(high_y, _F0))
@@ -257,7 +267,7 @@ def _touched(px, py, a, b, c, reach, x0, x1, y0, y1):
             low_x = np.float32(TILE * tx) + _HALF - px
             high_x = low_x + np.float32(TILE - 1)
             dx = max(low_x, min(high_x, _F0))
-            # The least over a rectangle lies on one of the two edges that face the middle.
+            # The minimum over a rectangle lies on one of the two edges that face the mean.
             ex, ey = min(max(slope_x * dy, low_x), high_x), min(max(slope_y * dx, low_y), high_y)
             least = min(
                 a * ex * ex + (b + b) * ex * dy + c * dy * dy, a * dx * dx + (b + b) * dx * ey + c * ey * ey
@@ -271,12 +281,12 @@ def _touched(px, py, a, b, c, reach, x0, x1, y0, y1):
 
 
 @part
-def _write(cam, gaussians, i, s, j, row, edges):
-    """Fill row (PROJECTED,) and edges (REACHED,) from lane j of ``s``. conic: the inverse of the picture
-    covariance, upper triangle."""
+def _write_projected(cam, gaussians, i, s, j, row, edges):
+    """Fill row (PROJECTED,) and edges (FOOTPRINT,) of Gaussian i from column j of ``s``. The conic is the
+    upper triangle of the inverse of the projected covariance."""
     params, harmonics = gaussians.params, gaussians.harmonics
-    row[MX], row[MY], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
-    row[QA], row[QB], row[QC] = s[_A + j], s[_B + j], s[_C + j]
+    row[MEAN_X], row[MEAN_Y], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
+    row[CONIC_A], row[CONIC_B], row[CONIC_C] = s[_A + j], s[_B + j], s[_C + j]
     row[ALPHA], row[RADIUS], row[HALF_HEIGHT] = s[_ALPHA + j], s[_WIDE + j], s[_HIGH + j]
     for k in range(3):
         row[RED + k] = params[i, COLOR + k]
@@ -292,33 +302,47 @@ def _write(cam, gaussians, i, s, j, row, edges):
     if is_finite(row[RED] + row[RED + 1] + row[RED + 2]):
         edges[0], edges[1] = np.int32(s[_LEFT + j]), np.int32(s[_RIGHT + j]) + 1
         edges[2], edges[3] = np.int32(s[_TOP + j]), np.int32(s[_BOTTOM + j]) + 1
-        bits = _touched(
-            row[MX], row[MY], row[QA], row[QB], row[QC], s[_REACH + j], edges[0], edges[1], edges[2], edges[3]
+        bits = _touched_tiles(
+            row[MEAN_X],
+            row[MEAN_Y],
+            row[CONIC_A],
+            row[CONIC_B],
+            row[CONIC_C],
+            s[_REACH + j],
+            edges[0],
+            edges[1],
+            edges[2],
+            edges[3],
         )
-        far = (bits_of_float(row[DEPTH]) - _NEAREST) >> _UPPER
-        edges[ORDER] = min(max(far, np.int32(0)), np.int32((1 << ORDER_BITS) - 1))
-        edges[FIRST_64] = np.int32(bits & np.uint64(0xFFFFFFFF))
-        edges[FIRST_64 + 1] = np.int32(bits >> np.uint64(32))
+        far = (bits_of_float(row[DEPTH]) - _NEAREST_BITS) >> _DROPPED_BITS
+        edges[DEPTH_KEY] = min(max(far, np.int32(0)), np.int32((1 << DEPTH_BITS) - 1))
+        edges[TILE_BITS] = np.int32(bits & np.uint64(0xFFFFFFFF))
+        edges[TILE_BITS + 1] = np.int32(bits >> np.uint64(32))
 
 
 @kernel
 def project(counter, worker, cams, gaussians, count, projected, tiles):
-    """Fill projected: float32 (B, >= count, PROJECTED), and tiles: int32 (B, >= count, REACHED). Tasks are
-    blocks of Gaussians, each for all the cameras (float32 (B, CAMERA)): what no camera changes is worked out
-    once."""
+    """Project all Gaussians into all cameras. Tasks are blocks of Gaussians, each for all cameras: what does
+    not depend on the camera is computed once.
+
+    cams: float32 (B, CAMERA).
+    gaussians: ``Gaussians``, of which the first ``count`` are projected.
+    projected: float32 (B, >= count, PROJECTED), written where a Gaussian is in the image.
+    tiles: int32 (B, >= count, FOOTPRINT), written.
+    """
     s = np.zeros(_ROWS * BLOCK, np.float32)
     while True:
         base = draw(counter, worker, (count + BLOCK - 1) // BLOCK) * BLOCK
         if base >= count:
             return
         here = min(BLOCK, count - base)
-        _unfold(gaussians, base, here, s)
+        _load_block(gaussians, base, here, s)
         for b in range(cams.shape[0]):
-            cam = held(cams, b)
-            _flatten(cam, s)
+            cam = load_camera(cams, b)
+            _project_block(cam, s)
             for j in range(here):
                 i = base + j
                 edges = tiles[b, i]
                 edges[0] = edges[1] = edges[2] = edges[3] = 0
                 if s[_LEFT + j] <= s[_RIGHT + j]:
-                    _write(cam, gaussians, i, s, j, projected[b, i], edges)
+                    _write_projected(cam, gaussians, i, s, j, projected[b, i], edges)

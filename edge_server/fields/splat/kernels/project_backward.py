@@ -1,7 +1,7 @@
-"""The gradient of ``splat_project``: from what a Gaussian's pixels say to its parameters, block by block.
+"""The gradient of ``project``: from the sums over a Gaussian's pixels to its parameters, block by block.
 
-As there, a block's Gaussians lie side by side in rows of BLOCK numbers of one piece of memory, so that every
-line is a loop that LLVM vectorises; what a camera does not see is worked out, too, and left out at the end.
+As in ``project``, a block is a set of rows of BLOCK numbers in one piece of memory, so that LLVM vectorizes
+every line over its Gaussians. Gaussians that the camera does not see are computed too, and masked at the end.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from edge_server.fields.splat.kernels.project import (
     BASE,
     BLOCK,
     COLOR,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
     LENS,
     OPACITY,
     ORIGIN,
-    QA,
-    QB,
-    QC,
     QUATERNION,
     RAW_OPACITY,
     SCALE,
     SCALE_HIGH,
     SCALE_LOW,
     TIME,
-    flattener,
-    held_scale,
+    exp_scale,
+    lens_terms,
+    rotate_to_camera,
+    rotate_to_world,
     rotation,
-    times,
-    turned,
     unit_quaternion,
 )
 
-# Rows of BLOCK numbers: place, velocity, raw scale, quaternion, raw opacity; of what a camera sees: opacity,
-# conic, the pairs' sums, whether there were any, and the length of the gradient of the mean; from GRADIENT on
-# a row for each parameter.
+# Rows of BLOCK numbers: position, velocity, raw scale, quaternion, raw opacity; then for one camera: opacity,
+# conic, sums over pairs, whether there are any pairs, and the length of the gradient by the projected mean;
+# from GRADIENT on, a row for each parameter's gradient.
 _X, _VX, _S, _Q, _RAW, _ALPHA, _QA, _QB, _QC, _SUM = (n * BLOCK for n in (0, 3, 6, 9, 13, 14, 15, 16, 17, 18))
 SEEN, SLOPE, GRADIENT = (n * BLOCK for n in (27, 28, 29))
 _ROWS = 29
@@ -46,14 +46,14 @@ _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.flo
 
 
 @part
-def scratch(width):
-    """Memory for a block of Gaussians of ``width`` parameters."""
+def block_scratch(width):
+    """Memory for a block of Gaussians with ``width`` parameters each."""
     return np.zeros((_ROWS + width) * BLOCK, np.float32)
 
 
 @part
-def begin_block(gaussians, ids, count, s):
-    """Gaussians ids[:count] to the rows of ``s``; their gradients are 0."""
+def load_block(gaussians, ids, count, s):
+    """Load Gaussians ids[:count] into the rows of ``s`` and set their gradients to 0."""
     params, velocity = gaussians.params, gaussians.velocity
     for j in range(count):
         i = ids[j]
@@ -68,9 +68,9 @@ def begin_block(gaussians, ids, count, s):
 
 
 @part
-def take_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
-    """What camera slot b's pairs say to the block: their sums, in the order they have. Returns to how many
-    Gaussians they say anything."""
+def gather_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
+    """Add up the sums of each Gaussian's pairs in camera slot b, in a fixed order. Returns how many Gaussians
+    of the block have pairs there."""
     seen = 0
     for j in range(count):
         i = ids[j]
@@ -83,7 +83,8 @@ def take_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
         for k, value in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8)):
             s[_SUM + k * BLOCK + j] = value
         row = projected[b, i]
-        s[_ALPHA + j], s[_QA + j], s[_QB + j], s[_QC + j] = row[ALPHA], row[QA], row[QB], row[QC]
+        s[_ALPHA + j] = row[ALPHA]
+        s[_QA + j], s[_QB + j], s[_QC + j] = row[CONIC_A], row[CONIC_B], row[CONIC_C]
         s[SEEN + j] = _F1 if pairs > 0 else _F0
         seen += np.int64(pairs > 0)
     for j in range(count, BLOCK):
@@ -92,34 +93,35 @@ def take_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
 
 
 @part
-def back(cam, s):
-    """Add to the rows from GRADIENT on what camera ``held`` makes of the sums: over the pixels a Gaussian
-    covers, d loss / d power (h), h dx, h dy, h dx^2, h dx dy, h dy^2 with (dx, dy) from the mean to the
-    pixel, and d loss / d colour. Row SLOPE: the length of the gradient of the mean in the picture (pixels),
-    0 where it is not seen."""
+def project_backward(cam, s):
+    """Add one camera's gradients to the rows from GRADIENT on. cam: see ``load_camera``.
+
+    The sums over the pixels that a Gaussian covers are: h = d loss / d power, h dx, h dy, h dx^2, h dx dy,
+    h dy^2, with (dx, dy) from the mean to the pixel, and d loss / d color. Row SLOPE gets the length of the
+    gradient by the projected mean (pixels), 0 where the Gaussian is not seen."""
     fx, fy, t = cam[LENS], cam[LENS + 1], cam[TIME]
     for j in range(BLOCK):
         seen = s[SEEN + j] > _F0
-        x, y, z = turned(
+        x, y, z = rotate_to_camera(
             cam,
             s[_X + j] + t * s[_VX + j] - cam[ORIGIN],
             s[_X + BLOCK + j] + t * s[_VX + BLOCK + j] - cam[ORIGIN + 1],
             s[_X + 2 * BLOCK + j] + t * s[_VX + 2 * BLOCK + j] - cam[ORIGIN + 2],
         )
-        a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = flattener(
+        a, c, ta, tc, _, _, dxx, dxy, dyy, xxx, xxy, xyy, yyy, inverse = lens_terms(
             cam, x, y, z if seen else _F1
         )
         gx, gy = fx * inverse, fy * inverse
         j0, j1, j2 = gx * dxx, gx * dxy, -gx * (dxx * ta + dxy * tc)
         j3, j4, j5 = gy * dxy, gy * dyy, -gy * (dxy * ta + dyy * tc)
-        t0, t1, t2 = times(cam, j0, j1, j2)
-        t3, t4, t5 = times(cam, j3, j4, j5)
+        t0, t1, t2 = rotate_to_world(cam, j0, j1, j2)
+        t3, t4, t5 = rotate_to_world(cam, j3, j4, j5)
         qw, qx, qy, qz, q_inverse = unit_quaternion(
             s[_Q + j], s[_Q + BLOCK + j], s[_Q + 2 * BLOCK + j], s[_Q + 3 * BLOCK + j]
         )
         r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(qw, qx, qy, qz)
         raw0, raw1, raw2 = s[_S + j], s[_S + BLOCK + j], s[_S + 2 * BLOCK + j]
-        s0, s1, s2 = held_scale(raw0), held_scale(raw1), held_scale(raw2)
+        s0, s1, s2 = exp_scale(raw0), exp_scale(raw1), exp_scale(raw2)
         v0, v1, v2 = (t0 * r0 + t1 * r3 + t2 * r6) * s0, (t0 * r1 + t1 * r4 + t2 * r7) * s1, (
             t0 * r2 + t1 * r5 + t2 * r8) * s2  # fmt: skip
         w0, w1, w2 = (t3 * r0 + t4 * r3 + t5 * r6) * s0, (t3 * r1 + t4 * r4 + t5 * r7) * s1, (
@@ -144,7 +146,7 @@ def back(cam, s):
         s[at + BLOCK] += d1 if seen & (raw1 > low) & (raw1 < high) else _F0
         s[at + 2 * BLOCK] += d2 if seen & (raw2 > low) & (raw2 < high) else _F0
         a0, a1, a2, b0, b1, b2 = a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2
-        # rotation: T^T dU, then the quaternion and its normalisation
+        # rotation: T^T dU, then the quaternion and its normalization
         d0, d1, d2 = t0 * a0 + t3 * b0, t0 * a1 + t3 * b1, t0 * a2 + t3 * b2
         d3, d4, d5 = t1 * a0 + t4 * b0, t1 * a1 + t4 * b1, t1 * a2 + t4 * b2
         d6, d7, d8 = t2 * a0 + t5 * b0, t2 * a1 + t5 * b1, t2 * a2 + t5 * b2
@@ -162,18 +164,18 @@ def back(cam, s):
         # dT = dU R^T, then dJ = dT W^T
         c0, c1, c2 = a0 * r0 + a1 * r1 + a2 * r2, a0 * r3 + a1 * r4 + a2 * r5, a0 * r6 + a1 * r7 + a2 * r8
         c3, c4, c5 = b0 * r0 + b1 * r1 + b2 * r2, b0 * r3 + b1 * r4 + b2 * r5, b0 * r6 + b1 * r7 + b2 * r8
-        k0, k1, k2 = turned(cam, c0, c1, c2)
-        k3, k4, k5 = turned(cam, c3, c4, c5)
+        k0, k1, k2 = rotate_to_camera(cam, c0, c1, c2)
+        k3, k4, k5 = rotate_to_camera(cam, c3, c4, c5)
         dz = -inverse * (k0 * j0 + k1 * j1 + k2 * j2 + k3 * j3 + k4 * j4 + k5 * j5)
-        # J by the ratios: J = D P with P = (1, 0, -ta; 0, 1, -tc) / z
+        # derivatives of J by the ratios: J = D P with P = (1, 0, -ta; 0, 1, -tc) / z
         dda = fx * du * dxx + fy * dv * dxy
         ddc = fx * du * dxy + fy * dv * dyy
         p0, p1 = gx * (k0 - ta * k2), gx * (k1 - tc * k2)  # by dxx and dxy through the first row
         p2, p3 = gy * (k3 - ta * k5), gy * (k4 - tc * k5)  # by dxy and dyy through the second
-        bent_a = p0 * xxx + (p1 + p2) * xxy + p3 * xyy - (gx * dxx * k2 + gy * dxy * k5)
-        bent_c = p0 * xxy + (p1 + p2) * xyy + p3 * yyy - (gx * dxy * k2 + gy * dyy * k5)
-        dda += bent_a if a == ta else _F0
-        ddc += bent_c if c == tc else _F0
+        lens_a = p0 * xxx + (p1 + p2) * xxy + p3 * xyy - (gx * dxx * k2 + gy * dxy * k5)
+        lens_c = p0 * xxy + (p1 + p2) * xyy + p3 * yyy - (gx * dxy * k2 + gy * dyy * k5)
+        dda += lens_a if a == ta else _F0
+        ddc += lens_c if c == tc else _F0
         dx, dy = dda * inverse, ddc * inverse
         dz -= (dda * a + ddc * c) * inverse
         o0 = cam[0] * dx + cam[3] * dy + cam[6] * dz
@@ -214,8 +216,8 @@ def _harmonic_slope(h, x, y, z):
 
 
 @part
-def tint_back(cam, gaussians, ids, count, s):
-    """What ``back`` leaves out: the colour by the direction it is seen from, if there are harmonics."""
+def harmonics_backward(cam, gaussians, ids, count, s):
+    """Add the gradient by way of the view-dependent color, which ``project_backward`` leaves out."""
     params, harmonics = gaussians.params, gaussians.harmonics
     if harmonics == 1:
         return

@@ -1,9 +1,8 @@
-"""Compositing a tile's Gaussians (thesis 3.20 with alphas in place of densities), losses of its pixels, and
-back.
+"""Rasterization of tiles (gsplat's ``rasterize_to_pixels``), the losses of their pixels, and the gradients.
 
-A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with offsets that
-are constants, which is what lets LLVM vectorise it without tests for overlap; the Gaussians are laid down
-strip by strip, in ``splat_strips``.
+A tile is 8 x 8 pixels. Every loop runs over its 64 pixels at once, on one piece of memory with constant
+offsets, which lets LLVM vectorize it without tests for overlap. ``composite`` adds the Gaussians strip by
+strip (thesis 3.20 with alphas in place of densities).
 """
 
 from __future__ import annotations
@@ -16,31 +15,31 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw, exp32, fetch_add, is_finite, uniform
 from edge_server.fields.splat.kernels.composite import (
-    ALPHA_MOST,
-    KEPT,
+    ALPHA_MAX,
     PIXELS,
+    SAVED,
     STOP,
     STRIP,
     STRIPS,
     SUMS,
-    lay,
-    lift,
-    sort_into_strips,
+    bin_strips,
+    composite,
+    composite_backward,
 )
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
-    ALPHA_LEAST,
-    MX,
-    MY,
-    QA,
-    QB,
-    QC,
+    ALPHA_MIN,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    MEAN_X,
+    MEAN_Y,
     RED,
     TILE,
 )
 
-# Rows of a tile's memory: light, colour and depth, in ``lay``'s order; what the loss makes of each colour,
-# and what lies behind, in ``lift``'s.
+# Rows of a tile's memory: light, color and depth, in the order of ``composite``; the loss's gradient by each
+# color, and the background's term, in the order of ``composite_backward``.
 _T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
 _ER, _EG, _EB, _BEHIND = (n * PIXELS for n in range(5, 9))
 ROWS = 9
@@ -51,9 +50,13 @@ _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # of SSIM
 
 
 class Loss(NamedTuple):
-    """What is minimised, per pixel and summed. absolute: L1 rather than squared errors. dssim: weight of
-    (1 - SSIM) / 2 over the tile as one window. background: float32 (3,); random: another one for each tile,
-    from stream ``key``."""
+    """The loss, summed over pixels.
+
+    absolute: absolute (L1) rather than squared errors.
+    dssim: weight of (1 - SSIM) / 2, with the tile as one window.
+    background: float32 (3,).
+    random: use a random background for each tile, from stream ``key``, instead.
+    """
 
     absolute: bool
     dssim: np.float32
@@ -63,16 +66,16 @@ class Loss(NamedTuple):
 
 
 @part
-def begin_tile(s):
-    """All light, no colour."""
+def clear_tile(s):
+    """Reset the tile memory ``s``: full light, no color."""
     for k in range(PIXELS):
         s[_T + k] = _F1
         s[_R + k] = s[_G + k] = s[_B + k] = s[_Z + k] = _F0
 
 
 @part
-def room(lists):
-    """Scratch of ``sort_into_strips`` for the longest list: who and count."""
+def strip_scratch(lists):
+    """Arrays for ``bin_strips`` that fit the longest tile list: strip_pairs and count."""
     longest = np.int64(1)
     for b in range(lists.longest.shape[0]):
         for r in range(lists.longest.shape[1]):
@@ -81,21 +84,21 @@ def room(lists):
 
 
 @part
-def lay_tile(s, lists, b, t, x0, y0, projected, who, count, store):
-    """Lay all Gaussians of tile t of camera slot b over the tile memory ``s``; nothing is kept of them."""
-    begin_tile(s)
-    sort_into_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, who, count)
+def composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store):
+    """Composite tile t of camera slot b into the tile memory ``s``, forward only."""
+    clear_tile(s)
+    bin_strips(lists, b, lists.first[b, t], lists.first[b, t + 1], projected, y0, strip_pairs, count)
     for n in range(STRIPS):
-        lay(
-            who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
+        composite(
+            strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
             _T + n * STRIP, store, 0,
         )  # fmt: skip
 
 
 @part
-def dissimilarity(s, row, error_row, target, count, weight):
-    """Add the gradient of weight * count * (1 - SSIM) / 2 between a colour row of ``s`` and target (PIXELS,)
-    over their first ``count`` pixels that lie in the picture; returns that loss."""
+def add_dssim(s, row, error_row, target, count, weight):
+    """Return the loss weight * count * (1 - SSIM) / 2 between the color row at ``row`` of ``s`` and target
+    (PIXELS,), over the ``count`` pixels where target is not negative; add its gradient at ``error_row``."""
     n = _F1 / np.float32(count)
     mx = my = xx = yy = xy = _F0
     for k in range(PIXELS):
@@ -122,8 +125,9 @@ def dissimilarity(s, row, error_row, target, count, weight):
 
 
 @part
-def _target(views, view, x0, y0, loss, task, target, back):
-    """Fill target (3, PIXELS), -1 outside the picture; back (3,). Returns how many pixels are inside."""
+def _load_target(views, view, x0, y0, loss, task, target, back):
+    """Fill target (3, PIXELS), -1 outside the image, and the background, back (3,). Returns how many pixels
+    are inside."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
     for c in range(3):
         back[c] = loss.background[c]
@@ -145,9 +149,9 @@ def _target(views, view, x0, y0, loss, task, target, back):
 
 
 @part
-def _trust(views, view, x0, y0, target, share):
-    """Fill share (PIXELS,) with the pixels' weights; those of none count as outside the picture, -1 in
-    target. Returns how many are left, and their mean weight."""
+def _load_weights(views, view, x0, y0, target, share):
+    """Fill share (PIXELS,) with the pixels' weights, and treat pixels of weight 0 as outside the image: -1 in
+    target. Returns how many pixels are left, and their mean weight."""
     width, height, first = views.size[view, 0], views.size[view, 1], views.first[view]
     count, total = 0, _F0
     for k in range(PIXELS):
@@ -163,8 +167,8 @@ def _trust(views, view, x0, y0, target, share):
 
 
 @part
-def _weigh(s, target, share, absolute):
-    """Multiply the error rows of ``s`` by the pixels' shares; returns loss and squared error, so weighed."""
+def _apply_weights(s, target, share, absolute):
+    """Multiply the error rows of ``s`` by the pixels' weights; returns weighted loss and squared error."""
     total, square = _F0, _F0
     for c in range(3):
         for k in range(PIXELS):
@@ -176,38 +180,42 @@ def _weigh(s, target, share, absolute):
 
 
 @kernel
-def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, kept,
+def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists, loss, memory, saved,
                 sums, losses):  # fmt: skip
-    """Render, compare, differentiate. views: ``rays.Views``; picked: int64 (B,), the view of each camera
-    slot. tasks: int32 (M, 2), slot and tile. memory: float32 (W, ROWS * PIXELS), kept: float32
-    (W, longest * STRIPS * KEPT), scratch. sums: float32 (B, P, SUMS), those of the tasks' pairs are written.
-    losses: float64 (M, 3), written: loss, squared error of the colours, 1 if the tile was left out as not
-    finite.
+    """Render tiles, compare them with the views, and backpropagate to the pairs.
 
-    With ``views.weight``, a pixel's loss is multiplied by its own, that of a tile's SSIM by their mean over
-    the pixels that have any; the others are not part of the window."""
-    s, store = memory[worker], kept[worker]
+    With ``views.weight``, each pixel's loss is multiplied by its weight and the tile's SSIM loss by the mean
+    of the positive weights; pixels of weight 0 are not part of the SSIM window.
+
+    views: ``rays.Views``.
+    picked: int64 (B,), the view of each camera slot.
+    tasks: int32 (M, 2), slot and tile.
+    memory, saved: float32 (W, ROWS * PIXELS) and (W, longest * STRIPS * SAVED), scratch of each worker.
+    sums: float32 (B, P, SUMS), written for the pairs of the tasks' tiles.
+    losses: float64 (M, 3), written: loss, squared color error, 1 if the tile is left out as not finite.
+    """
+    s, store = memory[worker], saved[worker]
     weighed, share = views.weight.size > 0, np.empty(PIXELS, np.float32)
     target, back = np.empty((3, PIXELS), np.float32), np.empty(3, np.float32)
-    (who, count), laid = room(lists), np.empty(STRIPS, np.int64)
+    (strip_pairs, count), composited = strip_scratch(lists), np.empty(STRIPS, np.int64)
     while True:
         task = draw(counter, worker, tasks.shape[0])
         if task >= tasks.shape[0]:
             return
         b, t = np.int64(tasks[task, 0]), np.int64(tasks[task, 1])
         x0, y0 = TILE * (t % columns[b]), TILE * (t // columns[b])
-        inside, dssim = _target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
+        inside, dssim = _load_target(views, picked[b], x0, y0, loss, task, target, back), loss.dssim
         if weighed:
-            inside, mean = _trust(views, picked[b], x0, y0, target, share)
+            inside, mean = _load_weights(views, picked[b], x0, y0, target, share)
             dssim *= mean
-        begin_tile(s)
+        clear_tile(s)
         begin, end = np.int64(lists.first[b, t]), np.int64(lists.first[b, t + 1])
-        size = (end - begin) * KEPT
-        sort_into_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, who, count)
+        size = (end - begin) * SAVED
+        bin_strips(lists, b, begin, end if inside > 0 else begin, projected, y0, strip_pairs, count)
         for n in range(STRIPS):
-            laid[n] = lay(
-                who[n], count[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
-                _T + n * STRIP, store[n * size : (n + 1) * size], KEPT,
+            composited[n] = composite(
+                strip_pairs[n], count[n], lists.owner[b], projected[b], np.float32(x0),
+                np.float32(y0 + 2 * n), s, _T + n * STRIP, store[n * size : (n + 1) * size], SAVED,
             )  # fmt: skip
         total, square = _F0, _F0
         for c in range(3):
@@ -220,10 +228,10 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
                 sign = _F1 if e > _F0 else (-_F1 if e < _F0 else _F0)
                 s[_ER + c * PIXELS + k] = sign if loss.absolute else _F2 * e
         if weighed:
-            total, square = _weigh(s, target, share, loss.absolute)
+            total, square = _apply_weights(s, target, share, loss.absolute)
         if dssim > _F0:
             for c in range(3):
-                total += dissimilarity(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], inside, dssim)
+                total += add_dssim(s, _R + c * PIXELS, _ER + c * PIXELS, target[c], inside, dssim)
         finite = is_finite(total)
         losses[task, 0], losses[task, 1] = total if finite else 0.0, square if finite else 0.0
         losses[task, 2] = 0.0 if finite else 1.0
@@ -236,24 +244,25 @@ def train_tiles(counter, worker, views, picked, tasks, columns, projected, lists
         for k in range(PIXELS):
             s[_BEHIND + k] = s[_T + k] * (back[0] * s[_ER + k] + back[1] * s[_EG + k] + back[2] * s[_EB + k])
         for n in range(STRIPS):
-            lift(
-                who[n], laid[n], lists.owner[b], projected[b], np.float32(x0), np.float32(y0 + 2 * n), s,
-                _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
+            composite_backward(
+                strip_pairs[n], composited[n], lists.owner[b], projected[b], np.float32(x0),
+                np.float32(y0 + 2 * n), s, _ER + n * STRIP, store[n * size : (n + 1) * size], sums[b],
             )  # fmt: skip
 
 
 @kernel
-def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, kept,
+def render_tiles(counter, worker, columns, rows, width, height, projected, lists, background, memory, saved,
                  color, depth, opacity):  # fmt: skip
-    """The picture of camera slot 0. color: float32 (H, W, 3), depth (z) and opacity (H, W), all written."""
-    s, store = memory[worker], kept[worker]
-    who, count = room(lists)
+    """Render camera slot 0. Tasks are tiles. color: float32 (H, W, 3), depth (z): (H, W), opacity: (H, W),
+    all written."""
+    s, store = memory[worker], saved[worker]
+    strip_pairs, count = strip_scratch(lists)
     while True:
         t = fetch_add(counter, 1)
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        lay_tile(s, lists, 0, t, x0, y0, projected, who, count, store)
+        composite_tile(s, lists, 0, t, x0, y0, projected, strip_pairs, count, store)
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x >= width or y >= height:
@@ -271,9 +280,13 @@ def render_tiles(counter, worker, columns, rows, width, height, projected, lists
 
 @kernel
 def render_points(counter, worker, columns, slots, points, projected, lists, background, color):
-    """The same at image points, float32 (N, 2), of which the tiles are wanted: some of them cost much less
-    than their tiles. color: float32 (N, 3), depth and opacity (N,), all written. Tasks are runs of 16."""
-    most, least, stop = np.float32(ALPHA_MOST), np.float32(ALPHA_LEAST), np.float32(STOP)
+    """Render single image points, which costs much less than their tiles. Tasks are runs of 16 points.
+
+    slots: int64 (N,), the camera slot of each point.
+    points: float32 (N, 2), image points in tiles that are wanted.
+    color: float32 (N, 3), written.
+    """
+    most, least, stop = np.float32(ALPHA_MAX), np.float32(ALPHA_MIN), np.float32(STOP)
     while True:
         base = fetch_add(counter, 1) * 16
         if base >= points.shape[0]:
@@ -286,8 +299,8 @@ def render_points(counter, worker, columns, slots, points, projected, lists, bac
             left = _F1
             for j in range(lists.first[v, t], lists.first[v, t + 1]):
                 row = projected[v, lists.owner[v, lists.pair[v, j]]]
-                dx, dy = x - row[MX], y - row[MY]
-                power = -_HALF * (row[QA] * dx * dx + row[QC] * dy * dy) - row[QB] * dx * dy
+                dx, dy = x - row[MEAN_X], y - row[MEAN_Y]
+                power = -_HALF * (row[CONIC_A] * dx * dx + row[CONIC_C] * dy * dy) - row[CONIC_B] * dx * dy
                 a = min(row[ALPHA] * exp32(power), most)
                 if a >= least:
                     w = a * left
@@ -304,13 +317,13 @@ def render_points(counter, worker, columns, slots, points, projected, lists, bac
 
 @kernel
 def compare_tiles(
-    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, kept, error
+    counter, worker, views, picked, tasks, columns, projected, lists, background, memory, saved, error
 ):
-    """How far off each pixel is: error, float32 (P,), the largest difference of a channel, written for the
-    pixels of the tasks' tiles. picked: int64 (B,), the view of each camera slot. tasks: int32 (M, 2), slot
-    and tile."""
-    s, store = memory[worker], kept[worker]
-    who, count = room(lists)
+    """Write each pixel's color error, the largest difference of a channel, for the tiles of ``tasks``.
+
+    error: float32 (P,), for all pixels of ``views``; other arguments as in ``train_tiles``."""
+    s, store = memory[worker], saved[worker]
+    strip_pairs, count = strip_scratch(lists)
     while True:
         task = fetch_add(counter, 1)
         if task >= tasks.shape[0]:
@@ -319,7 +332,7 @@ def compare_tiles(
         x0, y0, v = TILE * (t % columns[b]), TILE * (t // columns[b]), picked[b]
         width, height, first = views.size[v, 0], views.size[v, 1], views.first[v]
         transparent = views.pixels.shape[1] == 4
-        lay_tile(s, lists, b, t, x0, y0, projected, who, count, store)
+        composite_tile(s, lists, b, t, x0, y0, projected, strip_pairs, count, store)
         for k in range(PIXELS):
             x, y = x0 + k % TILE, y0 + k // TILE
             if x >= width or y >= height:

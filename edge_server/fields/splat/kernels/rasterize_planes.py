@@ -1,8 +1,7 @@
-"""Gaussians as small planes: normal and distance maps, and what each Gaussian is told of the normals it
-shows.
+"""Gaussians as small planes: maps of normal and distance, and the mean normal that each Gaussian shows.
 
 After PGSR (Chen et al. 2024): a pixel's depth is where its ray meets the blended plane, not the blend of the
-Gaussians' middles, which lies behind or before the surface wherever a flat Gaussian is seen at an angle.
+Gaussians' centers, which lies behind or before the surface wherever a flat Gaussian is seen at an angle.
 """
 
 from __future__ import annotations
@@ -11,58 +10,60 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.kernels.composite import PIXELS, STOP, STRIP, STRIPS, lay, sort_into_strips
+from edge_server.fields.splat.kernels.composite import PIXELS, STOP, STRIP, STRIPS, bin_strips, composite
 from edge_server.fields.splat.kernels.project import TILE
-from edge_server.fields.splat.kernels.rasterize import _T, begin_tile, room
+from edge_server.fields.splat.kernels.rasterize import _T, clear_tile, strip_scratch
 
-LOOK = 8  # Gaussians are laid one by one before it is looked again whether light is left
+CHECK_EVERY = 8  # Gaussians composited between two tests whether any light is left
 _F0 = np.float32(0.0)
 
 
 @part
-def lay_next(s, who, n, j, lists, slot, projected, x0, y0, store):
-    """Lay the j-th Gaussian of strip n alone: its alphas and the light before it are in ``store`` then.
-    False, and nothing is laid, if it was seen to be dark; it is looked every LOOK Gaussians."""
+def composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
+    """Composite the j-th Gaussian of strip n alone; ``store`` then has its alphas and the light before it.
+    Returns False, and composites nothing, if no light was left at the last test."""
     first = _T + n * STRIP
-    if j % LOOK == 0:
+    if j % CHECK_EVERY == 0:
         most = _F0
         for k in range(first, first + STRIP):
             most = max(most, s[k])
         if most < np.float32(STOP):
             return False
-    lay(
-        who[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0), np.float32(y0 + 2 * n), s,
-        first, store, 0,
+    composite(
+        strip_pairs[n, j : j + 1], 1, lists.owner[slot], projected[slot], np.float32(x0),
+        np.float32(y0 + 2 * n), s, first, store, 0,
     )  # fmt: skip
     return True
 
 
 @kernel
 def render_planes(
-    counter, worker, slot, columns, rows, width, height, projected, lists, planes, memory, kept, out
+    counter, worker, slot, columns, rows, width, height, projected, lists, planes, memory, saved, out
 ):
-    """Blended planes of camera slot ``slot``. planes: float32 (N, 4), each Gaussian's unit normal in camera
-    axes and its distance from the camera along it. out: float32 (H, W, 5), written: normal and distance, each
-    summed with the weights of the colours, and opacity. Tasks are tiles."""
-    s, store = memory[worker], kept[worker]
-    who, count = room(lists)
+    """Blend the Gaussians' planes with the weights of their colors. Tasks are tiles of camera ``slot``.
+
+    planes: float32 (N, 4), unit normal in camera axes, and the plane's distance from the camera along it.
+    out: float32 (H, W, 5), written: blended normal, blended distance, opacity.
+    """
+    s, store = memory[worker], saved[worker]
+    strip_pairs, count = strip_scratch(lists)
     sums = np.empty((4, PIXELS), np.float32)
     while True:
         t = fetch_add(counter, 1)
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        begin_tile(s)
+        clear_tile(s)
         sums[:] = _F0
-        sort_into_strips(
-            lists, slot, lists.first[slot, t], lists.first[slot, t + 1], projected, y0, who, count
+        bin_strips(
+            lists, slot, lists.first[slot, t], lists.first[slot, t + 1], projected, y0, strip_pairs, count
         )
         for n in range(STRIPS):
             for j in range(count[n]):
-                if not lay_next(s, who, n, j, lists, slot, projected, x0, y0, store):
+                if not composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
                     break
                 for c in range(4):
-                    value = planes[lists.owner[slot, who[n, j]], c]
+                    value = planes[lists.owner[slot, strip_pairs[n, j]], c]
                     for k in range(STRIP):
                         sums[c, n * STRIP + k] += store[k] * store[STRIP + k] * value
         for k in range(PIXELS):
@@ -74,27 +75,29 @@ def render_planes(
 
 
 @kernel
-def tell_normals(
-    counter, worker, slot, columns, rows, width, height, projected, lists, normals, memory, kept, told
+def accumulate_normals(
+    counter, worker, slot, columns, rows, width, height, projected, lists, normals, memory, saved, normal_sums
 ):
-    """What the pixels' normals (float32 (H, W, 4): unit vectors in camera axes, and how sure each is) say to
-    the Gaussians: told, float32 (P, 4), written for every pair of the slot: the normals times the weight that
-    the Gaussian has in the pixel, and the sum of these weights. Tasks are tiles."""
-    s, store = memory[worker], kept[worker]
-    who, count = room(lists)
+    """Sum the pixels' normals over each pair, with the Gaussian's weight in the pixel. Tasks are tiles.
+
+    normals: float32 (H, W, 4), unit vectors in camera axes, and the confidence in each.
+    normal_sums: float32 (P, 4), written for every pair of ``slot``: weighted normals, and the weights' sum.
+    """
+    s, store = memory[worker], saved[worker]
+    strip_pairs, count = strip_scratch(lists)
     while True:
         t = fetch_add(counter, 1)
         if t >= columns * rows:
             return
         x0, y0 = TILE * (t % columns), TILE * (t // columns)
-        begin_tile(s)
+        clear_tile(s)
         begin, end = lists.first[slot, t], lists.first[slot, t + 1]
-        sort_into_strips(lists, slot, begin, end, projected, y0, who, count)
+        bin_strips(lists, slot, begin, end, projected, y0, strip_pairs, count)
         for j in range(begin, end):
-            told[lists.pair[slot, j]] = _F0
+            normal_sums[lists.pair[slot, j]] = _F0
         for n in range(STRIPS):
             for j in range(count[n]):
-                if not lay_next(s, who, n, j, lists, slot, projected, x0, y0, store):
+                if not composite_next(s, strip_pairs, n, j, lists, slot, projected, x0, y0, store):
                     break
                 nx = ny = nz = total = _F0
                 for k in range(STRIP):
@@ -105,7 +108,7 @@ def tell_normals(
                         ny += w * normals[y, x, 1]
                         nz += w * normals[y, x, 2]
                         total += w
-                pair = told[who[n, j]]
+                pair = normal_sums[strip_pairs[n, j]]
                 pair[0] += nx
                 pair[1] += ny
                 pair[2] += nz

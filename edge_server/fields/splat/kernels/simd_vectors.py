@@ -1,7 +1,7 @@
-"""Vectors of 16 float32 in expressions: what LLVM makes of a loop over 16 numbers only if it likes the loop.
+"""Explicit SIMD for the code of numba intrinsics: vectors of 16 float32 whose operators emit instructions.
 
-For the code of intrinsics: the operators emit instructions. With AVX-512 a vector is a register, with AVX2 it
-is two.
+LLVM would vectorize only some of the loops that these replace. A vector takes one register with AVX-512 and
+two with AVX2.
 """
 
 from __future__ import annotations
@@ -22,131 +22,125 @@ _INTEGERS = ir.VectorType(ir.IntType(32), LANES)
 _FLAGS = tuple(sorted(FAST))
 
 # 2^r for r within [-1/2, 1/2], relative error below 3e-7: minimax, found by reweighted least squares.
-_POWER = (1.3276472e-3, 9.675541e-3, 5.5507131e-2, 0.2402212, 0.69314694, 1.0000001)
-_LEAST_POWER = -64.0
+_EXP2 = (1.3276472e-3, 9.675541e-3, 5.5507131e-2, 0.2402212, 0.69314694, 1.0000001)
+_MIN_EXPONENT = -64.0
 
 
 def constant(*numbers: float) -> ir.Constant:
-    """One number in all lanes, or one for each."""
+    """A vector constant: one number for all lanes, or one for each."""
     return ir.Constant(_VECTOR, [float(n) for n in (numbers * LANES if len(numbers) == 1 else numbers)])
 
 
-class Wide:
-    """16 lanes: ``+ - *`` and ``/`` with another or with a number, in all lanes at once."""
+class Vector:
+    """16 float32 lanes. ``+ - *`` and ``/`` take another vector, or a number for all lanes."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         self.builder, self.value = builder, value
 
     @classmethod
-    def load(cls, builder: Any, pointer: Any) -> Wide:
-        """The 16 numbers from a float pointer on."""
+    def load(cls, builder: Any, pointer: Any) -> Vector:
+        """Load 16 numbers from a float pointer."""
         value = builder.load(builder.bitcast(pointer, _VECTOR.as_pointer()))
         value.align = 4
         return cls(builder, value)
 
     @classmethod
-    def spread(cls, builder: Any, number: Any) -> Wide:
-        """A float in all lanes."""
+    def broadcast(cls, builder: Any, number: Any) -> Vector:
+        """A vector with a float value in all lanes."""
         undefined = ir.Constant(_VECTOR, ir.Undefined)
         first = builder.insert_element(undefined, number, ir.IntType(32)(0))
         return cls(builder, builder.shuffle_vector(first, undefined, ir.Constant(_INTEGERS, [0] * LANES)))
 
     def store(self, pointer: Any) -> None:
-        """To the 16 numbers from a float pointer on."""
         self.builder.store(self.value, self.builder.bitcast(pointer, _VECTOR.as_pointer())).align = 4
 
-    def _with(self, operation: str, other: Wide | float) -> Wide:
-        operand = other.value if isinstance(other, Wide) else constant(other)
-        return Wide(self.builder, getattr(self.builder, operation)(self.value, operand, flags=_FLAGS))
+    def _binary(self, operation: str, other: Vector | float) -> Vector:
+        operand = other.value if isinstance(other, Vector) else constant(other)
+        return Vector(self.builder, getattr(self.builder, operation)(self.value, operand, flags=_FLAGS))
 
-    def __add__(self, other: Wide | float) -> Wide:
-        return self._with("fadd", other)
+    def __add__(self, other: Vector | float) -> Vector:
+        return self._binary("fadd", other)
 
-    def __sub__(self, other: Wide | float) -> Wide:
-        return self._with("fsub", other)
+    def __sub__(self, other: Vector | float) -> Vector:
+        return self._binary("fsub", other)
 
-    def __mul__(self, other: Wide | float) -> Wide:
-        return self._with("fmul", other)
+    def __mul__(self, other: Vector | float) -> Vector:
+        return self._binary("fmul", other)
 
-    def __truediv__(self, other: Wide | float) -> Wide:
-        return self._with("fdiv", other)
+    def __truediv__(self, other: Vector | float) -> Vector:
+        return self._binary("fdiv", other)
 
-    def rest(self) -> Wide:
-        """1 - this."""
-        return Wide(self.builder, constant(1.0)) - self
+    def one_minus(self) -> Vector:
+        return Vector(self.builder, constant(1.0)) - self
 
-    def at_least(self, bound: float) -> Any:
-        """In which lanes it is a number no less than ``bound``: a mask."""
+    def greater_equal(self, bound: float) -> Any:
+        """A mask of the lanes that are >= ``bound``; NaN is not."""
         return self.builder.fcmp_ordered(">=", self.value, constant(bound))
 
-    def below(self, bound: float) -> Any:
-        """In which lanes it is a number less than ``bound``."""
+    def less(self, bound: float) -> Any:
+        """A mask of the lanes that are < ``bound``; NaN is not."""
         return self.builder.fcmp_ordered("<", self.value, constant(bound))
 
-    def where(self, mask: Any, other: Wide | float = 0.0) -> Wide:
-        """This where the mask holds, ``other`` elsewhere."""
-        operand = other.value if isinstance(other, Wide) else constant(other)
-        return Wide(self.builder, self.builder.select(mask, self.value, operand))
+    def where(self, mask: Any, other: Vector | float = 0.0) -> Vector:
+        """This vector where the mask is set, ``other`` elsewhere."""
+        operand = other.value if isinstance(other, Vector) else constant(other)
+        return Vector(self.builder, self.builder.select(mask, self.value, operand))
 
-    def most(self, bound: float) -> Wide:
-        """The lesser of this and ``bound``; ``bound`` where this is not a number."""
-        return self.where(self.below(bound), bound)
+    def minimum(self, bound: float) -> Vector:
+        """The minimum of this and ``bound``; ``bound`` for NaN."""
+        return self.where(self.less(bound), bound)
 
-    def least(self, bound: float) -> Wide:
-        """The greater of this and ``bound``; ``bound`` where this is not a number."""
-        return self.where(self.at_least(bound), bound)
+    def maximum(self, bound: float) -> Vector:
+        """The maximum of this and ``bound``; ``bound`` for NaN."""
+        return self.where(self.greater_equal(bound), bound)
 
-    def finite(self) -> Any:
-        """In which lanes it is a number, and not infinite."""
-        return self.builder.fcmp_ordered("<=", self._called("fabs", self.value), constant(3.4e38))
+    def is_finite(self) -> Any:
+        """A mask of the lanes that are neither NaN nor infinite."""
+        return self.builder.fcmp_ordered("<=", self._llvm("fabs", self.value), constant(3.4e38))
 
-    def root(self) -> Wide:
-        """The square root."""
-        return Wide(self.builder, self._called("sqrt", self.value))
+    def sqrt(self) -> Vector:
+        return Vector(self.builder, self._llvm("sqrt", self.value))
 
-    def _called(self, name: str, value: Any) -> Any:
+    def _llvm(self, name: str, value: Any) -> Any:
         kind = ir.FunctionType(_VECTOR, [_VECTOR])
         called = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.v{LANES}f32")
         return self.builder.call(called, [value])
 
-    def power_of_2(self) -> Wide:
-        """2 to this, which is taken to be 0 where it is more and -64 where it is less or not a number;
-        relative error below 3e-7."""
+    def exp2(self) -> Vector:
+        """2 to the power of this, clamped to [-64, 0] (NaN: -64); relative error below 3e-7."""
         builder = self.builder
-        clamped = self.least(_LEAST_POWER).most(0.0)
-        nearest = self._called("rint", clamped.value)
-        whole = Wide(builder, nearest)
+        clamped = self.maximum(_MIN_EXPONENT).minimum(0.0)
+        nearest = self._llvm("rint", clamped.value)
+        whole = Vector(builder, nearest)
         left = clamped - whole
-        power = left * _POWER[0] + _POWER[1]
-        for coefficient in _POWER[2:]:
+        power = left * _EXP2[0] + _EXP2[1]
+        for coefficient in _EXP2[2:]:
             power = power * left + coefficient
         # The exponent of a float32 begins at bit 23.
         moved = builder.shl(builder.fptosi(nearest, _INTEGERS), ir.Constant(_INTEGERS, [23] * LANES))
         raised = builder.add(builder.bitcast(power.value, _INTEGERS), moved)
-        return Wide(builder, builder.bitcast(raised, _VECTOR))
+        return Vector(builder, builder.bitcast(raised, _VECTOR))
 
 
-def contiguous(*kinds: Any) -> None:
-    """Refuse to compile for anything but contiguous arrays: pointers know of no strides."""
+def require_contiguous(*kinds: Any) -> None:
+    """Refuse to compile for anything but contiguous arrays: the emitted pointers ignore strides."""
     for kind in kinds:
         if not (isinstance(kind, types.Array) and kind.layout == "C"):
             raise TypingError(f"vectors take contiguous arrays, not {kind}")
 
 
-def both(builder: Any, a: Any, b: Any) -> Any:
-    """Where two masks hold."""
+def mask_and(builder: Any, a: Any, b: Any) -> Any:
     return builder.and_(a, b)
 
 
-def anywhere(builder: Any, mask: Any) -> Any:
-    """Whether a mask holds in any lane."""
+def any_lane(builder: Any, mask: Any) -> Any:
     bits = ir.IntType(LANES)
     return builder.icmp_unsigned("!=", builder.bitcast(mask, bits), bits(0))
 
 
-def sum_of(wide: Wide) -> Any:
-    """The sum of the lanes, a float."""
-    builder, value, lanes = wide.builder, wide.value, LANES
+def lane_sum(vector: Vector) -> Any:
+    """The sum of a vector's lanes, a float."""
+    builder, value, lanes = vector.builder, vector.value, LANES
     while lanes > 1:
         lanes //= 2
         halves = [
@@ -161,10 +155,10 @@ def sum_of(wide: Wide) -> Any:
     return builder.extract_element(value, ir.IntType(32)(0))
 
 
-def eight_sums(wides: Sequence[Wide]) -> Any:
-    """The sums of the lanes of eight, as a vector of eight floats: a third of what they take one by one."""
-    builder = wides[0].builder
-    values = [w.value for w in wides]
+def eight_lane_sums(vectors: Sequence[Vector]) -> Any:
+    """The lane sums of eight vectors, as a vector of eight floats: a third of the cost of one by one."""
+    builder = vectors[0].builder
+    values = [w.value for w in vectors]
 
     def picked(a: Any, b: Any, order: list[int]) -> Any:
         return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(order)), order))
@@ -173,7 +167,7 @@ def eight_sums(wides: Sequence[Wide]) -> Any:
         return builder.fadd(picked(a, b, low), picked(a, b, high), flags=_FLAGS)
 
     def each_four(order: list[int]) -> list[int]:
-        # Shuffles within four lanes are the cheap ones. 4 to 7 are those of the second vector.
+        # Shuffles within four lanes are the cheap ones. Numbers 4 to 7 mean lanes of the second vector.
         return [group + (k if k < 4 else k - 4 + LANES) for group in range(0, LANES, 4) for k in order]
 
     pairs = [

@@ -1,4 +1,4 @@
-"""What is the Gaussian field's own; ``test_every_representation`` has the rest."""
+"""What only the Gaussian field does; ``test_every_representation`` has the rest."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_cameras
 from edge_server.fields.splat.buffers import camera_rows
-from edge_server.fields.splat.densification import Cloud, make_room, opacity
+from edge_server.fields.splat.densification import GaussianCloud, opacity, prune_least_sensitive
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.motion import drift
-from edge_server.fields.splat.seeding import seeds
+from edge_server.fields.splat.motion import extrapolate
+from edge_server.fields.splat.seeding import seed_gaussians
 from tests.edge_server.fields.scenes import mean_psnr, picture
 from tests.edge_server.fields.small import HELD, SEEN, VIEWS, cut_out, same_state, score
 from tests.edge_server.fields.splat.small import SMALL
 
 
 def test_a_state_knows_the_views_it_was_fitted_to() -> None:
-    """The same frames after ``load_state`` are no new ones: nothing is judged or carried along twice."""
+    """The same frames after ``load_state`` are not new: nothing is tested for outliers or tracked twice."""
     ball_m = np.array([0.3, 0, 0.5])
     moved = [
         replace(v, image=picture(v.intrinsics, v.camera_to_world, ball_m), generated_ns=10**8) for v in SEEN
@@ -47,13 +47,13 @@ def test_nothing_begins_at_pixels_without_weight() -> None:
     box, pool, rng = scene_box(SEEN), CallerPool(), np.random.default_rng
     weight = [np.full(v.image.shape[:2], k % 2, np.float32) for k, v in enumerate(SEEN)]
     found = []
-    for other in (False, True):  # pictures that have no say may show anything
+    for other in (False, True):  # views of weight 0 may show anything
         views = [replace(v, image=255 - v.image) if other and k % 2 == 0 else v for k, v in enumerate(SEEN)]
         share = np.concatenate([w.ravel() for w in weight])
-        found.append(seeds(SMALL, pool, box, views, None, share, 300, rng(1)))
+        found.append(seed_gaussians(SMALL, pool, box, views, None, share, 300, rng(1)))
     assert len(found[0]) > 100
     np.testing.assert_array_equal(found[0], found[1])
-    assert len(seeds(SMALL, pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
+    assert len(seed_gaussians(SMALL, pool, box, SEEN, None, np.zeros_like(share), 300, rng(1))) == 0
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -114,7 +114,7 @@ def test_a_state_of_another_shape_is_refused() -> None:
 
 @pytest.mark.alone
 def test_a_budget_in_seconds_is_kept_while_things_move() -> None:
-    """New pictures at every update: they are taken in, judged, followed and seeded within the budget."""
+    """New views at every update: they are ingested, tested, tracked and seeded within the budget."""
     field = SplatField(SMALL)
     field.warm_up()
     field.fit(_ball_at(0), Budget(steps=200))
@@ -126,8 +126,8 @@ def test_a_budget_in_seconds_is_kept_while_things_move() -> None:
     assert np.median(spent) <= 1.1 * 0.3
 
 
-def test_what_is_gone_is_forgotten_and_what_came_grows() -> None:
-    """The ball moves aside; a few steps later it stands at its new place and nowhere else."""
+def test_a_ball_that_moved_is_removed_and_seeded_anew() -> None:
+    """A few steps later it is at its new place and nowhere else."""
     field = SplatField(SMALL)
     field.fit(SEEN, Budget(steps=200))
     place = np.array([0.45, -0.3, 0.5])
@@ -143,7 +143,7 @@ START, SPEED = np.array([-0.3, -0.3, 0.5]), np.array([0.8, 0.0, 0.0])  # metres,
 
 
 def _ball_at(t_ms: int, late: bool = False) -> list[View]:
-    """Views of the ball on its way; late: every other one is 100 ms old."""
+    """Views of the moving ball; late: every other one is 100 ms old."""
     views = []
     for k, v in enumerate(SEEN):
         taken_ms = t_ms - (100 if late and k % 2 else 0)
@@ -153,7 +153,7 @@ def _ball_at(t_ms: int, late: bool = False) -> list[View]:
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_what_moves_is_carried_along_and_on_to_the_present(late: bool) -> None:
+def test_motion_is_tracked_and_extrapolated_to_the_present(late: bool) -> None:
     truth, then = (
         picture(HELD.intrinsics, HELD.camera_to_world, START + SPEED * t) / 255.0 for t in (0.65, 0.5)
     )
@@ -175,11 +175,11 @@ def test_what_moves_is_carried_along_and_on_to_the_present(late: bool) -> None:
             return float(np.square(shown.color - truth)[moving].mean())
 
         assert off(field, 650 * MS) < 0.8 * off(field, None)
-        assert off(field, 100 * MS) == off(field, None)  # the past is not shown: what is known is newer
+        assert off(field, 100 * MS) == off(field, None)  # nothing is extrapolated to the past
     np.testing.assert_allclose(np.median(found, axis=0), SPEED, atol=0.3)
 
 
-def test_a_long_pause_leaves_nothing_known_of_motion() -> None:
+def test_a_long_pause_stops_all_guests() -> None:
     field = SplatField(SMALL)
     for t_ms in (0, 100, 200, 300):
         field.fit(_ball_at(t_ms), Budget(steps=40))
@@ -190,8 +190,8 @@ def test_a_long_pause_leaves_nothing_known_of_motion() -> None:
 
 @pytest.mark.parametrize("seen", [0, 1])
 def test_what_has_stopped_stays_where_it_is(seen: int) -> None:
-    """Guests must not go on when no camera, or only one, sees anything move: here and then it is equal
-    pictures that come in, of which ``seen`` have a little noise."""
+    """Guests must stop when no camera, or only one, sees motion: the same images come in again and again,
+    with a little noise in ``seen`` of them."""
     field = SplatField(SMALL)
     for t_ms in (0, 100, 200, 300):
         field.fit(_ball_at(t_ms), Budget(steps=40))
@@ -210,16 +210,16 @@ def test_what_has_stopped_stays_where_it_is(seen: int) -> None:
     assert score(field, replace(HELD, image=truth)) > 18.0
 
 
-def test_time_that_stands_still_or_goes_back_does_not_fling_anything() -> None:
+def test_no_or_negative_elapsed_time_is_extrapolated_soundly() -> None:
     field = SplatField(SMALL)
     for t_ms in (0, 100, 200, 300):
         field.fit(_ball_at(t_ms), Budget(steps=40))
     before = field.cloud.params[:, :3].copy()
     velocity = field.cloud.velocity.copy()
     assert np.abs(velocity).max() > 0
-    drift(field.cloud, 0.0, moves=True)
+    extrapolate(field.cloud, 0.0, moves=True)
     np.testing.assert_array_equal(field.cloud.params[:, :3], before)
-    drift(field.cloud, -0.1, moves=True)
+    extrapolate(field.cloud, -0.1, moves=True)
     np.testing.assert_allclose(field.cloud.params[:, :3], before - 0.1 * velocity, atol=1e-6)
     np.testing.assert_array_equal(field.cloud.velocity, velocity)
     field.fit(_ball_at(200), Budget(steps=5))
@@ -227,7 +227,7 @@ def test_time_that_stands_still_or_goes_back_does_not_fling_anything() -> None:
 
 
 def test_warming_up_compiles_every_kernel() -> None:
-    """In a process of its own: the first motion must not wait for a compiler."""
+    """In a process of its own. The first motion must not wait for a compiler."""
     code = """
 from edge_server.fields.common.kernels import plane_sweep
 from edge_server.fields.splat.kernels import bin_tiles, optimizer_step, project, rasterize, view_evidence
@@ -242,7 +242,13 @@ for module in (plane_sweep, view_evidence, project, rasterize, bin_tiles, optimi
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-1000:]
     counts = dict(line.split() for line in done.stdout.splitlines())
-    assert {"judge", "pull", "compare_tiles", "render_points", "train_tiles"} <= counts.keys()
+    assert {
+        "collect_evidence",
+        "position_gradients",
+        "compare_tiles",
+        "render_points",
+        "train_tiles",
+    } <= counts.keys()
     assert set(counts.values()) == {"1"}, counts
 
 
@@ -255,8 +261,8 @@ def test_the_number_of_gaussians_grows_to_the_cap_and_no_further() -> None:
     assert counts[0] < counts[-1] == max(counts) <= SMALL.gaussians and counts[-1] > 1400
 
 
-def test_room_is_made_by_what_pictures_depend_on_least() -> None:
-    """What is hidden goes before what is faint; of what has made no step, nothing."""
+def test_pruning_to_fit_removes_what_the_loss_depends_on_least() -> None:
+    """Hidden Gaussians are removed before faint ones; those that have made no step are kept."""
     field, hidden, unknown, count = SplatField(SMALL), 60, 5, 120
     field.fit(SEEN, Budget(steps=300))
     box = field.view_store.box
@@ -266,26 +272,34 @@ def test_room_is_made_by_what_pictures_depend_on_least() -> None:
     inside[:, :3] = box.normalise(np.array([0.0, 0.0, 0.5]) + spread_m)
     inside[:, SCALE:QUATERNION], inside[:, OPACITY] = np.log(0.03), 4.0
     field.cloud.keep(np.arange(len(field.cloud)) < SMALL.gaussians - 200)
-    field.cloud.add(Cloud.of(inside[:hidden]))
+    field.cloud.add(GaussianCloud.new(inside[:hidden]))
     field.fit(SEEN, Budget(steps=12))  # less than lies between two prunings
-    field.cloud.add(Cloud.of(inside[hidden:]))
+    field.cloud.add(GaussianCloud.new(inside[hidden:]))
     state, known, n = field.state(), mean_psnr(field, SEEN), len(field.cloud)
 
-    def without(room: Callable[[Cloud], None]) -> tuple[float, np.ndarray]:
+    def without(prune: Callable[[GaussianCloud], None]) -> tuple[float, np.ndarray]:
         """The score afterwards, and which are left."""
         other = SplatField(SMALL)
         other.load_state(state)
         other.cloud.slope[:] = np.arange(n)  # their names
-        room(other.cloud)
+        prune(other.cloud)
         return mean_psnr(other, SEEN), np.isin(np.arange(n), other.cloud.slope)
 
-    lowered, left = without(lambda cloud: make_room(cloud, count))
+    lowered, left = without(lambda cloud: prune_least_sensitive(cloud, count))
     assert left.sum() == n - count
     assert left[-unknown:].all() and left[-unknown - hidden : -unknown].mean() < 0.5
     faint = np.argsort(opacity(field.cloud.params), kind="stable")[:count]
     by_opacity, _ = without(lambda cloud: cloud.keep(~np.isin(np.arange(n), faint)))
     assert lowered > known - 0.1 and lowered > by_opacity, (known, lowered, by_opacity)
-    assert without(lambda cloud: make_room(cloud, -3))[1].all()
+    assert without(lambda cloud: prune_least_sensitive(cloud, -3))[1].all()
+
+
+def test_the_default_rates_find_positions() -> None:
+    """From random positions. Seeds reach 21.7 to 22.1 dB. A quarter of ``rate_position``, ``rate_opacity``,
+    ``rate_scale`` or ``rate_end`` reaches 21.2 at most, four times ``rate_position`` 21.3."""
+    field = SplatField(replace(SMALL, seed_cells=0))
+    field.fit(SEEN, Budget(steps=100))
+    assert score(field) > 21.4
 
 
 @pytest.mark.parametrize("options", [
@@ -298,7 +312,7 @@ def test_every_option_learns(options: dict) -> None:
     assert score(field) > 18.0
 
 
-def test_a_lens_with_distortion_is_learnt_as_it_is() -> None:
+def test_a_lens_with_distortion_needs_no_undistortion() -> None:
     bent = replace(HELD.intrinsics, distortion=(-0.15, 0.02, 0.003, -0.002))
     views = [replace(v, intrinsics=bent, image=picture(bent, v.camera_to_world)) for v in VIEWS]
     field = SplatField(SMALL)
@@ -307,7 +321,7 @@ def test_a_lens_with_distortion_is_learnt_as_it_is() -> None:
     assert score(field, HELD) > 19.0, "a pinhole camera sees the same scene"
 
 
-def test_a_random_background_leaves_transparent_pixels_open() -> None:
+def test_a_random_background_keeps_transparent_pixels_empty() -> None:
     views = [cut_out(view) for view in SEEN]
     field = SplatField(replace(SMALL, background="random"))
     field.fit(views, Budget(steps=150))

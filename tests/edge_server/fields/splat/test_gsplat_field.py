@@ -1,4 +1,4 @@
-"""The CUDA field's own code, with the torch oracle in the place of gsplat; no GPU is needed."""
+"""The gsplat field's own code, with the torch oracle in place of gsplat; needs no GPU."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat import gsplat_field
 from edge_server.fields.splat.field import SplatField
-from edge_server.fields.splat.gsplat_field import SplatCudaField
+from edge_server.fields.splat.gsplat_field import GsplatField
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.splat.torch_oracle import Flat, composite, rotations
@@ -24,11 +24,11 @@ TINY = SplatSettings(gaussians=40, start=24, seed_cells=16, densify_every=6, thr
 VIEWS = ring(4, size=16)
 
 
-def rasterise(
+def rasterize(
     *, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor,
     Ks: Tensor, width: int, height: int, near_plane: float, backgrounds: Tensor, packed: bool,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
-    """What gsplat's ``rasterization`` promises, for one camera, from the oracle's parts."""
+    """gsplat's ``rasterization`` for one camera, made of the oracle's parts."""
     assert not packed and len(viewmats) == len(Ks) == len(backgrounds) == 1
     view, k = viewmats[0], Ks[0]
     x, y, z = (means @ view[:3, :3].T + view[:3, 3]).unbind(-1)
@@ -51,7 +51,7 @@ def rasterise(
 @pytest.mark.parametrize("harmonics", [1, 4])
 def test_its_steps_are_those_of_the_kernels(harmonics: int) -> None:
     settings = replace(TINY, harmonics=harmonics, epsilon=1.0)  # or signs of tiny gradients decide
-    cpu, cuda = SplatField(settings), SplatCudaField(settings, rasterise, "cpu")
+    cpu, cuda = SplatField(settings), GsplatField(settings, rasterize, "cpu")
     for field in (cpu, cuda):
         report = field.fit(VIEWS, Budget(steps=4))
         assert report.dropped == 0 and report.loss > 0
@@ -66,7 +66,7 @@ def test_it_weighs_pixels_as_the_kernels_do() -> None:
     moments = []
     for tau_ms in (0.0, 100.0):
         settings = replace(TINY, start=8, age_tau_ms=tau_ms, epsilon=1.0)
-        cpu, cuda = SplatField(settings), SplatCudaField(settings, rasterise, "cpu")
+        cpu, cuda = SplatField(settings), GsplatField(settings, rasterize, "cpu")
         losses = [field.fit(views, Budget(steps=2)).loss for field in (cpu, cuda)]
         assert losses[0] == pytest.approx(losses[1], rel=0.02)
         moments.append(np.abs(cpu.cloud.m).sum())
@@ -75,7 +75,7 @@ def test_it_weighs_pixels_as_the_kernels_do() -> None:
 
 
 def test_it_grows_saves_and_resumes_on_the_cpu() -> None:
-    cuda = SplatCudaField(TINY, rasterise, "cpu")
+    cuda = GsplatField(TINY, rasterize, "cpu")
     cuda.fit(VIEWS, Budget(steps=14))
     assert 24 < len(cuda.cloud) <= 40
     cpu = SplatField(TINY)
@@ -84,12 +84,12 @@ def test_it_grows_saves_and_resumes_on_the_cpu() -> None:
     np.testing.assert_array_equal(a, b)
 
 
-def test_what_it_cannot_do_is_said() -> None:
+def test_unsupported_cameras_and_losses_are_refused() -> None:
     bent = replace(VIEWS[0].intrinsics, distortion=(0.01, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="pinhole cameras only"):
-        SplatCudaField(TINY, rasterise, "cpu").fit([replace(VIEWS[0], intrinsics=bent)], Budget(steps=1))
+        GsplatField(TINY, rasterize, "cpu").fit([replace(VIEWS[0], intrinsics=bent)], Budget(steps=1))
     with pytest.raises(ValueError, match="dssim"):
-        SplatCudaField(replace(TINY, dssim=0.2), rasterise, "cpu")
+        GsplatField(replace(TINY, dssim=0.2), rasterize, "cpu")
 
 
 def test_without_a_gpu_or_gsplat_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Gaussian splatting in plain torch, line by line as the equations are written (Kerbl et al. 2023).
+"""Gaussian splatting in plain torch, written as the equations are (Kerbl et al. 2023).
 
 The tests compare the kernels and their gradients with this, in float64.
 """
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
 from edge_server.fields.splat.kernels.project import (
-    ALPHA_LEAST,
+    ALPHA_MIN,
     COLOR,
     LENS,
     LIMITS,
@@ -26,7 +26,7 @@ from edge_server.fields.splat.kernels.project import (
     SCALE_HIGH,
     SCALE_LOW,
 )
-from edge_server.fields.splat.kernels.rasterize import ALPHA_MOST, STOP
+from edge_server.fields.splat.kernels.rasterize import ALPHA_MAX, STOP
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Flat:
 
 
 def rotations(quaternion: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length; the identity for one of none."""
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length; the identity for length 0."""
     norm = quaternion.norm(dim=-1, keepdim=True)
     none = norm < 1e-10
     unit = torch.where(none, torch.tensor([1.0, 0, 0, 0]).to(quaternion), quaternion / norm.clamp(min=1e-10))
@@ -57,7 +57,7 @@ def rotations(quaternion: Tensor) -> Tensor:
 
 
 def distort(lens: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """``Pinhole``'s distortion of normalised coordinates; lens (8,)."""
+    """``Pinhole``'s distortion of normalized coordinates; lens (8,)."""
     k1, k2, p1, p2 = lens[4:8]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * k2)
@@ -66,7 +66,7 @@ def distort(lens: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def flatten(cam: Tensor, params: Tensor, harmonics: int) -> Flat:
-    """Project Gaussians (N, P) into camera row ``cam`` (see ``kernels.splat_project``)."""
+    """Project Gaussians (N, P) into camera row ``cam`` (see ``kernels.project``)."""
     view, origin, lens = cam[:ORIGIN].view(3, 3), cam[ORIGIN:LENS], cam[LENS:LIMITS]
     x, y, z = ((params[:, :3] - origin) @ view.T).unbind(-1)
     seen = z > cam[NEAR]
@@ -76,7 +76,7 @@ def flatten(cam: Tensor, params: Tensor, harmonics: int) -> Flat:
         a.clamp(float(cam[LIMITS]), float(cam[LIMITS + 1])),
         b.clamp(float(cam[LIMITS + 2]), float(cam[LIMITS + 3])),
     )
-    with torch.enable_grad():  # the lens's Jacobian by differentiation, so that the kernel's is checked
+    with torch.enable_grad():  # the lens's Jacobian by autograd, to check the kernel's
         pa, pb = (ta, tb) if ta.requires_grad else (ta.requires_grad_(True), tb.requires_grad_(True))
         u, v = distort(lens, pa, pb)
         dxx, dxy = torch.autograd.grad(u.sum(), (pa, pb), create_graph=True)
@@ -100,7 +100,7 @@ def flatten(cam: Tensor, params: Tensor, harmonics: int) -> Flat:
 
 
 def composite(flat: Flat, width: int, height: int, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour (H, W, 3), depth (H, W) and opacity (H, W), front to back."""
+    """Color (H, W, 3), depth (H, W) and opacity (H, W), front to back."""
     ys, xs = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixel = torch.stack([xs, ys], dim=-1).to(flat.mean) + 0.5
     light = torch.ones(height, width).to(flat.mean)
@@ -111,8 +111,8 @@ def composite(flat: Flat, width: int, height: int, background: Tensor) -> tuple[
             continue
         offset = pixel - flat.mean[i]
         power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, inverse[i], offset)
-        alpha = (flat.alpha[i] * power.exp()).clamp(max=ALPHA_MOST)
-        alpha = torch.where((alpha >= ALPHA_LEAST) & (light >= STOP), alpha, torch.zeros_like(alpha))
+        alpha = (flat.alpha[i] * power.exp()).clamp(max=ALPHA_MAX)
+        alpha = torch.where((alpha >= ALPHA_MIN) & (light >= STOP), alpha, torch.zeros_like(alpha))
         weight = alpha * light
         color = color + weight[..., None] * flat.color[i]
         depth = depth + weight * flat.depth[i]

@@ -1,4 +1,4 @@
-"""The optimiser's step over several blocks and cameras, against the same in plain numpy."""
+"""The optimizer step over several blocks and cameras, against the same in plain numpy."""
 
 from __future__ import annotations
 
@@ -7,109 +7,87 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.thread_pool import CallerPool, Pool
-from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.buffers import Passes, camera_rows
+from edge_server.fields.splat.buffers import RasterBuffers, camera_rows
 from edge_server.fields.splat.kernels.composite import SUMS
-from edge_server.fields.splat.kernels.optimizer_step import Moments, Rule, update
-from edge_server.fields.splat.kernels.project import (
-    BASE,
-    BLOCK,
-    COLOR,
-    OPACITY,
-    QUATERNION,
-    SCALE,
-    Gaussians,
-)
+from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
+from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY
 from freshfield.geometry import Pinhole, look_at
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned, random_params, static
 
 COUNT = 2 * BLOCK + 44  # two full blocks and a part of one
-BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
 LENS = Pinhole(48, 40, 50.0, 50.0, 24.0, 20.0, (-0.05, 0.01, 0.002, -0.001))
 EYES = ((1.0, -2.5, 0.8), (-2.0, 1.5, 1.0))
 BETA1, BETA2, EPSILON, FADE = 0.9, 0.99, 1e-8, 0.3
 
 
-def _params(harmonics: int) -> NDArray[np.float32]:
-    rng = np.random.default_rng(3)
-    params = rng.normal(size=(COUNT, BASE + 3 * (harmonics - 1))).astype(np.float32)
-    params[:, :3] *= 0.5
-    params[:, SCALE:QUATERNION] = np.log(rng.uniform(0.08, 0.2, (COUNT, 3)))
-    params[:, OPACITY] = rng.uniform(-1.0, 2.0, COUNT)
-    params[:, COLOR : COLOR + 3] = rng.uniform(0.2, 0.8, (COUNT, 3))
-    params[:, BASE:] *= 0.2
-    return params
-
-
-def _passes(params: NDArray[np.float32], harmonics: int) -> tuple[Passes, NDArray[np.float32]]:
+def _raster(params: NDArray[np.float32]) -> tuple[RasterBuffers, NDArray[np.float32]]:
     cams = camera_rows([look_at(eye, (0.05, 0.0, 0.1)) for eye in EYES], [LENS] * 2, BOX)
-    passes = Passes(CallerPool())
-    passes.look(cams, Gaussians(params, harmonics, np.zeros((COUNT, 3), np.float32)), [None, None])
+    raster = binned(cams, params)
     # Some are seen by one camera alone, every fifth by none.
-    passes.lists.own_count[0, :COUNT:3] = passes.lists.own_count[1, 1:COUNT:4] = 0
-    passes.lists.own_count[:, :COUNT:5] = 0
+    raster.lists.own_count[0, :COUNT:3] = raster.lists.own_count[1, 1:COUNT:4] = 0
+    raster.lists.own_count[:, :COUNT:5] = 0
     rng = np.random.default_rng(4)
-    passes.sums[...] = rng.normal(size=passes.sums.shape) * 0.01
-    return passes, cams
+    raster.sums[...] = rng.normal(size=raster.sums.shape) * 0.01
+    return raster, cams
 
 
-def _moments(width: int, filled: bool) -> Moments:
+def _moments(width: int, filled: bool) -> OptimizerState:
     rng = np.random.default_rng(7)
     m, v = rng.normal(size=(COUNT, width)) * 0.1, rng.uniform(0.0, 0.1, (COUNT, width))
     age = rng.integers(0, 6, COUNT) if filled else np.zeros(COUNT)
     flat = [np.zeros(COUNT, np.float32) for _ in range(3)]
     share = 1.0 if filled else 0.0
-    return Moments(
+    return OptimizerState(
         (share * m).astype(np.float32), (share * v).astype(np.float32), age.astype(np.int32), *flat
     )
 
 
-def _rule(width: int, beta1: float, rate: float, fade: float = 0.0) -> Rule:
+def _adam_parameters(width: int, beta1: float, rate: float, fade: float = 0.0) -> AdamParameters:
     rates = rate * (1.0 + np.arange(width)) / width
     corrections = np.array([[9.0, 9.0, 9.0], [3.0, 2.5, 1.0], [2.0, 1.8, 0.9], [1.5, 1.2, 0.8]])
-    return Rule(
+    return AdamParameters(
         rates.astype(np.float32), corrections.astype(np.float32),
         *(np.float32(x) for x in (beta1, BETA2, EPSILON, fade, 4.0, 5.0)),
     )  # fmt: skip
 
 
 def _update(
-    params: NDArray[np.float32], harmonics: int, moments: Moments, rule: Rule, passes: Passes,
+    params: NDArray[np.float32], moments: OptimizerState, rule: AdamParameters, raster: RasterBuffers,
     cams: NDArray[np.float32], pool: Pool | None = None,
 ) -> int:  # fmt: skip
     """How many gradients were dropped; params and moments are changed."""
     dropped = np.zeros(-(-COUNT // BLOCK), np.int64)
-    gaussians = Gaussians(params, harmonics, np.zeros((COUNT, 3), np.float32))
     (pool or CallerPool()).run(
-        update, cams, gaussians, COUNT, passes.projected, passes.lists.own_first, passes.lists.own_count,
-        passes.sums, moments, rule, dropped,
+        adam_step, cams, static(params), COUNT, raster.projected, raster.lists.own_first,
+        raster.lists.own_count, raster.sums, moments, rule, dropped,
     )  # fmt: skip
     return int(dropped.sum())
 
 
 def _gradient(
-    params: NDArray[np.float32], harmonics: int, passes: Passes, cams: NDArray[np.float32]
+    params: NDArray[np.float32], raster: RasterBuffers, cams: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Adam's first moment after a step with beta1 = 0."""
     width = params.shape[1]
     moments = _moments(width, filled=False)
-    _update(params.copy(), harmonics, moments, _rule(width, 0.0, 0.0), passes, cams)
+    _update(params.copy(), moments, _adam_parameters(width, 0.0, 0.0), raster, cams)
     return moments.m
 
 
 @pytest.mark.parametrize("harmonics", [1, 4])
 def test_a_step_is_adams(harmonics: int) -> None:
-    params = _params(harmonics)
-    passes, cams = _passes(params, harmonics)
+    params = random_params(COUNT, harmonics, 3)
+    raster, cams = _raster(params)
     width = params.shape[1]
-    g = _gradient(params, harmonics, passes, cams).astype(np.float64)
-    seen = (passes.lists.own_count[:, :COUNT] > 0).any(axis=0)
+    g = _gradient(params, raster, cams).astype(np.float64)
+    seen = (raster.lists.own_count[:, :COUNT] > 0).any(axis=0)
     assert 0 < (~seen).sum() < COUNT // 2 and (np.abs(g[seen]).max(axis=1) > 0).all()
     alpha = 1.0 / (1.0 + np.exp(-params[:, OPACITY].astype(np.float64)))
     g[:, OPACITY] += FADE * alpha * (1.0 - alpha)
     moments, after = _moments(width, filled=True), params.copy()
-    before = Moments(*(np.array(array, np.float64) for array in moments))
-    rule = _rule(width, BETA1, 1e-3, FADE)
-    assert _update(after, harmonics, moments, rule, passes, cams) == 0
+    before = OptimizerState(*(np.array(array, np.float64) for array in moments))
+    rule = _adam_parameters(width, BETA1, 1e-3, FADE)
+    assert _update(after, moments, rule, raster, cams) == 0
 
     m = BETA1 * before.m + (1.0 - BETA1) * g
     v = BETA2 * before.v + (1.0 - BETA2) * g * g
@@ -131,15 +109,15 @@ def test_a_step_is_adams(harmonics: int) -> None:
 
 
 def test_a_gaussians_gradient_does_not_depend_on_its_place_in_a_block() -> None:
-    params = _params(1)
-    passes, cams = _passes(params, 1)
-    whole = _gradient(params, 1, passes, cams)
-    lists = passes.lists
+    params = random_params(COUNT, seed=3)
+    raster, cams = _raster(params)
+    whole = _gradient(params, raster, cams)
+    lists = raster.lists
     for only in (slice(0, BLOCK - 1), slice(BLOCK - 1, BLOCK + 9), slice(BLOCK + 9, COUNT)):
         kept = lists.own_count.copy()
         lists.own_count[:, :COUNT] = 0
         lists.own_count[:, only] = kept[:, only]
-        part = _gradient(params, 1, passes, cams)
+        part = _gradient(params, raster, cams)
         lists.own_count[:] = kept
         np.testing.assert_array_equal(part[only], whole[only])
         part[only] = 0.0
@@ -147,30 +125,30 @@ def test_a_gaussians_gradient_does_not_depend_on_its_place_in_a_block() -> None:
 
 
 def test_cameras_add_up() -> None:
-    params = _params(1)
-    passes, cams = _passes(params, 1)
-    both = _gradient(params, 1, passes, cams)
-    kept, parts = passes.lists.own_count.copy(), []
+    params = random_params(COUNT, seed=3)
+    raster, cams = _raster(params)
+    both = _gradient(params, raster, cams)
+    kept, parts = raster.lists.own_count.copy(), []
     for b in (0, 1):
-        passes.lists.own_count[:] = kept
-        passes.lists.own_count[1 - b] = 0
-        parts.append(_gradient(params, 1, passes, cams))
+        raster.lists.own_count[:] = kept
+        raster.lists.own_count[1 - b] = 0
+        parts.append(_gradient(params, raster, cams))
     np.testing.assert_allclose(parts[0] + parts[1], both, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("column", [1, 7])
 def test_what_is_not_finite_is_dropped_and_counted(column: int, broken: float) -> None:
-    params = _params(1)
-    passes, cams = _passes(params, 1)
-    victim = int(np.flatnonzero(passes.lists.own_count[0, :COUNT] > 0)[40])
-    rule, sound = _rule(BASE, BETA1, 1e-3), params.copy()
+    params = random_params(COUNT, seed=3)
+    raster, cams = _raster(params)
+    victim = int(np.flatnonzero(raster.lists.own_count[0, :COUNT] > 0)[40])
+    rule, sound = _adam_parameters(BASE, BETA1, 1e-3), params.copy()
     moments = _moments(BASE, filled=True)
-    _update(sound, 1, moments, rule, passes, cams)
-    passes.sums[0, passes.lists.own_first[0, victim], column] = broken
+    _update(sound, moments, rule, raster, cams)
+    raster.sums[0, raster.lists.own_first[0, victim], column] = broken
     hurt, moments = params.copy(), _moments(BASE, filled=True)
     was = moments.m[victim].copy()
-    lost = _update(hurt, 1, moments, rule, passes, cams)
+    lost = _update(hurt, moments, rule, raster, cams)
     assert 1 <= lost <= BASE and np.isfinite(hurt).all() and np.isfinite(moments.m).all()
     others = np.arange(COUNT) != victim
     np.testing.assert_array_equal(hurt[others], sound[others])
@@ -182,12 +160,12 @@ def test_what_is_not_finite_is_dropped_and_counted(column: int, broken: float) -
 
 
 def test_threads_do_not_change_a_bit() -> None:
-    params = _params(4)
-    passes, cams = _passes(params, 4)
+    params = random_params(COUNT, 4, 3)
+    raster, cams = _raster(params)
     results = []
     for pool in (CallerPool(), Pool(3)):
         after, moments = params.copy(), _moments(params.shape[1], filled=True)
-        _update(after, 4, moments, _rule(params.shape[1], BETA1, 1e-3, FADE), passes, cams, pool)
+        _update(after, moments, _adam_parameters(params.shape[1], BETA1, 1e-3, FADE), raster, cams, pool)
         results.append((after, moments.m, moments.v))
         pool.close()
     for a, b in zip(*results, strict=True):
@@ -195,5 +173,5 @@ def test_threads_do_not_change_a_bit() -> None:
 
 
 def test_sums_have_a_row_for_each_pair() -> None:
-    passes, _ = _passes(_params(1), 1)
-    assert passes.sums.shape == (*passes.lists.pair.shape, SUMS)
+    raster, _ = _raster(random_params(COUNT, seed=3))
+    assert raster.sums.shape == (*raster.lists.pair.shape, SUMS)

@@ -8,27 +8,34 @@ import pytest
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.buffers import Passes, camera_rows
-from edge_server.fields.splat.densification import Cloud
+from edge_server.fields.splat.buffers import RasterBuffers, camera_rows
+from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import (
     ALPHA,
-    ALPHA_LEAST,
+    ALPHA_MIN,
     BASE,
-    MX,
-    MY,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    MEAN_X,
+    MEAN_Y,
     OPACITY,
     ORIGIN,
-    QA,
-    QB,
-    QC,
     QUATERNION,
     SCALE,
     Gaussians,
 )  # fmt: skip
-from edge_server.fields.splat.kernels.rasterize import ALPHA_MOST
-from edge_server.fields.splat.kernels.rasterize_planes import render_planes, tell_normals
-from edge_server.fields.splat.planar import align, depth_normals, flatten, normals_of, plane_depth, planes_of
+from edge_server.fields.splat.kernels.rasterize import ALPHA_MAX
+from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
+from edge_server.fields.splat.planar import (
+    align,
+    depth_normals,
+    flatten,
+    gaussian_normals,
+    gaussian_planes,
+    plane_depth,
+)
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.surface.depth import rendered
 from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, world_rays
@@ -51,11 +58,20 @@ def flat(count: int, tilt: np.ndarray, seed: int = 0, thickness: float = -7.0) -
     return p
 
 
-def looked(params: np.ndarray) -> tuple[Passes, Gaussians, np.ndarray]:
+def looked(params: np.ndarray) -> tuple[RasterBuffers, Gaussians, np.ndarray]:
     gaussians = Gaussians(params, 1, np.zeros((len(params), 3), np.float32))
-    passes, cams = Passes(POOL), camera_rows([POSE], [LENS], BOX)
-    passes.look(cams, gaussians, [None], differentiate=False)
-    return passes, gaussians, cams[0]
+    raster, cams = RasterBuffers(POOL), camera_rows([POSE], [LENS], BOX)
+    raster.project_and_bin(cams, gaussians, [None], differentiate=False)
+    return raster, gaussians, cams[0]
+
+
+def blended(raster: RasterBuffers, planes: np.ndarray) -> np.ndarray:
+    out = np.zeros((24, 24, 5), np.float32)
+    POOL.run(
+        render_planes, 0, 3, 3, 24, 24, raster.projected, raster.lists, planes, raster.memory,
+        raster.saved, out,
+    )  # fmt: skip
+    return out
 
 
 def tilted(angle: float) -> np.ndarray:
@@ -66,8 +82,8 @@ def tilted(angle: float) -> np.ndarray:
 @pytest.mark.parametrize("angle", [0.0, 0.6, -0.9])
 def test_the_depth_of_a_plane_is_where_the_rays_meet_it(angle):
     tilt = tilted(angle)
-    passes, gaussians, camera = looked(flat(400, tilt))
-    depth, opacity = plane_depth(passes, POOL, gaussians, camera, LENS)
+    raster, gaussians, camera = looked(flat(400, tilt))
+    depth, opacity = plane_depth(raster, gaussians, camera, LENS)
     origin, rays = world_rays(LENS, POSE)
     exact = -(origin @ tilt[:, 2]) / (rays @ tilt[:, 2])
     solid = opacity > 0.9
@@ -79,33 +95,19 @@ def test_the_kernel_blends_as_a_loop_over_pixels_does():
     rng = np.random.default_rng(4)
     params = flat(40, tilted(0.4), thickness=-3.0)
     params[:, :3] += rng.normal(0, 0.2, (40, 3))
-    passes, gaussians, camera = looked(params)
-    planes = planes_of(gaussians, camera)
-    out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(
-        render_planes,
-        0,
-        3,
-        3,
-        24,
-        24,
-        passes.projected,
-        passes.lists,
-        planes,
-        passes.memory,
-        passes.kept,
-        out,
-    )
-    lists = passes.lists
+    raster, gaussians, camera = looked(params)
+    planes = gaussian_planes(gaussians, camera)
+    out = blended(raster, planes)
+    lists = raster.lists
     for y, x in [(3, 5), (12, 12), (20, 9)]:
         tile, left, total = (y // 8) * 3 + x // 8, 1.0, np.zeros(5)
         for pair in lists.pair[0, lists.first[0, tile] : lists.first[0, tile + 1]]:
             i = lists.owner[0, pair]
-            row = passes.projected[0, i].astype(float)
-            dx, dy = x + 0.5 - row[MX], y + 0.5 - row[MY]
-            power = -0.5 * (row[QA] * dx * dx + row[QC] * dy * dy) - row[QB] * dx * dy
-            alpha = min(row[ALPHA] * np.exp(power), ALPHA_MOST)
-            if alpha < ALPHA_LEAST or left < 1e-4:
+            row = raster.projected[0, i].astype(float)
+            dx, dy = x + 0.5 - row[MEAN_X], y + 0.5 - row[MEAN_Y]
+            power = -0.5 * (row[CONIC_A] * dx * dx + row[CONIC_C] * dy * dy) - row[CONIC_B] * dx * dy
+            alpha = min(row[ALPHA] * np.exp(power), ALPHA_MAX)
+            if alpha < ALPHA_MIN or left < 1e-4:
                 continue
             total += alpha * left * np.array([*planes[i], 1.0])
             left -= alpha * left
@@ -113,23 +115,22 @@ def test_the_kernel_blends_as_a_loop_over_pixels_does():
 
 
 def test_what_pixels_tell_adds_up_to_what_they_show():
-    passes, gaussians, camera = looked(flat(60, tilted(0.3)))
+    raster, gaussians, camera = looked(flat(60, tilted(0.3)))
     normals = np.random.default_rng(2).normal(size=(24, 24, 4)).astype(np.float32)
     normals[..., 3] = 1.0
-    told = np.zeros((passes.lists.pair.shape[1], 4), np.float32)
+    normal_sums = np.zeros((raster.lists.pair.shape[1], 4), np.float32)
     POOL.run(
-        tell_normals, 0, 3, 3, 24, 24, passes.projected, passes.lists, normals, passes.memory, passes.kept,
-        told,
+        accumulate_normals, 0, 3, 3, 24, 24, raster.projected, raster.lists, normals, raster.memory,
+        raster.saved, normal_sums,
     )  # fmt: skip
-    out = np.zeros((24, 24, 5), np.float32)
-    POOL.run(
-        render_planes, 0, 3, 3, 24, 24, passes.projected, passes.lists, planes_of(gaussians, camera),
-        passes.memory, passes.kept, out,
-    )  # fmt: skip
-    pairs = int(passes.lists.needed[0])
-    np.testing.assert_allclose(told[:pairs, 3].sum(), out[..., 4].sum(), rtol=1e-4)
+    out = blended(raster, gaussian_planes(gaussians, camera))
+    pairs = int(raster.lists.needed[0])
+    np.testing.assert_allclose(normal_sums[:pairs, 3].sum(), out[..., 4].sum(), rtol=1e-4)
     np.testing.assert_allclose(
-        told[:pairs, :3].sum(axis=0), (out[..., 4:] * normals[..., :3]).sum(axis=(0, 1)), rtol=2e-3, atol=1e-2
+        normal_sums[:pairs, :3].sum(axis=0),
+        (out[..., 4:] * normals[..., :3]).sum(axis=(0, 1)),
+        rtol=2e-3,
+        atol=1e-2,
     )
 
 
@@ -140,12 +141,12 @@ def test_gaussians_turn_to_the_surface_they_show_and_get_flat():
     rng = np.random.default_rng(6)
     q = params[:, QUATERNION : QUATERNION + 4]
     q += rng.normal(0, 0.15, q.shape)
-    cloud = Cloud.of(params)
+    cloud = GaussianCloud.new(params)
     off = [_degrees(cloud, tilt)]
     for _ in range(12):
         flatten(cloud, settings)
-        passes, _, camera = looked(cloud.params)
-        align(cloud, settings, passes, POOL, camera, LENS)
+        raster, _, camera = looked(cloud.params)
+        align(cloud, settings, raster, camera, LENS)
         off.append(_degrees(cloud, tilt))
     assert off[-1] < 0.4 * off[0]
     scale = cloud.params[:, SCALE : SCALE + 3]
@@ -153,11 +154,11 @@ def test_gaussians_turn_to_the_surface_they_show_and_get_flat():
     assert (scale.max(axis=1) - scale.min(axis=1)).max() <= np.log(settings.aspect) + 1e-5
 
 
-def _degrees(cloud: Cloud, tilt: np.ndarray) -> float:
+def _degrees(cloud: GaussianCloud, tilt: np.ndarray) -> float:
     """Mean angle between the normals of what is seen and the surface."""
-    passes, _, _ = looked(cloud.params)
-    seen = passes.lists.own_count[0, : len(cloud)] > 0
-    along = np.abs(normals_of(cloud.params)[seen] @ tilt[:, 2])
+    raster, _, _ = looked(cloud.params)
+    seen = raster.lists.own_count[0, : len(cloud)] > 0
+    along = np.abs(gaussian_normals(cloud.params)[seen] @ tilt[:, 2])
     return float(np.rad2deg(np.arccos(np.clip(along, 0, 1))).mean())
 
 
@@ -179,15 +180,15 @@ def test_hard_cases_stay_finite():
     params[0, QUATERNION : QUATERNION + 4] = 0.0
     params[1, SCALE : SCALE + 3] = -11.0
     params[2, :3] = POSE[:3, 3]  # in the camera
-    passes, gaussians, camera = looked(params)
-    depth, opacity = plane_depth(passes, POOL, gaussians, camera, LENS)
+    raster, gaussians, camera = looked(params)
+    depth, opacity = plane_depth(raster, gaussians, camera, LENS)
     assert np.isfinite(depth).all() and np.isfinite(opacity).all()
-    cloud = Cloud.of(params.copy())
-    align(cloud, SplatSettings(align=1.0), passes, POOL, camera, LENS)
+    cloud = GaussianCloud.new(params.copy())
+    align(cloud, SplatSettings(align=1.0), raster, camera, LENS)
     flatten(cloud, SplatSettings(flatten=1.0))
     assert np.isfinite(cloud.params).all()
     empty, gaussians, camera = looked(params[:0])
-    depth, opacity = plane_depth(empty, POOL, gaussians, camera, LENS)
+    depth, opacity = plane_depth(empty, gaussians, camera, LENS)
     assert not depth.any() and not opacity.any()
 
 

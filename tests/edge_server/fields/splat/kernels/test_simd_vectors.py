@@ -1,4 +1,4 @@
-"""Vectors of 16 float32 in expressions, against numpy."""
+"""SIMD vectors of 16 float32 against numpy."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import FAST
 from edge_server.fields.splat.kernels.simd_vectors import (
     LANES,
-    Wide,
-    anywhere,
-    both,
-    contiguous,
-    eight_sums,
-    sum_of,
+    Vector,
+    any_lane,
+    eight_lane_sums,
+    lane_sum,
+    mask_and,
+    require_contiguous,
 )
 
 
-def _run(work: Callable[[Wide, Wide], Any], a: NDArray[np.float32], b: NDArray[np.float32]) -> Any:
+def _run(work: Callable[[Vector, Vector], Any], a: NDArray[np.float32], b: NDArray[np.float32]) -> Any:
     """What ``work`` makes of two vectors: 16 numbers, or 8, or one."""
 
     @intrinsic
@@ -35,8 +35,8 @@ def _run(work: Callable[[Wide, Wide], Any], a: NDArray[np.float32], b: NDArray[n
                 context.make_array(kind)(context, builder, arg).data
                 for kind, arg in zip(signature.args, args, strict=True)
             ]
-            result = work(Wide.load(builder, data[0]), Wide.load(builder, data[1]))
-            if isinstance(result, Wide):
+            result = work(Vector.load(builder, data[0]), Vector.load(builder, data[1]))
+            if isinstance(result, Vector):
                 result.store(data[2])
             else:
                 place = builder.bitcast(data[2], result.type.as_pointer())
@@ -60,66 +60,66 @@ def pair() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return rng.normal(size=LANES).astype(np.float32), rng.normal(size=LANES).astype(np.float32) + 3.0
 
 
-def test_arithmetic_is_that_of_numbers(pair):
+def test_arithmetic_equals_numpy(pair):
     a, b = pair
-    got = _run(lambda x, y: (x * y + 2.0 - y) / y + x.rest(), a, b)
+    got = _run(lambda x, y: (x * y + 2.0 - y) / y + x.one_minus(), a, b)
     np.testing.assert_allclose(got, (a * b + 2.0 - b) / b + 1.0 - a, rtol=1e-5, atol=1e-6)
 
 
-def test_masks_choose_and_combine(pair):
+def test_masks_select_and_combine(pair):
     a, b = pair
 
-    def chosen(x: Wide, y: Wide) -> Wide:
-        return x.where(both(x.builder, x.at_least(-0.5), x.below(0.5)), 9.0)
+    def chosen(x: Vector, y: Vector) -> Vector:
+        return x.where(mask_and(x.builder, x.greater_equal(-0.5), x.less(0.5)), 9.0)
 
     np.testing.assert_array_equal(_run(chosen, a, b), np.where((a >= -0.5) & (a < 0.5), a, np.float32(9.0)))
 
 
 @pytest.mark.parametrize("bound, expected", [(1.0, 1.0), (7.0, 0.0)])
-def test_a_mask_holds_anywhere_or_nowhere(bound, expected):
+def test_any_lane_of_a_mask(bound, expected):
     a = np.zeros(LANES, np.float32)
     a[11] = 5.0
 
-    def told(x: Wide, y: Wide) -> Any:
-        return x.builder.uitofp(anywhere(x.builder, x.at_least(bound)), ir.FloatType())
+    def result(x: Vector, y: Vector) -> Any:
+        return x.builder.uitofp(any_lane(x.builder, x.greater_equal(bound)), ir.FloatType())
 
-    assert _run(told, a, a)[0] == expected
+    assert _run(result, a, a)[0] == expected
 
 
-def test_bounds_hold_for_what_is_not_a_number():
+def test_minimum_and_maximum_replace_nan():
     a = np.array([np.nan, np.inf, -np.inf, 0.5] * 4, np.float32)
-    np.testing.assert_array_equal(_run(lambda x, y: x.most(2.0), a, a), [2.0, 2.0, -np.inf, 0.5] * 4)
-    np.testing.assert_array_equal(_run(lambda x, y: x.least(-2.0), a, a), [-2.0, np.inf, -2.0, 0.5] * 4)
+    np.testing.assert_array_equal(_run(lambda x, y: x.minimum(2.0), a, a), [2.0, 2.0, -np.inf, 0.5] * 4)
+    np.testing.assert_array_equal(_run(lambda x, y: x.maximum(-2.0), a, a), [-2.0, np.inf, -2.0, 0.5] * 4)
 
 
-def test_what_is_not_finite_is_told():
+def test_is_finite():
     a = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, 1e-40, -1.0] * 2, np.float32)
-    got = _run(lambda x, y: (x - x + 1.0).where(x.finite(), y), a, np.full(LANES, 5.0, np.float32))
+    got = _run(lambda x, y: (x - x + 1.0).where(x.is_finite(), y), a, np.full(LANES, 5.0, np.float32))
     np.testing.assert_array_equal(got, [5, 5, 5, 1, 1, 1, 1, 1] * 2)
 
 
-def test_roots(pair):
-    got = _run(lambda x, y: (x * x).root() + y, *pair)
+def test_sqrt(pair):
+    got = _run(lambda x, y: (x * x).sqrt() + y, *pair)
     np.testing.assert_allclose(got, np.abs(pair[0]) + pair[1], rtol=1e-6)
 
 
-def test_powers_of_two_are_exact_to_the_last_bits():
+def test_exp2_is_exact_to_the_last_bits():
     for given in np.linspace(-63.99, 0.0, 160).astype(np.float32).reshape(-1, LANES):
-        got = _run(lambda x, y: x.power_of_2(), given, given)
+        got = _run(lambda x, y: x.exp2(), given, given)
         np.testing.assert_allclose(got, np.exp2(given.astype(np.float64)), rtol=3e-7)
 
 
-def test_powers_of_two_end_where_float32_would():
+def test_exp2_clamps_its_argument():
     given = np.array([1.0, 300.0, np.inf, -64.0, -1e3, -3e38, -np.inf, np.nan] * 2, np.float32)
     least = 2.0**-64
-    got = _run(lambda x, y: x.power_of_2(), given, given)
+    got = _run(lambda x, y: x.exp2(), given, given)
     np.testing.assert_allclose(got, [1, 1, 1, least, least, least, least, least] * 2, rtol=3e-7)
 
 
-def test_sums_of_lanes(pair):
+def test_lane_sums(pair):
     a, b = pair
-    assert _run(lambda x, y: sum_of(x), a, b)[0] == pytest.approx(a.sum(dtype=np.float64), abs=1e-5)
-    got = _run(lambda x, y: eight_sums([x, y, x * y, x + y, x - y, x * x, y * y, x * 3.0]), a, b)
+    assert _run(lambda x, y: lane_sum(x), a, b)[0] == pytest.approx(a.sum(dtype=np.float64), abs=1e-5)
+    got = _run(lambda x, y: eight_lane_sums([x, y, x * y, x + y, x - y, x * x, y * y, x * 3.0]), a, b)
     expected = [v.sum(dtype=np.float64) for v in (a, b, a * b, a + b, a - b, a * a, b * b, a * 3)]
     np.testing.assert_allclose(got[:8], expected, rtol=1e-5, atol=1e-4)
     assert (got[8:] == -7.0).all()
@@ -132,7 +132,7 @@ def test_strided_arrays_are_refused(pair):
 
     @intrinsic
     def checked(typingctx: Any, x: Any) -> Any:
-        contiguous(x)
+        require_contiguous(x)
         return types.void(x), lambda context, builder, signature, args: context.get_dummy_value()
 
     sliced(pair[0])
