@@ -140,7 +140,7 @@ def _run(args: argparse.Namespace) -> int:
 
     from edge_server.config import PolicyConfig, read_config
     from edge_server.fidelity.lpips_weights import weights_folder
-    from edge_server.live.server import EdgeServer, Options
+    from edge_server.live.server import EdgeServer, ServerOptions
     from edge_server.scheduler import read_policy
 
     scenario = load(args.scenario, args.seed)
@@ -151,7 +151,7 @@ def _run(args: argparse.Namespace) -> int:
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     config = replace(config, learn=_learn(args, config))
-    options = Options(
+    options = ServerOptions(
         listen=args.listen,
         out=args.out,
         transport=transport.from_arguments(args),

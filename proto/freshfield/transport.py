@@ -16,15 +16,13 @@ from typing import Any
 import grpc
 import grpc.aio
 
-from freshfield.payload import MAX_MESSAGE_BYTES
+from freshfield.limits import MAX_CONCURRENT_STREAMS, MAX_MESSAGE_BYTES
 
 _KEEPALIVE_MS = 10_000
-# Room for the header around the largest payload.
-_MESSAGE_LIMIT = MAX_MESSAGE_BYTES + 4096
 
 _COMMON: list[tuple[str, Any]] = [
-    ("grpc.max_receive_message_length", _MESSAGE_LIMIT),
-    ("grpc.max_send_message_length", _MESSAGE_LIMIT),
+    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
     ("grpc.http2.bdp_probe", 0),
     ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
     ("grpc.keepalive_timeout_ms", 5_000),
@@ -46,7 +44,7 @@ SERVER_OPTIONS = [
     # may queue is bounded by the credits, not by this.
     ("grpc.http2.lookahead_bytes", 1 << 20),
     ("grpc.http2.min_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
-    ("grpc.max_concurrent_streams", 1024),
+    ("grpc.max_concurrent_streams", MAX_CONCURRENT_STREAMS),
     # Two servers silently sharing one port would split the cameras between them.
     ("grpc.so_reuseport", 0),
 ]

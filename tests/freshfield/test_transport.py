@@ -11,7 +11,7 @@ import grpc
 import grpc.aio
 import pytest
 
-from freshfield.payload import MAX_MESSAGE_BYTES
+from freshfield.limits import MAX_PAYLOAD_BYTES
 from freshfield.transport import Transport, TransportError, add_arguments, from_arguments, host_port
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, frames_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
@@ -64,9 +64,9 @@ def test_plain_text_and_messages_up_to_the_limit():
         server, port = await serve(Transport())
         try:
             assert await ask(Transport(), port) == 42
-            assert await push(Transport(), port, MAX_MESSAGE_BYTES) == MAX_MESSAGE_BYTES
+            assert await push(Transport(), port, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
             with pytest.raises(grpc.aio.AioRpcError):
-                await push(Transport(), port, MAX_MESSAGE_BYTES + 8192)
+                await push(Transport(), port, MAX_PAYLOAD_BYTES + 8192)
             assert await ask(Transport(), port) == 42  # and the server lives on
         finally:
             await server.stop(None)
@@ -81,7 +81,7 @@ def test_a_server_refuses_a_message_that_a_stranger_sends_too_large():
         async with grpc.aio.insecure_channel(f"localhost:{port}", options=options) as channel:
             call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push(timeout=20)
             try:
-                await call.write(pb.PushRequest(payload=bytes(4 * MAX_MESSAGE_BYTES)))
+                await call.write(pb.PushRequest(payload=bytes(4 * MAX_PAYLOAD_BYTES)))
                 await call.read()
             finally:
                 await server.stop(None)

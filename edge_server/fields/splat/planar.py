@@ -17,7 +17,7 @@ from edge_server.fields.splat.densification import Cloud
 from edge_server.fields.splat.kernels.project import ORIGIN, QUATERNION, SCALE, SIZE, Gaussians
 from edge_server.fields.splat.kernels.rasterize_planes import render_planes, tell_normals
 from edge_server.fields.splat.settings import SplatSettings
-from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalise, quaternion_to_matrix
+from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalize, quaternion_to_matrix
 
 STEEPEST = 0.1  # cosine between ray and normal below which a plane has no depth
 SURE_OPACITY = 0.7  # of a pixel whose depth has a normal to teach
@@ -48,7 +48,7 @@ def directed(params: NDArray[np.float32]) -> NDArray[np.float64]:
     """Unit quaternions (N, 4) of Gaussians; one without a direction turns nothing, as when it is rendered."""
     given = params[:, QUATERNION : QUATERNION + 4].astype(np.float64)
     sound = np.isfinite(given).all(axis=1) & (np.abs(given).max(axis=1, initial=0.0) > 0.0)
-    return quaternion_normalise(np.where(sound[:, None], given, (1.0, 0.0, 0.0, 0.0)))
+    return quaternion_normalize(np.where(sound[:, None], given, (1.0, 0.0, 0.0, 0.0)))
 
 
 def plane_depth(
@@ -118,7 +118,7 @@ def align(
     turn = 0.5 * settings.align * np.cross(normal, wanted)
     step = np.concatenate([np.ones((len(turn), 1)), turn], axis=1)
     part = slice(QUATERNION, QUATERNION + 4)
-    cloud.params[which, part] = quaternion_normalise(quaternion_multiply(step, directed(cloud.params[which])))
+    cloud.params[which, part] = quaternion_normalize(quaternion_multiply(step, directed(cloud.params[which])))
 
 
 def depth_normals(

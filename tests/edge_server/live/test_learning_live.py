@@ -11,7 +11,7 @@ import pytest
 
 from edge_server.cli import main
 from edge_server.config import LearnConfig, PolicyConfig, read_config
-from edge_server.live.server import EdgeServer, Options
+from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
@@ -34,7 +34,7 @@ def policy(tmp_path):
 def server(tmp_path, policy, held_out=("cam00",), port=None, learn=None) -> EdgeServer:
     what = tiny_scenario(tmp_path, held_out)
     config = replace(read_config(what), policy=PolicyConfig(str(policy)), learn=learn)
-    options = Options(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
+    options = ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
     return EdgeServer(what, config, options)
 
 
@@ -53,7 +53,7 @@ def test_it_decides_learns_and_leaves_what_it_learnt(tmp_path, policy, monkeypat
         edge.state.set_policy("all", None)
         assert edge.state.learning() == ""
         edge.state.set_policy(f"bandit:{policy}", None)
-        assert edge.updates is not None and "learning" in edge.state.learning()
+        assert edge.updater is not None and "learning" in edge.state.learning()
     finally:
         feed.stop()
         edge.stop()
@@ -78,7 +78,7 @@ def test_who_cannot_learn_is_refused_in_one_line(held_out, name, said, tmp_path,
     if name == "threshold:90":
         what = tiny_scenario(tmp_path, held_out)
         config = replace(read_config(what), policy=PolicyConfig("threshold", 90.0), learn=LearnConfig())
-        make = lambda: EdgeServer(what, config, Options("127.0.0.1:1", tmp_path / "out"))  # noqa: E731
+        make = lambda: EdgeServer(what, config, ServerOptions("127.0.0.1:1", tmp_path / "out"))  # noqa: E731
     else:
         make = lambda: server(tmp_path, name or f"bandit:{policy}", held_out, learn=LearnConfig())  # noqa: E731
     with pytest.raises(ScenarioError, match=said) as error:
@@ -90,7 +90,7 @@ def test_a_policy_learns_on_by_the_reward_it_was_trained_by_or_says_what_is_miss
     learner = Learner.load(policy)
     learner.taught_by = asdict(make_reward("set", "moving", distance=-0.25))
     learner.save(policy)
-    by = server(tmp_path, f"bandit:{policy}", learn=LearnConfig()).lessons.reward
+    by = server(tmp_path, f"bandit:{policy}", learn=LearnConfig()).trainer.reward
     assert (by.name, by.fidelity) == ("set", "moving") and by.distance in (-0.25, 0.0)
     learner.taught_by = asdict(make_reward("set", distance_is="perceptual"))
     learner.save(policy)
@@ -100,8 +100,8 @@ def test_a_policy_learns_on_by_the_reward_it_was_trained_by_or_says_what_is_miss
 
 def test_without_being_asked_nothing_learns(tmp_path, policy):
     edge = server(tmp_path, f"bandit:{policy}")
-    assert edge.lessons is None and edge.status()["learning"] is None and edge.state.learning() == ""
-    assert edge.updates.embeddings is None
+    assert edge.trainer is None and edge.status()["learning"] is None and edge.state.learning() == ""
+    assert edge.updater.embeddings is None
 
 
 def refused(capsys, *words: str) -> str:
@@ -156,13 +156,13 @@ def test_a_scenario_says_that_its_policy_learns_and_the_command_has_the_last_wor
     monkeypatch.setattr(EdgeServer, "run", lambda self: found.append(self))
     monkeypatch.setattr("edge_server.cli.signal.signal", lambda *_: None)  # Ctrl-C is pytest's
     assert main(["run", file, "--out", str(tmp_path / "out"), *words]) == 0
-    lessons = found[0].lessons
+    trainer = found[0].trainer
     if reward is None:
-        assert lessons is None
+        assert trainer is None
         return
     name, _, on = reward.partition(":")
-    assert (lessons.reward.name, lessons.reward.fidelity) == (name, on or "whole")
-    assert name_of(lessons.apprentice.fixed) == fallback
+    assert (trainer.reward.name, trainer.reward.fidelity) == (name, on or "whole")
+    assert name_of(trainer.apprentice.fixed) == fallback
 
 
 def test_a_scenario_with_a_mistyped_key_of_learning_is_refused(tmp_path, policy, capsys):

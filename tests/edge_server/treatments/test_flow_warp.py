@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge_server.treatments.change_detection import compare, dilated
-from edge_server.treatments.flow_warp import Freshen
+from edge_server.treatments.flow_warp import FlowWarp
 from tests.edge_server.treatments.pictures import HEIGHT, MS, WIDTH, picture, seen, view
 
 GAP_MS = 60.0
@@ -15,7 +15,7 @@ GAP_MS = 60.0
 def freshened(age_ms: float, **other):
     """One view carried to ``age_ms`` after its capture."""
     before, now = seen(0.0, **other), seen(GAP_MS, **other)
-    (after,) = Freshen().treat([now], {"cam01": before}, round((GAP_MS + age_ms) * MS))
+    (after,) = FlowWarp().treat([now], {"cam01": before}, round((GAP_MS + age_ms) * MS))
     return now, after
 
 
@@ -46,8 +46,8 @@ def test_what_stands_is_untouched_bit_for_bit_and_counts_in_full():
 def test_the_older_of_two_views_counts_less_where_it_was_carried():
     young = seen(GAP_MS + 100.0, "cam02")
     before = {"cam01": seen(0.0), "cam02": seen(100.0, "cam02")}
-    old, fresh = Freshen().treat([seen(GAP_MS), young], before, round((GAP_MS + 110.0) * MS))
-    made = Freshen()
+    old, fresh = FlowWarp().treat([seen(GAP_MS), young], before, round((GAP_MS + 110.0) * MS))
+    made = FlowWarp()
     assert np.unique(fresh.weight) == pytest.approx([made.uncovered, 1.0])
     assert np.unique(old.weight) == pytest.approx(
         [made.uncovered * made.least_weight, made.least_weight, 1.0], abs=1e-6
@@ -71,7 +71,7 @@ def test_a_patch_is_followed_through_noise():
 def test_no_farther_than_most_ms():
     _now, near = freshened(300.0)
     _, far = freshened(3_600_000.0)
-    assert far.carried_to_ns - far.generated_ns == round(Freshen().most_ms * MS)
+    assert far.carried_to_ns - far.generated_ns == round(FlowWarp().max_ms * MS)
     assert np.array_equal(near.image, far.image)
 
 
@@ -84,7 +84,7 @@ def test_transparency_is_carried_along():
         return view(np.concatenate([image, alpha], axis=2), t_ms)
 
     now = rgba(GAP_MS)
-    (after,) = Freshen().treat([now], {"cam01": rgba(0.0)}, round(2 * GAP_MS * MS))
+    (after,) = FlowWarp().treat([now], {"cam01": rgba(0.0)}, round(2 * GAP_MS * MS))
     truth = rgba(2 * GAP_MS).image
     stale, fresh = (np.abs(x[..., 3].astype(int) - truth[..., 3]).mean() for x in (now.image, after.image))
     assert fresh < stale / 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge_server.treatments.change_detection import compare
-from edge_server.treatments.motion_mask import Mask, speed_px_per_ms
+from edge_server.treatments.motion_mask import MotionMask, speed_px_per_ms
 from tests.edge_server.treatments.pictures import MS, picture, seen
 
 
@@ -22,14 +22,14 @@ def masked(ages_ms: list[float], speed: float = 0.08):
         earlier[camera] = type(before)(
             **{**vars(before), "generated_ns": round((now_ms - age_ms - 60.0) * MS)}
         )
-    return views, Mask().treat(views, earlier, round(now_ms * MS))
+    return views, MotionMask().treat(views, earlier, round(now_ms * MS))
 
 
 def test_weights_fall_with_age_and_reach_farther():
     views, treated = masked([10.0, 60.0, 90.0])
     assert [t is v for t, v in zip(treated, views)] == [True, False, False], "the youngest stay whole"
     least = [1.0 if v.weight is None else float(v.weight.min()) for v in treated]
-    assert least[0] == 1.0 > least[1] > least[2] >= Mask().least_weight
+    assert least[0] == 1.0 > least[1] > least[2] >= MotionMask().least_weight
     wide = [int((v.weight < 1.0).sum()) for v in treated[1:]]
     assert wide[1] > wide[0], "what moved is farther by now"
     assert all(v.image is w.image and v.carried_to_ns is None for v, w in zip(treated, views))

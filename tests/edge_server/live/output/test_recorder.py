@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from edge_server.live.recorder import Recorder, schema_of
+from edge_server.live.output.recorder import Recorder, schema_of
 from edge_server.live.state import Publication
 from freshfield.v1 import frames_pb2 as pb
 from tests.freshfield.test_session import requests
@@ -45,7 +45,7 @@ def test_decisions_and_scores_are_json_that_keeps_its_schema(tmp_path):
 
 
 def test_what_finds_no_room_is_dropped_and_counted_and_nobody_waits(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_server.live.recorder._MOST_WAITING", 10)
+    monkeypatch.setattr("edge_server.live.output.recorder._MAX_QUEUE_MESSAGES", 10)
     recorder = Recorder(tmp_path / "a.mcap", "test")
     stuck, go_on = threading.Event(), threading.Event()
     write = recorder._writer.frame
@@ -70,7 +70,7 @@ def test_what_finds_no_room_is_dropped_and_counted_and_nobody_waits(tmp_path, mo
 
 
 def test_bytes_are_bounded_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_server.live.recorder._MOST_BYTES", 500)
+    monkeypatch.setattr("edge_server.live.output.recorder._MAX_QUEUE_BYTES", 500)
     recorder = Recorder(tmp_path / "a.mcap", "test")
     recorder.frame(*next(iter(requests(1))))
     recorder.close()

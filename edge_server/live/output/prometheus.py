@@ -12,7 +12,7 @@ from edge_server.live.state import EdgeState
 
 
 class EdgeCollector:
-    """Turns EdgeState into samples at scrape time: nothing is counted twice, nothing runs in between."""
+    """Turns the state into samples when it is scraped; nothing runs in between."""
 
     def __init__(self, state: EdgeState, ingest: Ingest) -> None:
         self._state = state
@@ -63,7 +63,7 @@ class EdgeCollector:
 
 
 def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int) -> None:
-    """Serve /metrics on a thread of its own until the process ends."""
+    """Serve /metrics on a thread until the process ends."""
     registry = CollectorRegistry()
     registry.register(EdgeCollector(state, ingest))  # type: ignore[arg-type]
     start_http_server(port, addr=host, registry=registry)
