@@ -50,8 +50,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
     async def GetStatus(
         self, request: edge_pb2.GetStatusRequest, context: grpc.aio.ServicerContext
     ) -> edge_pb2.GetStatusResponse:
-        state = self._state
-        publications = state.publications()
+        state, last = self._state, self._state.newest()
         return edge_pb2.GetStatusResponse(
             scenario=state.scenario,
             uptime_s=state.now_s(),
@@ -68,14 +67,14 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
             policy=state.controls.policy,
             value=state.controls.value,
             paused=state.controls.paused,
-            last=to_decision(publications[-1]) if publications else None,
+            last=to_decision(last) if last is not None else None,
         )
 
     async def WatchDecisions(
         self, request: edge_pb2.WatchDecisionsRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[edge_pb2.WatchDecisionsResponse]:
-        publications = self._state.publications()
-        seen = publications[-1].number if publications else -1
+        last = self._state.newest()
+        seen = -1 if last is None else last.number
         while True:
             for publication in self._state.publications(since=seen):
                 seen = publication.number

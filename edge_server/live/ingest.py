@@ -15,16 +15,10 @@ import grpc
 import grpc.aio
 
 from edge_server.live.buffer import FrameBuffer
+from freshfield import limits
 from freshfield.clock import Clock
 from freshfield.frame import Frame, FrameRejected, from_request, valid_id
 from freshfield.ledger import Ledger
-from freshfield.limits import (
-    MAX_CAPTURE_AGE_NS,
-    MAX_CAPTURE_AHEAD_NS,
-    MAX_CLOCK_UNCERTAINTY_NS,
-    MAX_SESSIONS_PER_CAMERA,
-    MAX_STREAMS_PER_CAMERA,
-)
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc
 
@@ -58,18 +52,22 @@ class FrameAdmission:
             raise FrameRejected("replayed_sequence", f"{frame.sequence} after {session.sequence}")
         if frame.generated_ns <= session.generated_ns:
             raise FrameRejected("time_reversed", "captured before the frame that came before it")
-        ahead = frame.generated_edge_ns - now_ns - min(frame.clock_uncertainty_ns, MAX_CLOCK_UNCERTAINTY_NS)
-        if ahead > MAX_CAPTURE_AHEAD_NS:
+        ahead = (
+            frame.generated_edge_ns
+            - now_ns
+            - min(frame.clock_uncertainty_ns, limits.MAX_CLOCK_UNCERTAINTY_NS)
+        )
+        if ahead > limits.MAX_CAPTURE_AHEAD_NS:
             raise FrameRejected(
                 "from_future", f"captured {ahead / 1e6:.0f} ms from now: clock offset unknown?"
             )
-        if -ahead > MAX_CAPTURE_AGE_NS:
+        if -ahead > limits.MAX_CAPTURE_AGE_NS:
             raise FrameRejected("too_old", f"captured {-ahead / 6e10:.0f} minutes ago: a wrong clock?")
         # Only an admitted frame changes the session: a refused one does not affect the next.
         session.sequence, session.generated_ns = frame.sequence, frame.generated_ns
         sessions[frame.session] = session
         sessions.move_to_end(frame.session)
-        while len(sessions) > MAX_SESSIONS_PER_CAMERA:
+        while len(sessions) > limits.MAX_SESSIONS_PER_CAMERA:
             sessions.popitem(last=False)
 
 
@@ -102,7 +100,7 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         self.newest_held_out: dict[str, Frame] = {}
         self.check_ms = RollingPercentiles(4096)
         self._streams = 0
-        self._max_streams = MAX_STREAMS_PER_CAMERA * (len(buffer.cameras) + len(held_out))
+        self._max_streams = limits.MAX_STREAMS_PER_CAMERA * (len(buffer.cameras) + len(held_out))
 
     async def Push(
         self, request_iterator: AsyncIterator[pb.PushRequest], context: grpc.aio.ServicerContext

@@ -260,40 +260,37 @@ class EdgeServer:
             raise RuntimeError(f"the update in progress took over {_SNAPSHOT_TIMEOUT_S:g} s") from None
 
     def _write_checkpoint(self, path: Path) -> None:
-        checkpoint.save(path, self.field.state(), self._about())
+        about = {
+            "field": self.config.field,
+            "options": self.config.field_options,
+            "scenario": self.scenario.name,
+            "seed": self.scenario.seed,
+            "updates": self.updater.number,
+        }
+        checkpoint.save(path, self.field.state(), about)
 
     def _cameras(self) -> list[CameraView]:
-        now_ns = self.clock.now_ns()
-        newest = self.buffer.newest()
-        rejected = self.ingest.rejected_by_camera
+        now_ns, ingest = self.clock.now_ns(), self.ingest
+        frames = ingest.newest_held_out | {c: item.frame for c, item in self.buffer.newest().items()}
         views = []
         for camera in self.scenario.cameras:
-            held_out = camera in self.scenario.held_out
-            if held_out:
-                frame = self.ingest.newest_held_out.get(camera)
-                age = (now_ns - frame.generated_edge_ns) / 1e6 if frame else None
-            else:
-                item = newest.get(camera)
-                frame, age = (item.frame, item.age_ms(now_ns)) if item else (None, None)
-            views.append(
-                CameraView(camera, held_out, frame, age, self.ingest.delivered[camera], rejected[camera])
-            )
+            frame = frames.get(camera)
+            age_ms = None if frame is None else (now_ns - frame.generated_edge_ns) / 1e6
+            counts = ingest.delivered[camera], ingest.rejected_by_camera[camera]
+            views.append(CameraView(camera, camera in self.scenario.held_out, frame, age_ms, *counts))
         return views
 
     def status(self) -> dict[str, Any]:
         """Contents of edge.json."""
-        publications = self.state.publications()
-        last = publications[-1] if publications else None
-        scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
+        last, scored = self.state.newest(), self.state.newest(scored=True)
         baselines = self.scoring.baselines
 
         def mean(name: str) -> float | None:
             values = [v for b in list(baselines) if (v := getattr(b, name)) is not None]
             return float(np.mean(values)) if values else None
 
-        recorded = {} if self.recorder is None else {"recording": self.recorder.status()}
         return {
-            **recorded,
+            **({} if self.recorder is None else {"recording": self.recorder.status()}),
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "started_ns": self.start_ns,
@@ -304,14 +301,7 @@ class EdgeServer:
             "paused": self.state.controls.paused,
             "doing": self.state.status_line,
             "cameras": [
-                {
-                    "camera": c.camera,
-                    "held_out": c.held_out,
-                    "age_ms": c.age_ms,
-                    "delivered": c.delivered,
-                    "rejected": c.rejected,
-                }
-                for c in self._cameras()
+                _values(c, "camera", "held_out", "age_ms", "delivered", "rejected") for c in self._cameras()
             ],
             "rejected": dict(self.ingest.rejected),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
@@ -326,34 +316,27 @@ class EdgeServer:
                 "deadline_ms": self.config.deadline_ms,
                 "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
             },
-            "treatment": {
-                "views": self.updater.treatment_cost.views,
-                "ms_per_view": self.updater.treatment_cost.ms_per_view,
-            },
+            "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
-            "baseline": {
-                "mean_colour_db": mean("mean_colour_db"),
-                "nearest_view_db": mean("nearest_view_db"),
-            },
+            "baseline": {name: mean(name) for name in ("mean_colour_db", "nearest_view_db")},
             "learning": None if self.trainer is None else self.trainer.apprentice.status(),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),
-            "last": None if last is None else {"t_s": last.t_s, "aaoi_ms": last.aaoi_ms,
-                                               "update_ms": last.update_ms, "selected": len(last.selected),
-                                               "omega_ms": last.omega_ms, "steps": last.steps},
-            "scores": None if scored is None else {"psnr_db": scored.psnr_db, "ssim": scored.ssim,
-                                                   "psnr_moving_db": scored.psnr_moving_db,
-                                                   "lpips": scored.lpips,
-                                                   "perceptual": scored.perceptual, "on": scored.scored_on},
+            "last": None if last is None else {
+                **_values(last, "t_s", "aaoi_ms", "update_ms", "omega_ms", "steps"),
+                "selected": len(last.selected),
+            },
+            "scores": None if scored is None else {
+                **_values(scored, "psnr_db", "ssim", "psnr_moving_db", "lpips", "perceptual"),
+                "on": scored.scored_on,
+            },
         }  # fmt: skip
 
     def _write_final(self) -> None:
         try:
-            comparison = self.state.comparison
-            if comparison is not None:
-                pair = {"truth": comparison.truth, "rendered": comparison.rendered}
-                for name, image in pair.items():
+            if (comparison := self.state.comparison) is not None:
+                for name, image in _values(comparison, "truth", "rendered").items():
                     cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
             if self.state.started and not self.loop.alive:
                 self._write_checkpoint(self.options.out / "field.npz")
@@ -370,11 +353,6 @@ class EdgeServer:
                     self.recorder.close()
                 self.journal.close()
 
-    def _about(self) -> dict[str, Any]:
-        return {
-            "field": self.config.field,
-            "options": self.config.field_options,
-            "scenario": self.scenario.name,
-            "seed": self.scenario.seed,
-            "updates": self.updater.number,
-        }
+
+def _values(of: Any, *names: str) -> dict[str, Any]:
+    return {name: getattr(of, name) for name in names}

@@ -66,13 +66,10 @@ class DeadlineBudget:
 
     deadline_ms: from decision to publication; ValueError if it leaves no time to fit.
     fit_ms: longest fit that is worth it.
-    met, missed: number of updates so far.
     """
 
     deadline_ms: float
     fit_ms: float = math.inf
-    met: int = 0
-    missed: int = 0
     _overhead_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
 
     def __post_init__(self) -> None:
@@ -89,10 +86,6 @@ class DeadlineBudget:
     def record(self, budget: Budget, update_ms: float) -> None:
         assert budget.seconds is not None
         self._overhead_ms.append(update_ms - budget.seconds * 1e3)
-        if update_ms <= self.deadline_ms:
-            self.met += 1
-        else:
-            self.missed += 1
 
 
 @dataclass(frozen=True)

@@ -12,21 +12,11 @@ from dataclasses import dataclass
 
 import google_crc32c
 
-from freshfield import payload
+from freshfield import limits, payload
 from freshfield.geometry import GeometryError, Pinhole, Pose, invertible, quaternion_normalize
-from freshfield.limits import (
-    MAX_CENTER_OUTSIDE_SIDES,
-    MAX_DISTORTION,
-    MAX_FOCAL_PX,
-    MAX_ID_CHARS,
-    MAX_IMAGE_SIDE_PX,
-    MAX_QUATERNION_ERROR,
-    MAX_TRANSLATION_M,
-    MIN_FOCAL_PER_SIDE,
-)
 from freshfield.v1 import frames_pb2 as pb
 
-_ID = re.compile(rf"[A-Za-z0-9._-]{{1,{MAX_ID_CHARS}}}")
+_ID = re.compile(rf"[A-Za-z0-9._-]{{1,{limits.MAX_ID_CHARS}}}")
 _CODECS = {"jpeg": pb.CODEC_JPEG, "png": pb.CODEC_PNG, "zstd": pb.CODEC_ZSTD}
 CODEC_NAMES = {number: name for name, number in _CODECS.items()}
 _PACKED = struct.Struct("<QqqqqIIII7d8d")
@@ -162,10 +152,10 @@ def _pose(p: pb.Pose) -> Pose:
     q, t = (p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)
     if not all(math.isfinite(v) for v in (*q, *t)):
         raise FrameRejected("bad_pose", "pose is not finite")
-    if abs(math.sqrt(sum(v * v for v in q)) - 1.0) > MAX_QUATERNION_ERROR:
+    if abs(math.sqrt(sum(v * v for v in q)) - 1.0) > limits.MAX_QUATERNION_ERROR:
         raise FrameRejected("bad_pose", "pose quaternion is not of unit length")
-    if max(abs(v) for v in t) > MAX_TRANSLATION_M:
-        raise FrameRejected("bad_pose", f"camera is more than {MAX_TRANSLATION_M:g} m from the origin")
+    if max(abs(v) for v in t) > limits.MAX_TRANSLATION_M:
+        raise FrameRejected("bad_pose", f"camera is more than {limits.MAX_TRANSLATION_M:g} m from the origin")
     try:
         unit = quaternion_normalize(q)
     except GeometryError as error:
@@ -178,15 +168,20 @@ def _intrinsics(h: pb.FrameHeader) -> Pinhole:
     values = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2)
     if not all(math.isfinite(v) for v in values):
         raise FrameRejected("bad_intrinsics", "intrinsics are not finite")
-    if not (0 < h.width <= MAX_IMAGE_SIDE_PX and 0 < h.height <= MAX_IMAGE_SIDE_PX):
-        raise FrameRejected("too_large", f"{h.width} x {h.height} is not within 1..{MAX_IMAGE_SIDE_PX}")
-    if min(k.fx, k.fy) < max(h.width, h.height) * MIN_FOCAL_PER_SIDE or max(k.fx, k.fy) > MAX_FOCAL_PX:
+    if not (0 < h.width <= limits.MAX_IMAGE_SIDE_PX and 0 < h.height <= limits.MAX_IMAGE_SIDE_PX):
+        raise FrameRejected(
+            "too_large", f"{h.width} x {h.height} is not within 1..{limits.MAX_IMAGE_SIDE_PX}"
+        )
+    if (
+        min(k.fx, k.fy) < max(h.width, h.height) * limits.MIN_FOCAL_PER_SIDE
+        or max(k.fx, k.fy) > limits.MAX_FOCAL_PX
+    ):
         raise FrameRejected(
             "bad_intrinsics", f"focal lengths {k.fx:g}, {k.fy:g} px do not fit the image size"
         )
-    if max(abs(v) for v in (k.k1, k.k2, k.p1, k.p2)) > MAX_DISTORTION:
+    if max(abs(v) for v in (k.k1, k.k2, k.p1, k.p2)) > limits.MAX_DISTORTION:
         raise FrameRejected("bad_intrinsics", "distortion coefficients are beyond any lens")
-    sides = MAX_CENTER_OUTSIDE_SIDES
+    sides = limits.MAX_CENTER_OUTSIDE_SIDES
     x_fits = -sides * h.width <= k.cx <= (1 + sides) * h.width
     if not (x_fits and -sides * h.height <= k.cy <= (1 + sides) * h.height):
         raise FrameRejected("bad_intrinsics", "principal point is far outside the image")

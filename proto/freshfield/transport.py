@@ -159,7 +159,7 @@ def from_arguments(args: argparse.Namespace) -> Transport:
 
 
 class _TokenInterceptor(grpc.aio.ServerInterceptor):
-    """Refuses calls without the token. Compared in constant time."""
+    """Refuses calls without the token, which is compared in constant time."""
 
     def __init__(self, token: str) -> None:
         self._expected = f"Bearer {token}".encode()
@@ -167,11 +167,13 @@ class _TokenInterceptor(grpc.aio.ServerInterceptor):
         async def refuse(request: Any, context: grpc.aio.ServicerContext) -> None:
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, "missing or wrong bearer token")
 
-        async def refuse_stream(request: Any, context: grpc.aio.ServicerContext) -> None:
-            await context.abort(grpc.StatusCode.UNAUTHENTICATED, "missing or wrong bearer token")
-
-        self._refuse = refuse
-        self._refuse_stream = refuse_stream
+        # By whether requests and responses are streams.
+        self._refusals = {
+            (False, False): grpc.unary_unary_rpc_method_handler(refuse),
+            (False, True): grpc.unary_stream_rpc_method_handler(refuse),
+            (True, False): grpc.stream_unary_rpc_method_handler(refuse),
+            (True, True): grpc.stream_stream_rpc_method_handler(refuse),
+        }
 
     async def intercept_service(
         self,
@@ -183,13 +185,9 @@ class _TokenInterceptor(grpc.aio.ServerInterceptor):
             if key == "authorization" and hmac.compare_digest(raw, self._expected):
                 return await continuation(handler_call_details)
         handler = await continuation(handler_call_details)
-        if handler is None or not (handler.request_streaming or handler.response_streaming):
-            return grpc.unary_unary_rpc_method_handler(self._refuse)
-        if handler.request_streaming and handler.response_streaming:
-            return grpc.stream_stream_rpc_method_handler(self._refuse_stream)
-        if handler.request_streaming:
-            return grpc.stream_unary_rpc_method_handler(self._refuse_stream)
-        return grpc.unary_stream_rpc_method_handler(self._refuse_stream)
+        if handler is None:
+            return self._refusals[False, False]
+        return self._refusals[bool(handler.request_streaming), bool(handler.response_streaming)]
 
 
 def _read(path: Path) -> bytes:

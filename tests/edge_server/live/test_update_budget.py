@@ -1,4 +1,5 @@
-"""How long an update may fit: the reserve a deadline keeps, what it chooses, and a real field under load."""
+"""How long an update may fit: the reserve of a deadline, the chosen frontier point, a real field under
+load."""
 
 from __future__ import annotations
 
@@ -33,19 +34,21 @@ def test_a_fixed_fit_stays_what_it_is():
     assert budgets.next().seconds == 0.25
 
 
-def drive(budgets: DeadlineBudget, rests_ms) -> None:
-    """Updates whose fit keeps its budget and whose rest takes what is given."""
-    for rest in rests_ms:
+def drive(budgets: DeadlineBudget, overheads_ms) -> int:
+    """Updates whose fit keeps its budget and whose overhead is given; returns how many met the deadline."""
+    met = 0
+    for overhead_ms in overheads_ms:
         budget = budgets.next()
-        budgets.record(budget, budget.seconds * 1e3 + rest)
+        update_ms = budget.seconds * 1e3 + overhead_ms
+        budgets.record(budget, update_ms)
+        met += update_ms <= budgets.deadline_ms
+    return met
 
 
-def test_nineteen_of_twenty_updates_meet_a_deadline_whatever_the_rest_of_them_takes():
+def test_nineteen_of_twenty_updates_meet_a_deadline_whatever_their_overhead():
     rng = np.random.default_rng(3)
-    for rests in (rng.exponential(15.0, 2000), rng.gamma(2.0, 20.0, 2000), rng.uniform(0, 80, 2000)):
-        budgets = DeadlineBudget(300.0)
-        drive(budgets, rests)
-        assert budgets.met / 2000 >= 0.95
+    for overheads in (rng.exponential(15.0, 2000), rng.gamma(2.0, 20.0, 2000), rng.uniform(0, 80, 2000)):
+        assert drive(DeadlineBudget(300.0), overheads) / 2000 >= 0.95
 
 
 def test_the_time_to_fit_shrinks_while_the_machine_is_busy_and_comes_back():
@@ -59,7 +62,7 @@ def test_the_time_to_fit_shrinks_while_the_machine_is_busy_and_comes_back():
     assert budgets.next().seconds == calm
 
 
-def test_a_hiccup_is_remembered_for_sixty_four_updates():
+def test_a_slow_update_is_remembered_for_sixty_four_updates():
     budgets = DeadlineBudget(300.0)
     drive(budgets, [5.0] * 30 + [150.0] + [5.0] * 63)
     assert budgets.next().seconds == pytest.approx(0.149)
@@ -73,11 +76,10 @@ def test_more_than_is_worth_it_is_not_spent():
 
 
 @given(st.lists(st.floats(-1e3, 1e7), max_size=80), st.floats(20.0, 1e6))
-def test_there_is_always_a_budget(rests, deadline_ms):
+def test_there_is_always_a_budget(overheads, deadline_ms):
     budgets = DeadlineBudget(deadline_ms)
-    drive(budgets, rests)
+    drive(budgets, overheads)
     assert budgets.next().seconds >= 0.01 and math.isfinite(budgets.next().seconds)
-    assert budgets.met + budgets.missed == len(rests)
 
 
 def test_a_deadline_without_time_to_fit_is_refused():
@@ -86,14 +88,14 @@ def test_a_deadline_without_time_to_fit_is_refused():
             DeadlineBudget(deadline_ms)
 
 
-def point(effort, speed, update_ms, whole, moving) -> FrontierPoint:
+def frontier_point(effort, speed, update_ms, whole, moving) -> FrontierPoint:
     return FrontierPoint(effort, {"effort": effort}, speed, update_ms, whole, moving)
 
 
 POINTS = [
-    point("low", 1.0, 100.0, 20.0, 18.0), point("low", 1.0, 400.0, 21.0, 17.5),
-    point("medium", 1.0, 400.0, 24.0, 17.0), point("medium", 1.0, 2000.0, 24.5, 14.0),
-    point("low", 4.0, 100.0, 19.0, 17.0), point("low", 4.0, 400.0, 19.0, 13.0),
+    frontier_point("low", 1.0, 100.0, 20.0, 18.0), frontier_point("low", 1.0, 400.0, 21.0, 17.5),
+    frontier_point("medium", 1.0, 400.0, 24.0, 17.0), frontier_point("medium", 1.0, 2000.0, 24.5, 14.0),
+    frontier_point("low", 4.0, 100.0, 19.0, 17.0), frontier_point("low", 4.0, 400.0, 19.0, 13.0),
 ]  # fmt: skip
 
 
@@ -143,7 +145,7 @@ def test_a_real_field_meets_its_deadline_while_others_keep_the_machine_busy():
     updates.field.warm_up()
     for camera in buffer.cameras:
         buffer.put(frame(camera, generated_ns=0), 1)
-    budgets = DeadlineBudget(250.0)
+    budgets, met = DeadlineBudget(250.0), 0
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     others = [spawn.Process(target=burn, args=(stop,), daemon=True) for _ in range(2)]
@@ -156,9 +158,11 @@ def test_a_real_field_meets_its_deadline_while_others_keep_the_machine_busy():
             budget = budgets.next()
             updates.fit(selection, budget)
             updates.field.snapshot()
-            budgets.record(budget, (time.perf_counter() - began) * 1e3)
+            update_ms = (time.perf_counter() - began) * 1e3
+            budgets.record(budget, update_ms)
+            met += update_ms <= budgets.deadline_ms
     finally:
         stop.set()
         for process in others:
             process.join()
-    assert budgets.met >= 95
+    assert met >= 95
