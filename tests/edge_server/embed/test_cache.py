@@ -7,8 +7,7 @@ import numpy as np
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.live.buffer import BufferedFrame
 from edge_server.live.view_decoder import ViewDecoder
-from freshfield import payload
-from tests.edge_server.frames import frame
+from tests.edge_server.frames import damaged_frame, frame
 
 DIM = 4
 
@@ -35,11 +34,6 @@ class NanForTheFirst(Means):
 
 def buffered(camera: str = "cam01", sequence: int = 0, **other) -> BufferedFrame:
     return BufferedFrame(frame(camera, sequence, **other), sequence, sequence)
-
-
-def damaged(camera: str) -> BufferedFrame:
-    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    return buffered(camera, codec="png", payload=payload.encode(image, "png")[:60])
 
 
 def test_a_frame_is_embedded_once_whoever_asks_again():
@@ -89,7 +83,7 @@ def test_a_frame_that_cannot_be_decoded_is_a_camera_without_embedding():
     means, decoder = Means(), ViewDecoder()
     cache = EmbeddingCache(means, decoder.view)
     for _ in range(3):
-        rows, ok = cache.of([damaged("cam01"), buffered("cam02")])
+        rows, ok = cache.of([BufferedFrame(damaged_frame("cam01"), 0, 0), buffered("cam02")])
         assert ok.tolist() == [False, True] and (rows[0] == 0).all()
     assert cache.failed == 1 and decoder.undecodable == 1 and means.asked == [1]
 

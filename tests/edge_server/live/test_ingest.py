@@ -1,4 +1,4 @@
-"""Every refusal at the edge's door: named, counted, and without harm to what comes after it."""
+"""Every refusal at the edge: named, counted, and without effect on the next frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
 from freshfield.clock import VirtualClock
-from freshfield.frame import FrameRejected, to_request
+from freshfield.frame import FrameRejected, checksum, to_request
 from freshfield.ledger import Ledger, LedgerReader
 from freshfield.v1 import frames_pb2 as pb
 from tests.edge_server.frames import frame
@@ -60,8 +60,6 @@ def bad(kind: str) -> pb.PushRequest:
     if kind == "bad_pose":
         request = to_request(base)
         request.header.pose.qw = 7.0
-        from freshfield.frame import checksum
-
         request.crc32c = checksum(request.header, request.payload)
         return request
     changes = {

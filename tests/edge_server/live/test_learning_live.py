@@ -1,4 +1,4 @@
-"""A learnt policy in a running edge server: it decides, goes on learning, says so, leaves what it learnt."""
+"""A learned policy in a running edge server: it decides, goes on learning, and leaves what it learned."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 from edge_server.cli import main
 from edge_server.config import LearnConfig, PolicyConfig, read_config
 from edge_server.live.server import EdgeServer, ServerOptions
+from edge_server.scheduler import read_policy
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
@@ -33,12 +34,12 @@ def policy(tmp_path):
 
 def server(tmp_path, policy, held_out=("cam00",), port=None, learn=None) -> EdgeServer:
     what = tiny_scenario(tmp_path, held_out)
-    config = replace(read_config(what), policy=PolicyConfig(str(policy)), learn=learn)
+    config = replace(read_config(what), policy=PolicyConfig(*read_policy(policy)), learn=learn)
     options = ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
     return EdgeServer(what, config, options)
 
 
-def test_it_decides_learns_and_leaves_what_it_learnt(tmp_path, policy, monkeypatch):
+def test_it_decides_learns_and_leaves_what_it_learned(tmp_path, policy, monkeypatch):
     monkeypatch.setattr("edge_server.scheduler.online.online_policy.Leash", lambda: Leash(batch=3, settle=2))
     port = free_port()
     edge = server(tmp_path, f"bandit:{policy}", port=port, learn=LearnConfig("set", "threshold:200"))
@@ -74,15 +75,9 @@ def test_it_decides_learns_and_leaves_what_it_learnt(tmp_path, policy, monkeypat
         (("cam00",), "bandit:nowhere.npz", "no such checkpoint"),
     ],
 )
-def test_who_cannot_learn_is_refused_in_one_line(held_out, name, said, tmp_path, policy):
-    if name == "threshold:90":
-        what = tiny_scenario(tmp_path, held_out)
-        config = replace(read_config(what), policy=PolicyConfig("threshold", 90.0), learn=LearnConfig())
-        make = lambda: EdgeServer(what, config, ServerOptions("127.0.0.1:1", tmp_path / "out"))  # noqa: E731
-    else:
-        make = lambda: server(tmp_path, name or f"bandit:{policy}", held_out, learn=LearnConfig())  # noqa: E731
+def test_a_policy_that_cannot_learn_is_refused_in_one_line(held_out, name, said, tmp_path, policy):
     with pytest.raises(ScenarioError, match=said) as error:
-        make()
+        server(tmp_path, name or f"bandit:{policy}", held_out, learn=LearnConfig())
     assert str(error.value).count("\n") == 0
 
 
@@ -105,7 +100,7 @@ def test_without_being_asked_nothing_learns(tmp_path, policy):
 
 
 def refused(capsys, *words: str) -> str:
-    """What the command says of options that it does not begin with: one line, once."""
+    """The message of options that the command refuses: one line, once."""
     assert main(["run", *map(str, words)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1

@@ -65,7 +65,7 @@ def test_a_treatment_sees_the_frame_before_and_what_was_delivered_is_handed_on()
     assert u.treatment_cost.views == 2 and u.treatment_cost.ms_per_view > 0
 
 
-def test_a_policy_without_treatment_gives_the_memory_back():
+def test_a_policy_without_treatment_frees_the_memory():
     u = updates("all")
     u.policy = make_policy("mask", None, np.random.default_rng(0))
     for k in range(3):
@@ -83,7 +83,7 @@ def test_an_empty_buffer_selects_nothing():
 
 
 class Running:
-    """A loop on the wall clock, with what it published and said."""
+    """A loop on the wall clock, with what it published and its status lines."""
 
     def __init__(self, u: FieldUpdater, grace_ms: float = 0.0, budget=None) -> None:
         self.published, self.lines, self.saved = [], [], []
@@ -143,7 +143,7 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.published[-1][0].omega_ms == 0.0
 
 
-def test_an_update_without_time_to_learn_is_told_once_and_again_if_it_comes_back(running, caplog):
+def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(running, caplog):
     class Changing:
         """No time at all, then some, then none again."""
 
@@ -163,8 +163,8 @@ def test_an_update_without_time_to_learn_is_told_once_and_again_if_it_comes_back
     run.until(lambda: len(run.published) >= 8)
     run.loop.stop()
     assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]
-    told = [record.message for record in caplog.records if "made no step" in record.message]
-    assert len(told) == 2 and "edge.update_ms" in told[0]
+    warnings = [record.message for record in caplog.records if "made no step" in record.message]
+    assert len(warnings) == 2 and "edge.update_ms" in warnings[0]
 
 
 def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):

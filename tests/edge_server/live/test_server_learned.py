@@ -1,4 +1,4 @@
-"""A whole edge server that decides by what was learnt: real frames, a real embedder, recorded decisions."""
+"""A whole edge server with a learned policy: real frames, a real embedder, recorded decisions."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from edge_server.live.buffer import BufferedFrame
 from edge_server.live.view_decoder import ViewDecoder
-from tests.edge_server.frames import frame
+from tests.edge_server.frames import damaged_frame, frame
 
 
 def test_a_frame_is_decoded_once_and_carries_the_edges_time():
@@ -20,20 +20,10 @@ def test_a_frame_is_decoded_once_and_carries_the_edges_time():
 
 def test_a_damaged_payload_is_counted_once_and_loses_nothing_else():
     decoder = ViewDecoder()
-    whole = frame("cam02")
-    # Headers intact, entropy-coded data gone: it passes the door and fails at decoding.
-    cut = frame("cam01", codec="png", payload=_png_without_data())
-    items = [BufferedFrame(cut, 0, 0), BufferedFrame(whole, 0, 0)]
+    items = [BufferedFrame(damaged_frame("cam01"), 0, 0), BufferedFrame(frame("cam02"), 0, 0)]
     assert [v.camera for v in decoder.views(items)] == ["cam02"]
     assert [v.camera for v in decoder.views(items)] == ["cam02"]
     assert decoder.undecodable == 1
-
-
-def _png_without_data() -> bytes:
-    from freshfield import payload
-
-    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    return payload.encode(image, "png")[:60]
 
 
 def test_memory_is_one_view_a_camera():
@@ -59,7 +49,7 @@ def test_what_was_newest_is_not_decoded_again_as_the_one_before():
 
 def test_a_damaged_frame_before_is_counted_once_and_is_missing():
     decoder = ViewDecoder()
-    cut = BufferedFrame(frame("cam01", codec="png", payload=_png_without_data()), 0, 0)
+    cut = BufferedFrame(damaged_frame("cam01"), 0, 0)
     whole = BufferedFrame(frame("cam02"), 0, 0)
     for _ in range(2):
         assert list(decoder.earlier([cut, whole])) == ["cam02"]

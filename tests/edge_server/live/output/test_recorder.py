@@ -1,4 +1,4 @@
-"""The recorder: whoever hands over never waits, what finds no room is counted, a full disk ends it."""
+"""The recorder: callers never wait, what finds no room is counted, a full disk ends the recording."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def test_decisions_and_scores_are_json_that_keeps_its_schema(tmp_path):
     assert [(c.topic, m.log_time) for _, c, m in found] == [("/decisions", 10**9), ("/scores", 2 * 10**9)]
     assert names["session"] == {"scenario": "test"} and names["counts"] == {"messages": "2", "dropped": "0"}
     for (schema, _, message), publication in zip(found, (PUBLICATION, None)):
-        told, kinds = json.loads(message.data), json.loads(schema.data)["properties"]
-        assert set(told) == set(kinds)
+        values, kinds = json.loads(message.data), json.loads(schema.data)["properties"]
+        assert set(values) == set(kinds)
         if publication is not None:
-            assert told == json.loads(json.dumps(dataclasses.asdict(publication)))
+            assert values == json.loads(json.dumps(dataclasses.asdict(publication)))
     assert kinds["number"] == {"type": "integer"} and kinds["psnr_db"] == {"type": ["number", "null"]}
     assert kinds["ages_ms"] == {"type": "array", "items": {"type": "number"}}
     assert schema_of(Publication)["properties"]["selected"] == {"type": "array", "items": {"type": "string"}}
