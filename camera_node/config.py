@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from freshfield.payload import CODECS, MAX_IMAGE_SIDE
+from freshfield.limits import MAX_IMAGE_SIDE_PX
+from freshfield.payload import CODECS
 from freshfield.scenario import Scenario, ScenarioError, read_section
 
 LOOPS = ("back-and-forth", "restart")
@@ -228,8 +229,8 @@ class LiveConfig(SourceConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (8 <= self.width <= MAX_IMAGE_SIDE and 8 <= self.height <= MAX_IMAGE_SIDE):
-            raise ValueError(f"width and height: expected 8 to {MAX_IMAGE_SIDE}")
+        if not (8 <= self.width <= MAX_IMAGE_SIDE_PX and 8 <= self.height <= MAX_IMAGE_SIDE_PX):
+            raise ValueError(f"width and height: expected 8 to {MAX_IMAGE_SIDE_PX}")
         if self.exposure_us is not None and not 1 <= self.exposure_us <= 1_000_000:
             raise ValueError("exposure_us: expected 1 to 1000000")
         if not 0.1 <= self.first_frame_s <= 60.0:

@@ -15,7 +15,7 @@ import numpy as np
 from camera_node.outbox import Outbox
 from freshfield.clock import Offset
 from freshfield.frame import Frame, to_request
-from freshfield.payload import MAX_PAST_NS
+from freshfield.limits import MAX_CAPTURE_AGE_NS
 from freshfield.transport import backoff_s
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc as rpc
@@ -28,7 +28,7 @@ MAX_BACKOFF_S = 3.0
 OFFSET_WAIT_S = 2.0
 _OFFSET_POLL_S = 0.01
 # An offset that was never measured may be anything: zero with a small uncertainty would be wrong.
-UNKNOWN_OFFSET = Offset(0, MAX_PAST_NS)
+UNKNOWN_OFFSET = Offset(0, MAX_CAPTURE_AGE_NS)
 # A peer that is broken must not fill the ledger with names that it makes up.
 _MAX_REASONS = 32
 _REASON = re.compile(r"[a-z0-9_]{1,48}")

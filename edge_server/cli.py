@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
 import signal
 import sys
+import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,60 +44,66 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
     _add_report(commands)
-    for name in _OFFLINE:
-        # Each offline command owns its options; it is imported only when it is called or asked for help.
-        sub = commands.add_parser(name, help=_OFFLINE[name], add_help=False)
-        sub.set_defaults(go=None)
+    for name, (_, line) in _COMMANDS.items():
+        commands.add_parser(name, help=line, add_help=False)
     words = list(sys.argv[1:] if argv is None else argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     try:
-        if words and words[0] in _OFFLINE:
-            return _offline(words[0], words[1:])
+        if words and words[0] in _COMMANDS:
+            return importlib.import_module(f"edge_server.{_COMMANDS[words[0]][0]}").main(words[1:])
         args = parser.parse_args(words)
-        return args.go(args)
-    except (ScenarioError, TransportError) as error:
-        print(f"edge-server: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:  # a folder or file that cannot be made, read or written
+        return args.run(args)
+    except (ScenarioError, TransportError, OSError) as error:  # OSError: of a file or folder
         print(f"edge-server: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
 
 
-_OFFLINE = {
-    "fit": "fit a recorded data set without a network and report fidelity over time",
-    "frontier": "what accuracy costs in time: sweep effort, plot fidelity against seconds",
-    "train-scheduler": "learn when and of which views to update, with real field fits as reward",
-    "simulate": "a scenario's whole deployment in virtual time, repeatable bit for bit",
-    "study": "the thesis's figures as commands, each with a verdict",
-    "bench": "measure this machine: field, track, limits, ingest and more (bench --help)",
-    "explain": "what moved a decision of a run: part of the state, camera, region of its picture",
-    "export": "a run's mesh, splats, points, cameras and poses as files for other programs",
-    "train-detector": "train the small detector whose backbone makes the default embeddings",
-    "train-perceptual": "fit the stand-in for LPIPS to real LPIPS on our own distorted renderings",
-    "fetch-lpips": "fetch LPIPS weights with the public package and convert them to our weights folder",
+# Commands with options and a main of their own, imported only when called: command -> (module, help).
+_COMMANDS = {
+    "fit": (
+        "experiments.fitting.command",
+        "fit a recorded data set without a network and report fidelity over time",
+    ),
+    "frontier": (
+        "experiments.frontier.command",
+        "what accuracy costs in time: sweep effort, plot fidelity against seconds",
+    ),
+    "train-scheduler": (
+        "experiments.training.scheduler.command",
+        "learn when and of which views to update, with real field fits as reward",
+    ),
+    "simulate": (
+        "experiments.virtual.simulate",
+        "a scenario's whole deployment in virtual time, repeatable bit for bit",
+    ),
+    "study": ("experiments.studies", "the thesis's figures as commands, each with a verdict"),
+    "bench": (
+        "experiments.bench.command",
+        "measure this machine: field, track, limits, ingest and more (bench --help)",
+    ),
+    "explain": (
+        "scheduler.learned.explain_command",
+        "what moved a decision of a run: part of the state, camera, region of its picture",
+    ),
+    "export": (
+        "export.command",
+        "a run's mesh, splats, points, cameras and poses as files for other programs",
+    ),
+    "train-detector": (
+        "experiments.training.detector.command",
+        "train the small detector whose backbone makes the default embeddings",
+    ),
+    "train-perceptual": (
+        "experiments.training.detector.perceptual",
+        "fit the stand-in for LPIPS to real LPIPS on our own distorted renderings",
+    ),
+    "fetch-lpips": (
+        "fidelity.fetch_lpips",
+        "fetch LPIPS weights with the public package and convert them to our weights folder",
+    ),
 }
-# command -> its module
-_PLACES = {
-    "bench": "experiments.bench.command",
-    "explain": "scheduler.learned.explain_command",
-    "export": "export.command",
-    "fetch-lpips": "fidelity.fetch_lpips",
-    "fit": "experiments.fitting.command",
-    "frontier": "experiments.frontier.command",
-    "simulate": "experiments.virtual.simulate",
-    "study": "experiments.studies",
-    "train-detector": "experiments.training.detector.command",
-    "train-perceptual": "experiments.training.detector.perceptual",
-    "train-scheduler": "experiments.training.scheduler.command",
-}
-
-
-def _offline(name: str, words: list[str]) -> int:
-    import importlib
-
-    return importlib.import_module(f"edge_server.{_PLACES[name]}").main(words)
 
 
 def _add_run(commands: argparse._SubParsersAction) -> None:
@@ -132,15 +141,13 @@ def _add_run(commands: argparse._SubParsersAction) -> None:
                      "replay (source kind mcap)")  # fmt: skip
     run.add_argument("--seconds", type=float, metavar="S", help="end by itself after this long")
     transport.add_arguments(run)
-    run.set_defaults(go=_run)
+    run.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
-    from dataclasses import replace
-
     from edge_server.config import PolicyConfig, read_config
     from edge_server.fidelity.lpips_weights import weights_folder
-    from edge_server.live.server import EdgeServer, Options
+    from edge_server.live.server import EdgeServer, ServerOptions
     from edge_server.scheduler import read_policy
 
     scenario = load(args.scenario, args.seed)
@@ -151,7 +158,7 @@ def _run(args: argparse.Namespace) -> int:
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     config = replace(config, learn=_learn(args, config))
-    options = Options(
+    options = ServerOptions(
         listen=args.listen,
         out=args.out,
         transport=transport.from_arguments(args),
@@ -174,8 +181,6 @@ def _run(args: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: server.stop())
     if args.seconds is not None:
-        import threading
-
         timer = threading.Timer(args.seconds, server.stop)
         timer.daemon = True
         timer.start()
@@ -184,7 +189,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _learn(args: argparse.Namespace, config: EdgeConfig) -> LearnConfig | None:
-    """How the policy goes on learning; a fixed one that --policy puts in the scenario's place does not."""
+    """How the policy goes on learning. A fixed policy that --policy puts in its place does not."""
     from edge_server.config import LearnConfig
     from edge_server.scheduler import BANDIT
 
@@ -207,7 +212,7 @@ def _add_report(commands: argparse._SubParsersAction) -> None:
         description="Write DIR/report.json, DIR/report.html and figures from what a run left in DIR.",
     )
     report.add_argument("directory", type=Path, metavar="DIR")
-    report.set_defaults(go=_report)
+    report.set_defaults(run=_report)
 
 
 def _report(args: argparse.Namespace) -> int:

@@ -17,9 +17,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Which views an update uses. value: the policy's one parameter (omega_ms, k, period_ms), see
-    edge_server.scheduler; None takes the policy's default. name: also bandit:FILE, relative to the
-    scenario."""
+    """Which views an update uses.
+
+    name: of edge_server.scheduler, or bandit:FILE, relative to the scenario.
+    value: the policy's one parameter (omega_ms, k, period_ms); None takes its default.
+    """
 
     name: str = "all"
     value: float | None = None
@@ -27,10 +29,11 @@ class PolicyConfig:
 
 @dataclass(frozen=True)
 class LearnConfig:
-    """How a policy that was learnt goes on learning while it is used (``edge-server run``; in virtual time
-    nobody does). reward: NAME or NAME:moving of edge_server.scheduler.learned.rewards; empty: the one it was
-    trained with. fallback: the fixed policy beside it, NAME or NAME:VALUE; empty: the best of its
-    training."""
+    """How a learned policy goes on learning while it is used (``edge-server run`` only, not in virtual time).
+
+    reward: NAME or NAME:moving of edge_server.scheduler.learned.rewards; empty: the one it was trained with.
+    fallback: the fixed policy beside it, NAME or NAME:VALUE; empty: the best one of its training.
+    """
 
     reward: str = ""
     fallback: str = ""
@@ -38,9 +41,8 @@ class LearnConfig:
 
 @dataclass(frozen=True)
 class ComputeConfig:
-    """What virtual time charges an update; live time charges what it takes. The default is nothing, as the
-    thesis has it; ``edge-server frontier`` measures what a machine takes. ms_per_treated_view: of policies
-    that mask or freshen views."""
+    """What an update costs in virtual time; by default nothing, as in the thesis. ``edge-server frontier``
+    measures what a machine takes. ms_per_treated_view: of policies that treat views."""
 
     ms_per_step: float = 0.0
     ms_per_update: float = 0.0
@@ -51,15 +53,18 @@ class ComputeConfig:
             raise ValueError("compute: milliseconds must be finite and not negative")
 
     def charge_ns(self, steps: int, treated: int = 0) -> int:
-        """Nanoseconds that an update of ``steps`` optimiser steps takes, ``treated`` views treated before."""
+        """Nanoseconds of an update of ``steps`` optimizer steps and ``treated`` treated views."""
         views_ms = self.ms_per_treated_view * treated
         return round((self.ms_per_update + self.ms_per_step * steps + views_ms) * 1e6)
 
 
 @dataclass(frozen=True)
 class KeyframesConfig:
-    """Earlier viewpoints of cameras that move, for ``live.keyframes``. most: of each camera. apart_m,
-    apart_deg: a viewpoint is another one if it lies so far from all that are kept, or is turned so far."""
+    """Earlier viewpoints of moving cameras (``live.keyframes``).
+
+    most: of each camera.
+    apart_m, apart_deg: a view becomes a keyframe at this distance or angle from all others.
+    """
 
     most: int = 32
     apart_m: float = 0.03
@@ -74,8 +79,11 @@ class KeyframesConfig:
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """What a run leaves at its end besides its report: deploy/up.py has ``edge-server export`` make it. mesh:
-    file in the run's folder, .ply or .glb. voxel_mm: of the mesh; None: what a pixel spans at the surface."""
+    """What ``edge-server export`` makes of the field at the end of a run of deploy/up.py.
+
+    mesh: file in the run's folder, .ply or .glb.
+    voxel_mm: of the mesh; None: the size of a pixel at the surface.
+    """
 
     mesh: str
     voxel_mm: float | None = None
@@ -92,21 +100,23 @@ class EdgeConfig:
     """The edge section of a scenario.
 
     field, field_options: the representation and its settings (edge_server.fields.registry).
-    update_ms: what one update may spend fitting. deadline_ms: instead of it, from decision to publication:
-    the best way to spend it is looked up in ``frontier`` (a frontier.json of ``edge-server frontier``,
-    relative to the scenario; None: the one shipped), and the time to fit follows how busy the machine is.
-    steps, compute: of an update in virtual time, where optimiser steps are counted, not seconds: how many,
-    and what is charged for them (``zero``, or ms_per_step and ms_per_update).
-    grace_ms: how long the first update waits for cameras that have not reported. lpips: network scored
-    with, where its weights are installed; none turns it off.
-    noisy_truth: held-out frames are real or noisy video, so that the bound of moving pixels follows
-    their noise. metrics: further ones to score with: perceptual, the stand-in where there is no LPIPS
-    (fidelity.perceptual). embedding: an edge_server.embed.EmbeddingConfig for policies that look at what
-    cameras see; None: nothing is embedded. keyframes: earlier viewpoints of cameras that move go on
-    supervising; not given, nothing of the kind is loaded or kept. learn: a policy bandit:FILE goes on
-    learning, by the held-out cameras; not given, it stays as it is. foreground: an
-    edge_server.foreground.ForegroundConfig, cuts the background out of every view; None: views stay whole.
-    export: an ``ExportConfig``, what deploy/up.py makes of the field when the run ends.
+    policy: which views an update uses.
+    update_ms: fitting time of an update.
+    deadline_ms: instead of it, the time from decision to publication. The setting that spends it best is
+    looked up in ``frontier``, and the fitting time follows how busy the machine is.
+    frontier: a frontier.json of ``edge-server frontier``, relative to the scenario; None: the shipped one.
+    steps, compute: of an update in virtual time, its optimizer steps and what it costs (``zero``, or
+    ms_per_step and ms_per_update).
+    grace_ms: how long the first update waits for cameras that have not reported.
+    lpips: network to score with, where its weights are installed; none turns it off.
+    noisy_truth: held-out frames are noisy video, so that the bound of moving pixels follows their noise.
+    metrics: further ones to score with: perceptual, the stand-in where there is no LPIPS.
+    embedding: an edge_server.embed.EmbeddingConfig, for policies that look at what cameras see.
+    keyframes: earlier viewpoints of moving cameras go on supervising.
+    foreground: an edge_server.foreground.ForegroundConfig, cuts the background out of every view.
+    learn: a policy bandit:FILE goes on learning from the held-out cameras.
+    export: what deploy/up.py makes of the field when the run ends.
+    What a scenario does not name is neither imported nor computed.
     """
 
     field: str = "ngp"
@@ -121,17 +131,17 @@ class EdgeConfig:
     lpips: str = "alex"
     noisy_truth: bool = False
     metrics: tuple[str, ...] = ()
-    embedding: Any = None  # named here, its module would be imported whether a scenario asks for it or not
+    embedding: Any = None  # its type would import its module whether a scenario asks for it or not
     keyframes: KeyframesConfig | None = None
     foreground: Any = None  # as embedding
     learn: LearnConfig | None = None
     export: ExportConfig | None = None
 
     def __post_init__(self) -> None:
-        if not 10.0 <= self.update_ms <= 3_600_000.0:
-            raise ValueError(f"update_ms: expected 10 to 3600000, got {self.update_ms:g}")
-        if self.deadline_ms is not None and not 20.0 <= self.deadline_ms <= 3_600_000.0:
-            raise ValueError(f"deadline_ms: expected 20 to 3600000, got {self.deadline_ms:g}")
+        for name, least in (("update_ms", 10.0), ("deadline_ms", 20.0)):
+            value = getattr(self, name)
+            if value is not None and not least <= value <= 3_600_000.0:
+                raise ValueError(f"{name}: expected {least:g} to 3600000, got {value:g}")
         if self.frontier is not None and self.deadline_ms is None:
             raise ValueError("frontier: it is read for a deadline_ms, which is not given")
         if not 1 <= self.steps <= 10_000_000:
@@ -145,8 +155,8 @@ class EdgeConfig:
 
 
 def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
-    """How frames are embedded, where the scenario or the policy asks for it: as the scenario says, else as
-    policies are taught where it says nothing. None: nobody asks, and nothing of it is imported."""
+    """How frames are embedded: as the scenario says, else, if the policy needs embeddings, as policies are
+    trained. None where neither asks for them."""
     if config.embedding is not None or not embedding_of(policy)[0]:
         return config.embedding
     from edge_server.embed import EmbeddingConfig
@@ -155,7 +165,7 @@ def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
 
 
 def open_embedder(embedding: EmbeddingConfig | None) -> Embedder | None:
-    """What embeds frames; None for None. ValueError where the model cannot be used."""
+    """The embedder; None without a config. ValueError where its model cannot be used."""
     if embedding is None:
         return None
     from edge_server.embed import make_embedder
@@ -164,7 +174,7 @@ def open_embedder(embedding: EmbeddingConfig | None) -> Embedder | None:
 
 
 def read_config(scenario: Scenario) -> EdgeConfig:
-    """The edge section of a scenario; raises freshfield.scenario.ScenarioError."""
+    """The edge section of a scenario. Raises ScenarioError."""
     section = dict(scenario.edge)
     if section.get("compute") == "zero":
         section["compute"] = {}

@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from freshfield.geometry import GeometryError, Pose, quaternion_normalise
+from freshfield.geometry import GeometryError, Pose, quaternion_normalize
 
 _COLUMN_NAMES = ("t", "time", "timestamp")
 
@@ -146,7 +146,7 @@ def read_samples(path: Path) -> tuple[list[int], list[Pose]]:
             t, x, y, z, qx, qy, qz, qw = map(float, fields)
             if not np.all(np.isfinite([t, x, y, z])):
                 raise ValueError
-            q = quaternion_normalise((qw, qx, qy, qz))
+            q = quaternion_normalize((qw, qx, qy, qz))
         except GeometryError as error:
             raise TrajectoryError(f"{path}:{number}: {error}") from None
         except ValueError:

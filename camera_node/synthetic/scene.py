@@ -17,7 +17,7 @@ from camera_node.synthetic.motion import MAX_SPEED_M_PER_S
 from camera_node.synthetic.render import CameraRenderer, Image, World
 from camera_node.synthetic.shapes import Array
 from freshfield.geometry import Pinhole
-from freshfield.payload import MAX_IMAGE_SIDE
+from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.scenario import ScenarioError, read_section
 
 SCENES = ("room", "tile", "tower")
@@ -25,8 +25,8 @@ HELD_OUT = "cam00"
 MAX_CAMERAS = 19
 _RANGES = (
     ("count", 1, MAX_CAMERAS),
-    ("width", 8, MAX_IMAGE_SIDE),
-    ("height", 8, MAX_IMAGE_SIDE),
+    ("width", 8, MAX_IMAGE_SIDE_PX),
+    ("height", 8, MAX_IMAGE_SIDE_PX),
     ("horizontal_fov_deg", 5.0, 150.0),
     ("supersample", 1, 8),
 )

@@ -35,6 +35,7 @@ from channel_emu.model.link import Link
 from freshfield.clock import Clock, WallClock
 from freshfield.frame import valid_id
 from freshfield.ledger import Ledger
+from freshfield.limits import MAX_STREAMS_PER_CAMERA
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, frames_pb2
 
@@ -42,7 +43,6 @@ log = logging.getLogger("channel-emu")
 
 SERVICE = frames_pb2.DESCRIPTOR.services_by_name["FrameStreamService"].full_name
 CLOCK_SERVICE = clock_pb2.DESCRIPTOR.services_by_name["ClockService"].full_name
-_STREAMS_PER_CAMERA = 4
 _EXCHANGE_TIMEOUT_S = 5.0
 _STATUS_EVERY_S = 0.5
 # How much of the chain's path is kept behind the present; events are never later than this.
@@ -203,7 +203,7 @@ class Proxy:
 
     async def _push(self, _: Any, context: grpc.aio.ServicerContext) -> None:
         """One stream of a node. Every message is answered once, as soon as the link has decided."""
-        if self._streams >= _STREAMS_PER_CAMERA * len(self.lanes):
+        if self._streams >= MAX_STREAMS_PER_CAMERA * len(self.lanes):
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too many streams are open")
         task = asyncio.current_task()
         assert task is not None

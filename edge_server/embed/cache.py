@@ -1,22 +1,25 @@
-"""Embeddings of buffered frames, computed when a decision first uses a frame and then kept."""
+"""Embeddings of frames, computed when a decision first uses a frame and then kept."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.live.buffer import Buffered
-from edge_server.live.view_decoder import Decoder
+from edge_server.fields import View
+from freshfield.frame import Frame
 
 # Frames whose embeddings are kept: several rounds of the largest rigs. A kilobyte each at most.
 CAPACITY = 1024
 
+_Key = tuple[str, str, int]
+_Row = NDArray[np.float32] | None
 
-class Embeds(Protocol):
+
+class EmbedderLike(Protocol):
     """An Embedder, as far as the cache needs it."""
 
     @property
@@ -28,25 +31,42 @@ class Embeds(Protocol):
     def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]: ...
 
 
-class EmbeddingCache:
-    """Embeds each frame once. ``computed`` and ``failed`` count frames; one that failed is remembered, so
-    that a frame that stays newest for long is tried and counted once. One owner: not thread-safe."""
+class HasFrame(Protocol):
+    """A frame with whatever its owner keeps beside it."""
 
-    def __init__(self, embedder: Embeds, decoder: Decoder, capacity: int = CAPACITY) -> None:
-        """decoder: shared with the field's, so that a frame that both use is decoded once."""
-        self._embedder, self._decoder, self._capacity = embedder, decoder, capacity
-        # Frame -> its row, or None where it has none.
-        self._rows: OrderedDict[tuple[str, str, int], NDArray[np.float32] | None] = OrderedDict()
+    @property
+    def frame(self) -> Frame: ...
+
+
+Item = TypeVar("Item", bound=HasFrame)
+
+
+class EmbeddingCache(Generic[Item]):
+    """Embeds each frame once. Not thread-safe.
+
+    computed, failed: number of frames. A failure is remembered, so that a frame is tried and counted once.
+    """
+
+    def __init__(
+        self, embedder: EmbedderLike, decode: Callable[[Item], View | None], capacity: int = CAPACITY
+    ) -> None:
+        """decode: gives the view of a frame, None where it is damaged. Share it with the field's decoder, so
+        that a frame that both use is decoded once."""
+        self._embedder, self._decode, self._capacity = embedder, decode, capacity
+        # None: the frame has no embedding.
+        self._rows: OrderedDict[_Key, _Row] = OrderedDict()
         self.computed = 0
         self.failed = 0
 
-    def of(self, items: Sequence[Buffered]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """(embeddings (n, dim), ok (n,)) of buffered frames, in their order. Where a frame cannot be decoded
-        or the model gave no finite embedding, its row is zero and its ok False: that camera counts as one
-        without embedding."""
+    def of(self, items: Sequence[Item]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Embeddings of frames in their order.
+
+        Returns float32 (n, dim), and bool (n,), which of them are valid. The row of a frame that cannot be
+        decoded, or for which the model gives nothing finite, is zero and not valid.
+        """
         keys = [(i.frame.camera, i.frame.session, i.frame.sequence) for i in items]
         missing = {key: item for key, item in zip(keys, items) if key not in self._rows}
-        # What this decision needs is not evicted by it, however large it is.
+        # Collected before anything is evicted: a decision may be larger than the cache.
         found = {key: self._rows[key] for key in keys if key in self._rows} | self._embed(missing)
         for key in keys:
             self._rows[key] = found[key]
@@ -61,19 +81,14 @@ class EmbeddingCache:
                 out[k], ok[k] = row, True
         return out, ok
 
-    def _embed(
-        self, missing: dict[tuple[str, str, int], Buffered]
-    ) -> dict[tuple[str, str, int], NDArray[np.float32] | None]:
-        found: dict[tuple[str, str, int], NDArray[np.float32] | None] = dict.fromkeys(missing)
-        views = {key: view for key, item in missing.items() for view in self._decoder.views([item])}
+    def _embed(self, missing: dict[_Key, Item]) -> dict[_Key, _Row]:
+        found: dict[_Key, _Row] = dict.fromkeys(missing)
+        views = {key: view for key, item in missing.items() if (view := self._decode(item)) is not None}
         if views:
             rows = self._embedder.embed([view.image for view in views.values()])
-            found |= {key: row.copy() if _good(row) else None for key, row in zip(views, rows)}
+            # An embedder gives zeros where its model gave NaN.
+            good = {key: row.copy() for key, row in zip(views, rows) if np.isfinite(row).all() and row.any()}
+            found |= good
         self.computed += len(missing)
         self.failed += sum(row is None for row in found.values())
         return found
-
-
-def _good(row: NDArray[np.float32]) -> bool:
-    """Whether it is an embedding: an Embedder gives zeros where the model gave NaN."""
-    return bool(np.isfinite(row).all() and row.any())

@@ -1,23 +1,31 @@
-"""gRPC services of the edge beside ingest: clock exchange, and what operators ask for."""
+"""gRPC at the edge: the clock and operator services, and the thread that serves them beside ingest."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import threading
 from collections.abc import AsyncIterator
 
 import grpc
 import grpc.aio
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
 
+from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState, Publication
 from freshfield.clock import Clock
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc
+from freshfield.transport import Transport
+from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 
-# How often a watcher's stream looks for new decisions; updates take hundreds of milliseconds.
+log = logging.getLogger(__name__)
+
+# Period of looking for new decisions; updates take hundreds of milliseconds.
 _WATCH_S = 0.05
 
 
 class ClockService(clock_pb2_grpc.ClockServiceServicer):
-    """Answers the NTP exchange at once, on the event loop."""
+    """Answers clock exchanges at once, on the event loop."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -42,8 +50,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
     async def GetStatus(
         self, request: edge_pb2.GetStatusRequest, context: grpc.aio.ServicerContext
     ) -> edge_pb2.GetStatusResponse:
-        state = self._state
-        publications = state.publications()
+        state, last = self._state, self._state.newest()
         return edge_pb2.GetStatusResponse(
             scenario=state.scenario,
             uptime_s=state.now_s(),
@@ -60,18 +67,18 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
             policy=state.controls.policy,
             value=state.controls.value,
             paused=state.controls.paused,
-            last=decision(publications[-1]) if publications else None,
+            last=to_decision(last) if last is not None else None,
         )
 
     async def WatchDecisions(
         self, request: edge_pb2.WatchDecisionsRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[edge_pb2.WatchDecisionsResponse]:
-        publications = self._state.publications()
-        seen = publications[-1].number if publications else -1
+        last = self._state.newest()
+        seen = -1 if last is None else last.number
         while True:
             for publication in self._state.publications(since=seen):
                 seen = publication.number
-                yield edge_pb2.WatchDecisionsResponse(decision=decision(publication))
+                yield edge_pb2.WatchDecisionsResponse(decision=to_decision(publication))
             await asyncio.sleep(_WATCH_S)
 
     async def ResetField(
@@ -104,7 +111,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
         return edge_pb2.SetPolicyResponse(name=controls.policy, value=controls.value, paused=controls.paused)
 
 
-def decision(publication: Publication) -> edge_pb2.Decision:
+def to_decision(publication: Publication) -> edge_pb2.Decision:
     """The wire form of a publication; scores that are missing stay unset."""
     scores = {
         name: value
@@ -121,3 +128,62 @@ def decision(publication: Publication) -> edge_pb2.Decision:
         update_ms=publication.update_ms,
         **scores,
     )
+
+
+class GrpcThread:
+    """Serves ingest, clock and operators on a thread with an event loop of its own.
+
+    stopping: ends the thread when it is set; the thread sets it itself when serving fails.
+    """
+
+    def __init__(
+        self, transport: Transport, address: str, ingest: Ingest, clock: Clock, state: EdgeState,
+        stopping: threading.Event,
+    ) -> None:  # fmt: skip
+        self._transport, self._address = transport, address
+        self._ingest, self._clock, self._state = ingest, clock, state
+        self._stopping = stopping
+        self._ready = threading.Event()
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._main, name="grpc", daemon=True)
+
+    def start(self) -> None:
+        """Returns once the server listens. Raises what kept it from that."""
+        self._thread.start()
+        self._ready.wait()
+        if self._failure is not None:
+            raise self._failure
+
+    def join(self, timeout_s: float = 5.0) -> None:
+        self._thread.join(timeout_s)
+
+    def _main(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except BaseException as error:
+            self._failure = error
+            self._stopping.set()
+            self._ready.set()
+
+    async def _serve(self) -> None:
+        server = self._transport.aio_server()
+        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(self._ingest, server)
+        clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(self._clock), server)
+        edge_pb2_grpc.add_EdgeServiceServicer_to_server(EdgeService(self._state), server)
+        checker = health.aio.HealthServicer()
+        health_pb2_grpc.add_HealthServicer_to_server(checker, server)
+        names = [
+            service.full_name
+            for module in (frames_pb2, clock_pb2, edge_pb2)
+            for service in module.DESCRIPTOR.services_by_name.values()
+        ]
+        reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
+        port = self._transport.bind(server, self._address)
+        await server.start()
+        for name in ("", *names):
+            await checker.set(name, health_pb2.HealthCheckResponse.SERVING)
+        log.info("listening on port %d", port)
+        self._ready.set()
+        await asyncio.to_thread(self._stopping.wait)
+        await checker.enter_graceful_shutdown()
+        await server.stop(0.5)

@@ -1,13 +1,13 @@
-"""Frames come in: the checks that need memory, the buffer, the ledger, the answer.
+"""Frames arrive: the checks that need memory, the buffer, the ledger, the response.
 
-Ingest never waits for the field and never decodes: an answer is given as soon as CRC, headers and limits are
+Ingest never waits for the field and never decodes: it answers as soon as checksum, headers and limits are
 checked and the frame is buffered.
 """
 
 from __future__ import annotations
 
 import time
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import AsyncIterator, Callable, Collection
 from dataclasses import dataclass
 
@@ -15,35 +15,33 @@ import grpc
 import grpc.aio
 
 from edge_server.live.buffer import FrameBuffer
+from freshfield import limits
 from freshfield.clock import Clock
 from freshfield.frame import Frame, FrameRejected, from_request, valid_id
 from freshfield.ledger import Ledger
-from freshfield.payload import MAX_FUTURE_NS, MAX_PAST_NS
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc
-
-# A camera that restarts opens a new session; older ones may still have frames on the way.
-# A session that is forgotten could be replayed, so many are remembered.
-_SESSIONS_PER_CAMERA = 64
-_STREAMS_PER_CAMERA = 4
-_MAX_UNCERTAINTY_NS = 1_000_000_000
 
 
 @dataclass
 class _Session:
+    """The last admitted frame of a session. A camera that restarts opens a new session while frames of the
+    old one may still be on their way."""
+
     sequence: int = -1
     generated_ns: int = -(2**63)
 
 
-class Gate:
-    """Order and time, per camera and session. ``admit`` raises FrameRejected with reason unknown_camera,
-    wrong_role, replayed_sequence, time_reversed, from_future or too_old."""
+class FrameAdmission:
+    """Checks the order and the time of frames, by camera and session."""
 
     def __init__(self, training: Collection[str], held_out: Collection[str]) -> None:
         self._roles = {c: False for c in training} | {c: True for c in held_out}
         self._sessions: dict[str, OrderedDict[str, _Session]] = {c: OrderedDict() for c in self._roles}
 
     def admit(self, frame: Frame, now_ns: int) -> None:
+        """Raises FrameRejected with reason unknown_camera, wrong_role, replayed_sequence, time_reversed,
+        from_future or too_old. now_ns: on the edge's clock."""
         if frame.camera not in self._roles:
             raise FrameRejected("unknown_camera", f"camera {frame.camera!r} is not part of this scenario")
         if frame.held_out != self._roles[frame.camera]:
@@ -54,27 +52,32 @@ class Gate:
             raise FrameRejected("replayed_sequence", f"{frame.sequence} after {session.sequence}")
         if frame.generated_ns <= session.generated_ns:
             raise FrameRejected("time_reversed", "captured before the frame that came before it")
-        # A node that has not measured its offset yet says so with a huge uncertainty: that must not let a
-        # frame from tomorrow be the newest until tomorrow.
-        ahead = frame.generated_edge_ns - now_ns - min(frame.clock_uncertainty_ns, _MAX_UNCERTAINTY_NS)
-        if ahead > MAX_FUTURE_NS:
+        ahead = (
+            frame.generated_edge_ns
+            - now_ns
+            - min(frame.clock_uncertainty_ns, limits.MAX_CLOCK_UNCERTAINTY_NS)
+        )
+        if ahead > limits.MAX_CAPTURE_AHEAD_NS:
             raise FrameRejected(
                 "from_future", f"captured {ahead / 1e6:.0f} ms from now: clock offset unknown?"
             )
-        if -ahead > MAX_PAST_NS:
+        if -ahead > limits.MAX_CAPTURE_AGE_NS:
             raise FrameRejected("too_old", f"captured {-ahead / 6e10:.0f} minutes ago: a wrong clock?")
-        # Only an admitted frame moves the bounds: a refused one loses nothing else.
+        # Only an admitted frame changes the session: a refused one does not affect the next.
         session.sequence, session.generated_ns = frame.sequence, frame.generated_ns
         sessions[frame.session] = session
         sessions.move_to_end(frame.session)
-        while len(sessions) > _SESSIONS_PER_CAMERA:
+        while len(sessions) > limits.MAX_SESSIONS_PER_CAMERA:
             sessions.popitem(last=False)
 
 
 class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
-    """FrameStreamService of the edge. ``on_held_out`` takes held-out frames, ``on_accepted`` what was
-    accepted (called on the event loop: they must not block). Counts are plain numbers; readers see them
-    without a lock."""
+    """FrameStreamService of the edge.
+
+    on_held_out(frame), on_accepted(request, now_ns): called on the event loop for held-out frames and for
+    every accepted one; they must not block.
+    Counts are plain numbers; readers see them without a lock.
+    """
 
     def __init__(
         self,
@@ -82,12 +85,12 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         buffer: FrameBuffer,
         held_out: Collection[str],
         ledger: Ledger,
-        on_held_out: Callable[[Frame, int], None],
+        on_held_out: Callable[[Frame], None],
         on_accepted: Callable[[pb.PushRequest, int], None] | None = None,
     ) -> None:
         self._clock = clock
         self._buffer = buffer
-        self._gate = Gate(buffer.cameras, held_out)
+        self._admission = FrameAdmission(buffer.cameras, held_out)
         self._ledger = ledger
         self._on_held_out = on_held_out
         self._on_accepted = on_accepted
@@ -95,9 +98,9 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
         self.rejected: Counter[str] = Counter()
         self.rejected_by_camera: Counter[str] = Counter()
         self.newest_held_out: dict[str, Frame] = {}
-        self.check_ms = Recent(4096)
+        self.check_ms = RollingPercentiles(4096)
         self._streams = 0
-        self._max_streams = _STREAMS_PER_CAMERA * (len(buffer.cameras) + len(held_out))
+        self._max_streams = limits.MAX_STREAMS_PER_CAMERA * (len(buffer.cameras) + len(held_out))
 
     async def Push(
         self, request_iterator: AsyncIterator[pb.PushRequest], context: grpc.aio.ServicerContext
@@ -112,49 +115,43 @@ class Ingest(frames_pb2_grpc.FrameStreamServiceServicer):
             self._streams -= 1
 
     def take(self, request: pb.PushRequest) -> pb.PushResponse:
-        """Check, buffer and account for one frame; the answer says what became of it."""
-        begun = time.perf_counter()
+        """Check and buffer one frame and enter it in the ledger; the response says what became of it."""
+        start_s = time.perf_counter()
         now_ns = self._clock.now_ns()
         header = request.header
         try:
             frame = from_request(request)
-            self._gate.admit(frame, now_ns)
+            self._admission.admit(frame, now_ns)
         except FrameRejected as error:
             self.rejected[error.reason] += 1
             # A hostile id must not break the ledger's lines.
-            ids = [i if valid_id(i) else "?" for i in (header.camera_id, header.session_id)]
-            self.rejected_by_camera[ids[0]] += 1
-            self._ledger.write(now_ns, ids[0], ids[1], header.sequence, "rejected", error.reason)
+            camera, session = (i if valid_id(i) else "?" for i in (header.camera_id, header.session_id))
+            self.rejected_by_camera[camera] += 1
+            self._ledger.write(now_ns, camera, session, header.sequence, "rejected", error.reason)
             return pb.PushResponse(
                 sequence=header.sequence, outcome=pb.OUTCOME_REJECTED, reason=error.reason, detail=str(error)
             )
         if frame.held_out:
             self.newest_held_out[frame.camera] = frame
-            self._on_held_out(frame, now_ns)
+            self._on_held_out(frame)
         else:
             self._buffer.put(frame, now_ns)
         self.delivered[frame.camera] += 1
         self._ledger.write(now_ns, frame.camera, frame.session, frame.sequence, "delivered")
         if self._on_accepted is not None:
             self._on_accepted(request, now_ns)
-        self.check_ms.add((time.perf_counter() - begun) * 1e3)
+        self.check_ms.add((time.perf_counter() - start_s) * 1e3)
         return pb.PushResponse(sequence=frame.sequence, outcome=pb.OUTCOME_ACCEPTED)
 
 
-class Recent:
-    """The last ``size`` values and their percentiles."""
+class RollingPercentiles:
+    """Percentiles of the last ``size`` values."""
 
     def __init__(self, size: int) -> None:
-        self._values: list[float] = []
-        self._size = size
-        self._next = 0
+        self._values: deque[float] = deque(maxlen=size)
 
     def add(self, value: float) -> None:
-        if len(self._values) < self._size:
-            self._values.append(value)
-        else:
-            self._values[self._next] = value
-            self._next = (self._next + 1) % self._size
+        self._values.append(value)
 
     def percentile(self, percent: float) -> float | None:
         values = sorted(self._values)

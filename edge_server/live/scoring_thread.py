@@ -1,8 +1,8 @@
 """Scores each publication on a thread of its own, so that neither ingest nor the field waits for it.
 
-The edge keeps a publication's renderer; once the held-out capture nearest to the present has arrived it is
-rendered at that capture's pose and compared. If scoring falls behind, publications go unscored (and the
-series says so with nulls); nothing queues up.
+A publication's renderer is kept until the held-out capture nearest to its present has arrived; it then
+renders that capture's pose, and the two images are compared. If scoring falls behind, publications stay
+unscored (nulls in the series) and nothing queues up.
 """
 
 from __future__ import annotations
@@ -26,25 +26,31 @@ from freshfield.frame import Frame
 
 log = logging.getLogger(__name__)
 
-# Below the loop's priority and above nothing: scoring is for the observer, not for the field.
+# Niceness: scoring serves observers and gives way to the field's updates.
 _NICE = 5
-# Held-out frames that wait while one publication is scored; older ones are not needed any more.
+# Items that wait while one publication is scored; older ones are no longer needed.
 _INBOX = 256
+_OPEN_PUBLICATIONS = 16
+_KEPT_FRAMES = 128
 _BASELINE_EVERY = 5
 _KEPT_RENDERINGS = 32
 
 
 @dataclass
-class _Open:
-    """A publication with some of its held-out cameras still to be scored."""
+class _OpenPublication:
+    """A publication of which some held-out cameras are still to be scored."""
 
     publication: Publication
     scores: list[Score]
 
 
-class Scoring:
-    """Owner of the Scorer. on_scored(publication with scores, comparison or None, final) runs on its thread;
-    final: every held-out camera's score is in."""
+class ScoringThread:
+    """The thread that owns the scorer.
+
+    held_out: ids of the held-out cameras; where there are none, the selected views are scored.
+    on_scored(publication with scores, comparison or None, final): called on this thread. final: the scores of
+    all held-out cameras are in.
+    """
 
     def __init__(
         self,
@@ -58,8 +64,8 @@ class Scoring:
         self._inbox: deque[Frame | tuple[Publication, Renderer, list[View]]] = deque(maxlen=_INBOX)
         self._wake = threading.Condition()
         self._ending = False
-        self._frames: dict[str, deque[Frame]] = {c: deque(maxlen=128) for c in self._held_out}
-        self._open: dict[int, _Open] = {}
+        self._frames: dict[str, deque[Frame]] = {c: deque(maxlen=_KEPT_FRAMES) for c in self._held_out}
+        self._open: dict[int, _OpenPublication] = {}
         self._views: list[View] = []
         self._rendered: dict[tuple[str, int], NDArray[np.float32]] = {}
         self.undecodable = 0
@@ -70,16 +76,15 @@ class Scoring:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Finish what can be scored now and end."""
+        """Score what has arrived, and end."""
         with self._wake:
             self._ending = True
             self._wake.notify()
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    def held_out_frame(self, frame: Frame, received_ns: int) -> None:
-        """A held-out frame has arrived; it stays encoded until it is a truth. Never blocks."""
-        del received_ns  # the truth's time is its generation time
+    def held_out_frame(self, frame: Frame) -> None:
+        """A held-out frame has arrived; it is decoded when it is compared with. Never blocks."""
         self._put(frame)
 
     def published(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
@@ -103,17 +108,17 @@ class Scoring:
                 item = self._inbox.popleft()
             try:
                 if isinstance(item, Frame):
-                    self._settle(item)
+                    self._score_with(item)
                 elif self._held_out:
-                    self._keep(*item)
+                    self._score_later(*item)
                 else:
                     self._score_selected(*item)
             except Exception:  # one bad image must not end all scoring; it is logged with its traceback
                 log.exception("a publication could not be scored")
 
-    def _keep(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
-        self._open[publication.number] = _Open(publication, [])
-        while len(self._open) > 16:
+    def _score_later(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
+        self._open[publication.number] = _OpenPublication(publication, [])
+        while len(self._open) > _OPEN_PUBLICATIONS:
             del self._open[min(self._open)]
         self._views = views
         for camera in self._held_out:
@@ -127,13 +132,13 @@ class Scoring:
             frame = next(f for f in self._frames[camera] if f.generated_edge_ns == generated_ns)
             image = renderer.render(frame.pose.matrix(), frame.intrinsics).color
             self._rendered[(camera, published_ns)] = image
-            while len(self._rendered) > _KEPT_RENDERINGS:  # of publications whose scoring failed afterwards
+            while len(self._rendered) > _KEPT_RENDERINGS:  # their publication's scoring failed afterwards
                 self._rendered.pop(next(iter(self._rendered)))
             return image
 
         return render
 
-    def _settle(self, frame: Frame) -> None:
+    def _score_with(self, frame: Frame) -> None:
         self._frames[frame.camera].append(frame)
         scores = self._scorer.held_out(
             frame.camera, lambda: self._decode(frame), frame.generated_edge_ns, frame.pose
@@ -178,7 +183,7 @@ class Scoring:
     def _score_selected(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
         with self._wake:
             if any(isinstance(i, tuple) for i in self._inbox):
-                return  # a younger publication waits already: this one goes unscored
+                return  # a newer publication is waiting: this one stays unscored
         renderings = [
             (v.camera, renderer.render(v.camera_to_world, v.intrinsics).color, v.image) for v in views
         ]
@@ -191,5 +196,5 @@ class Scoring:
 
 
 def to_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """float (H, W, 3) in [0, 1] -> uint8, rounded."""
+    """float (H, W, 3) in [0, 1] to uint8, rounded."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)

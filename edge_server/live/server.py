@@ -1,13 +1,12 @@
-"""Puts one edge server together: ingest, buffer, loop, scoring, page, and the files they leave.
+"""One edge server: ingest, buffer, update loop, scoring, page, and the files they write.
 
-Three sorts of threads: the event loop of gRPC (never blocked), the update loop with the field's workers (at
-lower priority), and observers (scoring, page, metrics), which only read what was published.
+It has three kinds of threads: the event loop of gRPC, which is never blocked; the update loop with the
+field's workers, at lower priority; and observers (scoring, page, metrics), which only read what was
+published.
 """
 
 from __future__ import annotations
 
-import asyncio
-import json
 import logging
 import threading
 from dataclasses import dataclass, field
@@ -16,48 +15,50 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
 
-from edge_server.config import EdgeConfig, embedding_for, open_embedder
+from edge_server.config import EdgeConfig, embedding_for
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.fields import View, checkpoint
 from edge_server.fields.common.kernels.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
-from edge_server.live.buffer import FrameBuffer
-from edge_server.live.decision_log import Decisions
-from edge_server.live.grpc_services import ClockService, EdgeService
-from edge_server.live.ingest import Ingest, Recent
-from edge_server.live.journal import Journal
-from edge_server.live.loop import Loop, Updates, open_foreground, open_keyframes
-from edge_server.live.scoring_thread import Scoring
+from edge_server.live.field_updater import open_updater
+from edge_server.live.grpc_services import GrpcThread
+from edge_server.live.ingest import Ingest, RollingPercentiles
+from edge_server.live.loop import UpdateLoop
+from edge_server.live.output.decision_log import DecisionLog
+from edge_server.live.output.journal import Journal
+from edge_server.live.policies import ServerPolicies
+from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Renderer
-from edge_server.live.update_budget import Deadline, Fixed, Pacing, choose, read_points
-from edge_server.scheduler import BANDIT, OFFERED, Policy, decision_of, make_live_policy
+from edge_server.live.update_budget import open_budget
+from edge_server.scheduler import decision_of
 from freshfield.clock import Clock, WallClock
+from freshfield.files import ReplacedJson
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.transport import Transport, TransportError
-from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 
-if TYPE_CHECKING:  # loaded only where a policy was learnt, or a run is recorded
-    from edge_server.live.recorder import Recorder
-    from edge_server.scheduler.online.online_trainer import Lessons
+if TYPE_CHECKING:  # imported at run time only where a run is recorded
+    from edge_server.live.output.recorder import Recorder
 
 log = logging.getLogger(__name__)
 
-# A person walking: what a scene that does not tell its speed is taken to move at.
-_USUAL_SPEED_M_PER_S = 1.0
-
-_STATUS_S = 0.5
-_AGES_S = 0.2
-_SNAPSHOT_S = 30.0
+_STATUS_PERIOD_S = 0.5
+_AGES_PERIOD_S = 0.2
+_SNAPSHOT_TIMEOUT_S = 30.0
+_UPDATE_TIMES = 4096  # of which percentiles are shown
 
 
 @dataclass(frozen=True)
-class Options:
-    """How one server process runs; the scenario says what it does."""
+class ServerOptions:
+    """How one server process runs; the scenario says what it does.
+
+    listen: HOST:PORT for frames. out: folder of the run's files. transport: security of connections.
+    page_host, page_port, metrics_port: of the page and of Prometheus metrics; without a port there is none.
+    lpips_folder: with weights. resume: checkpoint to start from. checkpoint_s: period of writing one.
+    record: MCAP file to write the session to.
+    """
 
     listen: str
     out: Path
@@ -75,7 +76,7 @@ class EdgeServer:
     """One edge server. ``run`` blocks until ``stop`` is called or the update loop fails."""
 
     def __init__(
-        self, scenario: Scenario, config: EdgeConfig, options: Options, clock: Clock | None = None
+        self, scenario: Scenario, config: EdgeConfig, options: ServerOptions, clock: Clock | None = None
     ) -> None:
         self.scenario = scenario
         self.config = config
@@ -83,20 +84,18 @@ class EdgeServer:
         self.clock = clock or WallClock()
         self.start_ns = self.clock.now_ns()
         self._stopping = threading.Event()
-        self._update_ms = Recent(4096)
+        self._update_ms = RollingPercentiles(_UPDATE_TIMES)
         self._first_ms: float | None = None
         options.out.mkdir(parents=True, exist_ok=True)
 
-        self.pacing, field_options = _pacing(scenario, config)
-        aside = {"nice": SERVER_NICE, **field_options}
-        self.field = make_field(config.field, aside, seed=scenario.seed)
-        updates = 0
+        budget, field_options = open_budget(scenario, config)
+        self.field = make_field(config.field, {"nice": SERVER_NICE, **field_options}, seed=scenario.seed)
+        resumed_updates = 0
         if options.resume is not None:
             state, about = checkpoint.load(options.resume)
             self.field.load_state(state)
-            # Numbers go on, so that a snapshot does not take the name of an earlier one.
-            updates = max(0, int(about.get("updates", 0)))
-        self.buffer = FrameBuffer(scenario.training)
+            # Numbers continue, so that a snapshot does not take the name of an earlier one.
+            resumed_updates = max(0, int(about.get("updates", 0)))
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)
         lpips, self.lpips_missing = (
             (None, "turned off by the scenario (edge.lpips: none)")
@@ -104,24 +103,20 @@ class EdgeServer:
             else open_lpips(options.lpips_folder, config.lpips)  # type: ignore[arg-type]
         )
         scorer = Scorer(lpips, config.noisy_truth, perceptual=listed_metric(config.metrics))
-        self.scoring = Scoring(scenario.held_out, scorer, self._scored)
+        self.scoring = ScoringThread(scenario.held_out, scorer, self._scored)
         try:
-            policy = self._policy(config.policy.name, config.policy.value)
-            self.lessons = self._lessons(policy)
-            if self.lessons is not None:
-                policy = self.lessons.apprentice
-            self._embedding = embedding_for(config, policy)
-            embedder = open_embedder(self._embedding)
-            keyframes = open_keyframes(config.keyframes, resumed=options.resume is not None)
-            foreground = open_foreground(config.foreground, scenario)
-            self.updates = Updates(
-                self.buffer, policy, self.field, self.start_ns, embedder, keyframes, foreground
-            )
+            self.policies = ServerPolicies(scenario, config, self.lpips_missing, options.out)
         except ValueError as error:
             raise ScenarioError(f"{scenario.path}: edge.policy: {error}") from None
+        self.trainer, policy = self.policies.trainer, self.policies.first
+        self.updater = open_updater(
+            scenario, config, policy, self.field, self.start_ns, resumed=options.resume is not None
+        )
+        self.updater.number = resumed_updates
+        self.buffer = self.updater.buffer
         self.recorder: Recorder | None = None
         if options.record is not None:
-            from edge_server.live.recorder import Recorder  # MCAP is loaded only where something is recorded
+            from edge_server.live.output.recorder import Recorder  # MCAP is imported only for recordings
 
             self.recorder = Recorder(options.record, scenario.name)
             log.info("recording to %s", self.recorder.file)
@@ -129,51 +124,46 @@ class EdgeServer:
             self.clock, self.buffer, scenario.held_out, self.ledger, self.scoring.held_out_frame,
             None if self.recorder is None else self.recorder.frame,
         )  # fmt: skip
-        self._decisions = Decisions(options.out, self._embedding)
-        self.updates.number = updates
-        self.loop = Loop(
-            self.updates,
+        self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
+        self.loop = UpdateLoop(
+            self.updater,
             self.clock,
-            self.pacing,
+            budget,
             config.grace_ms,
             self._published,
-            self._say,
-            self._checkpoint,
+            self._set_status_line,
+            self._write_checkpoint,
         )
+        embedder = self.updater.embedder
         self.state = EdgeState(
             scenario=scenario.name,
-            # Of what was learnt, only what the server was started with: nobody outside names files to open.
-            policies=OFFERED if policy.name in OFFERED else (policy.name, *OFFERED),
+            policies=self.policies.offered,
             controls=Controls(policy.name, policy.value),
             cameras=self._cameras,
             now_s=lambda: (self.clock.now_ns() - self.start_ns) / 1e9,
             set_policy=self._set_policy,
             save_snapshot=self._save_snapshot,
-            channel=_JsonFile(options.out / "channel.json"),
+            channel=ReplacedJson(options.out / "channel.json").read,
             field_name=config.field,
-            decision=lambda: decision_of(self.updates.policy),
+            decision=lambda: decision_of(self.updater.policy),
             embed=None if embedder is None else embedder.embed,
-            learning=self._learning,
+            learning=lambda: self.policies.learning_line(self.state.controls.policy),
         )
         self.journal = Journal(options.out, self.status)
 
     # --- running ----------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Serve until stopped, then write everything down. Raises what ended the update loop, if it did."""
-        grpc_ready = threading.Event()
-        problem: list[BaseException] = []
-        grpc_thread = threading.Thread(
-            target=self._serve, args=(grpc_ready, problem), name="grpc", daemon=True
+        """Serve until stopped, then write everything down. Raises what ended the update loop, if it
+        failed."""
+        grpc = GrpcThread(
+            self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
         )
-        grpc_thread.start()
-        grpc_ready.wait()
-        if problem:
-            raise problem[0]
+        grpc.start()
         page = None
         try:
             if self.options.page_port is not None:
-                # The viewer is loaded only where there is a page.
+                # The viewer is imported only where there is a page.
                 from edge_server.page import PageError, start_page
 
                 try:
@@ -182,23 +172,23 @@ class EdgeServer:
                     raise TransportError(f"page: {error}") from None
                 log.info("page: %s", page.url)
             if self.options.metrics_port is not None:
-                from edge_server.live.prometheus import serve_metrics
+                from edge_server.live.output.prometheus import serve_metrics
 
                 serve_metrics(self.state, self.ingest, self.options.page_host, self.options.metrics_port)
             self.scoring.start()
-            if self.lessons is not None:
-                self.lessons.start()
+            if self.trainer is not None:
+                self.trainer.start()
             self.loop.start()
             self._watch()
         finally:
             self._stopping.set()
             self.loop.stop()
             self.scoring.stop()
-            if self.lessons is not None:
-                self.lessons.stop()
+            if self.trainer is not None:
+                self.trainer.stop()
             if page is not None:
                 page.stop()
-            grpc_thread.join(5.0)
+            grpc.join()
             self._write_final()
         if self.loop.failure is not None:
             raise self.loop.failure
@@ -208,10 +198,10 @@ class EdgeServer:
         self._stopping.set()
 
     def _watch(self) -> None:
-        """Write status and ages, carry the operator's wishes to the loop, notice its death."""
-        ticks, every = 0, round(_STATUS_S / _AGES_S)
+        """Write status and ages, pass the operator's controls to the loop, and notice if it ends."""
+        ticks, every = 0, round(_STATUS_PERIOD_S / _AGES_PERIOD_S)
         saved_ns = self.clock.now_ns()
-        while not self._stopping.wait(_AGES_S) and self.loop.alive:
+        while not self._stopping.wait(_AGES_PERIOD_S) and self.loop.alive:
             now_ns = self.clock.now_ns()
             self.journal.ages((now_ns - self.start_ns) / 1e9, self.buffer.ages_ms(now_ns))
             if ticks % every == 0:
@@ -227,41 +217,7 @@ class EdgeServer:
                 saved_ns = now_ns
                 self.loop.request_checkpoint(self.options.out / "field.npz")
 
-    def _serve(self, ready: threading.Event, problem: list[BaseException]) -> None:
-        try:
-            asyncio.run(self._serve_until_stopped(ready))
-        except BaseException as error:
-            problem.append(error)
-            self._stopping.set()
-            ready.set()
-
-    async def _serve_until_stopped(self, ready: threading.Event) -> None:
-        server = self.options.transport.aio_server()
-        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(self.ingest, server)
-        clock_pb2_grpc.add_ClockServiceServicer_to_server(ClockService(self.clock), server)
-        edge_pb2_grpc.add_EdgeServiceServicer_to_server(EdgeService(self.state), server)
-        checker = health.aio.HealthServicer()
-        health_pb2_grpc.add_HealthServicer_to_server(checker, server)
-        names = [
-            module.DESCRIPTOR.services_by_name[name].full_name
-            for module, name in (
-                (frames_pb2, "FrameStreamService"),
-                (clock_pb2, "ClockService"),
-                (edge_pb2, "EdgeService"),
-            )
-        ]
-        reflection.enable_server_reflection([*names, health.SERVICE_NAME, reflection.SERVICE_NAME], server)
-        port = self.options.transport.bind(server, self.options.listen)
-        await server.start()
-        for name in ("", *names):
-            await checker.set(name, health_pb2.HealthCheckResponse.SERVING)
-        log.info("listening on port %d", port)
-        ready.set()
-        await asyncio.to_thread(self._stopping.wait)
-        await checker.enter_graceful_shutdown()
-        await server.stop(0.5)
-
-    # --- what others call -------------------------------------------------------------------------
+    # --- callbacks -------------------------------------------------------------------------
 
     def _published(self, publication: Publication, renderer: Renderer, views: list[View]) -> None:
         if self._first_ms is None:
@@ -271,7 +227,7 @@ class EdgeServer:
             self.state.bounds = getattr(self.field, "bounds", None)
         self.state.publish(publication, renderer)
         self.journal.published(publication)
-        self._decisions.keep(self.updates.policy, publication.number)
+        self._decision_log.record(self.updater.policy, publication.number)
         self.journal.poses(views)
         if self.recorder is not None:
             self.recorder.published(publication)
@@ -280,98 +236,61 @@ class EdgeServer:
     def _scored(self, publication: Publication, comparison: Comparison | None, final: bool) -> None:
         self.state.scored(publication, comparison)
         self.journal.scored(publication, final)
-        if self.lessons is not None and final:
-            self.lessons.scored(publication.number, publication)
+        if self.trainer is not None and final:
+            self.trainer.scored(publication.number, publication)
         if final and self.recorder is not None:
             self.recorder.scored(publication, self.clock.now_ns())
 
-    def _say(self, line: str) -> None:
-        self.state.last_decision = line
-
-    def _policy(self, name: str, value: float | None):
-        return make_live_policy(name, value, self.scenario.rng("policy", name))
-
-    def _lessons(self, policy: Policy) -> Lessons | None:
-        """What lets ``policy`` go on learning, where that was asked for. ValueError where it cannot."""
-        learn = self.config.learn
-        if learn is None:
-            return None
-        if not policy.name.startswith(BANDIT):
-            raise ValueError(f"{policy.name} cannot learn: only bandit:FILE can (--policy, edge.policy)")
-        if not self.scenario.held_out:
-            raise ValueError("nothing is held out (cameras.held_out), so that there is no reward to learn by")
-        from edge_server.scheduler.online.online_trainer import open_lessons
-
-        lessons = open_lessons(
-            Path(policy.name.removeprefix(BANDIT)), learn.reward, learn.fallback,
-            self.scenario.rng("lessons"), self.lpips_missing, self.options.out,
-        )  # fmt: skip
-        by = lessons.reward
-        if by.distance and by.distance_is == "perceptual" and "perceptual" not in self.config.metrics:
-            raise ValueError("the policy was trained by the stand-in distance, which nothing measures here: "
-                             "list it in the scenario, edge.metrics: [perceptual]")  # fmt: skip
-        return lessons
-
-    def _learning(self) -> str:
-        """How learning goes, for people; empty where nobody learns, or another policy was chosen."""
-        if self.lessons is None or self.state.controls.policy != self.lessons.apprentice.name:
-            return ""
-        return self.lessons.apprentice.told()
+    def _set_status_line(self, line: str) -> None:
+        self.state.status_line = line
 
     def _set_policy(self, name: str, value: float | None) -> None:
-        if name.startswith(BANDIT) and name not in self.state.policies:
-            raise ValueError(f"policy {name!r}: what was learnt is chosen at the start (--policy {name})")
-        policy = self._policy(name, value)
-        if self.lessons is not None and policy.name == self.lessons.apprentice.name:
-            policy = self.lessons.apprentice  # the one that learns goes on
-        self.updates.check(policy)
+        policy = self.policies.make(name, value)
+        self.updater.check(policy)
         self.state.controls.policy, self.state.controls.value = policy.name, policy.value
         self.loop.use_policy(policy)
 
     def _save_snapshot(self) -> Path:
         if not self.state.started:
             raise RuntimeError("the field has not been trained yet")
-        path = self.options.out / f"snapshot-{self.updates.number:06d}.npz"
+        path = self.options.out / f"snapshot-{self.updater.number:06d}.npz"
         try:
-            return self.loop.request_checkpoint(path).result(_SNAPSHOT_S)
+            return self.loop.request_checkpoint(path).result(_SNAPSHOT_TIMEOUT_S)
         except TimeoutError:
-            raise RuntimeError(f"the update in progress took over {_SNAPSHOT_S:g} s") from None
+            raise RuntimeError(f"the update in progress took over {_SNAPSHOT_TIMEOUT_S:g} s") from None
 
-    def _checkpoint(self, path: Path) -> None:
-        checkpoint.save(path, self.field.state(), self._about())
+    def _write_checkpoint(self, path: Path) -> None:
+        about = {
+            "field": self.config.field,
+            "options": self.config.field_options,
+            "scenario": self.scenario.name,
+            "seed": self.scenario.seed,
+            "updates": self.updater.number,
+        }
+        checkpoint.save(path, self.field.state(), about)
 
     def _cameras(self) -> list[CameraView]:
-        now_ns = self.clock.now_ns()
-        newest = self.buffer.newest()
-        rejected = self.ingest.rejected_by_camera
+        now_ns, ingest = self.clock.now_ns(), self.ingest
+        frames = ingest.newest_held_out | {c: item.frame for c, item in self.buffer.newest().items()}
         views = []
         for camera in self.scenario.cameras:
-            held_out = camera in self.scenario.held_out
-            if held_out:
-                frame = self.ingest.newest_held_out.get(camera)
-                age = (now_ns - frame.generated_edge_ns) / 1e6 if frame else None
-            else:
-                item = newest.get(camera)
-                frame, age = (item.frame, item.age_ms(now_ns)) if item else (None, None)
-            views.append(
-                CameraView(camera, held_out, frame, age, self.ingest.delivered[camera], rejected[camera])
-            )
+            frame = frames.get(camera)
+            age_ms = None if frame is None else (now_ns - frame.generated_edge_ns) / 1e6
+            counts = ingest.delivered[camera], ingest.rejected_by_camera[camera]
+            views.append(CameraView(camera, camera in self.scenario.held_out, frame, age_ms, *counts))
         return views
 
     def status(self) -> dict[str, Any]:
         """Contents of edge.json."""
-        publications = self.state.publications()
-        last = publications[-1] if publications else None
-        scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
+        last, scored = self.state.newest(), self.state.newest(scored=True)
         baselines = self.scoring.baselines
 
         def mean(name: str) -> float | None:
             values = [v for b in list(baselines) if (v := getattr(b, name)) is not None]
             return float(np.mean(values)) if values else None
 
-        recorded = {} if self.recorder is None else {"recording": self.recorder.status()}
         return {
-            **recorded,
+            **({} if self.recorder is None else {"recording": self.recorder.status()}),
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "started_ns": self.start_ns,
@@ -380,67 +299,53 @@ class EdgeServer:
             "policy": self.state.controls.policy,
             "value": self.state.controls.value,
             "paused": self.state.controls.paused,
-            "doing": self.state.last_decision,
+            "doing": self.state.status_line,
             "cameras": [
-                {
-                    "camera": c.camera,
-                    "held_out": c.held_out,
-                    "age_ms": c.age_ms,
-                    "delivered": c.delivered,
-                    "rejected": c.rejected,
-                }
-                for c in self._cameras()
+                _values(c, "camera", "held_out", "age_ms", "delivered", "rejected") for c in self._cameras()
             ],
             "rejected": dict(self.ingest.rejected),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
-            "decisions_lost": self._decisions.lost,
+            "decisions_lost": self._decision_log.lost,
             "stale_on_arrival": self.buffer.stale_on_arrival,
             "check_ms": {f"p{p}": self.ingest.check_ms.percentile(p) for p in (50, 99)},
             "updates": {
-                "count": self.updates.number,
+                "count": self.updater.number,
                 "ms_p50": self._update_ms.percentile(50),
                 "ms_p95": self._update_ms.percentile(95),
                 "first_ms": self._first_ms,
                 "deadline_ms": self.config.deadline_ms,
-                "undecodable": self.updates.decoder.undecodable + self.scoring.undecodable,
+                "undecodable": self.updater.decoder.undecodable + self.scoring.undecodable,
             },
-            "treatment": {
-                "views": self.updates.treatment_cost.views,
-                "ms_per_view": self.updates.treatment_cost.ms_per_view,
-            },
-            "foreground": None if (cut := self.updates.decoder.foreground) is None else cut.status(),
-            "baseline": {
-                "mean_colour_db": mean("mean_colour_db"),
-                "nearest_view_db": mean("nearest_view_db"),
-            },
-            "learning": None if self.lessons is None else self.lessons.apprentice.status(),
+            "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
+            "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
+            "baseline": {name: mean(name) for name in ("mean_colour_db", "nearest_view_db")},
+            "learning": None if self.trainer is None else self.trainer.apprentice.status(),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),
-            "last": None if last is None else {"t_s": last.t_s, "aaoi_ms": last.aaoi_ms,
-                                               "update_ms": last.update_ms, "selected": len(last.selected),
-                                               "omega_ms": last.omega_ms, "steps": last.steps},
-            "scores": None if scored is None else {"psnr_db": scored.psnr_db, "ssim": scored.ssim,
-                                                   "psnr_moving_db": scored.psnr_moving_db,
-                                                   "lpips": scored.lpips,
-                                                   "perceptual": scored.perceptual, "on": scored.scored_on},
+            "last": None if last is None else {
+                **_values(last, "t_s", "aaoi_ms", "update_ms", "omega_ms", "steps"),
+                "selected": len(last.selected),
+            },
+            "scores": None if scored is None else {
+                **_values(scored, "psnr_db", "ssim", "psnr_moving_db", "lpips", "perceptual"),
+                "on": scored.scored_on,
+            },
         }  # fmt: skip
 
     def _write_final(self) -> None:
         try:
-            comparison = self.state.comparison
-            if comparison is not None:
-                pair = {"truth": comparison.truth, "rendered": comparison.rendered}
-                for name, image in pair.items():
+            if (comparison := self.state.comparison) is not None:
+                for name, image in _values(comparison, "truth", "rendered").items():
                     cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
             if self.state.started and not self.loop.alive:
-                self._checkpoint(self.options.out / "field.npz")
-            if self.lessons is not None:
-                self.lessons.close()
+                self._write_checkpoint(self.options.out / "field.npz")
+            if self.trainer is not None:
+                self.trainer.close()
         except OSError as error:
             log.error("not everything was written at the end: %s", error)
         finally:
-            # Whatever failed: every frame's account is complete, and the status is the last one.
+            # Whatever failed, the ledger is complete and the status is the last one.
             try:
                 self.ledger.close(self.clock.now_ns())
             finally:
@@ -448,48 +353,6 @@ class EdgeServer:
                     self.recorder.close()
                 self.journal.close()
 
-    def _about(self) -> dict[str, Any]:
-        return {
-            "field": self.config.field,
-            "options": self.config.field_options,
-            "scenario": self.scenario.name,
-            "seed": self.scenario.seed,
-            "updates": self.updates.number,
-        }
 
-
-def _pacing(scenario: Scenario, config: EdgeConfig) -> tuple[Pacing, dict[str, Any]]:
-    """How long updates may be, and the field's options: the scenario's own, over those of the measured point
-    that a deadline leads to. ValueError where the frontier cannot be read."""
-    if config.deadline_ms is None:
-        return Fixed(config.update_ms), config.field_options
-    path = None if config.frontier is None else scenario.path.parent / config.frontier
-    points = read_points(path, config.field)
-    speed = scenario.source.get("speed_m_per_s", _USUAL_SPEED_M_PER_S)
-    point = choose(points, config.deadline_ms, float(speed))
-    log.info(
-        "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB, %.1f where it moves)",
-        config.deadline_ms, point.effort, point.update_ms, point.speed_m_per_s, point.psnr_db,
-        point.psnr_moving_db,
-    )  # fmt: skip
-    if point.update_ms > config.deadline_ms:
-        log.warning("no measured update is as short as that: what fits is done")
-    return Deadline(config.deadline_ms, point.update_ms), {**point.options, **config.field_options}
-
-
-class _JsonFile:
-    """A JSON file that another process replaces now and then; read again only when it has changed."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._stamp = -1
-        self._data: dict | None = None
-
-    def __call__(self) -> dict | None:
-        try:
-            stamp = self._path.stat().st_mtime_ns
-            if stamp != self._stamp:
-                self._data, self._stamp = json.loads(self._path.read_text()), stamp
-        except (OSError, ValueError):
-            return self._data
-        return self._data
+def _values(of: Any, *names: str) -> dict[str, Any]:
+    return {name: getattr(of, name) for name in names}

@@ -1,7 +1,7 @@
-"""What a running edge server shows to people and lets them change.
+"""The shared state of a running edge server: what people see of it and what they may change.
 
-One object between the loop and ingest, which write, and page, metrics, status service and report, which
-read. Readers never wait for the field: everything handed out is immutable or copied under a short lock.
+The loop and ingest write it; page, metrics and status service read it. Readers never wait for the field:
+whatever they get is immutable, or was copied under a short lock.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from edge_server.fidelity.scorer import Score
 from edge_server.fields import Renderer
 from freshfield.frame import Frame
 
-if TYPE_CHECKING:  # loaded only where a policy was learnt
+if TYPE_CHECKING:  # imported at run time only where a policy is learned
     from edge_server.scheduler.learned.bandit import Decided
 
 
@@ -28,9 +28,14 @@ if TYPE_CHECKING:  # loaded only where a policy was learnt
 class Publication:
     """One update of the field: a line of series.jsonl and of the report's fidelity series.
 
-    t_s: seconds since the run began, at the instant of publication (the present). aaoi_ms: mean age of the
-    selected views then (6.35). Scores are None until the held-out truth nearest to the present arrives,
-    or where there is nothing to score; truth_gap_ms: distance in time of that truth from the present.
+    t_s, published_ns: instant of publication (the present), in seconds since the run began and on the clock.
+    selected: cameras whose frames were used; ages_ms: their ages then; aaoi_ms: mean of these (6.35).
+    update_ms: from decision to publication.
+    refused: selected cameras whose view the field left out, because it contradicts all others.
+    psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or where there
+    is nothing to score. truth_gap_ms: time from the present to that truth.
+    scored_on: held-out camera, or "selected" where nothing is held out (6.21-6.22).
+    perceptual: the stand-in for LPIPS, where the scenario lists it (edge.metrics).
     """
 
     number: int
@@ -44,16 +49,13 @@ class Publication:
     steps: int = 0
     loss: float | None = None
     refused: tuple[str, ...] = ()
-    """Of the selected cameras, those whose picture the field left out, because it contradicts all others."""
     psnr_db: float | None = None
     psnr_moving_db: float | None = None
     ssim: float | None = None
     lpips: float | None = None
     truth_gap_ms: float | None = None
     scored_on: str | None = None
-    """Held-out camera id, or "selected" where nothing is held out (6.21-6.22)."""
     perceptual: float | None = None
-    """The stand-in for LPIPS, where the scenario lists it (edge.metrics)."""
 
     @property
     def views(self) -> float:
@@ -61,7 +63,7 @@ class Publication:
         return float(len(self.selected))
 
     def scored(self, score: Score) -> Publication:
-        """The same publication with its fidelity."""
+        """This publication with its fidelity."""
         return replace(
             self,
             psnr_db=score.psnr_db,
@@ -76,7 +78,7 @@ class Publication:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera as a reader sees it: its newest frame (still encoded), its age, its counts."""
+    """What readers see of a camera: its newest frame (still encoded), its age, its counts."""
 
     camera: str
     held_out: bool
@@ -88,7 +90,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Held-out truth beside the rendering, both uint8 RGB (H, W, 3)."""
+    """A held-out truth and its rendering, both uint8 RGB (H, W, 3). number: of the publication."""
 
     camera: str
     truth: NDArray[np.uint8]
@@ -98,7 +100,7 @@ class Comparison:
 
 @dataclass
 class Controls:
-    """What an operator may change while it runs. The loop reads it at each decision epoch."""
+    """What an operator may change during a run. The loop reads it at each decision epoch."""
 
     policy: str
     value: float | None
@@ -108,7 +110,15 @@ class Controls:
 
 @dataclass
 class EdgeState:
-    """Shared state of one run. Methods are thread-safe; callbacks are set once by the server."""
+    """The state of one run. Methods are thread-safe; the server sets the callbacks once.
+
+    channel: the emulator's status (channel.json) where it runs on the same machine, else None.
+    decision: the newest decision of a learned policy, with what it saw; None with other policies.
+    embed: embeds images as that policy does, on any thread; None where nothing is embedded.
+    learning: one line on a policy that learns while it is used; empty where none does.
+    bounds: world box (2, 3) in metres of what the field represents, once known.
+    status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
+    """
 
     scenario: str
     policies: tuple[str, ...]
@@ -118,59 +128,56 @@ class EdgeState:
     set_policy: Callable[[str, float | None], None]
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
-    """The emulator's status (channel.json) where it runs on the same machine, else None."""
     decision: Callable[[], Decided | None] = lambda: None
-    """The newest decision of a policy that was learnt, with what it saw; None of any other policy."""
     embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
-    """Embeds pictures as that policy does, on any thread; None where nothing is embedded."""
     field_name: str = ""
     learning: Callable[[], str] = lambda: ""
-    """One line on a policy that learns while it is used; empty where none does."""
     started: bool = False
     bounds: NDArray[np.float64] | None = None
-    """World box (2, 3) in metres of what the field represents, once known."""
-    last_decision: str = ""
-    """One line for people: what the loop is doing, e.g. waiting for a first frame."""
+    status_line: str = ""
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
     _renderer: Renderer | None = None
     _comparison: Comparison | None = None
-    _lock: threading.Lock = field(default_factory=threading.Lock)
     _changed: threading.Condition = field(default_factory=threading.Condition)
 
     def publish(self, publication: Publication, renderer: Renderer) -> None:
-        """The field was updated; wakes everybody who waits."""
-        with self._lock:
+        """Add a publication, and wake everybody who waits."""
+        with self._changed:
             self._publications.append(publication)
             self._renderer = renderer
             self.started = True
-        with self._changed:
             self._changed.notify_all()
 
     def scored(self, publication: Publication, comparison: Comparison | None) -> None:
-        """A publication has got its scores: replaces the unscored record of the same number."""
-        with self._lock:
+        """Replace the publication of the same number by this one, which has scores."""
+        with self._changed:
             for i in range(len(self._publications) - 1, -1, -1):
                 if self._publications[i].number == publication.number:
                     self._publications[i] = publication
                     break
             if comparison is not None:
                 self._comparison = comparison
-        with self._changed:
             self._changed.notify_all()
 
     def publications(self, since: int = -1) -> list[Publication]:
         """Publications with a number above ``since``, oldest first."""
-        with self._lock:
+        with self._changed:
             return [p for p in self._publications if p.number > since]
+
+    def newest(self, scored: bool = False) -> Publication | None:
+        """The newest publication, or the newest one that has scores; None before the first."""
+        with self._changed:
+            every = reversed(self._publications)
+            return next((p for p in every if not scored or p.psnr_db is not None), None)
 
     @property
     def renderer(self) -> Renderer | None:
-        with self._lock:
+        with self._changed:
             return self._renderer
 
     @property
     def comparison(self) -> Comparison | None:
-        with self._lock:
+        with self._changed:
             return self._comparison
 
     def wait_for_change(self, timeout_s: float) -> None:

@@ -1,12 +1,13 @@
-"""How long the next update may fit: a fixed time, or whatever keeps the whole update within a deadline.
+"""How long the next update may fit: a fixed time, or what keeps the whole update within a deadline.
 
-An update is more than its fit: frames are decoded, views packed, the field copied for those who look at it,
-and on a busy machine a step ends late. ``Deadline`` watches what that came to and leaves so much room.
+An update is more than its fit: frames are decoded, views packed, the field copied for its readers, and on a
+busy machine a step ends late. ``DeadlineBudget`` measures this overhead and reserves time for it.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -15,81 +16,87 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol
 
+from edge_server.config import EdgeConfig
 from edge_server.fields import Budget
+from freshfield.scenario import Scenario
 
-# The rest of an update is taken to be as long as the longest of the last 64 was: without a trend, the next is
-# longer once in 65 times. Load comes in bursts, so fewer misses than one in 20 are aimed at; what a hiccup
-# costs is 64 updates that are shorter by it.
+log = logging.getLogger(__name__)
+
+# The reserve is the longest overhead of the last 64 updates: without a trend, the next one is longer once in
+# 65 times. Load comes in bursts, so the aim is fewer misses than one in 20. The price: after one slow update,
+# 64 updates fit for less time.
 _WINDOW = 64
 _MARGIN_MS = 1.0
-# Below this a fit is not worth the decoding of its views.
+# A shorter fit is not worth the decoding of its views.
 _LEAST_MS = 10.0
-# Until an update was measured: the share of the deadline that is not spent fitting.
+# Share of the deadline that is reserved before the first update has been measured.
 _FIRST_RESERVE = 0.2
+# Assumed of a scene whose speed is not given: a person walking.
+_USUAL_SPEED_M_PER_S = 1.0
 
 
-class Pacing(Protocol):
-    """What the loop asks before an update, and tells after it."""
+class UpdateBudget(Protocol):
+    """Sets the fitting time of each update."""
 
-    def budget(self) -> Budget: ...
+    def next(self) -> Budget:
+        """What the next fit may spend."""
+        ...
 
-    def done(self, budget: Budget, update_ms: float) -> None: ...
+    def record(self, budget: Budget, update_ms: float) -> None:
+        """An update of ``budget`` took ``update_ms`` from its decision to its publication."""
+        ...
 
 
 @dataclass(frozen=True)
-class Fixed:
-    """Every update may fit for the same time, whatever else it takes."""
+class FixedBudget:
+    """Every update may fit for ``fit_ms``, however long the rest of it takes."""
 
     fit_ms: float
 
-    def budget(self) -> Budget:
+    def next(self) -> Budget:
         return Budget(seconds=self.fit_ms / 1e3)
 
-    def done(self, budget: Budget, update_ms: float) -> None:
+    def record(self, budget: Budget, update_ms: float) -> None:
         pass
 
 
 @dataclass
-class Deadline:
-    """From decision to publication in ``deadline_ms``; ``fit_ms``: longest fit worth making.
+class DeadlineBudget:
+    """Keeps updates within a deadline.
 
-    met, missed: updates so far. ValueError for a deadline that leaves no time to fit.
+    deadline_ms: from decision to publication; ValueError if it leaves no time to fit.
+    fit_ms: longest fit that is worth it.
     """
 
     deadline_ms: float
     fit_ms: float = math.inf
-    met: int = 0
-    missed: int = 0
-    _rest_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
+    _overhead_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_WINDOW))
 
     def __post_init__(self) -> None:
         if not self.deadline_ms >= 2 * _LEAST_MS:
             raise ValueError(f"deadline_ms: expected {2 * _LEAST_MS:g} or more, got {self.deadline_ms:g}")
 
-    def budget(self) -> Budget:
-        """What the next fit may spend: the deadline less what the rest of an update takes."""
-        if self._rest_ms:
-            reserve = max(self._rest_ms) + _MARGIN_MS
+    def next(self) -> Budget:
+        if self._overhead_ms:
+            reserve = max(self._overhead_ms) + _MARGIN_MS
         else:
             reserve = _FIRST_RESERVE * self.deadline_ms
         return Budget(seconds=max(_LEAST_MS, min(self.deadline_ms - reserve, self.fit_ms)) / 1e3)
 
-    def done(self, budget: Budget, update_ms: float) -> None:
-        """An update of ``budget`` took ``update_ms`` from its decision to its publication."""
+    def record(self, budget: Budget, update_ms: float) -> None:
         assert budget.seconds is not None
-        self._rest_ms.append(update_ms - budget.seconds * 1e3)
-        if update_ms <= self.deadline_ms:
-            self.met += 1
-        else:
-            self.missed += 1
+        self._overhead_ms.append(update_ms - budget.seconds * 1e3)
 
 
 @dataclass(frozen=True)
-class Point:
-    """One measured way to spend an update, and the fidelity at the present it led to.
+class FrontierPoint:
+    """A measured setting of updates, and the fidelity at the present that it led to.
 
-    options: of the field (its effort). update_ms: from decision to publication. psnr_db: whole image;
-    psnr_moving_db: where the scene moves. error_db: standard error of their mean, at most; 0 of one seed.
+    effort, options: name and field options of the setting.
+    speed_m_per_s: of the scene it was measured on.
+    update_ms: from decision to publication.
+    psnr_db: of the whole image; psnr_moving_db: where the scene moves.
+    error_db: upper bound of the standard error of their mean; 0 with one seed.
     """
 
     effort: str
@@ -101,20 +108,23 @@ class Point:
     error_db: float = 0.0
 
     @property
-    def worth_db(self) -> float:
-        """The mean of both: the whole image of a mostly still scene alone would hide what age costs."""
+    def mean_db(self) -> float:
+        """Mean of both: the whole image of a mostly static scene alone would hide what age costs."""
         return 0.5 * (self.psnr_db + self.psnr_moving_db)
 
 
-def read_points(path: Path | None, representation: str) -> list[Point]:
-    """The moving-scene points of a ``frontier.json`` (``edge-server frontier``), for one representation;
-    None: those measured once and shipped. ValueError where the file is none or knows nothing of it."""
+def read_frontier(path: Path | None, representation: str) -> list[FrontierPoint]:
+    """The points of one representation, measured on moving scenes.
+
+    path: a frontier.json of ``edge-server frontier``; None: the shipped one.
+    Raises ValueError for another kind of file, or one without such points.
+    """
     source = path if path is not None else resources.files("edge_server").joinpath("frontier.json")
     try:
         data = json.loads(source.read_text())
         rows: Sequence[Mapping[str, Any]] = data["updates"]
         points = [
-            Point(
+            FrontierPoint(
                 effort=row["effort"],
                 options=dict(row["options"]),
                 speed_m_per_s=float(row["speed_m_per_s"]),
@@ -136,18 +146,38 @@ def read_points(path: Path | None, representation: str) -> list[Point]:
     return points
 
 
-def choose(points: Sequence[Point], deadline_ms: float, speed_m_per_s: float) -> Point:
-    """The best point that fits the deadline, measured at the speed nearest to the scene's; the quickest one
-    where none fits. More time is not always better: what moves grows old meanwhile. Of points that cannot be
-    told from the best one by their seeds, the quickest."""
+def best_point(points: Sequence[FrontierPoint], deadline_ms: float, speed_m_per_s: float) -> FrontierPoint:
+    """The best point within the deadline, among those measured at the speed nearest to the scene's.
 
-    def off(p: Point) -> float:
+    More time is not always better: what moves ages meanwhile. Of points that their seeds cannot distinguish
+    from the best, the fastest is taken; the fastest of all where none meets the deadline.
+    """
+
+    def speed_distance(p: FrontierPoint) -> float:
         return abs(math.log(max(p.speed_m_per_s, 1e-3) / max(speed_m_per_s, 1e-3)))
 
-    nearest = min(off(p) for p in points)
-    here = [p for p in points if off(p) == nearest]
-    fitting = [p for p in here if p.update_ms <= deadline_ms]
+    nearest = min(speed_distance(p) for p in points)
+    candidates = [p for p in points if speed_distance(p) == nearest]
+    fitting = [p for p in candidates if p.update_ms <= deadline_ms]
     if fitting:
-        best = max(fitting, key=lambda p: p.worth_db)
-        here = [p for p in fitting if best.worth_db - p.worth_db <= math.hypot(best.error_db, p.error_db)]
-    return min(here, key=lambda p: (p.update_ms, -p.worth_db))
+        best = max(fitting, key=lambda p: p.mean_db)
+        candidates = [p for p in fitting if best.mean_db - p.mean_db <= math.hypot(best.error_db, p.error_db)]
+    return min(candidates, key=lambda p: (p.update_ms, -p.mean_db))
+
+
+def open_budget(scenario: Scenario, config: EdgeConfig) -> tuple[UpdateBudget, dict[str, Any]]:
+    """The budget that a scenario asks for, and the field's options: the scenario's own, over those of the
+    frontier point that a deadline leads to. ValueError where the frontier cannot be read."""
+    if config.deadline_ms is None:
+        return FixedBudget(config.update_ms), config.field_options
+    path = None if config.frontier is None else scenario.path.parent / config.frontier
+    speed = scenario.source.get("speed_m_per_s", _USUAL_SPEED_M_PER_S)
+    point = best_point(read_frontier(path, config.field), config.deadline_ms, float(speed))
+    log.info(
+        "deadline of %g ms: %s effort, updates of %.0f ms (measured at %g m/s: %.1f dB, %.1f where it moves)",
+        config.deadline_ms, point.effort, point.update_ms, point.speed_m_per_s, point.psnr_db,
+        point.psnr_moving_db,
+    )  # fmt: skip
+    if point.update_ms > config.deadline_ms:
+        log.warning("no measured update is as short as that: updates do what fits")
+    return DeadlineBudget(config.deadline_ms, point.update_ms), {**point.options, **config.field_options}

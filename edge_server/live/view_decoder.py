@@ -1,7 +1,7 @@
-"""Encoded frames become views, as late as possible and once.
+"""Decode buffered frames into views, as late as possible and once.
 
-Pay late: a frame is decoded only when a decision uses it. The cache holds the last decoded frame of each
-camera, because a policy may well select the same frame twice.
+A frame is decoded only when a decision uses it. A policy may well select the same frame twice, so the decoder
+keeps the last view of each camera.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from edge_server.fields import View
-from edge_server.live.buffer import Buffered
+from edge_server.live.buffer import BufferedFrame
 from freshfield import payload
 from freshfield.frame import Frame
 
@@ -18,10 +18,12 @@ if TYPE_CHECKING:
     from edge_server.foreground.foreground import Foreground
 
 
-class Decoder:
-    """Decodes buffered frames. ``undecodable`` counts damaged payloads; one that failed is remembered, so
-    that a frame that stays newest for long is counted once. foreground: cuts the background out of every
-    picture, or None."""
+class ViewDecoder:
+    """Decodes buffered frames.
+
+    foreground: cuts the background out of every image; None leaves images whole.
+    undecodable: number of damaged payloads. A failure is remembered, so that a frame counts once.
+    """
 
     def __init__(self, foreground: Foreground | None = None) -> None:
         self.foreground = foreground
@@ -29,31 +31,12 @@ class Decoder:
         self._earlier: dict[str, tuple[Frame, View | None]] = {}
         self.undecodable = 0
 
-    def views(self, selected: Iterable[Buffered]) -> list[View]:
-        """Views of the selected frames, in their order, without those that cannot be decoded."""
-        return [view for item in selected if (view := self._view(item)) is not None]
+    def views(self, selected: Iterable[BufferedFrame]) -> list[View]:
+        """Views of the selected frames in their order, without those that cannot be decoded."""
+        return [view for item in selected if (view := self.view(item)) is not None]
 
-    def earlier(self, items: Iterable[Buffered]) -> dict[str, View]:
-        """The views that cameras delivered before their newest, camera -> view, without those that cannot be
-        decoded. To be asked before ``views``: what was newest then need not be decoded again."""
-        found = {}
-        for item in items:
-            camera = item.frame.camera
-            known = next(
-                (c for c in (self._earlier.get(camera), self._views.get(camera)) if c and c[0] is item.frame),
-                None,
-            )
-            self._earlier[camera] = known or (item.frame, self._decode(item))
-            view = self._earlier[camera][1]
-            if view is not None:
-                found[camera] = view
-        return found
-
-    def forget_earlier(self) -> None:
-        """Give back the memory of ``earlier``: nobody compares frames any more."""
-        self._earlier.clear()
-
-    def _view(self, item: Buffered) -> View | None:
+    def view(self, item: BufferedFrame) -> View | None:
+        """View of one frame, from then on the camera's last; None where it cannot be decoded."""
         frame = item.frame
         cached = self._views.get(frame.camera)
         if cached is not None and cached[0] is frame:
@@ -62,16 +45,34 @@ class Decoder:
         self._views[frame.camera] = (frame, view)
         return view
 
-    def _decode(self, item: Buffered) -> View | None:
-        frame = item.frame
-        view: View | None = None
+    def earlier(self, items: Iterable[BufferedFrame]) -> dict[str, View]:
+        """Views of the frames before the newest, by camera, without those that cannot be decoded.
+
+        Call it before ``views``: a frame that was the newest one then needs no second decoding.
+        """
+        found = {}
+        for item in items:
+            camera = item.frame.camera
+            cached = (self._earlier.get(camera), self._views.get(camera))
+            known = next((c for c in cached if c is not None and c[0] is item.frame), None)
+            self._earlier[camera] = known or (item.frame, self._decode(item))
+            view = self._earlier[camera][1]
+            if view is not None:
+                found[camera] = view
+        return found
+
+    def forget_earlier(self) -> None:
+        """Free the views of ``earlier``."""
+        self._earlier.clear()
+
+    def _decode(self, item: BufferedFrame) -> View | None:
+        frame, k = item.frame, item.frame.intrinsics
         try:
-            k = frame.intrinsics
             image = payload.decode(frame.payload, frame.codec, k.width, k.height)
-            weight = None
-            if self.foreground is not None:
-                image, weight = self.foreground.apply(frame.camera, image)
-            view = View(frame.camera, image, frame.pose.matrix(), k, item.generated_ns, weight)
         except payload.PayloadError:
             self.undecodable += 1
-        return view
+            return None
+        weight = None
+        if self.foreground is not None:
+            image, weight = self.foreground.apply(frame.camera, image)
+        return View(frame.camera, image, frame.pose.matrix(), k, item.generated_ns, weight)

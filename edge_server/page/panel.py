@@ -101,7 +101,7 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
     return markup.Summary(
         scenario=state.scenario,
         field=state.field_name,
-        doing="paused by the operator" if state.controls.paused else state.last_decision,
+        doing="paused by the operator" if state.controls.paused else state.status_line,
         condition="paused" if state.controls.paused else "live" if state.started else "waiting",
         updates=last.number + 1 if last else 0,
         update_ms=last.update_ms if last else None,

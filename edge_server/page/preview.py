@@ -200,7 +200,7 @@ class Preview:
             controls = self.state.controls
             if controls.reset_requested:
                 controls.reset_requested = False
-                self.state.last_decision = "the field was reset"
+                self.state.status_line = "the field was reset"
             if controls.paused:
                 continue
             decided_ns = self._clock.now_ns()
@@ -210,7 +210,7 @@ class Preview:
             plan = self._policy.plan(epoch)
             selected = self._policy.select(epoch, plan)
             if not selected:
-                self.state.last_decision = "waiting for a frame that qualifies"
+                self.state.status_line = "waiting for a frame that qualifies"
                 continue
             captured_ns = np.array([newest[n].generated_ns for n in selected])
             renderer = self._scene(int(captured_ns.mean()))
@@ -222,7 +222,7 @@ class Preview:
                 number, self.state.now_s(), now_ns, plan.omega_ms, selected, ages, float(np.mean(ages)),
                 (now_ns - decided_ns) / 1e6, scored_on=self._held_out,
             )  # fmt: skip
-            self.state.last_decision = f"used {len(selected)} views of {len(newest)}"
+            self.state.status_line = f"used {len(selected)} views of {len(newest)}"
             self.state.publish(publication, renderer)
             error = float(np.mean((truth.astype(float) - shown) ** 2))
             psnr_db = 10 * np.log10(255.0**2 / error) if error else 99.0

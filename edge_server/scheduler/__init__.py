@@ -97,8 +97,8 @@ POLICIES: dict[str, tuple[str, str, str]] = {
 
 # name -> (module, class, one line of help)
 TREATMENTS: dict[str, tuple[str, str, str]] = {
-    "mask": ("motion_mask", "Mask", "of stale views, pixels that were moving count for less"),
-    "freshen": ("flow_warp", "Freshen", "stale views are carried forward to now by their optical flow"),
+    "mask": ("motion_mask", "MotionMask", "of stale views, pixels that were moving count for less"),
+    "freshen": ("flow_warp", "FlowWarp", "stale views are carried forward to now by their optical flow"),
 }
 
 # Prefix of a policy that was learnt: the path of a learner's checkpoint follows.

@@ -1,14 +1,13 @@
-"""What is done to stale views before they supervise: a stale view is only wrong where something moved.
+"""Treatments of stale views before they supervise: a stale view is wrong only where something moved.
 
-A policy chooses views (``edge_server.scheduler``), a treatment says what of them is still true: it takes the
-chosen views and the frame each camera delivered before, and gives views whose pixels are weighed
-(``View.weight``) and may have been carried forward in time. Pure functions of what they are given: live and
-virtual time share them, and a run repeats bit for bit.
+A policy chooses views (``edge_server.scheduler``). A treatment takes them, with the frame that each camera
+delivered before, and gives each pixel a weight (``View.weight``); it may also warp images forward in time.
+Treatments are pure functions: live and virtual time share them, and a run repeats bit for bit.
 
-Treatments run only where a policy's name asks for one (``threshold+freshen``). They know of motion only what
-one camera's last two frames show, so they leave alone the views of cameras that moved, zoomed or changed
-their size between the two, and of those that have delivered one frame only: what changed there is the
-camera's own doing, and their views stay as true of the static scene as they were.
+They run only where a policy's name asks for one (``threshold+freshen``). All they know of motion is in the
+last two frames of one camera. So they do not change views of cameras that moved, zoomed or changed their
+image size between these two, or that delivered only one frame: changes there come from the camera, and the
+views remain right about the static scene.
 """
 
 from __future__ import annotations
@@ -20,15 +19,16 @@ from edge_server.fields import View
 
 
 class Treatment(Protocol):
-    """Makes stale views fit to supervise the present."""
+    """Prepares stale views to supervise the present."""
 
     @property
     def name(self) -> str: ...
 
     def treat(self, views: Sequence[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
-        """The views, in their order, each as it is or with a weight and an image of its own.
+        """Treat views.
 
-        earlier: camera -> the view it delivered before; cameras without one are missing. now_ns: the present,
-        on the clock of ``generated_ns``.
+        earlier: the view before, by camera; cameras without one are missing.
+        now_ns: the present, on the clock of ``generated_ns``.
+        Returns the views in their order, unchanged or with a weight and an image of their own.
         """
         ...

@@ -1,7 +1,7 @@
 """Wall and virtual clocks behind one method, and the estimate of another machine's clock.
 
-Nothing else in the project reads the wall clock: links, buffers, policies and the edge loop take a time or
-a clock, so that a whole deployment can run in virtual time from one seed.
+Nothing else in the project reads the wall clock: links, buffers, policies and the edge's loop are given a
+time or a clock, so that a whole deployment can run in virtual time from one seed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Clock(Protocol):
 class WallClock:
     """UTC nanoseconds that never step: the wall clock read once, carried on by the monotonic one.
 
-    ``offset_ns`` and ``drift_ppm`` make a deliberately wrong clock (the clock_drift effect).
+    offset_ns, drift_ppm: errors of a deliberately wrong clock (the clock_drift effect).
     """
 
     def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
@@ -34,7 +34,7 @@ class WallClock:
 
 
 class VirtualClock:
-    """A clock that moves only when told; going backwards is a mistake and raises ValueError."""
+    """A clock that ``advance_to`` moves, forward only (else ValueError)."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now = int(start_ns)
@@ -50,16 +50,20 @@ class VirtualClock:
 
 @dataclass(frozen=True)
 class Offset:
-    """Other clock minus own, in ns, and its bound (half the round trip of the exchange it rests on)."""
+    """Another clock minus this one.
+
+    uncertainty_ns: bound of the error, half the round trip of the exchange that the estimate rests on.
+    """
 
     offset_ns: int
     uncertainty_ns: int
 
 
 class OffsetEstimator:
-    """NTP's estimate: of the last ``window`` exchanges, believe the one with the shortest round trip.
+    """NTP's estimate: the offset of the exchange with the shortest round trip among the last ``window``.
 
-    An old exchange loses trust at ``drift_ppm`` so that a drifting clock is followed.
+    The bound of an exchange grows by ``drift_ppm`` of its age, so that the estimate follows a drifting clock.
+    Thread-safe.
     """
 
     def __init__(self, window: int = 16, drift_ppm: float = 50.0) -> None:
@@ -68,7 +72,8 @@ class OffsetEstimator:
         self._lock = threading.Lock()
 
     def add(self, sent_ns: int, received_ns: int, replied_ns: int, returned_ns: int) -> None:
-        """One exchange: own send, other's receive and reply, own return. Impossible ones are ignored."""
+        """One exchange: sent by this clock, received and replied to by the other, returned by this one.
+        Impossible exchanges are ignored."""
         round_trip = (returned_ns - sent_ns) - (replied_ns - received_ns)
         if round_trip < 0 or replied_ns < received_ns:
             return
@@ -77,7 +82,7 @@ class OffsetEstimator:
             self._samples.append((returned_ns, offset, round_trip // 2))
 
     def estimate(self, now_ns: int) -> Offset | None:
-        """Best offset as of ``now_ns`` (own clock), or None before the first exchange."""
+        """Best offset at ``now_ns`` of this clock; None before the first exchange."""
         with self._lock:
             samples = list(self._samples)
         if not samples:

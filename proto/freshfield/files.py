@@ -1,7 +1,7 @@
-"""Files that are whole whenever somebody looks: replaced at once, or grown line by line.
+"""Files that are complete whenever somebody reads them: replaced atomically, or appended line by line.
 
-A full disk costs what could not be written, never the process that writes: appended lines that were lost are
-counted, so that an account can say that it is not complete.
+A full disk never ends the process that writes. Appended lines that were lost are counted, so that whoever
+adds them up can say that something is missing.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
-# Ends a line of which only a part was written, in such a way that no reader of JSON or of tab-separated
-# fields takes the part for the whole.
-_SPOIL = b"\t?" * 6 + b"\n"
+# Ends a line of which only a part was written: no reader of JSON or of tab-separated fields accepts it.
+_LINE_SPOILER = b"\t?" * 6 + b"\n"
 
 
 def write_json(path: Path, data: Any, indent: int | None = None) -> None:
-    """Replace ``path`` by ``data`` as JSON; see ``write_text``. ValueError for NaN, which JSON lacks."""
+    """Replace ``path`` by ``data`` as JSON; see ``write_bytes``. ValueError for NaN, which JSON lacks."""
     write_text(path, json.dumps(data, allow_nan=False, indent=indent) + "\n")
 
 
@@ -32,10 +31,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Replace ``path`` at once: a reader sees the old file or the new one, never half of one.
+    """Replace ``path`` atomically: a reader sees the old file or the new one, never half of one.
 
-    Any number of threads, processes and machines sharing the folder may do so. OSError where it cannot be
-    written; the old file is then untouched and nothing is left beside it.
+    Any number of threads, processes and machines that share the folder may do so at once. OSError where the
+    file cannot be written: the old one then stays, and nothing is left beside it.
     """
     # The process id is not enough: threads share it, and containers that share a folder often do.
     part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
@@ -48,20 +47,20 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 class Lines:
-    """Appends whole lines to a file. Thread-safe; each line is a single O_APPEND write, so that what was
-    written survives SIGKILL. A line that cannot be written is counted in ``lost`` and said once in the log.
+    """Appends whole lines to a file. Thread-safe.
 
-    first: written at once; OSError if that, or opening the file, fails.
+    Each line is a single O_APPEND write, so that it survives SIGKILL. Lines that cannot be written are
+    counted in ``lost``; the first of them is logged.
+    first: line to begin with. OSError if it cannot be written, or the file not opened.
     """
 
     def __init__(self, path: Path, first: str = "") -> None:
         self.path = path
         self.lost = 0
-        """Lines that could not be written."""
         self._lock = threading.Lock()
         self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
         size = os.fstat(self._fd).st_size
-        # A writer that was killed may have left half a line, which must not swallow the next one.
+        # A writer that was killed may have left half a line; the next one must not continue it.
         self._torn = size > 0 and os.pread(self._fd, 1, size - 1) != b"\n"
         if first and not self.write(first):
             self.close()
@@ -72,7 +71,7 @@ class Lines:
         with self._lock:
             if self._fd < 0:
                 return False
-            data = (_SPOIL if self._torn else b"") + line.encode() + b"\n"
+            data = (_LINE_SPOILER if self._torn else b"") + line.encode() + b"\n"
             try:
                 written = os.write(self._fd, data)
             except OSError as error:
@@ -95,3 +94,22 @@ class Lines:
         self.lost += 1
         if self.lost == 1:
             log.warning("%s: cannot be written (%s); lines are lost until it can be again", self.path, why)
+
+
+class ReplacedJson:
+    """A JSON file that another process replaces from time to time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._modified_ns = -1
+        self._data: Any = None
+
+    def read(self) -> Any:
+        """Its newest readable content, None before the first; parsed again only if the file has changed."""
+        try:
+            modified_ns = self._path.stat().st_mtime_ns
+            if modified_ns != self._modified_ns:
+                self._data, self._modified_ns = json.loads(self._path.read_text()), modified_ns
+        except (OSError, ValueError):
+            pass
+        return self._data

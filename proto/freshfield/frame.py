@@ -1,6 +1,6 @@
-"""A frame as Python sees it, and its way to and from the wire, with every stateless check.
+"""A frame in Python, its conversion to and from the wire message, and every stateless check of it.
 
-What needs memory (sequence order, clocks) is checked by the edge's ingest.
+The edge's ingest checks what needs memory: the order of sequence numbers, and clocks.
 """
 
 from __future__ import annotations
@@ -12,20 +12,18 @@ from dataclasses import dataclass
 
 import google_crc32c
 
-from freshfield import payload
-from freshfield.geometry import GeometryError, Pinhole, Pose, invertible, quaternion_normalise
+from freshfield import limits, payload
+from freshfield.geometry import GeometryError, Pinhole, Pose, invertible, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 
-_ID = re.compile(rf"[A-Za-z0-9._-]{{1,{payload.MAX_ID_CHARS}}}")
+_ID = re.compile(rf"[A-Za-z0-9._-]{{1,{limits.MAX_ID_CHARS}}}")
 _CODECS = {"jpeg": pb.CODEC_JPEG, "png": pb.CODEC_PNG, "zstd": pb.CODEC_ZSTD}
-_CODEC_NAMES = {number: name for name, number in _CODECS.items()}
+CODEC_NAMES = {number: name for name, number in _CODECS.items()}
 _PACKED = struct.Struct("<QqqqqIIII7d8d")
-# Translations beyond this are a wrong unit (millimetres of a kilometre) or garbage.
-_MAX_TRANSLATION_M = 1e6
 
 
 class FrameRejected(ValueError):
-    """A frame refused at the door. ``reason`` is the counted name, the message is for a person."""
+    """A frame that is refused on arrival. reason: the name that is counted; the message is for people."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -34,8 +32,13 @@ class FrameRejected(ValueError):
 
 @dataclass(frozen=True)
 class Frame:
-    """One captured image on its way. ``generated_ns`` is on the node's clock; ``generated_edge_ns`` adds
-    the node's estimate of the offset."""
+    """One captured image with its pose.
+
+    generated_ns: capture time on the node's clock.
+    clock_offset_ns, clock_uncertainty_ns: edge clock minus node clock, as the node estimates it.
+    pose_gap_ns: between the capture and the pose sample it was paired with.
+    held_out: never trained on; fidelity is measured against it.
+    """
 
     camera: str
     session: str
@@ -52,17 +55,18 @@ class Frame:
 
     @property
     def generated_edge_ns(self) -> int:
+        """Capture time on the edge's clock."""
         return self.generated_ns + self.clock_offset_ns
 
 
 def valid_id(text: str) -> bool:
-    """Camera and session ids: 1 to 64 letters, digits, dot, underscore, hyphen."""
+    """Whether ``text`` may be a camera or session id: 1 to 64 letters, digits, '.', '_', '-'."""
     return _ID.fullmatch(text) is not None
 
 
 def checksum(header: pb.FrameHeader, data: bytes) -> int:
-    """CRC32C over the header's fields, packed in a fixed order, then the payload: a flipped bit in a pose
-    must not become a wrong pose."""
+    """CRC32C over the header's fields, packed in a fixed order, and the payload: a flipped bit must not turn
+    into a wrong pose."""
     p, k = header.pose, header.intrinsics
     packed = _PACKED.pack(
         header.sequence, header.generated_ns, header.clock_offset_ns, header.clock_uncertainty_ns,
@@ -75,7 +79,7 @@ def checksum(header: pb.FrameHeader, data: bytes) -> int:
 
 
 def to_request(frame: Frame) -> pb.PushRequest:
-    """The wire message of a frame, checksummed."""
+    """The wire message of a frame, with its checksum."""
     q, t, k = frame.pose.quaternion, frame.pose.translation_m, frame.intrinsics
     header = pb.FrameHeader(
         camera_id=frame.camera,
@@ -99,24 +103,24 @@ def to_request(frame: Frame) -> pb.PushRequest:
 
 
 def pose_and_lens(h: pb.FrameHeader) -> tuple[Pose, Pinhole]:
-    """Pose and lens of a header as they stand in it, to the bit and unchecked: to send them again."""
+    """Pose and lens of a header, bit for bit and unchecked, for whoever sends them again."""
     p, k = h.pose, h.intrinsics
     lens = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
     return Pose((p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)), lens
 
 
 def from_request(request: pb.PushRequest) -> Frame:
-    """Check everything that needs no memory and return the frame; the payload stays encoded.
+    """Check a message and return its frame, the payload still encoded.
 
-    Raises FrameRejected with reason bad_id, bad_header, crc_mismatch, bad_pose, bad_intrinsics, or one of
-    payload.check's (too_large, unknown_codec, bad_payload, size_mismatch).
+    Raises FrameRejected with reason bad_id, bad_header, crc_mismatch, bad_pose, bad_intrinsics, or a reason
+    of ``payload.check`` (too_large, unknown_codec, bad_payload, size_mismatch).
     """
     h = request.header
     if not valid_id(h.camera_id) or not valid_id(h.session_id):
         raise FrameRejected("bad_id", "camera and session ids are 1 to 64 letters, digits, '.', '_', '-'")
     if checksum(h, request.payload) != request.crc32c:
         raise FrameRejected("crc_mismatch", f"frame {h.sequence} of {h.camera_id} was damaged on the way")
-    codec = _CODEC_NAMES.get(h.codec)
+    codec = CODEC_NAMES.get(h.codec)
     if codec is None:
         raise FrameRejected("unknown_codec", f"codec number {h.codec} is not known here")
     if h.role not in (pb.ROLE_TRAIN, pb.ROLE_HELD_OUT):
@@ -148,12 +152,12 @@ def _pose(p: pb.Pose) -> Pose:
     q, t = (p.qw, p.qx, p.qy, p.qz), (p.tx_m, p.ty_m, p.tz_m)
     if not all(math.isfinite(v) for v in (*q, *t)):
         raise FrameRejected("bad_pose", "pose is not finite")
-    if abs(math.sqrt(sum(v * v for v in q)) - 1.0) > 1e-3:
+    if abs(math.sqrt(sum(v * v for v in q)) - 1.0) > limits.MAX_QUATERNION_ERROR:
         raise FrameRejected("bad_pose", "pose quaternion is not of unit length")
-    if max(abs(v) for v in t) > _MAX_TRANSLATION_M:
-        raise FrameRejected("bad_pose", f"camera is more than {_MAX_TRANSLATION_M:g} m from the origin")
+    if max(abs(v) for v in t) > limits.MAX_TRANSLATION_M:
+        raise FrameRejected("bad_pose", f"camera is more than {limits.MAX_TRANSLATION_M:g} m from the origin")
     try:
-        unit = quaternion_normalise(q)
+        unit = quaternion_normalize(q)
     except GeometryError as error:
         raise FrameRejected("bad_pose", str(error)) from None
     return Pose(tuple(map(float, unit)), t)  # type: ignore[arg-type]
@@ -164,16 +168,22 @@ def _intrinsics(h: pb.FrameHeader) -> Pinhole:
     values = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2)
     if not all(math.isfinite(v) for v in values):
         raise FrameRejected("bad_intrinsics", "intrinsics are not finite")
-    if not (0 < h.width <= payload.MAX_IMAGE_SIDE and 0 < h.height <= payload.MAX_IMAGE_SIDE):
-        raise FrameRejected("too_large", f"{h.width} x {h.height} is not within 1..{payload.MAX_IMAGE_SIDE}")
-    # 1/16 of the width is a 166 degree lens, beyond what a pinhole can describe.
-    if min(k.fx, k.fy) < max(h.width, h.height) / 16 or max(k.fx, k.fy) > 1e6:
+    if not (0 < h.width <= limits.MAX_IMAGE_SIDE_PX and 0 < h.height <= limits.MAX_IMAGE_SIDE_PX):
+        raise FrameRejected(
+            "too_large", f"{h.width} x {h.height} is not within 1..{limits.MAX_IMAGE_SIDE_PX}"
+        )
+    if (
+        min(k.fx, k.fy) < max(h.width, h.height) * limits.MIN_FOCAL_PER_SIDE
+        or max(k.fx, k.fy) > limits.MAX_FOCAL_PX
+    ):
         raise FrameRejected(
             "bad_intrinsics", f"focal lengths {k.fx:g}, {k.fy:g} px do not fit the image size"
         )
-    if max(abs(v) for v in (k.k1, k.k2, k.p1, k.p2)) > 100:
+    if max(abs(v) for v in (k.k1, k.k2, k.p1, k.p2)) > limits.MAX_DISTORTION:
         raise FrameRejected("bad_intrinsics", "distortion coefficients are beyond any lens")
-    if not (-h.width <= k.cx <= 2 * h.width and -h.height <= k.cy <= 2 * h.height):
+    sides = limits.MAX_CENTER_OUTSIDE_SIDES
+    x_fits = -sides * h.width <= k.cx <= (1 + sides) * h.width
+    if not (x_fits and -sides * h.height <= k.cy <= (1 + sides) * h.height):
         raise FrameRejected("bad_intrinsics", "principal point is far outside the image")
     camera = Pinhole(h.width, h.height, k.fx, k.fy, k.cx, k.cy, (k.k1, k.k2, k.p1, k.p2))
     if not invertible(camera):

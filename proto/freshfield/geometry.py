@@ -1,13 +1,13 @@
-"""Rigid motions, pinhole cameras and axis conventions: the one place where they are decided.
+"""Rigid motions, pinhole cameras and the conventions of axes.
 
-Conventions used everywhere in this project (loaders convert at the door):
+Conventions of the whole project (loaders convert to them when they read):
 
 * poses are **camera-to-world** (``T_W^C``), in metres;
 * camera axes are **OpenCV's**: x right, y down, z forward;
 * quaternions are **w first**, unit length;
-* pixel coordinates have their origin at the **corner** of the top-left pixel, so the centre of that
-  pixel is (0.5, 0.5) and a centred principal point is (width / 2, height / 2). OpenCV calibrations,
-  whose pixel centres are integers, gain 0.5 when they are read.
+* pixel coordinates have their origin at the **corner** of the top-left pixel, so the center of that
+  pixel is (0.5, 0.5) and a centered principal point is (width / 2, height / 2). OpenCV calibrations,
+  whose pixel centers are integers, gain 0.5 when they are read.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from freshfield.limits import MAX_LENS_ERROR_PX, MAX_QUATERNION_ERROR
 
 Array = NDArray[np.float64]
 
@@ -35,8 +37,8 @@ class GeometryError(ValueError):
 # --- quaternions ------------------------------------------------------------------------------
 
 
-def quaternion_normalise(q: ArrayLike) -> Array:
-    """Unit quaternion(s) (..., 4), w >= 0. Raises GeometryError for a zero or non-finite one."""
+def quaternion_normalize(q: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) with w >= 0. Raises GeometryError for a zero or non-finite one."""
     given = np.asarray(q, dtype=np.float64)
     scale = np.max(np.abs(given), axis=-1, keepdims=True)
     if not np.all(np.isfinite(given)) or np.any(scale == 0.0):
@@ -62,8 +64,8 @@ def quaternion_multiply(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def quaternion_to_matrix(q: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4); normalises first."""
-    w, x, y, z = np.moveaxis(quaternion_normalise(q), -1, 0)
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4); normalizes first."""
+    w, x, y, z = np.moveaxis(quaternion_normalize(q), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -88,20 +90,20 @@ def matrix_to_quaternion(rotation: ArrayLike) -> Array:
         q[1 + i] = 1 + m[i, i] - m[j, j] - m[k, k]
         q[1 + j] = m[j, i] + m[i, j]
         q[1 + k] = m[k, i] + m[i, k]
-    return quaternion_normalise(q)
+    return quaternion_normalize(q)
 
 
 def slerp(a: ArrayLike, b: ArrayLike, fraction: float) -> Array:
     """Quaternion (4,) at ``fraction`` of the shorter way from a to b; exact at 0 and 1."""
-    a, b = quaternion_normalise(a), quaternion_normalise(b)
+    a, b = quaternion_normalize(a), quaternion_normalize(b)
     dot = float(np.dot(a, b))
     if dot < 0.0:
         b, dot = -b, -dot
     angle = np.arccos(np.clip(dot, -1.0, 1.0))
     if angle < _SMALL_ANGLE:
-        return quaternion_normalise((1 - fraction) * a + fraction * b)
+        return quaternion_normalize((1 - fraction) * a + fraction * b)
     q = np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b
-    return quaternion_normalise(q)
+    return quaternion_normalize(q)
 
 
 # --- SO(3) and SE(3) --------------------------------------------------------------------------
@@ -159,7 +161,7 @@ class Pose:
         if m.shape not in ((4, 4), (3, 4)) or not np.all(np.isfinite(m)):
             raise GeometryError("pose must be a finite 3 x 4 or 4 x 4 matrix")
         r = m[:3, :3]
-        if np.abs(r @ r.T - np.eye(3)).max() > 1e-3 or np.linalg.det(r) < 0:
+        if np.abs(r @ r.T - np.eye(3)).max() > MAX_QUATERNION_ERROR or np.linalg.det(r) < 0:
             raise GeometryError("the pose's rotation is not orthonormal and right-handed")
         q = matrix_to_quaternion(r)
         return Pose(tuple(map(float, q)), tuple(map(float, m[:3, 3])))  # type: ignore[arg-type]
@@ -180,7 +182,7 @@ class Pose:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """Camera-to-world (4, 4) at ``eye`` looking at ``target``; image-up is as near to ``up`` as can be."""
+    """Camera-to-world (4, 4) at ``eye`` looking at ``target``; image-up is as near to ``up`` as possible."""
     eye, target = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64)
     forward = target - eye
     distance = np.linalg.norm(forward)
@@ -188,7 +190,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
         raise GeometryError("look_at: the eye and the target are the same point")
     forward = forward / distance
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
-    if np.linalg.norm(right) < 1e-9:  # looking along ``up``: any right hand will do
+    if np.linalg.norm(right) < 1e-9:  # looking along ``up``: any right axis will do
         right = np.cross(forward, [1.0, 0.0, 0.0])
         if np.linalg.norm(right) < 1e-9:
             right = np.cross(forward, [0.0, 1.0, 0.0])
@@ -216,7 +218,7 @@ class Pinhole:
 
     @staticmethod
     def from_fov(width: int, height: int, horizontal_fov_deg: float) -> Pinhole:
-        """Centred square-pixel camera with the given horizontal field of view."""
+        """Centered square-pixel camera with the given horizontal field of view."""
         f = 0.5 * width / np.tan(0.5 * np.deg2rad(horizontal_fov_deg))
         return Pinhole(width, height, float(f), float(f), width / 2.0, height / 2.0)
 
@@ -275,27 +277,27 @@ class Pinhole:
 
 
 def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Array]:
-    """Origin (3,) and unit directions (H, W, 3) in world axes of every pixel's centre."""
+    """Origin (3,) and unit directions (H, W, 3) in world axes of every pixel's center."""
     m = np.asarray(camera_to_world, dtype=np.float64)
     return m[:3, 3].copy(), camera.rays() @ m[:3, :3].T
 
 
-# How far from where it started a point may come out of undistortion and back.
-_MAX_LENS_ERROR_PX = 1.0
-_RASTER = 33
+_RASTER_POINTS = 33  # points a side at which a lens is checked
 
 
-# Every frame of a camera brings the same lens. Bounded, because a stranger's frames may not.
+# Every frame of a camera has the same lens. The cache is bounded, because hostile frames may not.
 @lru_cache(maxsize=1024)
 def invertible(camera: Pinhole) -> bool:
-    """Whether rays through a raster over the whole image, its edges included, are finite and re-project to
-    where they came from: undistortion diverges for coefficients that no lens has."""
+    """Whether undistortion and projection bring the pixels of a raster over the whole image, its edges
+    included, back to where they were. Undistortion diverges for coefficients that no lens has."""
     if not camera.distorted:
         return True
-    u, v = np.meshgrid(np.linspace(0.0, camera.width, _RASTER), np.linspace(0.0, camera.height, _RASTER))
+    u, v = np.meshgrid(
+        np.linspace(0.0, camera.width, _RASTER_POINTS), np.linspace(0.0, camera.height, _RASTER_POINTS)
+    )
     points = np.stack([u.ravel(), v.ravel()], axis=-1)
     with np.errstate(all="ignore"):
         rays = camera.rays(points)
         error_px = np.abs(camera.project(rays) - points)
     # A NaN compares as False.
-    return bool(np.isfinite(rays).all() and (error_px <= _MAX_LENS_ERROR_PX).all())
+    return bool(np.isfinite(rays).all() and (error_px <= MAX_LENS_ERROR_PX).all())

@@ -1,7 +1,7 @@
-"""A small append-only account of what happened to each frame, one file per process instance.
+"""What happened to each frame: one append-only file per process instance.
 
-Every event is one ``write`` of one line, so what was written survives SIGKILL; at worst the last line is
-torn (no newline), and readers drop it. Lines are tab-separated::
+Every event is one ``write`` of one line, which survives SIGKILL; at worst the last line is torn (it has no
+newline), and readers drop it. Lines are tab-separated::
 
     t_ns  camera  session  sequence  event  detail
 
@@ -25,7 +25,6 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +32,7 @@ from freshfield.files import Lines
 
 VERSION = 1
 ROLES = ("node", "emulator", "edge")
-# Where the last event is looked for without reading the file; thousands of lines.
+# The last event is searched for in the end of the file: thousands of lines.
 _TAIL_BYTES = 1 << 16
 _HEAD_BYTES = 1 << 12
 
@@ -50,9 +49,11 @@ class Event(NamedTuple):
 
 
 class Ledger:
-    """Writes one process's events. Thread-safe: each event is a single O_APPEND write. A full disk costs
-    lines, which are counted in ``lines_lost`` and accounted for as soon as there is space again. OSError
-    where the file cannot be begun."""
+    """Writes the events of one process. Thread-safe: each event is a single O_APPEND write.
+
+    Lines lost to a full disk are counted in ``lines_lost``, and the ledger says so as soon as there is space
+    again. OSError where the file cannot be begun.
+    """
 
     def __init__(self, out: Path, role: str, name: str, start_ns: int) -> None:
         if role not in ROLES:
@@ -60,39 +61,40 @@ class Ledger:
         out.mkdir(parents=True, exist_ok=True)
         self.path = out / f"ledger-{role}-{name}-{start_ns}.tsv"
         self._lines = Lines(self.path, f"#freshfield-ledger {VERSION} {role} {name} {os.getpid()}")
-        self._said = 0
-        self._saying = threading.Lock()
+        self._lost_reported = 0
+        self._reporting = threading.Lock()
 
     @property
     def lines_lost(self) -> int:
-        """Lines that could not be written so far."""
+        """Number of lines that could not be written so far."""
         return self._lines.lost
 
     def write(
         self, t_ns: int, camera: str, session: str, sequence: int, event: str, detail: str = ""
     ) -> None:
         written = self._lines.write(f"{t_ns}\t{camera}\t{session}\t{sequence}\t{event}\t{detail}")
-        if written and self._lines.lost > self._said:
-            self._say_lost(t_ns)
+        if written and self._lines.lost > self._lost_reported:
+            self._report_lost(t_ns)
 
     def close(self, t_ns: int) -> None:
-        if self._lines.lost > self._said:
-            self._say_lost(t_ns)
+        if self._lines.lost > self._lost_reported:
+            self._report_lost(t_ns)
         self._lines.write(f"{t_ns}\t\t\t0\tclosed\t{self._lines.lost or ''}")
         self._lines.close()
 
-    def _say_lost(self, t_ns: int) -> None:
-        with self._saying:
+    def _report_lost(self, t_ns: int) -> None:
+        with self._reporting:
             lost = self._lines.lost
-            if lost > self._said and self._lines.write(f"{t_ns}\t\t\t0\tlost_lines\t{lost - self._said}"):
-                self._said = lost
+            new = lost - self._lost_reported
+            if new > 0 and self._lines.write(f"{t_ns}\t\t\t0\tlost_lines\t{new}"):
+                self._lost_reported = lost
 
 
 class LedgerReader:
-    """One ledger, read a line at a time, so that its length costs no memory; iterate once or again.
+    """One ledger. Iterating, once or again, reads a line at a time, so that its length takes no memory.
 
-    Raises ValueError if the file is no ledger of this version, OSError if it cannot be read. ``torn`` is
-    True once a line, the last or any other, could not be read and was left out; known after iterating.
+    torn: whether an iteration left out a line, the last one or any other, that could not be read.
+    Raises ValueError if the file is not a ledger of this version, OSError if it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -120,8 +122,13 @@ class LedgerReader:
                 else:
                     yield event
 
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """All events, in memory."""
+        return tuple(self)
+
     def last(self) -> Event | None:
-        """The last event that can be read, from the end of the file alone."""
+        """The last event that can be read, found without reading the whole file."""
         with self.path.open("rb") as file:
             end = file.seek(0, 2)
             start = max(self._body, end - _TAIL_BYTES)
@@ -132,45 +139,20 @@ class LedgerReader:
 
     @property
     def complete(self) -> bool:
-        """Ended in order and without a lost line: what is not written here did not happen."""
+        """Whether the process ended in order and lost no line: what is not written here did not happen."""
         last = self.last()
         return last is not None and last.event == "closed" and not last.detail
 
     @property
     def closed(self) -> bool:
-        """The process ended in order."""
+        """Whether the process ended in order."""
         last = self.last()
         return last is not None and last.event == "closed"
 
 
-@dataclass(frozen=True)
-class LedgerFile:
-    """A whole ledger in memory; for long ones see LedgerReader."""
-
-    path: Path
-    role: str
-    name: str
-    pid: int
-    events: tuple[Event, ...]
-    torn: bool
-    """True if the last line, or any other, could not be read and was left out."""
-
-    @property
-    def closed(self) -> bool:
-        return bool(self.events) and self.events[-1].event == "closed"
-
-
-def read(path: Path) -> LedgerFile:
-    """Read one ledger, leaving out torn lines. Raises ValueError if it is no ledger of this version."""
-    reader = LedgerReader(path)
-    events = tuple(reader)
-    return LedgerFile(path, reader.role, reader.name, reader.pid, events, reader.torn)
-
-
-def read_all(out: Path) -> Iterator[LedgerFile]:
-    """Every ledger under ``out`` (not recursive), in the order of their names."""
-    for path in sorted(out.glob("ledger-*.tsv")):
-        yield read(path)
+def read_all(out: Path) -> list[LedgerReader]:
+    """Every ledger in ``out`` (not in its folders), in the order of their names."""
+    return [LedgerReader(path) for path in sorted(out.glob("ledger-*.tsv"))]
 
 
 def _parse(line: bytes) -> Event | None:
@@ -179,7 +161,7 @@ def _parse(line: bytes) -> Event | None:
         return None
     try:
         t_ns, camera, session, sequence, event, detail = line[:-1].decode(errors="replace").split("\t")
-        # The same few names stand in every line: keep one of each.
+        # The same few names stand in every line: keep one copy of each.
         names = (sys.intern(camera), sys.intern(session), int(sequence), sys.intern(event))
         return Event(int(t_ns), *names, detail)
     except ValueError:

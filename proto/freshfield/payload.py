@@ -1,7 +1,7 @@
-"""Image <-> bytes, and every limit on what may cross the wire, in one place.
+"""Encode images into payloads and decode them again.
 
-Limits are checked on headers *before* anything is inflated: a 109 kB PNG can claim 2.7 GB of pixels, OpenCV
-makes room for as many bytes as a PNG's chunk says it has (one flipped bit: 4 GB, 5 s), and a zstandard frame
+The limits are checked on headers *before* anything is inflated: a 109 kB PNG can claim 2.7 GB of pixels,
+OpenCV allocates as many bytes as a PNG's chunk claims (one flipped bit: 4 GB, 5 s), and a zstandard frame
 that declares its size ignores ``max_output_size``.
 """
 
@@ -10,26 +10,21 @@ from __future__ import annotations
 import os
 import struct
 
-MAX_MESSAGE_BYTES = 8 * 2**20
-MAX_IMAGE_SIDE = 4096
-MAX_PNG_CHUNKS = 10_000  # of a message's 8 MB; encoders write 8 kB or more into one
-MAX_ID_CHARS = 64
-MAX_FUTURE_NS = 250_000_000  # a capture may not lie further ahead of the edge's clock than this
-MAX_PAST_NS = 3600 * 10**9  # nor further behind: an hour-old frame is a broken clock, not a slow link
+from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES, MAX_PNG_CHUNKS
 
-# OpenCV reads this when it is first imported: a second fence behind the header checks below.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE**2))
+# OpenCV reads this when it is first imported: a second barrier behind the header checks below.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_SIDE_PX**2))
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-import zstandard  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
+import cv2
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
 
 CODECS = ("jpeg", "png", "zstd")
 
 
 class PayloadError(ValueError):
-    """A payload that is refused; ``reason`` is the short counted name, the message is for a person."""
+    """A payload that is refused. reason: the short name that is counted; the message is for people."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -37,16 +32,18 @@ class PayloadError(ValueError):
 
 
 def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> bytes:
-    """Compress an RGB (H, W, 3) or RGBA (H, W, 4) uint8 image.
+    """Compress an image.
 
-    jpeg: ``quality`` 1..100, colour not subsampled from 90 up, RGB only. png: lossless, keeps alpha.
-    zstd: raw RGB, lossless. Raises PayloadError for a shape or codec that cannot be sent.
+    image: uint8 RGB (H, W, 3) or RGBA (H, W, 4).
+    codec: ``jpeg`` (RGB), ``png`` (lossless, keeps alpha) or ``zstd`` (raw RGB, lossless).
+    quality: of jpeg, 1..100; from 90 up the color is not subsampled.
+    Raises PayloadError for a shape or codec that cannot be sent.
     """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise PayloadError("bad_image", f"expected uint8 (H, W, 3 or 4), got {image.dtype} {image.shape}")
-    if max(image.shape[:2]) > MAX_IMAGE_SIDE or min(image.shape[:2]) < 1:
+    if max(image.shape[:2]) > MAX_IMAGE_SIDE_PX or min(image.shape[:2]) < 1:
         raise PayloadError(
-            "too_large", f"{image.shape[1]} x {image.shape[0]} exceeds {MAX_IMAGE_SIDE} a side"
+            "too_large", f"{image.shape[1]} x {image.shape[0]} exceeds {MAX_IMAGE_SIDE_PX} a side"
         )
     if codec == "zstd":
         return zstandard.ZstdCompressor(level=1).compress(np.ascontiguousarray(image[..., :3]).tobytes())
@@ -67,15 +64,15 @@ def encode(image: NDArray[np.uint8], codec: str = "jpeg", quality: int = 92) -> 
 
 
 def check(payload: bytes, codec: str, width: int, height: int) -> None:
-    """Refuse, by headers alone, what must not be decoded. Costs microseconds.
+    """Refuse, by headers alone, what must not be decoded. Takes microseconds.
 
-    Raises PayloadError: ``too_large``, ``unknown_codec``, ``bad_payload`` (no such format, or a png that ends
-    early), or ``size_mismatch`` (the image is not width x height as announced).
+    Raises PayloadError: ``too_large``, ``unknown_codec``, ``bad_payload`` (not this format, or a PNG that
+    ends early), or ``size_mismatch`` (the image is not width x height as announced).
     """
-    if len(payload) > MAX_MESSAGE_BYTES:
-        raise PayloadError("too_large", f"payload of {len(payload)} bytes exceeds {MAX_MESSAGE_BYTES}")
-    if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE):
-        raise PayloadError("too_large", f"{width} x {height} is not within 1..{MAX_IMAGE_SIDE} a side")
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise PayloadError("too_large", f"payload of {len(payload)} bytes exceeds {MAX_PAYLOAD_BYTES}")
+    if not (0 < width <= MAX_IMAGE_SIDE_PX and 0 < height <= MAX_IMAGE_SIDE_PX):
+        raise PayloadError("too_large", f"{width} x {height} is not within 1..{MAX_IMAGE_SIDE_PX} a side")
     if codec == "zstd":
         try:
             declared = zstandard.get_frame_parameters(payload).content_size
@@ -97,9 +94,9 @@ def check(payload: bytes, codec: str, width: int, height: int) -> None:
 
 
 def decode(payload: bytes, codec: str, width: int, height: int) -> NDArray[np.uint8]:
-    """RGB (H, W, 3) or RGBA (H, W, 4) uint8 of a payload that passed ``check`` (which is run again).
+    """Decode a payload to uint8 RGB (H, W, 3) or RGBA (H, W, 4), after ``check``.
 
-    Raises PayloadError with reason ``undecodable`` for damaged data.
+    Raises PayloadError: those of ``check``, and ``undecodable`` for damaged data.
     """
     check(payload, codec, width, height)
     if codec == "zstd":
@@ -125,7 +122,7 @@ def decode(payload: bytes, codec: str, width: int, height: int) -> NDArray[np.ui
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:
-    """Size in the header; None unless every chunk up to the last one lies within the data."""
+    """Width and height in the header; None unless every chunk up to the last lies within the data."""
     if len(data) < 33 or data[:8] != b"\x89PNG\r\n\x1a\n" or data[12:16] != b"IHDR":
         return None
     at, width, height = 8, *struct.unpack(">II", data[16:24])
@@ -142,7 +139,7 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Size in the first start-of-frame segment; None unless there is exactly one before the scan."""
+    """Width and height in the start-of-frame segment; None unless exactly one stands before the scan."""
     if data[:2] != b"\xff\xd8":
         return None
     at, size = 2, None

@@ -29,13 +29,13 @@ import numpy as np
 import yaml
 
 from freshfield.frame import valid_id
+from freshfield.limits import MAX_CAMERAS
 
 T = TypeVar("T")
 _HERE = Path(__file__).resolve()
 _CHECKOUT = _HERE.parents[2] / "deploy" / "scenarios"
 SCENARIO_FOLDER = _CHECKOUT if _CHECKOUT.is_dir() else _HERE.parent / "scenarios"
 """The shipped scenarios: of the checkout, or those that an installed wheel carries."""
-MAX_CAMERAS = 1000
 
 
 class ScenarioError(ValueError):
@@ -44,7 +44,11 @@ class ScenarioError(ValueError):
 
 @dataclass(frozen=True)
 class Cameras:
-    """Who takes part. count: cam00, cam01, ...; ids: named instead. held_out: never trained on."""
+    """The section ``cameras``.
+
+    count: of cameras, named cam00, cam01, ...; ids: their names instead.
+    held_out: those never trained on.
+    """
 
     count: int = 0
     ids: list[str] = field(default_factory=list)
@@ -53,7 +57,7 @@ class Cameras:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A parsed scenario file; the sections stay mappings until their package reads them."""
+    """A parsed scenario file. The sections stay mappings until their package reads them."""
 
     path: Path
     name: str
@@ -70,7 +74,8 @@ class Scenario:
         return tuple(c for c in self.cameras if c not in self.held_out)
 
     def rng(self, purpose: str, camera: str | None = None) -> np.random.Generator:
-        """An independent stream for a purpose and camera: adding a camera does not change the others'."""
+        """The random stream of a purpose and camera. Streams are independent: adding a camera does not change
+        those of the others."""
         return np.random.default_rng(self.seed_sequence(purpose, camera))
 
     def seed_sequence(self, purpose: str, camera: str | None = None) -> np.random.SeedSequence:
@@ -79,9 +84,11 @@ class Scenario:
 
 
 def load(path: str | Path, seed: int | None = None) -> Scenario:
-    """Read and check a scenario file; a bare name like ``room`` means the shipped one.
+    """Read and check a scenario file.
 
-    ``seed`` overrides the file's. Raises ScenarioError.
+    path: of the file, or the name of a shipped one, such as ``room``.
+    seed: instead of the file's.
+    Raises ScenarioError.
     """
     file = Path(path)
     if not file.exists() and file.suffix == "" and (SCENARIO_FOLDER / f"{file}.yaml").exists():
@@ -97,7 +104,7 @@ def load(path: str | Path, seed: int | None = None) -> Scenario:
 
 
 def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
-    """Check a scenario's mapping (``file`` is named in errors). Raises ScenarioError."""
+    """Check a scenario's mapping. file: named in errors. Raises ScenarioError."""
     known = ("name", "description", "seed", "cameras", "source", "channel", "edge")
     if not isinstance(data, dict):
         raise ScenarioError(f"{file}: expected a mapping with the keys {', '.join(known)}")
@@ -136,11 +143,13 @@ def parse(data: Any, file: Path, seed: int | None = None) -> Scenario:
 
 
 def read_section(cls: type[T], mapping: Any, where: str) -> T:
-    """Build dataclass ``cls`` from a mapping, strictly: types by annotation (int, float, bool, str, list,
-    dict, tuple, unions with None, nested dataclasses). ``where`` (file and key) starts every error.
+    """Build a dataclass from a mapping, strictly by its annotations.
 
-    A float field takes any finite number; an int field no float; NaN and infinity are refused. Ranges are
-    the dataclass's own: a ValueError from its ``__post_init__`` is passed on with ``where`` before it.
+    cls: its fields are int, float, bool, str, Path, list, dict, tuple, unions with None, or dataclasses.
+    mapping: what was read. A float field takes any finite number, an int field no float.
+    where: file and key, with which every error begins.
+    Raises ScenarioError. The dataclass checks its own ranges: a ValueError of its ``__post_init__`` becomes a
+    ScenarioError.
     """
     if not isinstance(mapping, dict):
         raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")

@@ -17,15 +17,13 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from freshfield.payload import MAX_MESSAGE_BYTES
+from freshfield.limits import MAX_CONCURRENT_STREAMS, MAX_MESSAGE_BYTES
 
 _KEEPALIVE_MS = 10_000
-# Room for the header around the largest payload.
-_MESSAGE_LIMIT = MAX_MESSAGE_BYTES + 4096
 
 _COMMON: list[tuple[str, Any]] = [
-    ("grpc.max_receive_message_length", _MESSAGE_LIMIT),
-    ("grpc.max_send_message_length", _MESSAGE_LIMIT),
+    ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+    ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
     ("grpc.http2.bdp_probe", 0),
     ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
     ("grpc.keepalive_timeout_ms", 5_000),
@@ -47,7 +45,7 @@ SERVER_OPTIONS = [
     # may queue is bounded by the credits, not by this.
     ("grpc.http2.lookahead_bytes", 1 << 20),
     ("grpc.http2.min_ping_interval_without_data_ms", _KEEPALIVE_MS // 2),
-    ("grpc.max_concurrent_streams", 1024),
+    ("grpc.max_concurrent_streams", MAX_CONCURRENT_STREAMS),
     # Two servers silently sharing one port would split the cameras between them.
     ("grpc.so_reuseport", 0),
 ]
@@ -172,7 +170,7 @@ def from_arguments(args: argparse.Namespace) -> Transport:
 
 
 class _TokenInterceptor(grpc.aio.ServerInterceptor):
-    """Refuses calls without the token. Compared in constant time."""
+    """Refuses calls without the token, which is compared in constant time."""
 
     def __init__(self, token: str) -> None:
         self._expected = f"Bearer {token}".encode()
@@ -180,11 +178,13 @@ class _TokenInterceptor(grpc.aio.ServerInterceptor):
         async def refuse(request: Any, context: grpc.aio.ServicerContext) -> None:
             await context.abort(grpc.StatusCode.UNAUTHENTICATED, "missing or wrong bearer token")
 
-        async def refuse_stream(request: Any, context: grpc.aio.ServicerContext) -> None:
-            await context.abort(grpc.StatusCode.UNAUTHENTICATED, "missing or wrong bearer token")
-
-        self._refuse = refuse
-        self._refuse_stream = refuse_stream
+        # By whether requests and responses are streams.
+        self._refusals = {
+            (False, False): grpc.unary_unary_rpc_method_handler(refuse),
+            (False, True): grpc.unary_stream_rpc_method_handler(refuse),
+            (True, False): grpc.stream_unary_rpc_method_handler(refuse),
+            (True, True): grpc.stream_stream_rpc_method_handler(refuse),
+        }
 
     async def intercept_service(
         self,
@@ -196,13 +196,9 @@ class _TokenInterceptor(grpc.aio.ServerInterceptor):
             if key == "authorization" and hmac.compare_digest(raw, self._expected):
                 return await continuation(handler_call_details)
         handler = await continuation(handler_call_details)
-        if handler is None or not (handler.request_streaming or handler.response_streaming):
-            return grpc.unary_unary_rpc_method_handler(self._refuse)
-        if handler.request_streaming and handler.response_streaming:
-            return grpc.stream_stream_rpc_method_handler(self._refuse_stream)
-        if handler.request_streaming:
-            return grpc.stream_unary_rpc_method_handler(self._refuse_stream)
-        return grpc.unary_stream_rpc_method_handler(self._refuse_stream)
+        if handler is None:
+            return self._refusals[False, False]
+        return self._refusals[bool(handler.request_streaming), bool(handler.response_streaming)]
 
 
 def _read(path: Path) -> bytes:

@@ -49,7 +49,7 @@ def test_preparing_stops_when_told(tmp_path):
 
 
 def test_a_frame_too_large_to_send_is_an_error_of_that_frame(tmp_path, monkeypatch):
-    monkeypatch.setattr("freshfield.payload.MAX_MESSAGE_BYTES", 100)
+    monkeypatch.setattr("freshfield.payload.MAX_PAYLOAD_BYTES", 100)
     scenario = photo_scenario(write_photos(tmp_path, 24), 3)
     camera = build_cameras(scenario, source_config(scenario), scenario.cameras)[1]
     with pytest.raises(ValueError, match="exceeds 100"):

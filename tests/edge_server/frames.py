@@ -26,3 +26,9 @@ def frame(camera: str = "cam01", sequence: int = 0, generated_ns: int = 0, **oth
         "payload": payload.encode(image),
     }
     return Frame(**{**values, **other})
+
+
+def damaged_frame(camera: str = "cam01", **other) -> Frame:
+    """A frame that passes every check of its headers and cannot be decoded: its image data is cut off."""
+    noise = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
+    return frame(camera, codec="png", payload=payload.encode(noise, "png")[:60], **other)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from freshfield import payload
 from freshfield.frame import Frame, FrameRejected, checksum, from_request, to_request, valid_id
-from freshfield.geometry import Pinhole, Pose, quaternion_normalise
+from freshfield.geometry import Pinhole, Pose, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
 from tests.conftest import data_dir
 
@@ -63,7 +63,7 @@ def test_what_is_sent_is_what_arrives(
         session=session,
         sequence=sequence,
         generated_ns=generated_ns,
-        pose=Pose(tuple(map(float, quaternion_normalise(q))), t),
+        pose=Pose(tuple(map(float, quaternion_normalize(q))), t),
         codec=codec,
         payload=DATA[codec],
         held_out=held_out,

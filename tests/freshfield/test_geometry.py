@@ -17,7 +17,7 @@ from freshfield.geometry import (
     look_at,
     matrix_to_quaternion,
     quaternion_multiply,
-    quaternion_normalise,
+    quaternion_normalize,
     quaternion_to_matrix,
     se3_inverse,
     slerp,
@@ -45,7 +45,7 @@ def test_quaternions_and_matrices_agree_with_scipy(q):
     np.testing.assert_allclose(m, scipy(q).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(m @ m.T, np.eye(3), atol=1e-12)
     # Up to sign: a half turn has w = 0, where both are normal.
-    assert abs(matrix_to_quaternion(m) @ quaternion_normalise(q)) == pytest.approx(1.0, abs=1e-12)
+    assert abs(matrix_to_quaternion(m) @ quaternion_normalize(q)) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(m)), m, atol=1e-12)
 
 
@@ -63,13 +63,13 @@ def test_normalising_survives_any_scale(scale):
     q = np.array([0.0, 3.0, -4.0, 0.0]) * scale
     if scale == 5e-324:
         q = np.array([0.0, scale, -scale, 0.0])
-    np.testing.assert_allclose(np.linalg.norm(quaternion_normalise(q)), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(quaternion_normalize(q)), 1.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("q", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1]])
 def test_quaternions_without_a_direction_are_refused(q):
     with pytest.raises(GeometryError):
-        quaternion_normalise(q)
+        quaternion_normalize(q)
 
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -2, 3]])
@@ -99,7 +99,7 @@ def test_slerp_goes_the_shorter_way_at_constant_speed(a, b, fraction):
 
 @given(quaternions, vectors)
 def test_poses_survive_the_way_through_a_matrix(q, t):
-    pose = Pose(tuple(quaternion_normalise(q)), t)
+    pose = Pose(tuple(quaternion_normalize(q)), t)
     back = Pose.from_matrix(pose.matrix())
     np.testing.assert_allclose(back.matrix(), pose.matrix(), atol=1e-9)
     np.testing.assert_allclose(se3_inverse(pose.matrix()) @ pose.matrix(), np.eye(4), atol=1e-9)

@@ -12,17 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from freshfield.ledger import Event, Ledger, LedgerReader, read, read_all
+from freshfield.ledger import Event, Ledger, LedgerReader, read_all
 from tests.freshfield.test_files import no_file_longer_than
 
 
 def write(out, events, closed=True):
-    book = Ledger(out, "node", "cam00", 7)
+    ledger = Ledger(out, "node", "cam00", 7)
     for e in events:
-        book.write(e.t_ns, e.camera, e.session, e.sequence, e.event, e.detail)
+        ledger.write(e.t_ns, e.camera, e.session, e.sequence, e.event, e.detail)
     if closed:
-        book.close(99)
-    return book.path
+        ledger.close(99)
+    return ledger.path
 
 
 EVENTS = [
@@ -33,10 +33,10 @@ EVENTS = [
 
 def test_events_come_back(tmp_path):
     path = write(tmp_path, EVENTS)
-    file = read(path)
+    file = LedgerReader(path)
     assert path.name == "ledger-node-cam00-7.tsv"
-    assert (file.role, file.name, file.closed, file.torn) == ("node", "cam00", True, False)
     assert file.events == (*EVENTS, Event(99, "", "", 0, "closed"))
+    assert (file.role, file.name, file.closed, file.torn) == ("node", "cam00", True, False)
     assert [f.path for f in read_all(tmp_path)] == [path]
 
 
@@ -47,7 +47,7 @@ def test_a_file_cut_anywhere_loses_at_most_its_last_line(tmp_path_factory, cut):
     head = data.index(b"\n") + 1
     cut = head + cut % (len(data) - head + 1)
     path.write_bytes(data[:cut])
-    file = read(path)
+    file = LedgerReader(path)
     whole = data[head:cut].count(b"\n")
     assert file.events == tuple((EVENTS * 2)[:whole])
     assert file.torn == (not data[:cut].endswith(b"\n")) and not file.closed
@@ -56,42 +56,42 @@ def test_a_file_cut_anywhere_loses_at_most_its_last_line(tmp_path_factory, cut):
 def test_damaged_lines_are_left_out_and_said(tmp_path):
     path = write(tmp_path, EVENTS)
     path.write_bytes(path.read_bytes().replace(b"\tanswered\t", b"\0\xff"))
-    file = read(path)
-    assert file.torn and file.events[0] == EVENTS[0] and file.closed
+    file = LedgerReader(path)
+    assert file.events[0] == EVENTS[0] and file.torn and file.closed
 
 
 def test_other_files_are_refused(tmp_path):
     for data in (b"", b"hello\n", b"#freshfield-ledger 2 node cam00 1\n", b"\xff\xfe"):
         (tmp_path / "ledger-x.tsv").write_bytes(data)
         with pytest.raises(ValueError, match="not a freshfield ledger"):
-            read(tmp_path / "ledger-x.tsv")
+            LedgerReader(tmp_path / "ledger-x.tsv")
     with pytest.raises(ValueError, match="role"):
         Ledger(tmp_path, "camera", "x", 1)
 
 
 def test_threads_do_not_tear_each_others_lines(tmp_path):
-    book = Ledger(tmp_path, "emulator", "e", 1)
+    ledger = Ledger(tmp_path, "emulator", "e", 1)
 
     def work(camera):
         for k in range(500):
-            book.write(k, camera, "s" * 40, k, "forwarded", "d" * 40)
+            ledger.write(k, camera, "s" * 40, k, "forwarded", "d" * 40)
 
     threads = [threading.Thread(target=work, args=(f"cam{i}",)) for i in range(4)]
     for t in threads:
         t.start()
     for t in threads:
         t.join()
-    book.close(0)
-    book.write(1, "late", "s", 1, "forwarded")  # after the end: ignored
-    file = read(book.path)
-    assert not file.torn and len(file.events) == 2001 and file.closed
+    ledger.close(0)
+    ledger.write(1, "late", "s", 1, "forwarded")  # after the end: ignored
+    file = LedgerReader(ledger.path)
+    assert len(file.events) == 2001 and not file.torn and file.closed
 
 
 def test_what_was_written_survives_sigkill(tmp_path):
     program = (
         "import sys; from pathlib import Path; from freshfield.ledger import Ledger\n"
-        "book, k = Ledger(Path(sys.argv[1]), 'edge', 'e', 1), 0\n"
-        "while True:\n    book.write(k, 'cam00', 's', k, 'delivered'); k += 1\n    print(k, flush=True)\n"
+        "ledger, k = Ledger(Path(sys.argv[1]), 'edge', 'e', 1), 0\n"
+        "while True:\n    ledger.write(k, 'cam00', 's', k, 'delivered'); k += 1\n    print(k, flush=True)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE) as child:
         time.sleep(0.5)
@@ -103,21 +103,21 @@ def test_what_was_written_survives_sigkill(tmp_path):
 
 
 def test_a_full_disk_costs_lines_and_the_ledger_says_how_many(tmp_path):
-    book = Ledger(tmp_path, "node", "cam00", 7)
-    size = book.path.stat().st_size
+    ledger = Ledger(tmp_path, "node", "cam00", 7)
+    size = ledger.path.stat().st_size
     with no_file_longer_than(size + 70):
         for k in range(10):
-            book.write(k, "cam00", "s", k, "captured")
-    assert book.lines_lost > 5
-    lost = book.lines_lost
-    book.write(10, "cam00", "s", 10, "captured")
-    book.close(11)
-    file = read(book.path)
+            ledger.write(k, "cam00", "s", k, "captured")
+    assert ledger.lines_lost > 5
+    lost = ledger.lines_lost
+    ledger.write(10, "cam00", "s", 10, "captured")
+    ledger.close(11)
+    file = LedgerReader(ledger.path)
     kept = [e.sequence for e in file.events if e.event == "captured"]
     assert kept == [*range(10 - lost), 10]
     assert [e.detail for e in file.events if e.event == "lost_lines"] == [str(lost)]
     assert file.closed and file.events[-1].detail == str(lost)
-    reader = LedgerReader(book.path)
+    reader = LedgerReader(ledger.path)
     assert reader.closed and not reader.complete
 
 

@@ -14,8 +14,8 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from freshfield import payload
-from freshfield.payload import MAX_IMAGE_SIDE, PayloadError, check, decode, encode
+from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_BYTES
+from freshfield.payload import PayloadError, check, decode, encode
 
 # --- what is encoded comes back ----------------------------------------------------------------
 
@@ -76,7 +76,7 @@ def test_exif_orientation_does_not_turn_pixels():
         (np.zeros((4, 4, 3), np.float32), "png", "bad_image"),
         (np.zeros((4, 4), np.uint8), "png", "bad_image"),
         (np.zeros((4, 4, 2), np.uint8), "jpeg", "bad_image"),
-        (np.zeros((1, MAX_IMAGE_SIDE + 1, 3), np.uint8), "png", "too_large"),
+        (np.zeros((1, MAX_IMAGE_SIDE_PX + 1, 3), np.uint8), "png", "too_large"),
         (np.zeros((0, 4, 3), np.uint8), "zstd", "too_large"),
         (np.zeros((4, 4, 3), np.uint8), "webp", "unknown_codec"),
     ],
@@ -129,7 +129,7 @@ BOMB = zstandard.ZstdCompressor(level=19).compress(bytes(2**30))
         (png(0, 0), "png", (0, 0), "too_large"),
         (BOMB, "zstd", (64, 48), "size_mismatch"),
         (BOMB, "zstd", (30000, 30000), "too_large"),
-        (bytes(payload.MAX_MESSAGE_BYTES + 1), "jpeg", (64, 48), "too_large"),
+        (bytes(MAX_PAYLOAD_BYTES + 1), "jpeg", (64, 48), "too_large"),
         (JPEG, "png", (64, 48), "bad_payload"),
         (JPEG, "gif", (64, 48), "unknown_codec"),
         (b"", "jpeg", (64, 48), "bad_payload"),
@@ -155,7 +155,7 @@ def test_hostile_headers_are_refused_by_check_alone(data, codec, size, reason):
 
 def test_a_bomb_of_the_announced_size_is_bounded():
     """The worst that passes the headers: the largest image there may be, from a few kilobytes."""
-    side = MAX_IMAGE_SIDE
+    side = MAX_IMAGE_SIDE_PX
     row = b"\0" + bytes(side * 3)
     data = png(side, side, rows=row * side)
     assert len(data) < 200_000
@@ -207,7 +207,7 @@ def test_flipped_bytes_raise_nothing_but_payload_error(data, codec):
 
 @given(width=st.integers(-10, 10**6), height=st.integers(-10, 10**6))
 def test_impossible_sizes_are_refused(width, height):
-    if 0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE:
+    if 0 < width <= MAX_IMAGE_SIDE_PX and 0 < height <= MAX_IMAGE_SIDE_PX:
         return
     for codec in ("jpeg", "png", "zstd"):
         with pytest.raises(PayloadError):

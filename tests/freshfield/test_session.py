@@ -121,8 +121,8 @@ def test_every_cut_leaves_every_complete_message(tmp_path):
         # After the payload come only the image's other few fields.
         sure, possible = (sum(end <= cut - slack for end in ends) for slack in (40, 0))
         assert sure <= len(found) <= possible, cut
-        by_place = sorted(found, key=lambda f: f.place)
-        assert [session.payload(f) for f in by_place] == [r.payload for r, _ in sent[: len(found)]]
+        in_file = sorted(found, key=lambda f: f.location)
+        assert [session.payload(f) for f in in_file] == [r.payload for r, _ in sent[: len(found)]]
         said = session.cut or ""
         if cut < len(whole) - 40:  # the last bytes say only that it is whole
             assert f" {cut}: {session.messages.total()} complete messages are used" in said

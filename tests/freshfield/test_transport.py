@@ -6,13 +6,14 @@ import argparse
 import asyncio
 import shutil
 import subprocess
+from contextlib import asynccontextmanager
 
 import grpc
 import grpc.aio
 import numpy as np
 import pytest
 
-from freshfield.payload import MAX_MESSAGE_BYTES
+from freshfield.limits import MAX_PAYLOAD_BYTES
 from freshfield.transport import (
     Transport,
     TransportError,
@@ -36,13 +37,18 @@ class Frames(frames_pb2_grpc.FrameStreamServiceServicer):
             yield pb.PushResponse(sequence=len(request.payload))
 
 
-async def serve(transport: Transport) -> tuple[grpc.aio.Server, int]:
+@asynccontextmanager
+async def serving(transport: Transport, frames: frames_pb2_grpc.FrameStreamServiceServicer | None = None):
+    """A server of both services; gives its port."""
     server = transport.aio_server()
     clock_pb2_grpc.add_ClockServiceServicer_to_server(Clock(), server)
-    frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(Frames(), server)
+    frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(frames or Frames(), server)
     port = transport.bind(server, "localhost:0")
     await server.start()
-    return server, port
+    try:
+        yield port
+    finally:
+        await server.stop(None)
 
 
 async def ask(transport: Transport, port: int) -> int:
@@ -69,30 +75,26 @@ def refusal(work) -> grpc.StatusCode:
 
 def test_plain_text_and_messages_up_to_the_limit():
     async def scene():
-        server, port = await serve(Transport())
-        try:
+        async with serving(Transport()) as port:
             assert await ask(Transport(), port) == 42
-            assert await push(Transport(), port, MAX_MESSAGE_BYTES) == MAX_MESSAGE_BYTES
+            assert await push(Transport(), port, MAX_PAYLOAD_BYTES) == MAX_PAYLOAD_BYTES
             with pytest.raises(grpc.aio.AioRpcError):
-                await push(Transport(), port, MAX_MESSAGE_BYTES + 8192)
+                await push(Transport(), port, MAX_PAYLOAD_BYTES + 8192)
             assert await ask(Transport(), port) == 42  # and the server lives on
-        finally:
-            await server.stop(None)
 
     asyncio.run(scene())
 
 
 def test_a_server_refuses_a_message_that_a_stranger_sends_too_large():
     async def scene():
-        server, port = await serve(Transport())
         options = [("grpc.max_send_message_length", -1)]
-        async with grpc.aio.insecure_channel(f"localhost:{port}", options=options) as channel:
+        async with (
+            serving(Transport()) as port,
+            grpc.aio.insecure_channel(f"localhost:{port}", options=options) as channel,
+        ):
             call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push(timeout=20)
-            try:
-                await call.write(pb.PushRequest(payload=bytes(4 * MAX_MESSAGE_BYTES)))
-                await call.read()
-            finally:
-                await server.stop(None)
+            await call.write(pb.PushRequest(payload=bytes(4 * MAX_PAYLOAD_BYTES)))
+            await call.read()
 
     assert refusal(scene()) == grpc.StatusCode.RESOURCE_EXHAUSTED
 
@@ -100,13 +102,10 @@ def test_a_server_refuses_a_message_that_a_stranger_sends_too_large():
 @pytest.mark.parametrize("token", [None, "wrong", "right "])
 def test_without_the_right_token_nothing_is_served(token):
     async def scene(call):
-        server, port = await serve(Transport(token="right"))
-        try:
+        async with serving(Transport(token="right")) as port:
             assert await ask(Transport(token="right"), port) == 42
             assert await push(Transport(token="right"), port, 7) == 7
             await call(port)
-        finally:
-            await server.stop(None)
 
     stranger = Transport(token=token)
     assert refusal(scene(lambda port: ask(stranger, port))) == grpc.StatusCode.UNAUTHENTICATED
@@ -115,12 +114,9 @@ def test_without_the_right_token_nothing_is_served(token):
 
 def test_a_port_in_use_is_not_shared():
     async def scene():
-        server, port = await serve(Transport())
-        try:
+        async with serving(Transport()) as port:
             with pytest.raises(TransportError, match=f"localhost:{port}"):
                 Transport().bind(Transport().aio_server(), f"localhost:{port}")
-        finally:
-            await server.stop(None)
 
     asyncio.run(scene())
 
@@ -200,11 +196,8 @@ def test_tls_and_mutual_tls(pem):
     deceived = Transport(ca=pem / "stranger.pem")
 
     async def scene(server_side, client):
-        server, port = await serve(server_side)
-        try:
+        async with serving(server_side) as port:
             return await ask(client, port)
-        finally:
-            await server.stop(None)
 
     assert asyncio.run(scene(server_tls, trusting)) == 42
     assert asyncio.run(scene(mutual, known)) == 42
@@ -242,12 +235,11 @@ def test_a_slow_reader_is_felt_at_once():
             yield pb.PushResponse()
 
     async def scene():
-        server = Transport().aio_server()
-        frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(Stalled(), server)
-        port = Transport().bind(server, "localhost:0")
-        await server.start()
         written = 0
-        async with Transport().aio_channel(f"localhost:{port}") as channel:
+        async with (
+            serving(Transport(), Stalled()) as port,
+            Transport().aio_channel(f"localhost:{port}") as channel,
+        ):
             call = frames_pb2_grpc.FrameStreamServiceStub(channel).Push()
             try:
                 async with asyncio.timeout(2):
@@ -257,7 +249,6 @@ def test_a_slow_reader_is_felt_at_once():
             except TimeoutError:
                 pass
             call.cancel()
-        await server.stop(None)
         return written
 
     assert asyncio.run(scene()) < 20

@@ -148,7 +148,7 @@ def test_sigterm_ends_cleanly_with_the_last_answer(tmp_path):
     assert code == 0 and seconds < 5 and said == ""
     assert status["phase"] in ("preparing", "streaming") and status["cameras"]["cam02"]["fps"] == 50
     (file,) = ledger.read_all(tmp_path / "out")
-    assert file.closed and not file.torn
+    assert file.events and file.closed and not file.torn
     assert all(c["sent"] == c["answered"] for c in books(tmp_path / "out").values())
 
 

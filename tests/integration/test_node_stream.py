@@ -18,6 +18,7 @@ from camera_node.config import source_config
 from camera_node.node import Node, NodeOptions
 from freshfield import ledger, payload
 from freshfield.clock import WallClock
+from freshfield.limits import MAX_CAPTURE_AGE_NS
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from tests.camera_node.sources.datasets.photos import photo_scenario, picture, write_photos
@@ -200,7 +201,7 @@ def test_without_a_clock_service_the_offset_is_said_to_be_unknown(tmp_path):
         return peer
 
     peer = asyncio.run(scene())
-    assert {f.clock_uncertainty_ns for f in peer.frames} == {payload.MAX_PAST_NS}
+    assert {f.clock_uncertainty_ns for f in peer.frames} == {MAX_CAPTURE_AGE_NS}
 
 
 def test_the_first_frame_waits_for_the_clock_and_is_the_newest(tmp_path):

@@ -20,8 +20,8 @@ from camera_node.node import Node, NodeOptions
 from edge_server.config import read_config
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.ingest import Ingest
-from edge_server.live.recorder import Recorder
-from edge_server.live.server import EdgeServer, Options
+from edge_server.live.output.recorder import Recorder
+from edge_server.live.server import EdgeServer, ServerOptions
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
@@ -85,7 +85,7 @@ def session(tmp_path_factory):
     recorder = Recorder(folder / "a.mcap", "test")
     ingest = Ingest(
         WallClock(), FrameBuffer(("cam01", "cam02")), ["cam00"], Ledger(folder, "edge", "edge", 1),
-        lambda frame, now_ns: None, recorder.frame,
+        lambda frame: None, recorder.frame,
     )  # fmt: skip
     scenario = photo_scenario(write_photos(folder / "data", 24), 3, fps=25)
     sent = sent_by(scenario, seconds=1.5, take=ingest.take)
@@ -203,7 +203,7 @@ def test_a_whole_edge_server_records_what_it_decides(session, tmp_path):
     port = free_port()
     top = {"name": "edge", "seed": 3, "cameras": CAMERAS, "edge": EDGE}
     edge = parse(top, tmp_path / "e.yaml")
-    options = Options(f"127.0.0.1:{port}", tmp_path / "out", record=tmp_path / "b.mcap")
+    options = ServerOptions(f"127.0.0.1:{port}", tmp_path / "out", record=tmp_path / "b.mcap")
     server = EdgeServer(edge, read_config(edge), options)
     thread = threading.Thread(target=server.run)
     thread.start()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.live.buffer import FrameBuffer
-from edge_server.live.ingest import Gate
+from edge_server.live.ingest import FrameAdmission
 from edge_server.scheduler import POLICIES, Epoch, make_policy
 from freshfield.frame import FrameRejected
 from tests.edge_server.frames import frame
@@ -35,7 +35,7 @@ class Edge:
     """The part of the edge that time goes through: gate, buffer, one policy."""
 
     def __init__(self, policy: str) -> None:
-        self.gate = Gate(CAMERAS, [])
+        self.gate = FrameAdmission(CAMERAS, [])
         self.buffer = FrameBuffer(CAMERAS)
         self.policy = make_policy(policy, None, np.random.default_rng(1))
         self.plan = None

@@ -11,8 +11,8 @@ pytest.importorskip("onnx", reason="the extra embed is not installed")
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.embed.letterbox import GREY, letterbox
-from edge_server.live.buffer import Buffered
-from edge_server.live.view_decoder import Decoder
+from edge_server.live.buffer import BufferedFrame
+from edge_server.live.view_decoder import ViewDecoder
 from freshfield import payload
 from freshfield.geometry import Pinhole
 from tests.edge_server.embed.graphs import CHANNELS, detector
@@ -100,9 +100,9 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
     rows = made.embed([dark, HARD["white"], dark])
     assert np.isfinite(rows).all() and made.failed == 1
     assert rows[0].any() and not rows[1].any() and (rows[0] == rows[2]).all()
-    cache, square = EmbeddingCache(made, Decoder()), Pinhole.from_fov(32, 32, 60.0)
+    cache, square = EmbeddingCache(made, ViewDecoder().view), Pinhole.from_fov(32, 32, 60.0)
     items = [
-        Buffered(
+        BufferedFrame(
             frame(f"cam{k}", intrinsics=square, payload=payload.encode(np.full((32, 32, 3), v, np.uint8))),
             0,
             0,
@@ -114,14 +114,14 @@ def test_a_nan_of_one_frame_costs_no_other_frame_of_its_batch(tmp_path):
 
 
 def test_two_hundred_cameras_of_all_sizes(shipped):
-    cache = EmbeddingCache(shipped, Decoder())
+    cache = EmbeddingCache(shipped, ViewDecoder().view)
     items = []
     for k in range(200):
         height, width = int(RNG.integers(8, 120)), int(RNG.integers(8, 120))
         image = RNG.integers(0, 256, (height, width, 3), dtype=np.uint8)
         camera = Pinhole.from_fov(width, height, 60.0)
         items.append(
-            Buffered(
+            BufferedFrame(
                 frame(f"cam{k:03d}", intrinsics=camera, codec="zstd", payload=payload.encode(image, "zstd")),
                 k,
                 k,

@@ -20,7 +20,7 @@ from freshfield.geometry import (
     Pose,
     matrix_to_quaternion,
     quaternion_multiply,
-    quaternion_normalise,
+    quaternion_normalize,
     quaternion_to_matrix,
     so3_exp,
 )
@@ -155,7 +155,7 @@ def composed(steps: int, each: int) -> tuple[np.ndarray, float]:
         q = quaternion_multiply(q, step)
         if (k + 1) % each == 0:
             furthest = max(furthest, abs(float(np.linalg.norm(q)) - 1.0))
-            q = quaternion_normalise(q)
+            q = quaternion_normalize(q)
     return quaternion_to_matrix(q), furthest
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.teleop.stylus import FARTHEST_M, StylusSample
-from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalise, so3_exp
+from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 Array = NDArray[np.float64]
 
@@ -35,4 +35,4 @@ class Hand:
         half = 0.5 * FARTHEST_M  # with the clutch open it may be moved for ever
         self.position = np.clip(self.position + way, -half, half)
         turned = matrix_to_quaternion(so3_exp(turn))
-        self.quaternion = quaternion_normalise(quaternion_multiply(turned, self.quaternion))
+        self.quaternion = quaternion_normalize(quaternion_multiply(turned, self.quaternion))

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from freshfield.geometry import quaternion_normalise
+from freshfield.geometry import quaternion_normalize
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class StylusSample:
 
     def arrays(self) -> tuple[Array, Array]:
         """Position (3,) and unit quaternion (4,) of a sound sample."""
-        return np.array(self.position_m), quaternion_normalise(self.quaternion)
+        return np.array(self.position_m), quaternion_normalize(self.quaternion)
 
 
 class Stylus(Protocol):

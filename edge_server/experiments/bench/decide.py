@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments.common.machine_load import Usage
-from edge_server.live.buffer import Buffered
+from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler import Epoch
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import Actor
@@ -92,14 +92,14 @@ def _rng() -> np.random.Generator:
     return np.random.default_rng(1)
 
 
-def _rig(n: int) -> dict[str, Buffered]:
+def _rig(n: int) -> dict[str, BufferedFrame]:
     """The newest frames of ``n`` cameras in a circle; nobody decodes them."""
     found = {}
     for i in range(n):
         angle = 2.0 * np.pi * i / n
         pose = Pose.from_matrix(look_at([3.0 * np.cos(angle), 3.0 * np.sin(angle), 1.5], [0.0, 0.0, 0.0]))
         frame = Frame(f"cam{i:03d}", "bench", 0, i * 1_000_000, pose, _LENS, "jpeg", b"")
-        found[frame.camera] = Buffered(frame, frame.generated_ns, 0)
+        found[frame.camera] = BufferedFrame(frame, frame.generated_ns, 0)
     return found
 
 

@@ -12,13 +12,12 @@ from camera_node.sources.with_effects import camera_effects
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from channel_emu.model.config import channel_from_mapping
-from edge_server.config import EdgeConfig, embedding_for, open_embedder, read_config
+from edge_server.config import EdgeConfig, read_config
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Terms, Truth, VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
-from edge_server.live.buffer import FrameBuffer
-from edge_server.live.loop import Updates, open_foreground, open_keyframes
+from edge_server.live.field_updater import open_updater
 from edge_server.live.state import Publication
 from edge_server.scheduler import make_policy
 from freshfield.scenario import Scenario, ScenarioError
@@ -53,17 +52,10 @@ def deploy(
         field = field or _field(edge, scenario.seed)
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: edge: {error}") from None
-    try:
-        embedder = open_embedder(embedding_for(edge, policy))
-        keyframes = open_keyframes(edge.keyframes)
-        foreground = open_foreground(edge.foreground, scenario)
-        updates = Updates(FrameBuffer(scenario.training), policy, field, 0, embedder, keyframes, foreground)
-    except ValueError as error:
-        raise ScenarioError(f"{scenario.path}: edge: {error}") from None
     return VirtualDeployment(
         cameras or training_cameras(scenario, data),
         channel,
-        updates,
+        open_updater(scenario, edge, policy, field, start_ns=0),
         terms,
         scenario.seed,
         truth or truth_of(scenario, source, edge, scorer or Scorer(), data),

@@ -21,7 +21,7 @@ from edge_server.experiments.virtual.from_scenario import deploy
 from edge_server.experiments.virtual.virtual_deployment import Terms, VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
 from edge_server.fidelity.scorer import Scorer, listed_metric
-from edge_server.live.decision_log import Decisions
+from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
 from edge_server.scheduler import read_policy
@@ -65,15 +65,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         if config.lpips != "none":
             metric, missing = open_lpips(lpips, cast(Network, config.lpips))
         scorer = Scorer(metric, config.noisy_truth, perceptual=listed_metric(config.metrics))
-        decisions: Decisions | None = None
+        decisions: DecisionLog | None = None
 
         def published(publication: Publication) -> None:
             if decisions is not None:
-                decisions.keep(deployment.updates.policy, publication.number)
+                decisions.record(deployment.updates.policy, publication.number)
 
         deployment = deploy(scenario, terms, scorer=scorer, data=base, on_published=published)
         if args.out is not None:
-            decisions = Decisions(args.out, embedding_for(config, deployment.updates.policy))
+            decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
         if config.deadline_ms is not None:
             print(
                 f"  edge.deadline_ms: virtual time counts steps; an update is {terms.steps} of them, with "

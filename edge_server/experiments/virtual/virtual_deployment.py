@@ -24,9 +24,9 @@ from channel_emu.model.link import Event, Kind, Link
 from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget
-from edge_server.live.buffer import Buffered
-from edge_server.live.ingest import Gate
-from edge_server.live.loop import Selection, Updates
+from edge_server.live.buffer import BufferedFrame
+from edge_server.live.field_updater import FieldUpdater, Selection
+from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
 from edge_server.scheduler import treatment_of
 from freshfield.clock import VirtualClock
@@ -112,7 +112,7 @@ class VirtualDeployment:
         self,
         cameras: Sequence[Camera],
         channel: ChannelConfig,
-        updates: Updates,
+        updates: FieldUpdater,
         terms: Terms,
         seed: int,
         truth: Truth | None = None,
@@ -120,7 +120,7 @@ class VirtualDeployment:
     ) -> None:
         self.clock = VirtualClock(updates.start_ns)
         self.updates = updates
-        updates.expose = self.exposed
+        updates.materialize = self.exposed
         self.terms = terms
         self.truth = truth
         self.publications: list[Publication] = []
@@ -138,7 +138,7 @@ class VirtualDeployment:
         self._links: dict[str, Link] = {name: self._channel.link(name) for name in self._cameras}
         # Only a fault that limits bandwidth asks how large a frame is.
         self._weigh = "bandwidth" in channel.faults
-        self._gate = Gate(updates.buffer.cameras, ())
+        self._admission = FrameAdmission(updates.buffer.cameras, ())
         self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
         self._tick = dict.fromkeys(self._cameras, 0)
         self._used: dict[str, tuple[Frame, ...]] = {}
@@ -173,7 +173,7 @@ class VirtualDeployment:
         self.clock.advance_to(end_ns)
         return self.publications[known:]
 
-    def exposed(self, items: Sequence[Buffered]) -> tuple[Buffered, ...]:
+    def exposed(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
         """Frames of the buffer with their images and poses, made now; without those that a source cannot
         give. For who decides in the place of this deployment's own edge."""
         return self._exposed_once(items)
@@ -242,7 +242,7 @@ class VirtualDeployment:
                 request = to_request(self._exposed(frame))
                 request.payload = damage(request.payload, flips)
                 frame = from_request(request)
-            self._gate.admit(frame, now_ns)
+            self._admission.admit(frame, now_ns)
         except FrameRejected as error:
             self.rejected[error.reason] += 1
             return
@@ -313,7 +313,7 @@ class VirtualDeployment:
         earlier = self._exposed_once(selection.earlier)  # first: what a camera made last is kept longest
         return dataclasses.replace(selection, items=self._exposed_once(selection.items), earlier=earlier)
 
-    def _exposed_once(self, items: Sequence[Buffered]) -> tuple[Buffered, ...]:
+    def _exposed_once(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
         """With images, those that a source could give. A frame used again stays the same object: it is
         decoded once."""
         made = []
@@ -328,7 +328,7 @@ class VirtualDeployment:
                     self.failed[camera] += 1
                     continue
                 self._used[camera] = (used, *known)[:2]
-            made.append(Buffered(used, item.generated_ns, item.received_ns))
+            made.append(BufferedFrame(used, item.generated_ns, item.received_ns))
         return tuple(made)
 
     def _publish(self, publication: Publication) -> None:

@@ -15,7 +15,7 @@ from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.kernels.project import ORIGIN, QUATERNION, SCALE, SIZE, Gaussians
 from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
 from edge_server.fields.splat.settings import SplatSettings
-from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalise, quaternion_to_matrix
+from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalize, quaternion_to_matrix
 
 STEEPEST = 0.1  # cosine between ray and normal below which a plane has no depth
 SURE_OPACITY = 0.7  # opacity above which the depth of a pixel gives a normal
@@ -46,7 +46,7 @@ def unit_quaternions(params: NDArray[np.float32]) -> NDArray[np.float64]:
     """Unit quaternions (N, 4) of Gaussians; the identity where there is no direction, as in rendering."""
     given = params[:, QUATERNION : QUATERNION + 4].astype(np.float64)
     sound = np.isfinite(given).all(axis=1) & (np.abs(given).max(axis=1, initial=0.0) > 0.0)
-    return quaternion_normalise(np.where(sound[:, None], given, (1.0, 0.0, 0.0, 0.0)))
+    return quaternion_normalize(np.where(sound[:, None], given, (1.0, 0.0, 0.0, 0.0)))
 
 
 def plane_depth(
@@ -118,7 +118,7 @@ def align(
     half_turn = 0.5 * settings.align * np.cross(normal, wanted)
     step = np.concatenate([np.ones((len(half_turn), 1)), half_turn], axis=1)
     part = slice(QUATERNION, QUATERNION + 4)
-    cloud.params[which, part] = quaternion_normalise(
+    cloud.params[which, part] = quaternion_normalize(
         quaternion_multiply(step, unit_quaternions(cloud.params[which]))
     )
 

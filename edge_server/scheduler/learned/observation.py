@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.live.buffer import Buffered
+from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler.learned.state import PARTS, POSE_WIDTH, State
-from freshfield.geometry import quaternion_normalise
+from freshfield.geometry import quaternion_normalize
 
 # A rig of one camera, or of several at one point, has no size to scale by.
 _SMALLEST_RIG_M = 1e-6
@@ -19,14 +19,14 @@ _SMALLEST_RIG_M = 1e-6
 class Embeddings(Protocol):
     """What computes z = F_e(frame) (6.31) and remembers it per frame (edge_server.embed)."""
 
-    def of(self, items: Sequence[Buffered]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def of(self, items: Sequence[BufferedFrame]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Embeddings (n, d), and (n,) which of the frames have one."""
         ...
 
 
 def observe(
     cameras: Sequence[str],
-    newest: Mapping[str, Buffered],
+    newest: Mapping[str, BufferedFrame],
     now_ns: int,
     embeddings: Embeddings | None = None,
     parts: Sequence[str] = PARTS,
@@ -55,13 +55,13 @@ def observe(
     return State(ages, poses, z, reported, tuple(cameras), frames)
 
 
-def relative_poses(items: Sequence[Buffered]) -> NDArray[np.float64]:
+def relative_poses(items: Sequence[BufferedFrame]) -> NDArray[np.float64]:
     """(n, 6): translation from the cameras' centre in units of their mean distance from it, so that neither
     where a rig stands nor how large it is matters; rotation vector in radians, world axes."""
     positions = np.array([item.frame.pose.translation_m for item in items], np.float64)
     centred = positions - positions.mean(axis=0)
     size = float(np.linalg.norm(centred, axis=1).mean())
-    q = quaternion_normalise([item.frame.pose.quaternion for item in items])
+    q = quaternion_normalize([item.frame.pose.quaternion for item in items])
     sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
     # Twice the half angle over its sine; 2 where there is no turn to speak of.
     per_sine = np.where(sine > 1e-12, 2.0 * np.arctan2(sine, q[:, :1]) / np.maximum(sine, 1e-12), 2.0)

@@ -1,4 +1,4 @@
-"""A session as one MCAP file: exactly what arrived at the edge, and what was decided.
+"""A session in one MCAP file: exactly what arrived at the edge, and what was decided.
 
 Topics, CAMERA being a camera's id:
 
@@ -10,9 +10,10 @@ Topics, CAMERA being a camera's id:
     /decisions           freshfield.Decision          JSON: an update of the field, when published
     /scores              freshfield.Decision          JSON: the same with its fidelity, when that is known
 
-A message's log time is when it arrived at the edge, its publish time when it was captured, by the edge's
-clock. Header and image hold everything that was sent; the others say the same in terms that viewers know.
-Chunks are not compressed: payloads are already, and what was written before a cut can be had.
+A message's log time is its arrival at the edge, its publish time the capture, both on the edge's clock.
+Header and image hold everything that was sent; the other topics repeat it in terms that viewers know. Chunks
+are not
+compressed: payloads already are, and whatever was written before a cut can be read.
 
 Needs the packages mcap, mcap-protobuf-support and foxglove-schemas-protobuf (extra ``mcap``), which only
 ``writer`` and ``reader`` import.
@@ -20,20 +21,16 @@ Needs the packages mcap, mcap-protobuf-support and foxglove-schemas-protobuf (ex
 
 from __future__ import annotations
 
-from freshfield.v1 import frames_pb2 as pb
-
 WORLD = "world"
 HEADER, IMAGE, POSE, CALIBRATION = "header", "image", "pose", "calibration"
 TRANSFORMS, DECISIONS, SCORES = "/tf", "/decisions", "/scores"
 INSTALL = "recordings need MCAP: pip install 'freshfield[mcap]'"
-
-CODEC_NAMES = {pb.CODEC_JPEG: "jpeg", pb.CODEC_PNG: "png", pb.CODEC_ZSTD: "zstd"}
 
 
 class SessionError(ValueError):
     """A recording that cannot be written or read; the message says why and what to do."""
 
 
-def topic(camera: str, kind: str) -> str:
-    """Where a camera's messages of a kind stand."""
+def topic_of(camera: str, kind: str) -> str:
+    """Topic of a camera's messages of a kind."""
     return f"/{camera}/{kind}"

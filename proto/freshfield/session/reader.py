@@ -1,4 +1,4 @@
-"""Reads the frames of a session, also of one that was cut short: an index first, payloads when asked for."""
+"""Read the frames of a session, also of a file that was cut short: the index first, payloads on request."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ try:
 except ImportError:
     raise SessionError(INSTALL) from None
 
-_HEAD = struct.Struct("<BQ")
-# Of a chunk: times, size, checksum, and the length of the compression's name.
-_CHUNK = struct.Struct("<QQQII")
+_RECORD_HEAD = struct.Struct("<BQ")
+# Times, uncompressed size, checksum, and the length of the compression's name.
+_CHUNK_HEAD = struct.Struct("<QQQII")
 _KEPT_CHUNKS = 4
 
 
-class _Place(NamedTuple):
-    """Where a message's record lies: in the file, or in the records of a compressed chunk at ``chunk``."""
+class _Location(NamedTuple):
+    """Location of a message's record: in the file, or in the records of the compressed chunk at ``chunk``."""
 
     chunk: int | None
     offset: int
@@ -45,18 +45,20 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True)
 class SessionFrame:
-    """A frame as it came over the wire, its payload still in the file. arrived_ns: on the edge's clock."""
+    """A frame as it arrived, its payload still in the file. arrived_ns: on the edge's clock."""
 
     header: pb.FrameHeader
     arrived_ns: int
-    place: _Place
+    location: _Location
 
 
 class Session:
-    """The frames of a recording, by camera, in the order of their arrival. Thread-safe.
+    """The frames of a recording by camera, in the order of arrival. Thread-safe.
 
-    messages: complete ones of all topics, counted by topic. cut: what is missing, in one line, or None: for
-    a file that was not closed, or of which parts are damaged. Raises SessionError, OSError."""
+    messages: number of complete messages by topic.
+    cut: one line on what is missing of a file that was not closed or is damaged; else None.
+    Raises SessionError, OSError.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -73,18 +75,18 @@ class Session:
         if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise SessionError(f"{path}: is no MCAP file")
         end = self._read_all()
-        said = []
+        parts = []
         if end is not None:
             where = f"cut short at byte {end} of {self._size}"
-            said.append(where if end < self._size else f"never closed, ends at byte {end}")
+            parts.append(where if end < self._size else f"never closed, ends at byte {end}")
         if self._damaged:
-            said.append(f"{self._damaged} damaged chunks or records left out")
-        if said:
-            self.cut = f"{path}: {', '.join(said)}: {sum(self.messages.values())} complete messages are used"
+            parts.append(f"{self._damaged} damaged chunks or records left out")
+        if parts:
+            self.cut = f"{path}: {', '.join(parts)}: {sum(self.messages.values())} complete messages are used"
 
     def payload(self, frame: SessionFrame) -> bytes:
         """The payload of one of ``frames``, byte for byte. SessionError where the file has changed."""
-        body = self._body(frame.place)
+        body = self._body(frame.location)
         try:
             return bytes(CompressedImage.FromString(_message(body).data).data)
         except (DecodeError, McapError, struct.error, ValueError, EOFError) as error:
@@ -93,10 +95,10 @@ class Session:
     def close(self) -> None:
         self._file.close()
 
-    def _body(self, place: _Place) -> bytes:
-        if place.chunk is not None:
-            return self._records(place.chunk)[place.offset : place.offset + place.size]
-        return self._at(place.offset, place.size)
+    def _body(self, location: _Location) -> bytes:
+        if location.chunk is not None:
+            return self._records(location.chunk)[location.offset : location.offset + location.size]
+        return self._at(location.offset, location.size)
 
     def _at(self, offset: int, size: int) -> bytes:
         with self._lock:
@@ -106,7 +108,7 @@ class Session:
     # --- the index --------------------------------------------------------------------------------
 
     def _read_all(self) -> int | None:
-        """Note every complete message; where what is complete ends, or None for a file that was closed."""
+        """Index every complete message. Returns where the complete part ends, None for a closed file."""
         heads, end = self._heads()
         # A closed file repeats its channels at the end: a damaged chunk takes only its own messages with it.
         for wanted in (Opcode.CHANNEL, None):
@@ -115,31 +117,31 @@ class Session:
                 if opcode == Opcode.CHUNK and wanted is None:
                     self._chunk(at, min(size, self._size - at), whole)
                 elif whole and opcode == (wanted or Opcode.MESSAGE):
-                    self._record(opcode, self._at(at, size), _Place(None, at, size))
+                    self._record(opcode, self._at(at, size), _Location(None, at, size))
         return end
 
     def _heads(self) -> tuple[list[tuple[int, int, int]], int | None]:
-        """(opcode, offset, size) of the file's records, the last of which may be cut; and where."""
+        """(opcode, offset, size) of the file's records, of which the last may be cut, and where they end."""
         heads: list[tuple[int, int, int]] = []
         at = len(MCAP0_MAGIC)
-        while at + _HEAD.size <= self._size:
-            opcode, size = _HEAD.unpack(self._at(at, _HEAD.size))
-            heads.append((opcode, at + _HEAD.size, size))
-            if at + _HEAD.size + size > self._size:
+        while at + _RECORD_HEAD.size <= self._size:
+            opcode, size = _RECORD_HEAD.unpack(self._at(at, _RECORD_HEAD.size))
+            heads.append((opcode, at + _RECORD_HEAD.size, size))
+            if at + _RECORD_HEAD.size + size > self._size:
                 break
             if opcode == Opcode.FOOTER:
                 return heads, None
-            at += _HEAD.size + size
+            at += _RECORD_HEAD.size + size
         return heads, at
 
     def _chunk(self, at: int, size: int, whole: bool) -> None:
-        if size < _CHUNK.size:
+        if size < _CHUNK_HEAD.size:
             return
         data = self._at(at, size)
-        *_, crc, name = _CHUNK.unpack_from(data)
-        compressed, begin = bool(name), _CHUNK.size + name + 8
+        *_, crc, name = _CHUNK_HEAD.unpack_from(data)
+        compressed, begin = bool(name), _CHUNK_HEAD.size + name + 8
         if compressed and not whole:
-            return  # half of a compressed chunk is nothing
+            return  # half of a compressed chunk cannot be read
         if not compressed and whole and crc and zlib.crc32(data[begin:]) != crc:
             self._damaged += 1
             return
@@ -150,23 +152,23 @@ class Session:
                 self._damaged += 1
                 return
         for opcode, offset, length in _framed(data, begin):
-            place = _Place(at, offset, length) if compressed else _Place(None, at + offset, length)
+            place = _Location(at, offset, length) if compressed else _Location(None, at + offset, length)
             self._record(opcode, data[offset : offset + length], place)
 
     def _decompressed(self, at: int) -> bytes:
-        """Records of the compressed chunk whose body is at ``at``."""
-        _, size = _HEAD.unpack(self._at(at - _HEAD.size, _HEAD.size))
+        """The records of the compressed chunk whose body is at ``at``."""
+        _, size = _RECORD_HEAD.unpack(self._at(at - _RECORD_HEAD.size, _RECORD_HEAD.size))
         chunk = Chunk.read(ReadDataStream(BytesIO(self._at(at, size))))
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         return stream.read(length)
 
-    def _record(self, opcode: int, body: bytes, place: _Place) -> None:
+    def _record(self, opcode: int, body: bytes, location: _Location) -> None:
         try:
-            self._note(opcode, body, place)
-        except (McapError, struct.error, ValueError, EOFError):  # nothing checks what stands outside chunks
+            self._index(opcode, body, location)
+        except (McapError, struct.error, ValueError, EOFError):  # outside chunks there is no checksum
             self._damaged += 1
 
-    def _note(self, opcode: int, body: bytes, place: _Place) -> None:
+    def _index(self, opcode: int, body: bytes, location: _Location) -> None:
         if opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(BytesIO(body)))
             self._channels[channel.id] = channel.topic
@@ -184,17 +186,17 @@ class Session:
                     return
                 self._headers[camera] = (message.log_time, message.publish_time, header)
             elif kind == IMAGE and camera:
-                # The image follows its header: one whose header is missing is no frame.
+                # The image follows its header; without one it is not a frame.
                 before = self._headers.pop(camera, None)
                 if before is not None and before[:2] == (message.log_time, message.publish_time):
-                    self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], place))
+                    self.frames.setdefault(camera, []).append(SessionFrame(before[2], before[0], location))
 
 
 def _framed(data: bytes, at: int) -> Iterator[tuple[int, int, int]]:
     """(opcode, offset, size) of the complete records of a chunk from ``at`` on."""
-    while at + _HEAD.size <= len(data):
-        opcode, size = _HEAD.unpack_from(data, at)
-        at += _HEAD.size
+    while at + _RECORD_HEAD.size <= len(data):
+        opcode, size = _RECORD_HEAD.unpack_from(data, at)
+        at += _RECORD_HEAD.size
         if at + size > len(data):
             return
         yield opcode, at, size

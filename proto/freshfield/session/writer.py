@@ -1,16 +1,16 @@
-"""Writes a session. One thread at a time may use it."""
+"""Write a session. One thread at a time may use the writer."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from freshfield.frame import CODEC_NAMES
 from freshfield.session import (
     CALIBRATION,
-    CODEC_NAMES,
     HEADER,
     IMAGE,
     INSTALL,
@@ -18,7 +18,7 @@ from freshfield.session import (
     TRANSFORMS,
     WORLD,
     SessionError,
-    topic,
+    topic_of,
 )
 from freshfield.v1 import frames_pb2 as pb
 
@@ -33,17 +33,15 @@ try:
 except ImportError:
     raise SessionError(INSTALL) from None
 
-# What a process that is killed loses at most, besides what its thread had not come to.
+# A process that is killed loses at most one chunk, besides what its thread had not written yet.
 _CHUNK_BYTES = 256 * 1024
 
 
 class SessionWriter:
-    """A session being written to ``path``, which must not exist. Raises OSError where it cannot be written.
-
-    messages: how many were written.
-    """
+    """A session being written. messages: number of messages written."""
 
     def __init__(self, path: Path, about: Mapping[str, str]) -> None:
+        """path: must not exist; OSError where it cannot be written. about: metadata of the session."""
         self.messages = 0
         self._file = path.open("xb")
         self._mcap = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
@@ -62,43 +60,39 @@ class SessionWriter:
         lens = size + header.intrinsics.SerializeToString(deterministic=True)
         if self._lenses.get(camera) != lens:
             self._lenses[camera] = lens
-            self._proto(topic(camera, CALIBRATION), _calibration(header, captured_ns), *times)
+            self._proto(topic_of(camera, CALIBRATION), _calibration(header, captured_ns), *times)
         transform = FrameTransform(parent_frame_id=WORLD, child_frame_id=camera)
         pose = PoseInFrame(frame_id=WORLD)
-        for place, turn in (
+        for position, rotation in (
             (transform.translation, transform.rotation),
             (pose.pose.position, pose.pose.orientation),
         ):
-            place.x, place.y, place.z = header.pose.tx_m, header.pose.ty_m, header.pose.tz_m
-            turn.w, turn.x, turn.y, turn.z = header.pose.qw, header.pose.qx, header.pose.qy, header.pose.qz
+            position.x, position.y, position.z = header.pose.tx_m, header.pose.ty_m, header.pose.tz_m
+            q = header.pose
+            rotation.w, rotation.x, rotation.y, rotation.z = q.qw, q.qx, q.qy, q.qz
         image = CompressedImage(frame_id=camera, data=request.payload, format=CODEC_NAMES[header.codec])
         for message in (transform, pose, image):
             message.timestamp.FromNanoseconds(captured_ns)
         self._proto(TRANSFORMS, transform, *times)
-        self._proto(topic(camera, POSE), pose, *times)
-        self._proto(topic(camera, HEADER), header, *times)
-        self._proto(topic(camera, IMAGE), image, *times)
+        self._proto(topic_of(camera, POSE), pose, *times)
+        self._proto(topic_of(camera, HEADER), header, *times)
+        self._proto(topic_of(camera, IMAGE), image, *times)
 
     def data(
-        self, where: str, name: str, schema: Mapping[str, Any], values: Mapping[str, Any], t_ns: int
+        self, topic: str, name: str, schema: Mapping[str, Any], values: Mapping[str, Any], t_ns: int
     ) -> None:
-        """A JSON message of topic ``where``, whose schema has a name."""
-        if where not in self._channels:
-            if name not in self._schemas:
-                self._schemas[name] = self._mcap.register_schema(
-                    name, SchemaEncoding.JSONSchema, json.dumps(schema).encode()
-                )
-            self._channels[where] = self._mcap.register_channel(
-                where, MessageEncoding.JSON, self._schemas[name]
-            )
-        self._add(where, json.dumps(values, allow_nan=False).encode(), t_ns, t_ns, 0)
+        """A JSON message. name: of its schema."""
+        self._register(topic, name, MessageEncoding.JSON, lambda: self._mcap.register_schema(
+            name, SchemaEncoding.JSONSchema, json.dumps(schema).encode()
+        ))  # fmt: skip
+        self._add(topic, json.dumps(values, allow_nan=False).encode(), t_ns, t_ns, 0)
 
     def flush(self) -> None:
         """Give finished chunks to the system."""
         self._file.flush()
 
     def close(self, counts: Mapping[str, int]) -> None:
-        """Write the index and what there is to count, and close the file."""
+        """Write the index and ``counts``, and close the file."""
         try:
             self._mcap.add_metadata("counts", {name: str(count) for name, count in counts.items()})
             self._mcap.finish()
@@ -106,28 +100,32 @@ class SessionWriter:
             self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is."""
+        """Close the file without an index."""
         with suppress(OSError):
             self._file.close()
 
-    def _proto(self, where: str, message: Any, log_ns: int, publish_ns: int, sequence: int) -> None:
-        if where not in self._channels:
-            name = message.DESCRIPTOR.full_name
-            if name not in self._schemas:
-                self._schemas[name] = register_schema(self._mcap, type(message))
-            self._channels[where] = self._mcap.register_channel(
-                where, MessageEncoding.Protobuf, self._schemas[name]
-            )
-        self._add(where, message.SerializeToString(), log_ns, publish_ns, sequence)
+    def _proto(self, topic: str, message: Any, log_ns: int, publish_ns: int, sequence: int) -> None:
+        name = message.DESCRIPTOR.full_name
+        self._register(
+            topic, name, MessageEncoding.Protobuf, lambda: register_schema(self._mcap, type(message))
+        )
+        self._add(topic, message.SerializeToString(), log_ns, publish_ns, sequence)
 
-    def _add(self, where: str, data: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
-        self._mcap.add_message(self._channels[where], log_ns, data, publish_ns, sequence)
+    def _register(self, topic: str, name: str, encoding: str, new_schema: Callable[[], int]) -> None:
+        """The channel of a new topic, and the schema of a new ``name``."""
+        if topic not in self._channels:
+            if name not in self._schemas:
+                self._schemas[name] = new_schema()
+            self._channels[topic] = self._mcap.register_channel(topic, encoding, self._schemas[name])
+
+    def _add(self, topic: str, data: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
+        self._mcap.add_message(self._channels[topic], log_ns, data, publish_ns, sequence)
         self.messages += 1
 
 
 def _calibration(header: pb.FrameHeader, captured_ns: int) -> CameraCalibration:
     k = header.intrinsics
-    cx, cy = k.cx - 0.5, k.cy - 0.5  # OpenCV and ROS count pixel centres
+    cx, cy = k.cx - 0.5, k.cy - 0.5  # OpenCV and ROS count from pixel centers
     message = CameraCalibration(
         frame_id=header.camera_id,
         width=header.width,

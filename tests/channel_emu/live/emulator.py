@@ -56,7 +56,11 @@ class Edge:
         self._ledger = Ledger(self._out, "edge", "edge", clock.now_ns())
         self._clock = clock
         self.ingest = Ingest(
-            clock, FrameBuffer(training), self._held_out, self._ledger, lambda f, t: self.truth.append((f, t))
+            clock,
+            FrameBuffer(training),
+            self._held_out,
+            self._ledger,
+            lambda f: self.truth.append((f, clock.now_ns())),
         )
         self._server = self._transport.aio_server()
         frames_pb2_grpc.add_FrameStreamServiceServicer_to_server(self.ingest, self._server)

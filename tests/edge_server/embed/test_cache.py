@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.embed.cache import EmbeddingCache
-from edge_server.live.buffer import Buffered
-from edge_server.live.view_decoder import Decoder
-from freshfield import payload
-from tests.edge_server.frames import frame
+from edge_server.live.buffer import BufferedFrame
+from edge_server.live.view_decoder import ViewDecoder
+from tests.edge_server.frames import damaged_frame, frame
 
 DIM = 4
 
@@ -33,18 +32,13 @@ class NanForTheFirst(Means):
         return rows
 
 
-def buffered(camera: str = "cam01", sequence: int = 0, **other) -> Buffered:
-    return Buffered(frame(camera, sequence, **other), sequence, sequence)
-
-
-def damaged(camera: str) -> Buffered:
-    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    return buffered(camera, codec="png", payload=payload.encode(image, "png")[:60])
+def buffered(camera: str = "cam01", sequence: int = 0, **other) -> BufferedFrame:
+    return BufferedFrame(frame(camera, sequence, **other), sequence, sequence)
 
 
 def test_a_frame_is_embedded_once_whoever_asks_again():
     means = Means()
-    cache = EmbeddingCache(means, Decoder())
+    cache = EmbeddingCache(means, ViewDecoder().view)
     items = [buffered("cam01"), buffered("cam02", 3)]
     first, ok = cache.of(items)
     again, _ = cache.of(list(reversed(items)))
@@ -57,7 +51,7 @@ def test_a_frame_is_embedded_once_whoever_asks_again():
 
 def test_another_session_with_the_same_number_is_another_frame():
     means = Means()
-    cache = EmbeddingCache(means, Decoder())
+    cache = EmbeddingCache(means, ViewDecoder().view)
     cache.of([buffered("cam01", 1)])
     cache.of([buffered("cam01", 1, session="s2")])
     assert means.asked == [1, 1]
@@ -65,18 +59,18 @@ def test_another_session_with_the_same_number_is_another_frame():
 
 def test_the_same_frame_twice_in_one_question_is_embedded_once():
     means = Means()
-    rows, ok = EmbeddingCache(means, Decoder()).of([buffered()] * 3)
+    rows, ok = EmbeddingCache(means, ViewDecoder().view).of([buffered()] * 3)
     assert means.asked == [1] and ok.all() and (rows == rows[0]).all()
 
 
 def test_nothing_is_embedded_for_nothing():
     means = Means()
-    rows, ok = EmbeddingCache(means, Decoder()).of([])
+    rows, ok = EmbeddingCache(means, ViewDecoder().view).of([])
     assert rows.shape == (0, DIM) and ok.shape == (0,) and means.asked == []
 
 
 def test_a_nan_costs_its_own_camera_and_is_counted_once():
-    cache = EmbeddingCache(NanForTheFirst(), Decoder())
+    cache = EmbeddingCache(NanForTheFirst(), ViewDecoder().view)
     items = [buffered("cam01"), buffered("cam02")]
     for _ in range(3):
         rows, ok = cache.of(items)
@@ -86,17 +80,17 @@ def test_a_nan_costs_its_own_camera_and_is_counted_once():
 
 
 def test_a_frame_that_cannot_be_decoded_is_a_camera_without_embedding():
-    means, decoder = Means(), Decoder()
-    cache = EmbeddingCache(means, decoder)
+    means, decoder = Means(), ViewDecoder()
+    cache = EmbeddingCache(means, decoder.view)
     for _ in range(3):
-        rows, ok = cache.of([damaged("cam01"), buffered("cam02")])
+        rows, ok = cache.of([BufferedFrame(damaged_frame("cam01"), 0, 0), buffered("cam02")])
         assert ok.tolist() == [False, True] and (rows[0] == 0).all()
     assert cache.failed == 1 and decoder.undecodable == 1 and means.asked == [1]
 
 
 def test_memory_is_bounded_and_the_latest_used_stay():
     means = Means()
-    cache = EmbeddingCache(means, Decoder(), capacity=4)
+    cache = EmbeddingCache(means, ViewDecoder().view, capacity=4)
     kept = buffered("cam02")
     for k in range(20):
         cache.of([buffered("cam01", k), kept])
@@ -105,7 +99,7 @@ def test_memory_is_bounded_and_the_latest_used_stay():
 
 
 def test_a_decision_larger_than_the_cache_is_answered_whole():
-    cache = EmbeddingCache(Means(), Decoder(), capacity=2)
+    cache = EmbeddingCache(Means(), ViewDecoder().view, capacity=2)
     items = [buffered(f"cam{k:02d}") for k in range(9)]
     for _ in range(2):
         rows, ok = cache.of(items)
@@ -114,7 +108,7 @@ def test_a_decision_larger_than_the_cache_is_answered_whole():
 
 
 def test_a_caller_that_writes_into_its_rows_does_not_change_the_cache():
-    cache = EmbeddingCache(Means(), Decoder())
+    cache = EmbeddingCache(Means(), ViewDecoder().view)
     rows, _ = cache.of([buffered()])
     rows[:] = np.nan
     again, ok = cache.of([buffered()])

@@ -126,7 +126,7 @@ def test_a_camera_that_moved_has_its_whole_way(run, tmp_path, capsys):
 
 def test_a_run_writes_down_where_its_cameras_were(tmp_path):
     from edge_server.fields import View
-    from edge_server.live.journal import Journal
+    from edge_server.live.output.journal import Journal
     from freshfield.geometry import Pinhole
 
     lens, picture = Pinhole.from_fov(8, 8, 50), np.zeros((8, 8, 3), np.uint8)

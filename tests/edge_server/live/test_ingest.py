@@ -1,4 +1,4 @@
-"""Every refusal at the edge's door: named, counted, and without harm to what comes after it."""
+"""Every refusal at the edge: named, counted, and without effect on the next frame."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from edge_server.live.buffer import FrameBuffer
-from edge_server.live.ingest import Gate, Ingest, Recent
+from edge_server.live.ingest import FrameAdmission, Ingest, RollingPercentiles
 from freshfield.clock import VirtualClock
-from freshfield.frame import FrameRejected, to_request
-from freshfield.ledger import Ledger, read
+from freshfield.frame import FrameRejected, checksum, to_request
+from freshfield.ledger import Ledger, LedgerReader
 from freshfield.v1 import frames_pb2 as pb
 from tests.edge_server.frames import frame
 
@@ -24,7 +24,7 @@ def ingest(tmp_path):
     clock = VirtualClock(NOW)
     held = []
     ledger = Ledger(tmp_path, "edge", "edge", NOW)
-    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, lambda f, t: held.append(f))
+    made = Ingest(clock, FrameBuffer(["cam01"]), ["cam00"], ledger, held.append)
     made.test_clock, made.test_held, made.test_ledger = clock, held, ledger
     yield made
     ledger.close(NOW)
@@ -38,7 +38,7 @@ def test_an_accepted_frame_is_buffered_and_written_down(ingest):
     answer = ingest.take(to_request(good()))
     assert (answer.outcome, answer.sequence) == (pb.OUTCOME_ACCEPTED, 0)
     assert ingest._buffer.ages_ms(NOW)["cam01"] == pytest.approx(50.0)
-    (event,) = read(ingest.test_ledger.path).events
+    (event,) = LedgerReader(ingest.test_ledger.path).events
     assert (event.event, event.camera, event.sequence) == ("delivered", "cam01", 0)
 
 
@@ -60,8 +60,6 @@ def bad(kind: str) -> pb.PushRequest:
     if kind == "bad_pose":
         request = to_request(base)
         request.header.pose.qw = 7.0
-        from freshfield.frame import checksum
-
         request.crc32c = checksum(request.header, request.payload)
         return request
     changes = {
@@ -89,45 +87,45 @@ def test_a_refusal_is_named_counted_and_loses_nothing_else(ingest, kind):
     assert ingest.rejected == {kind: 1}
     # The very next frame, with a sequence below the refused one's, is welcome.
     assert ingest.take(to_request(good(sequence=1))).outcome == pb.OUTCOME_ACCEPTED
-    events = [e.event for e in read(ingest.test_ledger.path).events]
+    events = [e.event for e in LedgerReader(ingest.test_ledger.path).events]
     assert events == ["rejected", "delivered"]
 
 
 def test_replay_and_reversed_time_are_refused_within_a_session_only():
-    gate = Gate(["cam01"], [])
-    gate.admit(good(sequence=3), NOW)
+    admission = FrameAdmission(["cam01"], [])
+    admission.admit(good(sequence=3), NOW)
     with pytest.raises(FrameRejected) as replay:
-        gate.admit(good(sequence=3), NOW)
+        admission.admit(good(sequence=3), NOW)
     assert replay.value.reason == "replayed_sequence"
     with pytest.raises(FrameRejected) as reversed_time:
-        gate.admit(frame(sequence=4, generated_ns=NOW - 90 * MS), NOW)
+        admission.admit(frame(sequence=4, generated_ns=NOW - 90 * MS), NOW)
     assert reversed_time.value.reason == "time_reversed"
-    gate.admit(good(sequence=0, session="s2"), NOW)
+    admission.admit(good(sequence=0, session="s2"), NOW)
 
 
-def test_a_thousand_sessions_do_not_grow_the_gate():
-    gate = Gate(["cam01"], [])
+def test_a_thousand_sessions_do_not_grow_the_admission():
+    admission = FrameAdmission(["cam01"], [])
     for i in range(1000):
-        gate.admit(good(session=f"s{i}"), NOW)
-    assert len(gate._sessions["cam01"]) <= 64
+        admission.admit(good(session=f"s{i}"), NOW)
+    assert len(admission._sessions["cam01"]) <= 64
 
 
 def test_an_uncertain_clock_is_given_its_uncertainty():
     ahead = frame(generated_ns=NOW + 400 * MS, clock_uncertainty_ns=200 * MS)
-    Gate(["cam01"], []).admit(ahead, NOW)
+    FrameAdmission(["cam01"], []).admit(ahead, NOW)
     with pytest.raises(FrameRejected):
-        Gate(["cam01"], []).admit(dataclasses.replace(ahead, clock_uncertainty_ns=0), NOW)
+        FrameAdmission(["cam01"], []).admit(dataclasses.replace(ahead, clock_uncertainty_ns=0), NOW)
 
 
 def test_an_unknown_clock_cannot_bring_a_frame_from_tomorrow():
     tomorrow = frame(generated_ns=NOW + 2 * 10**9, clock_uncertainty_ns=3600 * 10**9)
     with pytest.raises(FrameRejected) as refused:
-        Gate(["cam01"], []).admit(tomorrow, NOW)
+        FrameAdmission(["cam01"], []).admit(tomorrow, NOW)
     assert refused.value.reason == "from_future"
 
 
 def test_recent_percentiles_match_numpy_over_the_window():
-    recent = Recent(100)
+    recent = RollingPercentiles(100)
     assert recent.percentile(50) is None
     values = np.random.default_rng(0).random(250)
     for value in values:

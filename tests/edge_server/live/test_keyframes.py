@@ -12,8 +12,8 @@ import pytest
 from edge_server.config import EdgeConfig, KeyframesConfig
 from edge_server.fields import Budget, View
 from edge_server.live.buffer import FrameBuffer
+from edge_server.live.field_updater import FieldUpdater
 from edge_server.live.keyframes import Keyframes
-from edge_server.live.loop import Updates, open_keyframes
 from edge_server.scheduler import make_policy
 from freshfield.geometry import Pinhole, Pose, look_at
 from tests.edge_server.fields_for_tests import tiny_field
@@ -100,24 +100,24 @@ def test_the_oldest_gives_way():
         given = kept.with_earlier([view("hand", 15 * t_ms, t_ms)])
         assert len(kept) == min(3, t_ms + 1)
     assert sorted(v.generated_ns for v in given) == [7_000_000, 8_000_000, 9_000_000]
-    kept.forget()
+    kept.clear()
     assert len(kept.with_earlier([view("hand", 0, 11)])) == 1
 
 
 def test_a_field_of_few_viewpoints_is_begun_anew_when_they_double_and_a_resumed_one_never():
     kept = Keyframes(KeyframesConfig())
     counts = (1, 1, 2, 3, 4, 4, 7, 9, 15, 16, 18, 40)
-    assert [n for n in counts if kept.outgrown(n)] == [2, 4, 9, 18]
-    kept.forget()
-    assert [n for n in (1, 2) if kept.outgrown(n)] == [2]
-    assert not any(Keyframes(KeyframesConfig(), resumed=True).outgrown(n) for n in counts)
+    assert [n for n in counts if kept.should_restart(n)] == [2, 4, 9, 18]
+    kept.clear()
+    assert [n for n in (1, 2) if kept.should_restart(n)] == [2]
+    assert not any(Keyframes(KeyframesConfig(), resumed=True).should_restart(n) for n in counts)
     many = Keyframes(KeyframesConfig())  # a rig of twenty is no beginning
-    assert not any(many.outgrown(n) for n in (20, 40, 80))
+    assert not any(many.should_restart(n) for n in (20, 40, 80))
 
 
 def test_updates_hand_them_to_the_field_and_report_frames_only():
     policy = make_policy("all", None, np.random.default_rng(0))
-    u = Updates(FrameBuffer(["hand"]), policy, tiny_field(), 0, keyframes=Keyframes(KeyframesConfig()))
+    u = FieldUpdater(FrameBuffer(["hand"]), policy, tiny_field(), 0, keyframes=Keyframes(KeyframesConfig()))
     given, fit, reset = [], u.field.fit, u.field.reset
 
     def watched(views, budget):
@@ -138,12 +138,12 @@ def _update(u, k):
     pose = Pose.from_matrix(view("", 30 * k, 0, radius_m=2.0).camera_to_world)
     u.buffer.put(frame("hand", sequence=k, generated_ns=k * 10**9, pose=pose), k * 10**9)
     views, report = u.fit(u.select(u.plan(k * 10**9), k * 10**9), Budget(steps=1))
-    assert report.refused == ("hand",)  # what is refused of an earlier viewpoint is no frame's matter
+    assert report.refused == ("hand",)  # without "hand#0", an earlier viewpoint
     return views
 
 
 def test_without_the_key_nothing_of_it_is_loaded():
-    assert open_keyframes(EdgeConfig().keyframes) is None
+    assert EdgeConfig().keyframes is None
     code = "import sys, edge_server.live.server; print('edge_server.live.keyframes' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 

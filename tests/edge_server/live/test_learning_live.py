@@ -1,4 +1,4 @@
-"""A learnt policy in a running edge server: it decides, goes on learning, says so, leaves what it learnt."""
+"""A learned policy in a running edge server: it decides, goes on learning, and leaves what it learned."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import pytest
 
 from edge_server.cli import main
 from edge_server.config import LearnConfig, PolicyConfig, read_config
-from edge_server.live.server import EdgeServer, Options
+from edge_server.live.server import EdgeServer, ServerOptions
+from edge_server.scheduler import read_policy
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
@@ -33,12 +34,12 @@ def policy(tmp_path):
 
 def server(tmp_path, policy, held_out=("cam00",), port=None, learn=None) -> EdgeServer:
     what = tiny_scenario(tmp_path, held_out)
-    config = replace(read_config(what), policy=PolicyConfig(str(policy)), learn=learn)
-    options = Options(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
+    config = replace(read_config(what), policy=PolicyConfig(*read_policy(policy)), learn=learn)
+    options = ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
     return EdgeServer(what, config, options)
 
 
-def test_it_decides_learns_and_leaves_what_it_learnt(tmp_path, policy, monkeypatch):
+def test_it_decides_learns_and_leaves_what_it_learned(tmp_path, policy, monkeypatch):
     monkeypatch.setattr("edge_server.scheduler.online.online_policy.Leash", lambda: Leash(batch=3, settle=2))
     port = free_port()
     edge = server(tmp_path, f"bandit:{policy}", port=port, learn=LearnConfig("set", "threshold:200"))
@@ -53,7 +54,7 @@ def test_it_decides_learns_and_leaves_what_it_learnt(tmp_path, policy, monkeypat
         edge.state.set_policy("all", None)
         assert edge.state.learning() == ""
         edge.state.set_policy(f"bandit:{policy}", None)
-        assert edge.updates is not None and "learning" in edge.state.learning()
+        assert edge.updater is not None and "learning" in edge.state.learning()
     finally:
         feed.stop()
         edge.stop()
@@ -74,15 +75,9 @@ def test_it_decides_learns_and_leaves_what_it_learnt(tmp_path, policy, monkeypat
         (("cam00",), "bandit:nowhere.npz", "no such checkpoint"),
     ],
 )
-def test_who_cannot_learn_is_refused_in_one_line(held_out, name, said, tmp_path, policy):
-    if name == "threshold:90":
-        what = tiny_scenario(tmp_path, held_out)
-        config = replace(read_config(what), policy=PolicyConfig("threshold", 90.0), learn=LearnConfig())
-        make = lambda: EdgeServer(what, config, Options("127.0.0.1:1", tmp_path / "out"))  # noqa: E731
-    else:
-        make = lambda: server(tmp_path, name or f"bandit:{policy}", held_out, learn=LearnConfig())  # noqa: E731
+def test_a_policy_that_cannot_learn_is_refused_in_one_line(held_out, name, said, tmp_path, policy):
     with pytest.raises(ScenarioError, match=said) as error:
-        make()
+        server(tmp_path, name or f"bandit:{policy}", held_out, learn=LearnConfig())
     assert str(error.value).count("\n") == 0
 
 
@@ -90,7 +85,7 @@ def test_a_policy_learns_on_by_the_reward_it_was_trained_by_or_says_what_is_miss
     learner = Learner.load(policy)
     learner.taught_by = asdict(make_reward("set", "moving", distance=-0.25))
     learner.save(policy)
-    by = server(tmp_path, f"bandit:{policy}", learn=LearnConfig()).lessons.reward
+    by = server(tmp_path, f"bandit:{policy}", learn=LearnConfig()).trainer.reward
     assert (by.name, by.fidelity) == ("set", "moving") and by.distance in (-0.25, 0.0)
     learner.taught_by = asdict(make_reward("set", distance_is="perceptual"))
     learner.save(policy)
@@ -100,12 +95,12 @@ def test_a_policy_learns_on_by_the_reward_it_was_trained_by_or_says_what_is_miss
 
 def test_without_being_asked_nothing_learns(tmp_path, policy):
     edge = server(tmp_path, f"bandit:{policy}")
-    assert edge.lessons is None and edge.status()["learning"] is None and edge.state.learning() == ""
-    assert edge.updates.embeddings is None
+    assert edge.trainer is None and edge.status()["learning"] is None and edge.state.learning() == ""
+    assert edge.updater.embeddings is None
 
 
 def refused(capsys, *words: str) -> str:
-    """What the command says of options that it does not begin with: one line, once."""
+    """The message of options that the command refuses: one line, once."""
     assert main(["run", *map(str, words)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
@@ -156,13 +151,13 @@ def test_a_scenario_says_that_its_policy_learns_and_the_command_has_the_last_wor
     monkeypatch.setattr(EdgeServer, "run", lambda self: found.append(self))
     monkeypatch.setattr("edge_server.cli.signal.signal", lambda *_: None)  # Ctrl-C is pytest's
     assert main(["run", file, "--out", str(tmp_path / "out"), *words]) == 0
-    lessons = found[0].lessons
+    trainer = found[0].trainer
     if reward is None:
-        assert lessons is None
+        assert trainer is None
         return
     name, _, on = reward.partition(":")
-    assert (lessons.reward.name, lessons.reward.fidelity) == (name, on or "whole")
-    assert name_of(lessons.apprentice.fixed) == fallback
+    assert (trainer.reward.name, trainer.reward.fidelity) == (name, on or "whole")
+    assert name_of(trainer.apprentice.fixed) == fallback
 
 
 def test_a_scenario_with_a_mistyped_key_of_learning_is_refused(tmp_path, policy, capsys):

@@ -10,8 +10,9 @@ import pytest
 
 from edge_server.fields import Budget
 from edge_server.live.buffer import FrameBuffer
-from edge_server.live.loop import Loop, Updates
-from edge_server.live.update_budget import Fixed
+from edge_server.live.field_updater import FieldUpdater
+from edge_server.live.loop import UpdateLoop
+from edge_server.live.update_budget import FixedBudget
 from edge_server.scheduler import make_policy
 from freshfield.clock import WallClock
 from tests.edge_server.fields_for_tests import tiny_field
@@ -20,9 +21,9 @@ from tests.edge_server.frames import frame
 MS = 1_000_000
 
 
-def updates(policy="all", value=None, cameras=("cam01", "cam02")) -> Updates:
+def updates(policy="all", value=None, cameras=("cam01", "cam02")) -> FieldUpdater:
     made = make_policy(policy, value, np.random.default_rng(0))
-    return Updates(FrameBuffer(cameras), made, tiny_field(), start_ns=0)
+    return FieldUpdater(FrameBuffer(cameras), made, tiny_field(), start_ns=0)
 
 
 def test_an_update_in_virtual_time_is_charged_to_the_ages():
@@ -64,7 +65,7 @@ def test_a_treatment_sees_the_frame_before_and_what_was_delivered_is_handed_on()
     assert u.treatment_cost.views == 2 and u.treatment_cost.ms_per_view > 0
 
 
-def test_a_policy_without_treatment_gives_the_memory_back():
+def test_a_policy_without_treatment_frees_the_memory():
     u = updates("all")
     u.policy = make_policy("mask", None, np.random.default_rng(0))
     for k in range(3):
@@ -82,13 +83,13 @@ def test_an_empty_buffer_selects_nothing():
 
 
 class Running:
-    """A loop on the wall clock, with what it published and said."""
+    """A loop on the wall clock, with what it published and its status lines."""
 
-    def __init__(self, u: Updates, grace_ms: float = 0.0, pacing=None) -> None:
+    def __init__(self, u: FieldUpdater, grace_ms: float = 0.0, budget=None) -> None:
         self.published, self.lines, self.saved = [], [], []
         self.clock = WallClock()
-        self.loop = Loop(
-            u, self.clock, pacing or Fixed(100.0), grace_ms,
+        self.loop = UpdateLoop(
+            u, self.clock, budget or FixedBudget(100.0), grace_ms,
             lambda p, r, v: self.published.append((p, r)), self.lines.append, self.saved.append,
         )  # fmt: skip
 
@@ -104,7 +105,7 @@ class Running:
 def running():
     made: list[Running] = []
 
-    def start(u: Updates, **options) -> Running:
+    def start(u: FieldUpdater, **options) -> Running:
         run = Running(u, **options)
         made.append(run)
         run.loop.start()
@@ -142,28 +143,28 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(running, tm
     assert run.published[-1][0].omega_ms == 0.0
 
 
-def test_an_update_without_time_to_learn_is_told_once_and_again_if_it_comes_back(running, caplog):
+def test_an_update_without_time_to_learn_is_warned_of_once_and_again_if_it_comes_back(running, caplog):
     class Changing:
         """No time at all, then some, then none again."""
 
         def __init__(self):
             self.updates = 0
 
-        def budget(self):
+        def next(self):
             return Budget(steps=1) if self.updates == 4 else Budget(seconds=1e-6)
 
-        def done(self, budget, update_ms):
+        def record(self, budget, update_ms):
             self.updates += 1
 
     u = updates()
     now = WallClock().now_ns()
     u.buffer.put(frame("cam01", generated_ns=now), now)
-    run = running(u, pacing=Changing())
+    run = running(u, budget=Changing())
     run.until(lambda: len(run.published) >= 8)
     run.loop.stop()
     assert [publication.steps for publication, _ in run.published[:8]] == [0, 0, 0, 0, 1, 0, 0, 0]
-    told = [record.message for record in caplog.records if "made no step" in record.message]
-    assert len(told) == 2 and "edge.update_ms" in told[0]
+    warnings = [record.message for record in caplog.records if "made no step" in record.message]
+    assert len(warnings) == 2 and "edge.update_ms" in warnings[0]
 
 
 def test_a_camera_that_never_reports_does_not_hold_the_others_up(running):

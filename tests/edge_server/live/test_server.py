@@ -13,7 +13,7 @@ import pytest
 
 from edge_server.config import read_config
 from edge_server.fields import checkpoint
-from edge_server.live.server import EdgeServer, Options
+from edge_server.live.server import EdgeServer, ServerOptions
 from freshfield import frame as wire
 from freshfield import payload, scenario
 from freshfield.geometry import Pose, look_at
@@ -84,7 +84,7 @@ def serve(tmp_path):
         made = made or tiny_scenario(tmp_path)
         port = free_port()
         server = EdgeServer(
-            made, read_config(made), Options(f"127.0.0.1:{port}", tmp_path / "out", **options)
+            made, read_config(made), ServerOptions(f"127.0.0.1:{port}", tmp_path / "out", **options)
         )
         thread = threading.Thread(target=server.run)
         thread.start()
@@ -135,9 +135,9 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     _, about = checkpoint.load(out / "field.npz")
     assert about["updates"] == len(series)
     again, _, _ = serve(resume=out / "field.npz")
-    assert again.field.step > 0 and again.updates.number == len(series)
+    assert again.field.step > 0 and again.updater.number == len(series)
     fresh, _, _ = serve()
-    assert fresh.updates.number == 0
+    assert fresh.updater.number == 0
     kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     assert kept[: len(series)] == series  # what the first process wrote is still there
 
@@ -201,7 +201,7 @@ def test_a_taken_port_is_one_clear_error(serve, tmp_path):
     _, port, _ = serve()
     grpc.channel_ready_future(Transport().channel(f"127.0.0.1:{port}")).result(30)
     made = tiny_scenario(tmp_path)
-    second = EdgeServer(made, read_config(made), Options(f"127.0.0.1:{port}", tmp_path / "second"))
+    second = EdgeServer(made, read_config(made), ServerOptions(f"127.0.0.1:{port}", tmp_path / "second"))
     with pytest.raises(ValueError, match="cannot listen"):
         second.run()
 

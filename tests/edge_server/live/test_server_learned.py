@@ -1,4 +1,4 @@
-"""A whole edge server that decides by what was learnt: real frames, a real embedder, recorded decisions."""
+"""A whole edge server with a learned policy: real frames, a real embedder, recorded decisions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
 pytest.importorskip("onnx", reason="the extra embed is not installed")
 
 from edge_server.config import read_config
-from edge_server.live.server import EdgeServer, Options
+from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.explain_command import main as explain
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -33,7 +33,9 @@ def server_of(tmp_path, layout, embedding=True, port=None):
         edge["embedding"] = {"model": "d.onnx", "dim": CHANNELS, "provider": "cpu"}
     data = {"name": "tiny", "seed": 3, "cameras": {"count": 3, "held_out": ["cam00"]}, "edge": edge}
     made = scenario.parse(data, tmp_path / "tiny.yaml")
-    return EdgeServer(made, read_config(made), Options(f"127.0.0.1:{port or free_port()}", tmp_path / "out"))
+    return EdgeServer(
+        made, read_config(made), ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
+    )
 
 
 def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_path, capsys):
@@ -44,7 +46,7 @@ def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_
     feed = Feed(port, server.scenario.cameras, server.scenario.held_out)
     feed.start()
     try:
-        until(lambda: server.updates.number >= 4)
+        until(lambda: server.updater.number >= 4)
         decided = server.state.decision()
         assert decided is not None and decided.actor.spec.layout.dim == CHANNELS
         with pytest.raises(ValueError, match="chosen at the start"):

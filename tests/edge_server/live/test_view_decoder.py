@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.live.buffer import Buffered
-from edge_server.live.view_decoder import Decoder
-from tests.edge_server.frames import frame
+from edge_server.live.buffer import BufferedFrame
+from edge_server.live.view_decoder import ViewDecoder
+from tests.edge_server.frames import damaged_frame, frame
 
 
 def test_a_frame_is_decoded_once_and_carries_the_edges_time():
-    decoder = Decoder()
-    item = Buffered(frame(generated_ns=5, clock_offset_ns=7), 12, 20)
+    decoder = ViewDecoder()
+    item = BufferedFrame(frame(generated_ns=5, clock_offset_ns=7), 12, 20)
     (first,) = decoder.views([item])
     (second,) = decoder.views([item])
     assert first is second
@@ -19,33 +19,23 @@ def test_a_frame_is_decoded_once_and_carries_the_edges_time():
 
 
 def test_a_damaged_payload_is_counted_once_and_loses_nothing_else():
-    decoder = Decoder()
-    whole = frame("cam02")
-    # Headers intact, entropy-coded data gone: it passes the door and fails at decoding.
-    cut = frame("cam01", codec="png", payload=_png_without_data())
-    items = [Buffered(cut, 0, 0), Buffered(whole, 0, 0)]
+    decoder = ViewDecoder()
+    items = [BufferedFrame(damaged_frame("cam01"), 0, 0), BufferedFrame(frame("cam02"), 0, 0)]
     assert [v.camera for v in decoder.views(items)] == ["cam02"]
     assert [v.camera for v in decoder.views(items)] == ["cam02"]
     assert decoder.undecodable == 1
 
 
-def _png_without_data() -> bytes:
-    from freshfield import payload
-
-    image = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
-    return payload.encode(image, "png")[:60]
-
-
 def test_memory_is_one_view_a_camera():
-    decoder = Decoder()
+    decoder = ViewDecoder()
     for i in range(200):
-        decoder.views([Buffered(frame(sequence=i), i, i)])
+        decoder.views([BufferedFrame(frame(sequence=i), i, i)])
     assert len(decoder._views) == 1
 
 
 def test_what_was_newest_is_not_decoded_again_as_the_one_before():
-    decoder = Decoder()
-    items = [Buffered(frame(sequence=i, generated_ns=i), i, i) for i in range(3)]
+    decoder = ViewDecoder()
+    items = [BufferedFrame(frame(sequence=i, generated_ns=i), i, i) for i in range(3)]
     (first,) = decoder.views([items[0]])
     assert decoder.earlier([items[0]])["cam01"] is first
     (second,) = decoder.views([items[1]])
@@ -58,9 +48,9 @@ def test_what_was_newest_is_not_decoded_again_as_the_one_before():
 
 
 def test_a_damaged_frame_before_is_counted_once_and_is_missing():
-    decoder = Decoder()
-    cut = Buffered(frame("cam01", codec="png", payload=_png_without_data()), 0, 0)
-    whole = Buffered(frame("cam02"), 0, 0)
+    decoder = ViewDecoder()
+    cut = BufferedFrame(damaged_frame("cam01"), 0, 0)
+    whole = BufferedFrame(frame("cam02"), 0, 0)
     for _ in range(2):
         assert list(decoder.earlier([cut, whole])) == ["cam02"]
     assert decoder.undecodable == 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge_server.live.journal import Journal
+from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
 from tests.edge_server.report.ledgers import write
 

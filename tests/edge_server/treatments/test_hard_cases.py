@@ -1,4 +1,4 @@
-"""Whatever two frames a camera delivers, a treatment gives views that a field can take, and says so alike."""
+"""Whatever two frames a camera delivers, treatments return views that a field accepts, deterministically."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from freshfield.geometry import look_at
 from tests.edge_server.treatments.pictures import HEIGHT, MS, POSE, WIDTH, picture, seen, view
 
 every = pytest.mark.parametrize("name", TREATMENTS)
-FRESH = seen(2000.0, "cam09")  # a young view beside, so that the others are stale
+FRESH = seen(2000.0, "cam09")  # a young view, so that the others are stale
 
 
 def treat(name: str, now, before, at_ms: float = 2000.0):
-    """The view after its treatment, which must not have touched what it was given."""
+    """The treated view. The treatment must not change its arguments."""
     treatment = treatment_of(make_policy(name, None, np.random.default_rng(0)))
     images = [v.image.copy() for v in (now, before) if v is not None]
     earlier = {} if before is None else {now.camera: before}
@@ -86,7 +86,7 @@ def test_a_gap_of_a_nanosecond_and_of_an_hour(name):
 
 
 @every
-def test_another_size_or_lens_or_place_is_the_cameras_own_doing(name):
+def test_another_size_lens_or_pose_leaves_the_view_as_it_is(name):
     now, before = seen(60.0), seen(0.0)
     half = replace(before, image=before.image[::2, ::2], intrinsics=before.intrinsics.scaled(0.5))
     assert treat(name, now, half) is now

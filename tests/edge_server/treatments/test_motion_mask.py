@@ -1,4 +1,4 @@
-"""Of stale views, what was moving counts for less, the more the older they are."""
+"""Moving pixels of stale views count for less, and for less the older the views are."""
 
 from __future__ import annotations
 
@@ -6,30 +6,26 @@ import numpy as np
 import pytest
 
 from edge_server.treatments.change_detection import compare
-from edge_server.treatments.motion_mask import Mask, speed_px_per_ms
-from tests.edge_server.treatments.pictures import MS, picture, seen
+from edge_server.treatments.motion_mask import MotionMask, speed_px_per_ms
+from tests.edge_server.treatments.pictures import MS, picture, seen, view
 
 
 def masked(ages_ms: list[float], speed: float = 0.08):
-    """Cameras that saw the same at other times, treated at one instant."""
+    """Views of the same at several ages, before and after their treatment."""
     now_ms = 1000.0
     views, earlier = [], {}
     for k, age_ms in enumerate(ages_ms):
-        camera = f"cam{k:02d}"
-        views.append(seen(100.0, camera, px_per_ms=speed))
-        views[-1] = type(views[-1])(**{**vars(views[-1]), "generated_ns": round((now_ms - age_ms) * MS)})
-        before = seen(40.0, camera, px_per_ms=speed)
-        earlier[camera] = type(before)(
-            **{**vars(before), "generated_ns": round((now_ms - age_ms - 60.0) * MS)}
-        )
-    return views, Mask().treat(views, earlier, round(now_ms * MS))
+        camera, captured_ms = f"cam{k:02d}", now_ms - age_ms
+        views.append(view(picture(100.0, speed), captured_ms, camera))
+        earlier[camera] = view(picture(40.0, speed), captured_ms - 60.0, camera)
+    return views, MotionMask().treat(views, earlier, round(now_ms * MS))
 
 
 def test_weights_fall_with_age_and_reach_farther():
     views, treated = masked([10.0, 60.0, 90.0])
     assert [t is v for t, v in zip(treated, views)] == [True, False, False], "the youngest stay whole"
     least = [1.0 if v.weight is None else float(v.weight.min()) for v in treated]
-    assert least[0] == 1.0 > least[1] > least[2] >= Mask().least_weight
+    assert least[0] == 1.0 > least[1] > least[2] >= MotionMask().least_weight
     wide = [int((v.weight < 1.0).sum()) for v in treated[1:]]
     assert wide[1] > wide[0], "what moved is farther by now"
     assert all(v.image is w.image and v.carried_to_ns is None for v, w in zip(treated, views))

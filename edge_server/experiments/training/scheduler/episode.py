@@ -31,8 +31,8 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
-from edge_server.live.buffer import Buffered, FrameBuffer
-from edge_server.live.view_decoder import Decoder
+from edge_server.live.buffer import BufferedFrame, FrameBuffer
+from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import make_policy, treatment_of
 from edge_server.scheduler.learned.observation import Embeddings, observe
 from edge_server.scheduler.learned.state import State
@@ -139,11 +139,11 @@ class _Recorder(FrameBuffer):
 
     def __init__(self, cameras: Sequence[str]) -> None:
         super().__init__(cameras)
-        self.record: list[Buffered] = []
+        self.record: list[BufferedFrame] = []
 
     def put(self, frame: Frame, received_ns: int) -> None:
         super().put(frame, received_ns)
-        self.record.append(Buffered(frame, frame.generated_edge_ns, received_ns))
+        self.record.append(BufferedFrame(frame, frame.generated_edge_ns, received_ns))
 
 
 def _remembered(image: Image, period_ns: int | None) -> Image:
@@ -201,7 +201,7 @@ class Ground:
             return None
         from edge_server.embed.cache import EmbeddingCache
 
-        return EmbeddingCache(self._embedder, Decoder())
+        return EmbeddingCache(self._embedder, ViewDecoder().view)
 
     def field(self, seed: int) -> Field:
         """The field of an episode, in any state: whoever takes it resets or loads it."""
@@ -336,14 +336,14 @@ class Episode:
         state = observe(cameras, newest, now_ns, self._embeddings, setting.parts)
         return Moment(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)
 
-    def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[Buffered, ...]:
+    def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[BufferedFrame, ...]:
         return self._deployment.exposed([self._frames[a.camera, a.sequence] for a in arrivals])
 
     def _decoded(self, arrivals: Sequence[Arrival]) -> list[View]:
         """Views in the order given, each decoded once, without those that cannot be."""
         missing = [a for a in arrivals if (a.camera, a.sequence) not in self._views]
         for item in self._exposed(missing):
-            views = Decoder().views([item])
+            views = ViewDecoder().views([item])
             self._views[item.frame.camera, item.frame.sequence] = views[0] if views else None
         found = [self._views.get((a.camera, a.sequence)) for a in arrivals]
         return [view for view in found if view is not None]

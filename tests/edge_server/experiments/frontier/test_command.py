@@ -16,7 +16,7 @@ from edge_server.experiments.frontier.update_time import Moving, Stage, charges,
 from edge_server.experiments.scenes.multiview_still import synthetic
 from edge_server.experiments.virtual.virtual_deployment import Compute
 from edge_server.fields.voxel import settings
-from edge_server.live.update_budget import read_points
+from edge_server.live.update_budget import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
 TINY = Moving(cameras=4, size=32)
@@ -153,7 +153,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
     assert all(ms > 0 for ms in data["ms_per_step"].values())
     with (tmp_path / "updates.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 4  # two efforts, two update times
-    assert {p.effort for p in read_points(tmp_path / "frontier.json", "ngp")} == {"low", "medium"}
+    assert {p.effort for p in read_frontier(tmp_path / "frontier.json", "ngp")} == {"low", "medium"}
 
     # As after Ctrl-C: what is finished is not measured again, the rest is, and nothing else has changed.
     points = data["points"]

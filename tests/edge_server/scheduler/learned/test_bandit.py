@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.config import read_config
 from edge_server.live.buffer import FrameBuffer
-from edge_server.live.loop import Updates
+from edge_server.live.field_updater import FieldUpdater
 from edge_server.scheduler import Epoch, help_of, make_live_policy, make_policy, read_policy
 from edge_server.scheduler.learned.bandit import Bandit
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -132,7 +132,7 @@ class Brightness:
 
 
 def updates(p, embedder=None):
-    made = Updates(FrameBuffer(("a", "b", "c")), p, tiny_field(), start_ns=0, embedder=embedder)
+    made = FieldUpdater(FrameBuffer(("a", "b", "c")), p, tiny_field(), start_ns=0, embedder=embedder)
     for i, camera in enumerate("ac"):
         made.buffer.put(frame(camera, i, generated_ns=10 * i * MS), 20 * MS)
     return made

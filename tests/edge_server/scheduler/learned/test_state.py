@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.live.buffer import Buffered
+from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler.learned.observation import observe
 from edge_server.scheduler.learned.state import State, StateLayout
 from freshfield.geometry import Pose, look_at, so3_exp
@@ -119,7 +119,7 @@ def rig(scale=1.0, shift=(0.0, 0.0, 0.0)):
         matrix = look_at(eye, [0.0, 0.0, 0.0])
         matrix[:3, 3] += shift
         made = frame(f"c{i}", sequence=i, generated_ns=10 * i * MS, pose=Pose.from_matrix(matrix))
-        out[f"c{i}"] = Buffered(made, made.generated_ns, 50 * MS)
+        out[f"c{i}"] = BufferedFrame(made, made.generated_ns, 50 * MS)
     return out
 
 

@@ -1,4 +1,4 @@
-"""Keeps what a learnt policy decided and saw, so that it can be explained (``edge-server explain``)."""
+"""Records what a learned policy decided and saw, so that ``edge-server explain`` can explain it."""
 
 from __future__ import annotations
 
@@ -8,32 +8,34 @@ from typing import TYPE_CHECKING
 
 from edge_server.scheduler import Policy, decision_of
 
-if TYPE_CHECKING:  # loaded only where a policy was learnt
+if TYPE_CHECKING:  # imported at run time only where a policy is learned
     from edge_server.embed import EmbeddingConfig
     from edge_server.scheduler.learned.decision_record import DecisionRecord
 
 
-class Decisions:
-    """Writes decisions under ``out``, live and in virtual time; of policies that were not learnt there are
-    none, and nothing is written. embedding: how frames are embedded, if they are. Not thread-safe."""
+class DecisionLog:
+    """Writes the decisions of learned policies under ``out``; with other policies it writes nothing.
+
+    embedding: how frames are embedded, if they are. Not thread-safe.
+    """
 
     def __init__(self, out: Path, embedding: EmbeddingConfig | None) -> None:
         self._out, self._embedding = out, embedding
         self._record: DecisionRecord | None = None
 
-    def keep(self, policy: Policy, number: int) -> None:
-        """Keep the decision of update ``number``, where ``policy`` took it as it has learnt to."""
-        decided = decision_of(policy)
-        if decided is None or decided.number != number:
+    def record(self, policy: Policy, number: int) -> None:
+        """Write the decision of update ``number``, if ``policy`` is learned and took it."""
+        decision = decision_of(policy)
+        if decision is None or decision.number != number:
             return
         if self._record is None:
             from edge_server.scheduler.learned.decision_record import DecisionRecord
 
             known = None if self._embedding is None else dataclasses.asdict(self._embedding)
             self._record = DecisionRecord(self._out, known)
-        self._record.write(decided)
+        self._record.write(decision)
 
     @property
     def lost(self) -> int:
-        """Decisions that could not be written."""
+        """Number of decisions that could not be written."""
         return 0 if self._record is None else self._record.lost

@@ -1,9 +1,9 @@
-"""What a run leaves behind, written as it goes: edge.json, series.jsonl, ages.jsonl, poses.jsonl.
+"""The files of a run, written as it goes: edge.json, series.jsonl, ages.jsonl, poses.jsonl.
 
-edge.json is replaced atomically about twice a second (live tables read it); series.jsonl gets one line per
-publication once its scores are final; ages.jsonl samples every camera's age at a fixed rate, so that its
-mean is a time average. poses.jsonl has a line for every view that the field learnt from and that stands
-elsewhere than its camera's last one: a rig that stands still leaves one line a camera.
+edge.json is replaced about twice a second (live tables read it). series.jsonl gets a line for each
+publication, once its scores are final. ages.jsonl samples every camera's age at a fixed rate, so that its
+mean is a time average. poses.jsonl gets a line for each view that the field was trained on and whose pose
+differs from its camera's last one: cameras that stand still leave one line each.
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ from freshfield.geometry import Pose
 
 log = logging.getLogger(__name__)
 
-# A publication whose scores have not come after this many younger ones will not get any.
+# After this many newer publications, one without scores will not get any.
 _FINAL_AFTER = 8
 # Some 100 MB: days of an arm that never rests.
 _MOST_POSES = 500_000
 
 
 class Journal:
-    """Files of one run under ``out``. Thread-safe. ``status`` is asked for the contents of edge.json.
+    """Writes the files of one run. Thread-safe.
 
-    Lines are added to those of an earlier process of the same run: an edge that was restarted goes on. A full
-    disk costs lines, counted in ``lines_lost``, and statuses, never the edge.
+    out: the run's folder. Lines are appended to those of an earlier process: an edge may be restarted.
+    status: gives the contents of edge.json.
+    A full disk costs lines (counted in ``lines_lost``) and statuses, and never ends the edge.
     """
 
     def __init__(self, out: Path, status: Callable[[], dict[str, Any]]) -> None:
@@ -46,13 +47,13 @@ class Journal:
         self._series = Lines(out / "series.jsonl")
         self._ages = Lines(out / "ages.jsonl")
         self._poses = Lines(out / "poses.jsonl")
-        self._posed: dict[str, Pose] = {}
+        self._last_pose: dict[str, Pose] = {}
         self._poses_left = _MOST_POSES
         self._status_failed = False
 
     @property
     def lines_lost(self) -> int:
-        """Lines that could not be written so far."""
+        """Number of lines that could not be written so far."""
         return self._series.lost + self._ages.lost + self._poses.lost
 
     def published(self, publication: Publication) -> None:
@@ -62,12 +63,12 @@ class Journal:
                 self._write_oldest()
 
     def scored(self, publication: Publication, final: bool) -> None:
-        """``publication`` carries scores; ``final``: all of its held-out cameras are in."""
+        """``publication`` has scores. final: those of all held-out cameras."""
         with self._lock:
             if publication.number not in self._open:
                 return
             self._open[publication.number] = publication
-            # Lines stand in the order of publication: a final one waits for its elders.
+            # Lines keep the order of publication: a final one waits for those before it.
             if final and next(iter(self._open)) == publication.number:
                 self._write_oldest()
 
@@ -79,12 +80,12 @@ class Journal:
         self._ages.write(json.dumps(line))
 
     def poses(self, views: Sequence[View]) -> None:
-        """Where the views of an update were taken from, of those cameras that have moved."""
+        """Write the poses of those views whose cameras have moved."""
         for view in views:
             pose = Pose.from_matrix(view.camera_to_world)
-            if self._posed.get(view.camera) == pose or not self._poses_left:
+            if self._last_pose.get(view.camera) == pose or not self._poses_left:
                 continue
-            self._posed[view.camera] = pose
+            self._last_pose[view.camera] = pose
             self._poses_left -= 1
             q, t_m = pose.quaternion, pose.translation_m
             line = {"camera": view.camera, "ns": view.generated_ns, "q": q, "t_m": t_m}

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 
-from edge_server.live.journal import Journal
+from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
 from tests.freshfield.test_files import no_file_longer_than
 

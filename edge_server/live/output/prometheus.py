@@ -12,7 +12,7 @@ from edge_server.live.state import EdgeState
 
 
 class EdgeCollector:
-    """Turns EdgeState into samples at scrape time: nothing is counted twice, nothing runs in between."""
+    """Turns the state into samples when it is scraped; nothing runs in between."""
 
     def __init__(self, state: EdgeState, ingest: Ingest) -> None:
         self._state = state
@@ -39,31 +39,20 @@ class EdgeCollector:
             if value is not None:
                 check.add_metric([str(percent / 100)], value / 1e3)
         yield check
-        publications = self._state.publications()
-        if not publications:
+        last, scored = self._state.newest(), self._state.newest(scored=True)
+        if last is None:
             return
-        last = publications[-1]
         yield CounterMetricFamily("freshfield_updates", "updates published", value=last.number + 1)
         yield GaugeMetricFamily("freshfield_update_seconds", "last update", value=last.update_ms / 1e3)
         yield GaugeMetricFamily("freshfield_aaoi_seconds", "mean age of selection", value=last.aaoi_ms / 1e3)
         yield GaugeMetricFamily("freshfield_selected_views", "views used last", value=len(last.selected))
-        scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
-        if scored is None:
-            return
-        named = (
-            ("psnr_db", scored.psnr_db),
-            ("psnr_moving_db", scored.psnr_moving_db),
-            ("ssim", scored.ssim),
-            ("lpips", scored.lpips),
-            ("perceptual", scored.perceptual),
-        )
-        for name, value in named:
-            if value is not None:
+        for name in ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual"):
+            if (value := getattr(scored, name, None)) is not None:
                 yield GaugeMetricFamily(f"freshfield_{name}", "fidelity at the present", value=value)
 
 
 def serve_metrics(state: EdgeState, ingest: Ingest, host: str, port: int) -> None:
-    """Serve /metrics on a thread of its own until the process ends."""
+    """Serve /metrics on a thread until the process ends."""
     registry = CollectorRegistry()
     registry.register(EdgeCollector(state, ingest))  # type: ignore[arg-type]
     start_http_server(port, addr=host, registry=registry)

@@ -1,4 +1,4 @@
-"""The recorder: whoever hands over never waits, what finds no room is counted, a full disk ends it."""
+"""The recorder: callers never wait, what finds no room is counted, a full disk ends the recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from edge_server.live.recorder import Recorder, schema_of
+from edge_server.live.output.recorder import Recorder, schema_of
 from edge_server.live.state import Publication
 from freshfield.v1 import frames_pb2 as pb
 from tests.freshfield.test_session import requests
@@ -35,17 +35,17 @@ def test_decisions_and_scores_are_json_that_keeps_its_schema(tmp_path):
     assert [(c.topic, m.log_time) for _, c, m in found] == [("/decisions", 10**9), ("/scores", 2 * 10**9)]
     assert names["session"] == {"scenario": "test"} and names["counts"] == {"messages": "2", "dropped": "0"}
     for (schema, _, message), publication in zip(found, (PUBLICATION, None)):
-        told, kinds = json.loads(message.data), json.loads(schema.data)["properties"]
-        assert set(told) == set(kinds)
+        values, kinds = json.loads(message.data), json.loads(schema.data)["properties"]
+        assert set(values) == set(kinds)
         if publication is not None:
-            assert told == json.loads(json.dumps(dataclasses.asdict(publication)))
+            assert values == json.loads(json.dumps(dataclasses.asdict(publication)))
     assert kinds["number"] == {"type": "integer"} and kinds["psnr_db"] == {"type": ["number", "null"]}
     assert kinds["ages_ms"] == {"type": "array", "items": {"type": "number"}}
     assert schema_of(Publication)["properties"]["selected"] == {"type": "array", "items": {"type": "string"}}
 
 
 def test_what_finds_no_room_is_dropped_and_counted_and_nobody_waits(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_server.live.recorder._MOST_WAITING", 10)
+    monkeypatch.setattr("edge_server.live.output.recorder._MAX_QUEUE_MESSAGES", 10)
     recorder = Recorder(tmp_path / "a.mcap", "test")
     stuck, go_on = threading.Event(), threading.Event()
     write = recorder._writer.frame
@@ -70,7 +70,7 @@ def test_what_finds_no_room_is_dropped_and_counted_and_nobody_waits(tmp_path, mo
 
 
 def test_bytes_are_bounded_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_server.live.recorder._MOST_BYTES", 500)
+    monkeypatch.setattr("edge_server.live.output.recorder._MAX_QUEUE_BYTES", 500)
     recorder = Recorder(tmp_path / "a.mcap", "test")
     recorder.frame(*next(iter(requests(1))))
     recorder.close()

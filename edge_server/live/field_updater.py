@@ -1,0 +1,244 @@
+"""Decisions and updates of one field: decision epoch -> views -> fit -> publication.
+
+Every method takes the time as an argument, so that the live loop and virtual time share them. The present is
+the instant at which an update is published: fitting ages the scene as much as the network does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from edge_server.config import EdgeConfig, embedding_for, open_embedder
+from edge_server.fields import Budget, Field, FitReport, View
+from edge_server.live.buffer import BufferedFrame, FrameBuffer
+from edge_server.live.state import Publication
+from edge_server.live.view_decoder import ViewDecoder
+from edge_server.scheduler import STATE_PARTS, Epoch, Plan, Policy, embedding_of, treatment_of
+from freshfield.scenario import Scenario, ScenarioError
+
+if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a scenario asks for it
+    from edge_server.embed.cache import EmbedderLike, EmbeddingCache
+    from edge_server.foreground.foreground import Foreground
+    from edge_server.live.keyframes import Keyframes
+    from edge_server.scheduler.learned.state import State
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A finished decision.
+
+    now_ns: instant of the selection.
+    items: selected frames.
+    earlier: the frames that their cameras delivered before, where the policy treats views and there are any.
+    """
+
+    plan: Plan
+    now_ns: int
+    items: tuple[BufferedFrame, ...]
+    earlier: tuple[BufferedFrame, ...] = ()
+
+
+@dataclass
+class TreatmentCost:
+    """Number of views treated so far, and the wall seconds it took (measured, never part of a decision)."""
+
+    views: int = 0
+    seconds: float = 0.0
+
+    @property
+    def ms_per_view(self) -> float | None:
+        return 1e3 * self.seconds / self.views if self.views else None
+
+
+class FieldUpdater:
+    """Decides on and carries out the updates of one field from one buffer. Owns no thread, reads no clock.
+
+    embedder: for policies that look at what the cameras see.
+    keyframes: earlier viewpoints of moving cameras.
+    foreground: cuts the background out of views.
+    number: of the next update.
+    materialize: gives buffered frames their images and poses where these are made late (virtual time).
+    """
+
+    def __init__(
+        self,
+        buffer: FrameBuffer,
+        policy: Policy,
+        field: Field,
+        start_ns: int,
+        embedder: EmbedderLike | None = None,
+        keyframes: Keyframes | None = None,
+        foreground: Foreground | None = None,
+    ) -> None:
+        self.buffer = buffer
+        self.decoder = ViewDecoder(foreground)
+        self.embedder = embedder
+        self.embeddings: EmbeddingCache | None = None
+        if embedder is not None:
+            from edge_server.embed.cache import EmbeddingCache
+
+            # A frame that is both embedded and trained on is decoded once.
+            self.embeddings = EmbeddingCache(embedder, self.decoder.view)
+        self.materialize: Callable[[Sequence[BufferedFrame]], Sequence[BufferedFrame]] | None = None
+        self.policy = policy
+        self.field = field
+        self.keyframes = keyframes
+        self.treatment_cost = TreatmentCost()
+        self.start_ns = start_ns
+        self.number = 0
+
+    @property
+    def policy(self) -> Policy:
+        return self._policy
+
+    @policy.setter
+    def policy(self, policy: Policy) -> None:
+        """Takes effect with the next decision. Frames before the newest are kept only for policies that treat
+        views. ValueError as ``check``."""
+        self.check(policy)
+        self._policy = policy
+        treats = treatment_of(policy) is not None
+        self.buffer.keep_earlier(treats)
+        if not treats:
+            self.decoder.forget_earlier()
+
+    def check(self, policy: Policy) -> None:
+        """ValueError where ``policy`` needs embeddings that are not computed here: there is no embedder, or
+        not the one that it was trained with."""
+        dim, name = embedding_of(policy)
+        if not dim:
+            return
+        if self.embedder is None:
+            raise ValueError(f"{policy.name} decides by what cameras see: it needs an edge.embedding section")
+        if dim != self.embedder.dim or (name and name != self.embedder.name):
+            raise ValueError(
+                f"{policy.name} was trained with {name or 'embeddings'} of {dim} numbers, edge.embedding "
+                f"is {self.embedder.name} of {self.embedder.dim}"
+            )
+
+    def epoch(self, now_ns: int) -> Epoch:
+        """What the policy may look at, at ``now_ns``."""
+        return self._epoch(self.buffer.newest(), now_ns)
+
+    def _epoch(self, newest: Mapping[str, BufferedFrame], now_ns: int) -> Epoch:
+        def state(parts: Sequence[str] = STATE_PARTS) -> State:
+            from edge_server.scheduler.learned.observation import observe
+
+            seen = newest
+            if self.materialize is not None:
+                seen = {item.frame.camera: item for item in self.materialize(tuple(newest.values()))}
+            return observe(self.buffer.cameras, seen, now_ns, self.embeddings, parts, keep_frames=True)
+
+        generated = {c: item.generated_ns for c, item in newest.items()}
+        return Epoch(now_ns, self.number, generated, state)
+
+    def plan(self, now_ns: int) -> Plan:
+        """The first half of a decision: how long to wait for frames."""
+        return self.policy.plan(self.epoch(now_ns))
+
+    def select(self, plan: Plan, now_ns: int) -> Selection | None:
+        """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on."""
+        if now_ns < plan.wait_until_ns:
+            return None
+        newest, earlier = self.buffer.newest_and_earlier()
+        cameras = self.policy.select(self._epoch(newest, now_ns), plan)
+        if not cameras:
+            return None
+        before = tuple(earlier[c] for c in cameras if c in earlier)
+        return Selection(plan, now_ns, tuple(newest[c] for c in cameras), before)
+
+    def fit(
+        self, selection: Selection, budget: Budget, publishes_ns: int | None = None
+    ) -> tuple[list[View], FitReport] | None:
+        """Decode the selected views, treat them where the policy says so, and train on them.
+
+        publishes_ns: expected instant of publication, the present that stale views are treated for; None: the
+        instant of the selection.
+        Returns the views as they were delivered, and the field's report; None where no view can be decoded.
+        """
+        earlier = self.decoder.earlier(selection.earlier)
+        views = self.decoder.views(selection.items)
+        if not views:
+            return None
+        treated = self._treated(views, earlier, publishes_ns or selection.now_ns)
+        if self.keyframes is None:
+            return views, self.field.fit(treated, budget)
+        supervision = self.keyframes.with_earlier(treated)
+        if self.keyframes.should_restart(len(supervision)):
+            self.field.reset()
+        report = self.field.fit(supervision, budget)
+        # Refusals of earlier viewpoints are not counted against current frames.
+        current = {view.camera for view in views}
+        return views, replace(report, refused=tuple(c for c in report.refused if c in current))
+
+    def reset(self) -> None:
+        """Forget the scene."""
+        self.field.reset()
+        if self.keyframes is not None:
+            self.keyframes.clear()
+
+    def _treated(self, views: list[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
+        treatment = treatment_of(self.policy)
+        if treatment is None:
+            return views
+        start_s = time.perf_counter()
+        treated = treatment.treat(views, earlier, now_ns)
+        self.treatment_cost.views += len(views)
+        self.treatment_cost.seconds += time.perf_counter() - start_s
+        return treated
+
+    def publication(
+        self, selection: Selection, views: Sequence[View], fit: FitReport, published_ns: int
+    ) -> Publication:
+        """The record of an update that became visible at ``published_ns``; ages are taken then (6.35)."""
+        ages = tuple((published_ns - view.generated_ns) / 1e6 for view in views)
+        publication = Publication(
+            number=self.number,
+            t_s=(published_ns - self.start_ns) / 1e9,
+            published_ns=published_ns,
+            omega_ms=selection.plan.omega_ms,
+            selected=tuple(view.camera for view in views),
+            ages_ms=ages,
+            aaoi_ms=float(np.mean(ages)),
+            update_ms=(published_ns - selection.now_ns) / 1e6,
+            steps=fit.steps,
+            loss=fit.loss if np.isfinite(fit.loss) else None,
+            refused=fit.refused,
+        )
+        self.number += 1
+        return publication
+
+
+def open_updater(
+    scenario: Scenario, config: EdgeConfig, policy: Policy, field: Field, start_ns: int, resumed: bool = False
+) -> FieldUpdater:
+    """The updater of a scenario's training cameras, with what its edge section asks for.
+
+    resumed: the field has been trained before (see ``Keyframes``).
+    Nothing of embedder, keyframes and foreground is imported unless asked for. Raises ScenarioError.
+    """
+    keyframes: Keyframes | None = None
+    if config.keyframes is not None:
+        from edge_server.live.keyframes import Keyframes
+
+        keyframes = Keyframes(config.keyframes, resumed)
+    foreground: Foreground | None = None
+    if config.foreground is not None:
+        from edge_server.foreground import ForegroundError
+        from edge_server.foreground.foreground import make_foreground
+
+        try:
+            foreground = make_foreground(config.foreground)
+        except ForegroundError as error:
+            raise ScenarioError(f"{scenario.path}: edge.foreground: {error}") from None
+    try:
+        embedder = open_embedder(embedding_for(config, policy))
+        buffer = FrameBuffer(scenario.training)
+        return FieldUpdater(buffer, policy, field, start_ns, embedder, keyframes, foreground)
+    except ValueError as error:
+        raise ScenarioError(f"{scenario.path}: edge: {error}") from None

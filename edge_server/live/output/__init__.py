@@ -1,0 +1,1 @@
+"""What a running edge leaves and shows: run files, recordings, decisions, metrics."""

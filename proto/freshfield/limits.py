@@ -1,0 +1,76 @@
+"""Every bound on what a process accepts from outside, with its unit and the reason for its value.
+
+A frame, a scenario or a stream beyond one of these is refused where it arrives, and the refusal is counted by
+its reason. Bounds of settings (what a scenario's sections may say) stand with the settings.
+"""
+
+from __future__ import annotations
+
+# --- messages and images ----------------------------------------------------------------------
+
+MAX_PAYLOAD_BYTES = 8 * 2**20
+"""Of one encoded image: four bits a pixel of the largest one, more than a JPEG of high quality takes."""
+
+MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096
+"""Of one gRPC message: the header's room beside the largest payload."""
+
+MAX_IMAGE_SIDE_PX = 4096
+"""Of a decoded image: 50 MB of RGB, which bounds what a decompression bomb can cost."""
+
+MAX_PNG_CHUNKS = 10_000
+"""Of one PNG, all of which a decoder looks at. Encoders write 8 kB or more into a chunk: 1000 in 8 MB."""
+
+MAX_ID_CHARS = 64
+"""Of a camera or session id: it becomes part of file names and of ledger lines."""
+
+# --- streams and cameras ----------------------------------------------------------------------
+
+MAX_CAMERAS = 1000
+"""Of one scenario: a stream each, so that one connection serves them all."""
+
+MAX_STREAMS_PER_CAMERA = 4
+"""Streams open at once at a process, for each of its cameras: one is in use, others may be closing after a
+restart."""
+
+MAX_CONCURRENT_STREAMS = 1024
+"""Of one gRPC connection: a stream for each camera of the largest scenario, and some calls beside them."""
+
+MAX_SESSIONS_PER_CAMERA = 64
+"""Sessions remembered for a camera. A forgotten session could be replayed, so many are remembered."""
+
+# --- time -------------------------------------------------------------------------------------
+
+MAX_CAPTURE_AHEAD_NS = 250_000_000
+"""How far a capture may lie ahead of the edge's clock, beyond the uncertainty of the node's offset."""
+
+MAX_CAPTURE_AGE_NS = 3600 * 10**9
+"""How far behind it: an hour-old frame comes from a broken clock, not over a slow link."""
+
+MAX_CLOCK_UNCERTAINTY_NS = 10**9
+"""What an offset's uncertainty may excuse. A node that has not measured its offset announces an hour, which
+must not make a frame from the future the newest one until that future has come."""
+
+# --- poses and lenses -------------------------------------------------------------------------
+
+MAX_TRANSLATION_M = 1e6
+"""From the origin, by axis: more is a wrong unit (a kilometre in millimetres) or garbage."""
+
+MAX_QUATERNION_ERROR = 1e-3
+"""Of a quaternion's length from 1; also of a rotation matrix from orthonormal. Real calibrations are
+better."""
+
+MIN_FOCAL_PER_SIDE = 1 / 16
+"""Focal length over the longer image side: 1/16 is a 166 degree lens, beyond what a pinhole can describe."""
+
+MAX_FOCAL_PX = 1e6
+"""Focal length: more is parallel light."""
+
+MAX_DISTORTION = 100.0
+"""Of each distortion coefficient: more than any lens has."""
+
+MAX_CENTER_OUTSIDE_SIDES = 1.0
+"""How far the principal point may lie outside the image, in image sides: only a crop puts it outside at
+all."""
+
+MAX_LENS_ERROR_PX = 1.0
+"""Between a pixel and itself after undistortion and projection: more, and the lens cannot be inverted."""
