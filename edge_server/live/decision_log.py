@@ -6,11 +6,11 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge_server.scheduler import Policy, decision_of
+from edge_server.scheduler import Policy
 
 if TYPE_CHECKING:  # loaded only where a policy was learnt
     from edge_server.embed import EmbeddingConfig
-    from edge_server.scheduler.learned.decision_record import DecisionRecord
+    from edge_server.scheduler.learned.decision_record import DecisionWriter
 
 
 class Decisions:
@@ -19,18 +19,18 @@ class Decisions:
 
     def __init__(self, out: Path, embedding: EmbeddingConfig | None) -> None:
         self._out, self._embedding = out, embedding
-        self._record: DecisionRecord | None = None
+        self._record: DecisionWriter | None = None
 
     def keep(self, policy: Policy, number: int) -> None:
         """Keep the decision of update ``number``, where ``policy`` took it as it has learnt to."""
-        decided = decision_of(policy)
+        decided = policy.last_decision
         if decided is None or decided.number != number:
             return
         if self._record is None:
-            from edge_server.scheduler.learned.decision_record import DecisionRecord
+            from edge_server.scheduler.learned.decision_record import DecisionWriter
 
             known = None if self._embedding is None else dataclasses.asdict(self._embedding)
-            self._record = DecisionRecord(self._out, known)
+            self._record = DecisionWriter(self._out, known)
         self._record.write(decided)
 
     @property

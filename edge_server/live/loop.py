@@ -25,7 +25,7 @@ from edge_server.live.buffer import Buffered, FrameBuffer
 from edge_server.live.state import Publication
 from edge_server.live.update_budget import Pacing
 from edge_server.live.view_decoder import Decoder
-from edge_server.scheduler import STATE_PARTS, Epoch, Plan, Policy, embedding_of, treatment_of
+from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
 from freshfield.clock import Clock
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -47,7 +47,7 @@ class Selection:
     """A finished decision: which buffered frames to use, as of ``now_ns``. earlier: where the policy treats
     what it selects, the frames that these cameras delivered before, of those that did."""
 
-    plan: Plan
+    plan: SelectionWindow
     now_ns: int
     items: tuple[Buffered, ...]
     earlier: tuple[Buffered, ...] = ()
@@ -109,7 +109,7 @@ class Updates:
         ValueError for a policy that needs embeddings where there are none."""
         self.check(policy)
         self._policy = policy
-        treats = treatment_of(policy) is not None
+        treats = policy.treatment is not None
         self.buffer.keep_earlier(treats)
         if not treats:
             self.decoder.forget_earlier()
@@ -117,7 +117,7 @@ class Updates:
     def check(self, policy: Policy) -> None:
         """ValueError where ``policy`` needs embeddings that are not computed here: there are none, or
         another embedder's than it was taught with."""
-        wanted, whose = embedding_of(policy)
+        wanted, whose = policy.embedding
         if not wanted:
             return
         if self._embedder is None:
@@ -143,10 +143,10 @@ class Updates:
         generated = {c: item.generated_ns for c, item in newest.items()}
         return Epoch(now_ns, self.number, generated, state)
 
-    def plan(self, now_ns: int) -> Plan:
+    def plan(self, now_ns: int) -> SelectionWindow:
         return self.policy.plan(self.epoch(now_ns))
 
-    def select(self, plan: Plan, now_ns: int) -> Selection | None:
+    def select(self, plan: SelectionWindow, now_ns: int) -> Selection | None:
         """What the plan's policy admits of the buffer as it is at ``now_ns``; None: wait on."""
         if now_ns < plan.wait_until_ns:
             return None
@@ -184,7 +184,7 @@ class Updates:
             self.keyframes.forget()
 
     def _treated(self, views: list[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
-        treatment = treatment_of(self.policy)
+        treatment = self.policy.treatment
         if treatment is None:
             return views
         begun = time.perf_counter()

@@ -34,7 +34,7 @@ from edge_server.live.loop import Loop, Updates, open_foreground, open_keyframes
 from edge_server.live.scoring_thread import Scoring
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Renderer
 from edge_server.live.update_budget import Deadline, Fixed, Pacing, choose, read_points
-from edge_server.scheduler import BANDIT, OFFERED, Policy, decision_of, make_live_policy
+from edge_server.scheduler import BANDIT, OFFERED, Policy, make_live_policy
 from freshfield.clock import Clock, WallClock
 from freshfield.ledger import Ledger
 from freshfield.scenario import Scenario, ScenarioError
@@ -43,7 +43,7 @@ from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, fr
 
 if TYPE_CHECKING:  # loaded only where a policy was learnt, or a run is recorded
     from edge_server.live.recorder import Recorder
-    from edge_server.scheduler.online.online_trainer import Lessons
+    from edge_server.scheduler.online.online_trainer import OnlineTrainer
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class EdgeServer:
             policy = self._policy(config.policy.name, config.policy.value)
             self.lessons = self._lessons(policy)
             if self.lessons is not None:
-                policy = self.lessons.apprentice
+                policy = self.lessons.policy
             self._embedding = embedding_for(config, policy)
             embedder = open_embedder(self._embedding)
             keyframes = open_keyframes(config.keyframes, resumed=options.resume is not None)
@@ -151,7 +151,7 @@ class EdgeServer:
             save_snapshot=self._save_snapshot,
             channel=_JsonFile(options.out / "channel.json"),
             field_name=config.field,
-            decision=lambda: decision_of(self.updates.policy),
+            decision=lambda: self.updates.policy.last_decision,
             embed=None if embedder is None else embedder.embed,
             learning=self._learning,
         )
@@ -281,7 +281,7 @@ class EdgeServer:
         self.state.scored(publication, comparison)
         self.journal.scored(publication, final)
         if self.lessons is not None and final:
-            self.lessons.scored(publication.number, publication)
+            self.lessons.add_score(publication.number, publication)
         if final and self.recorder is not None:
             self.recorder.scored(publication, self.clock.now_ns())
 
@@ -291,7 +291,7 @@ class EdgeServer:
     def _policy(self, name: str, value: float | None):
         return make_live_policy(name, value, self.scenario.rng("policy", name))
 
-    def _lessons(self, policy: Policy) -> Lessons | None:
+    def _lessons(self, policy: Policy) -> OnlineTrainer | None:
         """What lets ``policy`` go on learning, where that was asked for. ValueError where it cannot."""
         learn = self.config.learn
         if learn is None:
@@ -300,9 +300,9 @@ class EdgeServer:
             raise ValueError(f"{policy.name} cannot learn: only bandit:FILE can (--policy, edge.policy)")
         if not self.scenario.held_out:
             raise ValueError("nothing is held out (cameras.held_out), so that there is no reward to learn by")
-        from edge_server.scheduler.online.online_trainer import open_lessons
+        from edge_server.scheduler.online.online_trainer import open_online_trainer
 
-        lessons = open_lessons(
+        lessons = open_online_trainer(
             Path(policy.name.removeprefix(BANDIT)), learn.reward, learn.fallback,
             self.scenario.rng("lessons"), self.lpips_missing, self.options.out,
         )  # fmt: skip
@@ -314,16 +314,16 @@ class EdgeServer:
 
     def _learning(self) -> str:
         """How learning goes, for people; empty where nobody learns, or another policy was chosen."""
-        if self.lessons is None or self.state.controls.policy != self.lessons.apprentice.name:
+        if self.lessons is None or self.state.controls.policy != self.lessons.policy.name:
             return ""
-        return self.lessons.apprentice.told()
+        return self.lessons.policy.summary()
 
     def _set_policy(self, name: str, value: float | None) -> None:
         if name.startswith(BANDIT) and name not in self.state.policies:
             raise ValueError(f"policy {name!r}: what was learnt is chosen at the start (--policy {name})")
         policy = self._policy(name, value)
-        if self.lessons is not None and policy.name == self.lessons.apprentice.name:
-            policy = self.lessons.apprentice  # the one that learns goes on
+        if self.lessons is not None and policy.name == self.lessons.policy.name:
+            policy = self.lessons.policy  # the one that learns goes on
         self.updates.check(policy)
         self.state.controls.policy, self.state.controls.value = policy.name, policy.value
         self.loop.use_policy(policy)
@@ -413,7 +413,7 @@ class EdgeServer:
                 "mean_colour_db": mean("mean_colour_db"),
                 "nearest_view_db": mean("nearest_view_db"),
             },
-            "learning": None if self.lessons is None else self.lessons.apprentice.status(),
+            "learning": None if self.lessons is None else self.lessons.policy.status(),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),

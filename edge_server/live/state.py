@@ -21,7 +21,7 @@ from edge_server.fields import Renderer
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # loaded only where a policy was learnt
-    from edge_server.scheduler.learned.bandit import Decided
+    from edge_server.scheduler.learned.bandit import Decision
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class EdgeState:
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
     """The emulator's status (channel.json) where it runs on the same machine, else None."""
-    decision: Callable[[], Decided | None] = lambda: None
+    decision: Callable[[], Decision | None] = lambda: None
     """The newest decision of a policy that was learnt, with what it saw; None of any other policy."""
     embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
     """Embeds pictures as that policy does, on any thread; None where nothing is embedded."""

@@ -24,7 +24,7 @@ from edge_server.fidelity.scorer import Scorer, listed_metric
 from edge_server.live.decision_log import Decisions
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
-from edge_server.scheduler import read_policy
+from edge_server.scheduler import parse_policy
 from freshfield.files import write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
 
@@ -178,7 +178,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     edge = dict(scenario.edge)
     if args.policy:
         try:
-            edge["policy"] = dataclasses.asdict(PolicyConfig(*read_policy(args.policy)))
+            edge["policy"] = dataclasses.asdict(PolicyConfig(*parse_policy(args.policy)))
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     if args.compute:

@@ -25,7 +25,7 @@ from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
-from edge_server.scheduler.learned.rewards import REWARDS, Reward, available, make_reward
+from edge_server.scheduler.learned.rewards import REWARDS, Reward, make_reward, without_missing_lpips
 from edge_server.scheduler.learned.state import PARTS, StateLayout
 from freshfield.files import write_json
 from freshfield.scenario import Scenario, ScenarioError, load
@@ -204,7 +204,7 @@ def reward_of(
     missing: str | None = "the scenario's edge.lpips is none"
     if network != "none":
         _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]
-    found = available(reward, missing)
+    found = without_missing_lpips(reward, missing)
     return found, None if found == reward else f"the reward has no term of distance: {missing}"
 
 

@@ -33,8 +33,8 @@ from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.live.buffer import Buffered, FrameBuffer
 from edge_server.live.view_decoder import Decoder
-from edge_server.scheduler import make_policy, treatment_of
-from edge_server.scheduler.learned.observation import Embeddings, observe
+from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.observation import FrameEmbeddings, observe
 from edge_server.scheduler.learned.state import State
 from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError
@@ -195,7 +195,7 @@ class Ground:
         """The pictures of an episode."""
         return self._shared or self._stage(self.scenario(seed))
 
-    def embeddings(self) -> Embeddings | None:
+    def embeddings(self) -> FrameEmbeddings | None:
         """Of one episode: frames of the same number are other pictures in the next."""
         if self._embedder is None:
             return None
@@ -297,7 +297,7 @@ class Episode:
             before = moment.earlier(choice.at_ns)
             earlier = self._decoded([before[c] for c in choice.cameras if c in before])
             by_camera = {view.camera: view for view in earlier}
-            treatment = treatment_of(make_policy(choice.treatment, None, np.random.default_rng(0)))
+            treatment = make_policy(choice.treatment, None, np.random.default_rng(0)).treatment
             assert treatment is not None
             shown = treatment.treat(views, by_camera, published_ns)
         field = self._ground.field(self.seed)

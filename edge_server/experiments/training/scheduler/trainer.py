@@ -90,7 +90,7 @@ def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable
         for name in ("policy.npz", *REPORTS):
             (out / name).unlink(missing_ok=True)
         learner = _new_learner(setting, course, crew)
-    learner.taught_by = dataclasses.asdict(course.reward)
+    learner.reward_fields = dataclasses.asdict(course.reward)
     for number in range(first, course.batches):
         at = time.monotonic()
         row = _one_batch(setting, course, crew, learner, number, say)
@@ -197,7 +197,7 @@ def _new_learner(setting: Setting, course: Course, crew: Crew) -> Learner:
     spec = course.spec
     if "semantics" in spec.layout.parts and not spec.layout.centre:
         first: list[Moment] = [m for e in crew.draw(setting, course.seeds(0)) for m in e]
-        spec = dataclasses.replace(spec, layout=spec.layout.standardised([m.state for m in first]))
+        spec = dataclasses.replace(spec, layout=spec.layout.standardized([m.state for m in first]))
     return Learner(spec, course.seed)
 
 
