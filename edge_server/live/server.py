@@ -21,7 +21,7 @@ from grpc_reflection.v1alpha import reflection
 
 from edge_server.config import EdgeConfig, embedding_for, open_embedder
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.fields import View, checkpoint
 from edge_server.fields.common.kernels.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
@@ -103,7 +103,7 @@ class EdgeServer:
             if config.lpips == "none"
             else open_lpips(options.lpips_folder, config.lpips)  # type: ignore[arg-type]
         )
-        scorer = Scorer(lpips, config.noisy_truth, perceptual=listed_metric(config.metrics))
+        scorer = Scorer(lpips, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
         self.scoring = Scoring(scenario.held_out, scorer, self._scored)
         try:
             policy = self._policy(config.policy.name, config.policy.value)

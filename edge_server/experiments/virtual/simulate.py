@@ -20,7 +20,7 @@ from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_
 from edge_server.experiments.virtual.from_scenario import deploy
 from edge_server.experiments.virtual.virtual_deployment import Terms, VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
-from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.live.decision_log import Decisions
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metric, missing = None, None
         if config.lpips != "none":
             metric, missing = open_lpips(lpips, cast(Network, config.lpips))
-        scorer = Scorer(metric, config.noisy_truth, perceptual=listed_metric(config.metrics))
+        scorer = Scorer(metric, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
         decisions: Decisions | None = None
 
         def published(publication: Publication) -> None:

@@ -28,7 +28,7 @@ from edge_server.experiments.virtual.from_scenario import deploy, exact_scene, t
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Terms, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.live.buffer import Buffered, FrameBuffer
@@ -175,7 +175,7 @@ class Ground:
             if scene.moving and effects is NO_EFFECTS and not self._moving:
                 self._period_ns = round(scene.period_s * 1e9)
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips, edge.lpips)[0]  # type: ignore[arg-type]
-        self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=listed_metric(edge.metrics))
+        self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=open_listed_perceptual(edge.metrics))
         self.setting, self.folders = setting, folders
         self._shared = None if self._moving else self._stage(scenario)
         self._field: tuple[int, Field] | None = None
