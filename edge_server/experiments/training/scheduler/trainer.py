@@ -24,7 +24,7 @@ from edge_server.experiments.training.scheduler.episode import Moment, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.workers import Crew, Progress
 from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.rewards import Reward, Rewarded
+from edge_server.scheduler.learned.rewards import Reward, RewardTerms
 from freshfield.files import write_json, write_text
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def told_now_and_then(say: Callable[[str], None], what: str) -> Progress:
     return told
 
 
-def _why_not(outcomes: list[Outcome], found: list[Rewarded]) -> str:
+def _why_not(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
     """Why not one of these has a reward, and what to do."""
     if not any(outcome.views for outcome in outcomes):
         return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
