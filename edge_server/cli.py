@@ -148,13 +148,13 @@ def _run(args: argparse.Namespace) -> int:
     from edge_server.config import PolicyConfig, read_config
     from edge_server.fidelity.lpips_weights import weights_folder
     from edge_server.live.server import EdgeServer, ServerOptions
-    from edge_server.scheduler import read_policy
+    from edge_server.scheduler import parse_policy
 
     scenario = load(args.scenario, args.seed)
     config = read_config(scenario)
     if args.policy:
         try:
-            config = replace(config, policy=PolicyConfig(*read_policy(args.policy)))
+            config = replace(config, policy=PolicyConfig(*parse_policy(args.policy)))
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     config = replace(config, learn=_learn(args, config))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from edge_server.scheduler import Policy, embedding_of, learnt_policy
+from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.scenario import Scenario, read_section
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class EdgeConfig:
 def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
     """How frames are embedded: as the scenario says, else, if the policy needs embeddings, as policies are
     trained. None where neither asks for them."""
-    if config.embedding is not None or not embedding_of(policy)[0]:
+    if config.embedding is not None or not policy.embedding[0]:
         return config.embedding
     from edge_server.embed import EmbeddingConfig
 
@@ -187,5 +187,5 @@ def read_config(scenario: Scenario) -> EdgeConfig:
 
         section["foreground"] = read_foreground(section["foreground"], scenario.path)
     config = read_section(EdgeConfig, section, f"{scenario.path}: edge")
-    name = learnt_policy(config.policy.name, scenario.path.parent)
+    name = resolve_checkpoint(config.policy.name, scenario.path.parent)
     return dataclasses.replace(config, policy=dataclasses.replace(config.policy, name=name))

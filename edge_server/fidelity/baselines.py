@@ -1,4 +1,4 @@
-"""What a field must beat to have learned anything: the mean colour, and the nearest camera's own image."""
+"""Baselines that need no field: the mean color, and the nearest camera's own image."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_server.fidelity.images import BLACK, Colour, to_unit
+from edge_server.fidelity.images import BLACK, Color, to_unit
 from edge_server.fidelity.psnr import psnr, psnr_of_mse
 from edge_server.fields import View
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """PSNR in dB of two renderings that need no field; None where there was no training view."""
+    """PSNR in dB of both baselines; None where there was no training view."""
 
     mean_colour_db: float | None
     nearest_view_db: float | None
@@ -24,7 +24,7 @@ class Baseline:
 
 
 def baseline(
-    views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, background: Colour = BLACK
+    views: Sequence[View], truth: NDArray, camera_to_world: ArrayLike, background: Color = BLACK
 ) -> Baseline:
     """Both baselines of one held-out image (H, W, 3) seen from ``camera_to_world`` (4, 4)."""
     if not views:
@@ -37,14 +37,14 @@ def baseline(
     )
 
 
-def mean_colour_db(images: Sequence[NDArray], truth: NDArray, background: Colour = BLACK) -> float:
-    """PSNR of a flat image in the mean colour of the training images (each image weighs the same)."""
+def mean_colour_db(images: Sequence[NDArray], truth: NDArray, background: Color = BLACK) -> float:
+    """PSNR of a flat image in the mean color of the training images (each image weighs the same)."""
     mean = np.mean([to_unit(i, "training view", background).mean((0, 1)) for i in images], axis=0)
     return psnr_of_mse(float(((to_unit(truth, "truth", background) - mean) ** 2).mean()))
 
 
-def view_db(image: NDArray, truth: NDArray, background: Colour = BLACK) -> float:
-    """PSNR of a training image shown as it is; resampled where its size differs from the truth's."""
+def view_db(image: NDArray, truth: NDArray, background: Color = BLACK) -> float:
+    """PSNR of an unchanged training image, resampled where its size differs from the truth's."""
     target = to_unit(truth, "truth", background)
     shown = to_unit(image, "training view", background)
     height, width = target.shape[:2]
@@ -57,13 +57,13 @@ def view_db(image: NDArray, truth: NDArray, background: Colour = BLACK) -> float
 
 
 def nearest_view(views: Sequence[View], camera_to_world: ArrayLike) -> View:
-    """The view whose camera is nearest: distance of centres, in units of the rig's own size, plus the angle
-    between viewing directions in radians. The first of equals wins."""
+    """The view with the nearest camera: distance of centers in units of the rig's radius plus angle between
+    viewing directions in radians. The first of equals wins."""
     pose = np.asarray(camera_to_world, dtype=np.float64)
-    centres = np.array([v.camera_to_world[:3, 3] for v in views])
+    centers = np.array([v.camera_to_world[:3, 3] for v in views])
     forward = np.array([v.camera_to_world[:3, 2] for v in views])
     # One radian of turning counts as much as one rig radius of moving.
-    radius = float(np.median(np.linalg.norm(centres - centres.mean(0), axis=1)))
-    distance = np.linalg.norm(centres - pose[:3, 3], axis=1) / (radius if radius > 1e-9 else 1.0)
+    radius = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    distance = np.linalg.norm(centers - pose[:3, 3], axis=1) / (radius if radius > 1e-9 else 1.0)
     angle = np.arccos(np.clip(forward @ pose[:3, 2], -1.0, 1.0))
     return views[int(np.argmin(distance + angle))]

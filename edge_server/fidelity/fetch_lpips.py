@@ -1,4 +1,4 @@
-"""``edge-server fetch-lpips``: the public LPIPS package's weights as the plain arrays that we read."""
+"""``edge-server fetch-lpips``: converts the public LPIPS package's weights to the arrays that we read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _BACKBONES = {"alex": "alexnet", "squeeze": "squeezenet1_1"}
 
 
 class FetchError(ValueError):
-    """Weights that cannot be had or converted; one line says why."""
+    """Weights that cannot be fetched or converted; one line says why."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         for network in args.network or get_args(Network):
-            features, lins = _fetched(network)
+            features, lins = _fetch(network)
             for path in convert(network, features, lins, args.out):
                 print(path)
     except FetchError as error:
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _fetched(network: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def _fetch(network: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """State dictionaries of the backbone's features and of the learned weights."""
     try:
         import lpips
@@ -73,10 +73,10 @@ def _fetched(network: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def convert(network: str, features: Mapping[str, Any], lins: Mapping[str, Any], out: Path) -> list[Path]:
-    """Write the two files of ``network`` into ``out`` and try them; returns their paths.
+    """Write the two files of ``network`` into ``out`` and check that they load; returns their paths.
 
     features: torchvision's ``features`` of the backbone, "0.weight" and so on. lins: the package's
-    "lin0.model.1.weight" (1, C, 1, 1) and so on. Raises FetchError where they do not make a working LPIPS.
+    "lin0.model.1.weight" (1, C, 1, 1) and so on. FetchError where they do not make a working LPIPS.
     """
     learned = {}
     for k in range(len(lins)):

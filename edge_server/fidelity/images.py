@@ -1,4 +1,4 @@
-"""The door of every metric: images become float64 in [0, 1], and what is no image is refused by name."""
+"""Input of every metric: images become float64 in [0, 1]; anything else is refused by name."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float64]
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
-BLACK: Colour = (0.0, 0.0, 0.0)
+BLACK: Color = (0.0, 0.0, 0.0)
 
 
 class ImageError(ValueError):
-    """Not an image that can be scored; the message says which one, what is wrong and what was expected."""
+    """An image that cannot be scored; the message says which one, what is wrong and what was expected."""
 
 
-def to_unit(image: NDArray, what: str = "image", background: Colour = BLACK) -> Image:
+def to_unit(image: NDArray, what: str = "image", background: Color = BLACK) -> Image:
     """``image`` as float64 (H, W, 3) in [0, 1].
 
-    image: uint8 in 0..255 or floating in [0, 1], RGB or straight-alpha RGBA (laid over ``background``).
-    Floating values outside [0, 1] are clipped, as a screen clips them. Raises ImageError for any other
-    shape or type, for an empty image, and for NaN or infinity: a metric of those would be NaN itself.
+    image: uint8 in 0..255 or floating in [0, 1], (H, W, 3) RGB or (H, W, 4) straight-alpha RGBA. Floating
+    values outside [0, 1] are clipped, as on a screen. what: its name in error messages. background: under the
+    alpha. ImageError for any other shape or type, an empty image, NaN or infinity (any metric of those would
+    be NaN).
     """
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] not in (3, 4) or 0 in array.shape:
@@ -46,7 +47,7 @@ def to_unit(image: NDArray, what: str = "image", background: Colour = BLACK) -> 
 
 
 def same_size(rendering: Image, truth: Image) -> None:
-    """Raise ImageError unless both have one shape: resizing one silently would change the figure."""
+    """ImageError unless both have the same shape: silently resizing one would change the score."""
     if rendering.shape != truth.shape:
         raise ImageError(
             f"rendering is {rendering.shape[1]} x {rendering.shape[0]} but the truth is "

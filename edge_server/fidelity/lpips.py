@@ -1,10 +1,10 @@
 """Learned perceptual image patch similarity, thesis (3.34) and (3.35), as Zhang et al. published it (v0.1).
 
-Features after each slice of a frozen ImageNet network are normalised over channels, their squared
+Features after each slice of a frozen ImageNet network are normalized over channels, their squared
 difference is weighted by the learned (not squared) channel weights, averaged over pixels and summed over
-slices. The thesis's (3.35) squares the weights and does not mention the normalisation; papers and tools
-report the published network, so this does too. A distance is comparable only within one network, hence
-``Lpips.network`` travels with every figure.
+slices. The thesis's (3.35) squares the weights and does not mention the normalization; papers and tools
+report the published network, and so does this. Distances are comparable only within one network, hence
+``Lpips.network`` accompanies every figure.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from edge_server.fidelity.images import ImageError, same_size, to_unit
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 EPSILON = 1e-10
-# Below these a pooling of the network has nothing left to pool.
+# Smaller images leave a pooling layer of the network without input.
 MINIMUM_SIDE = {"alex": 31, "squeeze": 17}
 
 Parameters = dict[str, Tensor]
@@ -32,7 +32,7 @@ Slices = Callable[[Parameters, Tensor], list[Tensor]]
 
 
 class Lpips:
-    """One network's LPIPS on the CPU. Stateless once built, so threads may share it."""
+    """LPIPS of one network on the CPU. Stateless once built, so that threads may share it."""
 
     def __init__(self, network: str, features: Path, lin: Path) -> None:
         """network: "alex" or "squeeze"; features, lin: npz files (see ``lpips_weights``).
@@ -51,7 +51,8 @@ class Lpips:
         self._check()
 
     def __call__(self, rendering: NDArray, truth: NDArray) -> float:
-        """Distance of two images as ``images.to_unit`` takes them: 0 for equal ones, about 1 for strangers.
+        """Distance of two images as ``images.to_unit`` takes them: 0 for equal ones, about 1 for unrelated
+        ones.
 
         Raises ImageError where a side is shorter than ``minimum_side``.
         """
@@ -85,7 +86,8 @@ class Lpips:
         return distances
 
     def _check(self) -> None:
-        """One tiny image through the network finds missing and misshapen arrays before the first score."""
+        """Run a tiny image through the network to find missing and misshapen arrays before the first
+        score."""
         side = self.minimum_side
         with torch.inference_mode():
             try:

@@ -1,4 +1,4 @@
-"""Finds LPIPS weights and says what to do where there are none. Imports torch only once they are found.
+"""Finds LPIPS weights, or says what to do where there are none. Imports torch only once they are found.
 
 A weights folder holds, for each network, the backbone's convolutions and the learned channel weights as
 plain npz arrays: ``alexnet_features.npz`` with ``lin_alex_v0.1.npz``, ``squeezenet1_1_features.npz``
@@ -25,8 +25,8 @@ FILES: dict[str, tuple[str, str]] = {
 
 
 def weights_folder(given: Path | None = None, data: Path | None = None) -> Path | None:
-    """Where the weights are looked for: the folder given, else FRESHFIELD_LPIPS, else ``lpips`` in the folder
-    of data sets (``data``, else FRESHFIELD_DATA), if there is one."""
+    """Folder to look for the weights in: the given one, else FRESHFIELD_LPIPS, else ``lpips`` in the data
+    folder (``data``, else FRESHFIELD_DATA) if it exists."""
     if given is not None:
         return given
     if named := os.environ.get(FOLDER_VARIABLE):
@@ -38,10 +38,11 @@ def weights_folder(given: Path | None = None, data: Path | None = None) -> Path 
 def open_lpips(
     folder: str | Path | None = None, network: Network = "alex"
 ) -> tuple[Lpips | None, str | None]:
-    """(metric, None), or (None, reason) where the weights are not to be had.
+    """(metric, None), or (None, reason) where the weights are missing or unusable.
 
-    folder: the weights folder; else the environment variable FRESHFIELD_LPIPS. The reason is one line for
-    a person: what was looked for, where, and what to do. It is what a report prints as ``lpips_missing``.
+    folder: of the weights; None takes the environment variable FRESHFIELD_LPIPS. The reason, one line for
+    people, says what was looked for, where, and what to do; reports print it as ``lpips_missing``. ValueError
+    for an unknown network.
     """
     if network not in FILES:
         raise ValueError(f"no LPIPS network {network!r}: choose one of {', '.join(FILES)}")

@@ -1,9 +1,9 @@
-"""Which pixels of a held-out camera move: where the age of information can be seen at all.
+"""Which pixels of a held-out camera move: only there is the age of information visible.
 
-A pixel moves where the truth at the present differs from the truth 60, 120, 200 or 300 ms earlier by more
-than a bound in some channel. On a mostly static scene the whole-image PSNR hardly notices a late field;
-on these pixels it does. On noise-free truth the bound is 0.03; for real video it is max(0.03, 4 sigma) of
-the camera's own noise, which ``NoiseEstimate`` takes from its successive frames.
+A pixel moves where the present truth differs from the truth 60, 120, 200 or 300 ms earlier by more than a
+bound in some channel. In a mostly static scene the PSNR of the whole image hardly notices a late field; that
+of these pixels does. On noise-free truth the bound is 0.03; for real video it is max(0.03, 4 sigma) of the
+camera's own noise, which ``NoiseEstimate`` measures from successive frames.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ BOUND = 0.03
 NOISE_SIGMAS = 4.0
 
 _BLOCK = 8
-# Of 192 values (8 x 8 pixels, 3 channels), the median of a mean square lies this much under its mean.
+# Ratio of median to mean of a mean square of 192 normal values (8 x 8 pixels, 3 channels).
 _CHI2_MEDIAN = (1.0 - 2.0 / (9.0 * 3 * _BLOCK**2)) ** 3
-# No camera worth watching is noisier; a larger estimate means that the camera itself moves.
+# No usable camera is noisier; a larger estimate means that the camera itself moves.
 _NOISE_LIMIT = 0.05
-_PAIRS_KEPT = 32
+_MAX_PAIRS = 32
 
 
 def moving_mask(truth: NDArray, earlier: Sequence[NDArray], bound: float = BOUND) -> NDArray[np.bool_]:
     """Mask (H, W) of the pixels of ``truth`` that differ from any of ``earlier`` by more than ``bound``.
 
-    Images are as ``images.to_unit`` takes them. Without earlier frames nothing is known to move.
+    Images are as ``images.to_unit`` takes them. Without earlier frames the mask is empty.
     """
     now = to_unit(truth, "truth")
     mask = np.zeros(now.shape[:2], dtype=bool)
@@ -49,7 +49,7 @@ def frames_at_lags(
 ) -> list[int]:
     """Indices into ``times_ns`` of the frames nearest to each lag before ``present_ns``, without repeats.
 
-    Only frames before the present count, however far from their lag: two frames a second still tell what
+    Only frames before the present count, however far from their lag: even two frames a second show what
     moved.
     """
     past = [i for i, t in enumerate(times_ns) if t < present_ns]
@@ -67,10 +67,9 @@ def frames_at_lags(
 def pair_noise(a: Image, b: Image) -> float | None:
     """Standard deviation in [0, 1] units of one frame's noise, from two successive frames (H, W, 3).
 
-    Mean squares of the difference over 8 x 8 blocks, median over blocks: static blocks outvote moving
-    ones, and averaging sees noise far under one 8-bit step, where a median of pixels sees 0. Clipped
-    blocks (black or saturated anywhere in both frames) show no noise and have no vote. None where no
-    block is left.
+    Mean squares of the difference over 8 x 8 blocks, median over blocks: static blocks outvote moving ones,
+    and the mean resolves noise far below one 8-bit step, where a median over pixels is 0. Blocks that are
+    black or saturated anywhere show no noise and are left out. None where no block is left.
     """
     rows, columns = a.shape[0] // _BLOCK, a.shape[1] // _BLOCK
     if a.shape != b.shape or rows == 0 or columns == 0:
@@ -91,22 +90,22 @@ def pair_noise(a: Image, b: Image) -> float | None:
 
 @dataclass
 class NoiseEstimate:
-    """A running estimate of one camera's noise: the median over its latest pairs of frames."""
+    """Running estimate of one camera's noise: the median over its latest pairs of frames."""
 
     pairs: list[float] = field(default_factory=list)
 
     def add(self, a: NDArray, b: NDArray) -> None:
-        """Learn from two successive frames of one camera."""
+        """Take two successive frames of the camera."""
         sigma = pair_noise(to_unit(a, "frame"), to_unit(b, "frame"))
         if sigma is not None:
-            self.pairs = [*self.pairs, sigma][-_PAIRS_KEPT:]
+            self.pairs = [*self.pairs, sigma][-_MAX_PAIRS:]
 
     @property
     def sigma(self) -> float:
-        """Standard deviation in [0, 1] units; 0 while nothing is known."""
+        """Standard deviation in [0, 1] units; 0 before the first pair."""
         return min(float(np.median(self.pairs)), _NOISE_LIMIT) if self.pairs else 0.0
 
     @property
     def bound(self) -> float:
-        """What a difference must exceed to be motion rather than noise."""
+        """A larger difference is motion rather than noise."""
         return max(BOUND, NOISE_SIGMAS * self.sigma)

@@ -1,12 +1,11 @@
-"""A perceptual distance on our own small detector's backbone: the stand-in where no LPIPS weights are.
+"""A perceptual distance on our own small detector's backbone: the stand-in where LPIPS weights are missing.
 
-It is thesis (3.34) and (3.35): features of the backbone's layers, normalised over channels as LPIPS does,
+It is thesis (3.34) and (3.35): features of the backbone's layers, normalized over channels as LPIPS does,
 squared differences weighted by w_l^2 >= 0 and averaged over pixels, summed over layers, and
 g(d) = d^power. Weights and power were fitted to real LPIPS on distorted renderings of our own scenes
-(``edge-server train-perceptual``), so figures are of LPIPS's size and order, but they are not LPIPS: wherever
-they appear they are called ``perceptual``. Spearman's correlation with LPIPS is .90 on variations of those
-scenes that were not fitted to, .86 to .90 on one of the scenes where only the others were fitted to
-(``embed/models/perceptual.json``).
+(``edge-server train-perceptual``), so figures have LPIPS's size and order. They are not LPIPS: wherever they
+appear they are called ``perceptual``. Spearman's correlation with LPIPS is .90 on unseen variations of the
+fitted scenes, and .86 to .90 on a scene that was left out of the fit (``embed/models/perceptual.json``).
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ DETECTOR, COEFFICIENTS = "detector_fp32.onnx", "perceptual.npz"
 
 
 class Perceptual:
-    """The fitted distance; stateless once built, so threads may share it."""
+    """The fitted distance; stateless once built, so that threads may share it."""
 
     minimum_side = MINIMUM_SIDE
 
     def __init__(self, layers: Layers, weights: list[NDArray[np.float64]], power: float) -> None:
-        """weights: w_l^2 (C_l,) of each layer, not negative. Raises ValueError where they do not fit."""
+        """weights: w_l^2 (C_l,) of each layer, not negative. ValueError where they do not fit the layers."""
         if len(weights) != len(layers.taps) or not 0.0 < power <= 4.0:
             raise ValueError(f"{len(weights)} weights for {len(layers.taps)} layers, power {power}")
         if not all(np.isfinite(w).all() and (w >= 0.0).all() for w in weights):
@@ -59,7 +58,7 @@ class Perceptual:
 
 
 class Layers:
-    """The backbone's feature maps ``taps``, and how much two stacks of images differ in them."""
+    """The backbone's feature maps ``taps``, and the differences of image stacks in them."""
 
     def __init__(self, detector: Path, taps: tuple[str, ...], threads: int = 1) -> None:
         """Raises edge_server.embed.EmbeddingError where the file cannot be used."""
@@ -71,8 +70,8 @@ class Layers:
         self.taps, self.name = taps, detector.stem
 
     def differences(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, sum of C_l): squared differences of normalised features of image stacks (N, H, W, 3) in [0, 1],
-        averaged over pixels, channel by channel and layer after layer."""
+        """(N, sum of C_l) squared differences of normalized features of image stacks (N, H, W, 3) in [0, 1],
+        averaged over pixels; the channels of all layers in order."""
         n = len(a)
         stack = np.concatenate([a, b]).transpose(0, 3, 1, 2).astype(np.float32)
         found = []
@@ -89,8 +88,8 @@ class Layers:
 
 
 def open_perceptual(folder: Path = MODELS) -> tuple[Perceptual | None, str | None]:
-    """(metric, None), or (None, reason) in one line where it cannot be had. folder: with the detector and the
-    coefficients of ``edge-server train-perceptual``; the shipped ones are the default."""
+    """(metric, None), or (None, reason) in one line where it cannot be used. folder: with the detector and
+    the coefficients of ``edge-server train-perceptual``; by default the shipped ones."""
     try:
         with np.load(folder / COEFFICIENTS, allow_pickle=False) as archive:
             taps = tuple(str(tap) for tap in archive["taps"])
@@ -103,13 +102,13 @@ def open_perceptual(folder: Path = MODELS) -> tuple[Perceptual | None, str | Non
     except ModuleNotFoundError as error:
         return None, f"perceptual: {error.name} is not installed: pip install 'freshfield[embed]'"
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        return None, f"perceptual: what is in {folder} cannot be used ({error})"
+        return None, f"perceptual: the files in {folder} cannot be used ({error})"
 
 
 def save_coefficients(
     path: Path, taps: tuple[str, ...], weights: list[NDArray[np.float64]], power: float
 ) -> None:
-    """Write what ``open_perceptual`` reads."""
+    """Write the coefficients that ``open_perceptual`` reads."""
     arrays: dict[str, NDArray] = {f"w{k}": w.astype(np.float32) for k, w in enumerate(weights)}
     arrays |= {"taps": np.array(taps), "power": np.array(power)}
     np.savez(path, **arrays)  # type: ignore[arg-type]  # arrays by name, not its one option

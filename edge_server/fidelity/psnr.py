@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.images import same_size, to_unit
 
-# What equal images score: (3.31) is infinite there, and an infinity would swallow every mean it enters.
-# An error below 1e-10 of the squared range is far under what 8-bit images can tell.
+# PSNR of equal images: (3.31) is infinite there, and an infinity would spoil every mean. An error below 1e-10
+# of the squared range is far below the resolution of 8-bit images.
 PSNR_CEILING_DB = 100.0
 
 

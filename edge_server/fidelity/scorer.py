@@ -1,12 +1,12 @@
-"""Scores what the edge publishes against the truth at the present.
+"""Scores publications against the truth at the present.
 
-The present is the instant of publication. The held-out camera's capture nearest to it may not have
-arrived yet, so a rendering waits here until a capture at or after it has (or until the wait is hopeless):
+The present is the instant of publication. The held-out camera's capture nearest to it may not have arrived
+yet, so a rendering waits here until a capture at or after that instant has arrived:
 
-    scorer.publish(camera, rendering, published_ns)      # keeps the rendering
-    scores = scorer.held_out(camera, image, generated_ns)  # whatever has become scorable
+    scorer.publish(camera, rendering, published_ns)        # keeps the rendering
+    scores = scorer.held_out(camera, image, generated_ns)  # the scores that this capture completes
 
-Where nothing is held out, ``score_selected`` takes the views the field was trained on (6.21)-(6.22), and
+Where nothing is held out, ``score_selected`` scores on the views the field was trained on (6.21)-(6.22), and
 the score says so.
 """
 
@@ -21,29 +21,29 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity.images import BLACK, Colour, Image, ImageError, same_size, to_unit
+from edge_server.fidelity.images import BLACK, Color, Image, ImageError, same_size, to_unit
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import TAPS, ssim
 
 log = logging.getLogger(__name__)
 
-# One lag more than the longest, so that the frame nearest to it is still here at ten frames a second.
+# Longer than the longest lag, so that the frame nearest to it is still here at low frame rates.
 HISTORY_MS = LAGS_MS[-1] + 1000.0
 HISTORY_FRAMES = 128
-# Renderings that wait for their truth. More would mean that no held-out frame comes at all.
-PENDING = 8
-# The truth may be half a period from the present; a tenth more lets a real camera's clock jitter.
+# Renderings that wait for their truth. More than this means that no held-out frames arrive.
+MAX_PENDING = 8
+# The truth may be half a period from the present; the rest allows for jitter of a real camera's clock.
 GAP_PERIODS = 0.55
 
 Load = Callable[[], NDArray]
-# What was rendered, or a function that renders it once the truth's generation time is known: a held-out
-# camera that moves has another pose by then.
+# A rendering, or a function that makes it once the truth's generation time is known: by then a moving
+# held-out camera has another pose.
 Render = NDArray | Callable[[int], NDArray]
 
 
 class PerceptualMetric(Protocol):
-    """LPIPS, or its stand-in (fidelity.perceptual), as far as the scorer needs it."""
+    """LPIPS or its stand-in (fidelity.perceptual)."""
 
     network: str
     minimum_side: int
@@ -55,10 +55,10 @@ class PerceptualMetric(Protocol):
 class Score:
     """Fidelity of one publication.
 
-    published_ns: the present. psnr_moving_db: None where nothing moves or nothing is known to. ssim and
-    lpips: None where the image is too small for them, lpips also without weights. truth_gap_ms: truth's
-    capture minus the present (None on selected views). on: what it was compared with. perceptual: None unless
-    it is asked for; it is not LPIPS, see fidelity.perceptual.
+    published_ns: the present. psnr_moving_db: None where nothing is known to move. ssim, lpips: None where
+    the image is too small, lpips also without weights. truth_gap_ms: capture of the truth minus the present
+    (None on selected views). on: the kind of truth. perceptual: None unless it was asked for; it is not
+    LPIPS, see fidelity.perceptual.
     """
 
     camera: str
@@ -78,8 +78,8 @@ class _Frame:
     generated_ns: int
     load: Load
     viewpoint: Hashable = None
-    background: Colour = BLACK
-    # Kept as decoded: 8-bit images take an eighth of the room that metrics need for a moment.
+    background: Color = BLACK
+    # As decoded: 8-bit images take an eighth of the memory of the metrics' float64.
     image: NDArray | None = None
 
     def pixels(self) -> Image:
@@ -91,11 +91,12 @@ class _Frame:
 @dataclass
 class _Camera:
     frames: deque[_Frame] = field(default_factory=lambda: deque(maxlen=HISTORY_FRAMES))
-    pending: deque[tuple[int, Render]] = field(default_factory=lambda: deque(maxlen=PENDING))
+    pending: deque[tuple[int, Render]] = field(default_factory=lambda: deque(maxlen=MAX_PENDING))
     noise: NoiseEstimate = field(default_factory=NoiseEstimate)
 
     def pixels(self, frame: _Frame) -> Image | None:
-        """The frame's image; one that cannot be decoded leaves the history, so that it fails once."""
+        """The frame's image. A frame that cannot be decoded is removed from the history, so that it fails
+        only once."""
         try:
             return frame.pixels()
         except ValueError as error:
@@ -108,10 +109,9 @@ class _Camera:
 class Scorer:
     """Keeps a short history of each held-out camera and the renderings that wait for it.
 
-    lpips: an ``Lpips`` or None. noisy_truth: held-out frames are real video, so the bound of moving pixels
-    follows their noise. period_ms: of the held-out cameras; None takes the median gap of their frames.
-    background: under held-out images with alpha. perceptual: a ``Perceptual`` or None. Not thread-safe: one
-    owner.
+    lpips: an ``Lpips`` or None. noisy_truth: held-out frames are real video, so that the bound of moving
+    pixels follows their noise. period_ms: of the held-out cameras; None takes the median gap of their frames.
+    background: under held-out images with alpha. perceptual: a ``Perceptual`` or None. Not thread-safe.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class Scorer:
         lpips: PerceptualMetric | None = None,
         noisy_truth: bool = False,
         period_ms: float | None = None,
-        background: Colour = BLACK,
+        background: Color = BLACK,
         perceptual: PerceptualMetric | None = None,
     ) -> None:
         self._lpips = lpips
@@ -132,32 +132,35 @@ class Scorer:
 
     def publish(self, camera: str, rendering: Render, published_ns: int) -> list[Score]:
         """Keep a rendering (H, W, 3) in [0, 1] of held-out ``camera``, or a function of the truth's
-        generation time that makes it; returns what is scorable already."""
+        generation time that makes it; returns the scores that are complete already."""
         pending = self._camera(camera).pending
-        if len(pending) == PENDING:
+        if len(pending) == MAX_PENDING:
             self.unscored += 1  # the oldest falls off the deque
         pending.append((published_ns, rendering))
-        return self._settle(camera)
+        return self._score_ready(camera)
 
     def held_out(
         self, camera: str, image: NDArray | Load, generated_ns: int, viewpoint: Hashable = None
     ) -> list[Score]:
-        """Take a held-out frame, uint8 or floating (H, W, 3 or 4), or a function that decodes it when it
-        is needed; returns the scores it completes, oldest first. Frames come in order of capture; one
-        that does not is a clock's jump or a new session and starts the history afresh. Moving pixels are
-        looked for among frames of the same ``viewpoint`` (a moving camera's pose), which may be None."""
+        """Take a held-out frame; returns the scores it completes, oldest first.
+
+        image: uint8 or floating (H, W, 3 or 4), or a function that decodes it when it is needed.
+        generated_ns: of its capture; a frame that is not later than the one before means a clock jump or a
+        new session, and restarts the history. viewpoint: a moving camera's pose; moving pixels are looked for
+        among frames of the same viewpoint.
+        """
         state = self._camera(camera)
         if state.frames and generated_ns <= state.frames[-1].generated_ns:
             state.frames.clear()
         load: Load = image if callable(image) else (lambda: image)
         state.frames.append(_Frame(generated_ns, load, viewpoint, self._background))
         oldest = generated_ns - round(HISTORY_MS * 1e6)
-        # A rendering may be older than the history is long: what it needs is kept while it waits.
+        # A waiting rendering may be older than the history: the frames it needs are kept.
         if state.pending:
             oldest = min(oldest, state.pending[0][0] - round(HISTORY_MS * 1e6))
         while state.frames[0].generated_ns < oldest:
             state.frames.popleft()
-        return self._settle(camera)
+        return self._score_ready(camera)
 
     def score(
         self,
@@ -169,10 +172,8 @@ class Scorer:
         earlier: Sequence[NDArray] = (),
         bound: float = BOUND,
     ) -> Score:
-        """Score one rendering against one truth; ``earlier`` truths tell which pixels move.
-
-        Raises ImageError for NaN, infinity or a wrong shape in either image.
-        """
+        """Score one rendering against one truth; ``earlier`` truths show which pixels move. ImageError for
+        NaN, infinity or a wrong shape in either image."""
         a = to_unit(rendering, "rendering")
         b = to_unit(truth, "held-out frame", self._background)
         same_size(a, b)
@@ -199,14 +200,15 @@ class Scorer:
     def score_selected(
         self, renderings: Sequence[tuple[str, NDArray, NDArray]], published_ns: int
     ) -> Score | None:
-        """Mean score over (camera, rendering, selected image), (6.22) metric by metric; None for none."""
+        """Mean score, metric by metric, over (camera, rendering, selected image) (6.22); None for no
+        renderings."""
         scores = [self.score(c, r, published_ns, image, published_ns) for c, r, image in renderings]
         if not scores:
             return None
         return replace(mean_score(scores), truth_gap_ms=None, on="selected")
 
     def period_ms(self, camera: str) -> float | None:
-        """The camera's period as given, else the median gap of its frames; None before the second."""
+        """The given period, else the median gap of the camera's frames; None before the second frame."""
         if self._period_ms is not None:
             return self._period_ms
         times = [f.generated_ns for f in self._camera(camera).frames]
@@ -215,18 +217,18 @@ class Scorer:
     def _camera(self, name: str) -> _Camera:
         return self._cameras.setdefault(name, _Camera())
 
-    def _settle(self, camera: str) -> list[Score]:
+    def _score_ready(self, camera: str) -> list[Score]:
         state = self._camera(camera)
         done: list[Score] = []
         # The nearest capture is known once one at or after the present has arrived.
         period = self.period_ms(camera)
         if period is None:
-            return done  # the first frame cannot tell yet whether it is near enough
+            return done  # with one frame it is unknown whether it is near enough
         while state.frames and state.pending and state.frames[-1].generated_ns >= state.pending[0][0]:
             published_ns, rendering = state.pending.popleft()
             try:
                 score = self._against_nearest(camera, state, period, published_ns, rendering)
-            except ValueError as error:  # a bad rendering or truth costs this publication, no other
+            except ValueError as error:  # a bad rendering or truth costs only this publication
                 log.warning("%s: a publication goes unscored: %s", camera, error)
                 score = None
             if score is None:
@@ -259,9 +261,9 @@ class Scorer:
         return self.score(camera, image, published_ns, truth, times[nearest], earlier, bound)
 
 
-def listed_metric(metrics: Sequence[str]) -> PerceptualMetric | None:
-    """The stand-in for LPIPS where a scenario's ``edge.metrics`` lists it. Raises ValueError with the reason
-    where it cannot be had."""
+def open_listed_perceptual(metrics: Sequence[str]) -> PerceptualMetric | None:
+    """The stand-in for LPIPS if a scenario's ``edge.metrics`` lists it. ValueError with the reason where it
+    cannot be used."""
     if "perceptual" not in metrics:
         return None
     from edge_server.fidelity.perceptual import open_perceptual
@@ -273,8 +275,8 @@ def listed_metric(metrics: Sequence[str]) -> PerceptualMetric | None:
 
 
 def mean_score(scores: Sequence[Score]) -> Score:
-    """Mean over several held-out cameras of one publication; a metric that some lack is averaged over
-    those that have it."""
+    """Mean over several held-out cameras of one publication; a metric is averaged over the cameras that have
+    it."""
     if not scores:
         raise ImageError("no scores to average")
 

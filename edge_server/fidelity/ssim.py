@@ -3,7 +3,7 @@
 Window: 11-tap Gaussian, sigma 1.5; K = (0.01, 0.03) on a range of 1 (the thesis writes k L^2 where the
 paper squares K too; the paper's is what every tool computes). Variances are the window's weighted ones,
 without Bessel's correction. **Valid region only**: the map is averaged where the window lies wholly
-inside the image, so no border rule enters; three channels are scored separately and averaged.
+inside the image, so that no border rule matters; the three channels are scored separately and averaged.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def gaussian_window() -> NDArray[np.float64]:
 
 
 def ssim(rendering: NDArray, truth: NDArray) -> float:
-    """Mean SSIM in [-1, 1]; 1 for equal images, whatever they show.
+    """Mean SSIM in [-1, 1]; 1 for equal images of any content.
 
     Images are as ``images.to_unit`` takes them; both sides at least 11 pixels, else ImageError.
     """
@@ -37,7 +37,7 @@ def ssim(rendering: NDArray, truth: NDArray) -> float:
     if min(a.shape[:2]) < TAPS:
         raise ImageError(f"SSIM needs at least {TAPS} x {TAPS} pixels, got {a.shape[1]} x {a.shape[0]}")
     mu_a, mu_b = _windowed(a), _windowed(b)
-    # A flat window's variance is a difference of equal numbers: rounding may make it negative.
+    # A flat window's variance is a difference of equal numbers, which rounding may make negative.
     var_a = np.maximum(_windowed(a * a) - mu_a * mu_a, 0.0)
     var_b = np.maximum(_windowed(b * b) - mu_b * mu_b, 0.0)
     cov = _windowed(a * b) - mu_a * mu_b

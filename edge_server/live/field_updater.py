@@ -18,7 +18,7 @@ from edge_server.fields import Budget, Field, FitReport, View
 from edge_server.live.buffer import BufferedFrame, FrameBuffer
 from edge_server.live.state import Publication
 from edge_server.live.view_decoder import ViewDecoder
-from edge_server.scheduler import STATE_PARTS, Epoch, Plan, Policy, embedding_of, treatment_of
+from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned, or a scenario asks for it
@@ -37,7 +37,7 @@ class Selection:
     earlier: the frames that their cameras delivered before, where the policy treats views and there are any.
     """
 
-    plan: Plan
+    plan: SelectionWindow
     now_ns: int
     items: tuple[BufferedFrame, ...]
     earlier: tuple[BufferedFrame, ...] = ()
@@ -102,7 +102,7 @@ class FieldUpdater:
         views. ValueError as ``check``."""
         self.check(policy)
         self._policy = policy
-        treats = treatment_of(policy) is not None
+        treats = policy.treatment is not None
         self.buffer.keep_earlier(treats)
         if not treats:
             self.decoder.forget_earlier()
@@ -110,7 +110,7 @@ class FieldUpdater:
     def check(self, policy: Policy) -> None:
         """ValueError where ``policy`` needs embeddings that are not computed here: there is no embedder, or
         not the one that it was trained with."""
-        dim, name = embedding_of(policy)
+        dim, name = policy.embedding
         if not dim:
             return
         if self.embedder is None:
@@ -137,11 +137,11 @@ class FieldUpdater:
         generated = {c: item.generated_ns for c, item in newest.items()}
         return Epoch(now_ns, self.number, generated, state)
 
-    def plan(self, now_ns: int) -> Plan:
+    def plan(self, now_ns: int) -> SelectionWindow:
         """The first half of a decision: how long to wait for frames."""
         return self.policy.plan(self.epoch(now_ns))
 
-    def select(self, plan: Plan, now_ns: int) -> Selection | None:
+    def select(self, plan: SelectionWindow, now_ns: int) -> Selection | None:
         """The second half: the frames that the policy uses of the buffer at ``now_ns``; None to wait on."""
         if now_ns < plan.wait_until_ns:
             return None
@@ -183,7 +183,7 @@ class FieldUpdater:
             self.keyframes.clear()
 
     def _treated(self, views: list[View], earlier: Mapping[str, View], now_ns: int) -> list[View]:
-        treatment = treatment_of(self.policy)
+        treatment = self.policy.treatment
         if treatment is None:
             return views
         start_s = time.perf_counter()

@@ -172,7 +172,7 @@ class UpdateLoop:
                 future.set_exception(error)
 
     def _select(self) -> Selection | None:
-        """Plan, wait as the plan says, and select; None if the controls changed meanwhile."""
+        """SelectionWindow, wait as the plan says, and select; None if the controls changed meanwhile."""
         plan = self._updater.plan(self._clock.now_ns())
         arrivals = self._updater.buffer.arrivals
         while not self._stop.is_set():

@@ -10,7 +10,7 @@ from edge_server.scheduler import BANDIT, OFFERED, Policy, make_live_policy
 from freshfield.scenario import Scenario
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
-    from edge_server.scheduler.online.online_trainer import Lessons
+    from edge_server.scheduler.online.online_trainer import OnlineTrainer
 
 
 class ServerPolicies:
@@ -29,27 +29,27 @@ class ServerPolicies:
         self.offered = OFFERED if self.first.name in OFFERED else (self.first.name, *OFFERED)
         self.trainer = self._open_trainer(config, lpips_missing, out)
         if self.trainer is not None:
-            self.first = self.trainer.apprentice
+            self.first = self.trainer.policy
 
     def make(self, name: str, value: float | None) -> Policy:
         """The policy that an operator asks for. Raises ValueError if it is not offered."""
         if name.startswith(BANDIT) and name not in self.offered:
             raise ValueError(f"policy {name!r}: what was learned is chosen at the start (--policy {name})")
         policy = self._make(name, value)
-        if self.trainer is not None and policy.name == self.trainer.apprentice.name:
-            return self.trainer.apprentice  # it goes on learning
+        if self.trainer is not None and policy.name == self.trainer.policy.name:
+            return self.trainer.policy  # it goes on learning
         return policy
 
     def learning_line(self, policy: str) -> str:
         """How learning goes, for people; empty where nothing learns, or another ``policy`` decides."""
-        if self.trainer is None or policy != self.trainer.apprentice.name:
+        if self.trainer is None or policy != self.trainer.policy.name:
             return ""
-        return self.trainer.apprentice.told()
+        return self.trainer.policy.summary()
 
     def _make(self, name: str, value: float | None) -> Policy:
         return make_live_policy(name, value, self._scenario.rng("policy", name))
 
-    def _open_trainer(self, config: EdgeConfig, lpips_missing: str | None, out: Path) -> Lessons | None:
+    def _open_trainer(self, config: EdgeConfig, lpips_missing: str | None, out: Path) -> OnlineTrainer | None:
         learn, name = config.learn, self.first.name
         if learn is None:
             return None
@@ -57,9 +57,9 @@ class ServerPolicies:
             raise ValueError(f"{name} cannot learn: only bandit:FILE can (--policy, edge.policy)")
         if not self._scenario.held_out:
             raise ValueError("nothing is held out (cameras.held_out), so that there is no reward to learn by")
-        from edge_server.scheduler.online.online_trainer import open_lessons
+        from edge_server.scheduler.online.online_trainer import open_online_trainer
 
-        trainer = open_lessons(
+        trainer = open_online_trainer(
             Path(name.removeprefix(BANDIT)), learn.reward, learn.fallback, self._scenario.rng("lessons"),
             lpips_missing, out,
         )  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 
 from edge_server.config import EdgeConfig, embedding_for
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.fields import View, checkpoint
 from edge_server.fields.common.kernels.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
@@ -32,7 +32,6 @@ from edge_server.live.policies import ServerPolicies
 from edge_server.live.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Renderer
 from edge_server.live.update_budget import open_budget
-from edge_server.scheduler import decision_of
 from freshfield.clock import Clock, WallClock
 from freshfield.files import ReplacedJson
 from freshfield.ledger import Ledger
@@ -102,7 +101,7 @@ class EdgeServer:
             if config.lpips == "none"
             else open_lpips(options.lpips_folder, config.lpips)  # type: ignore[arg-type]
         )
-        scorer = Scorer(lpips, config.noisy_truth, perceptual=listed_metric(config.metrics))
+        scorer = Scorer(lpips, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
         self.scoring = ScoringThread(scenario.held_out, scorer, self._scored)
         try:
             self.policies = ServerPolicies(scenario, config, self.lpips_missing, options.out)
@@ -145,7 +144,7 @@ class EdgeServer:
             save_snapshot=self._save_snapshot,
             channel=ReplacedJson(options.out / "channel.json").read,
             field_name=config.field,
-            decision=lambda: decision_of(self.updater.policy),
+            decision=lambda: self.updater.policy.last_decision,
             embed=None if embedder is None else embedder.embed,
             learning=lambda: self.policies.learning_line(self.state.controls.policy),
         )
@@ -237,7 +236,7 @@ class EdgeServer:
         self.state.scored(publication, comparison)
         self.journal.scored(publication, final)
         if self.trainer is not None and final:
-            self.trainer.scored(publication.number, publication)
+            self.trainer.add_score(publication.number, publication)
         if final and self.recorder is not None:
             self.recorder.scored(publication, self.clock.now_ns())
 
@@ -319,7 +318,7 @@ class EdgeServer:
             "treatment": _values(self.updater.treatment_cost, "views", "ms_per_view"),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
             "baseline": {name: mean(name) for name in ("mean_colour_db", "nearest_view_db")},
-            "learning": None if self.trainer is None else self.trainer.apprentice.status(),
+            "learning": None if self.trainer is None else self.trainer.policy.status(),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else self.config.lpips,
             "held_out": list(self.scenario.held_out),

@@ -21,7 +21,7 @@ from edge_server.fields import Renderer
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
-    from edge_server.scheduler.learned.bandit import Decided
+    from edge_server.scheduler.learned.bandit import Decision
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class EdgeState:
     set_policy: Callable[[str, float | None], None]
     save_snapshot: Callable[[], Path]
     channel: Callable[[], dict | None] = lambda: None
-    decision: Callable[[], Decided | None] = lambda: None
+    decision: Callable[[], Decision | None] = lambda: None
     embed: Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]] | None = None
     field_name: str = ""
     learning: Callable[[], str] = lambda: ""

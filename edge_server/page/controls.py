@@ -17,7 +17,7 @@ import viser
 
 from edge_server.live.state import EdgeState
 from edge_server.page.markup import note
-from edge_server.scheduler import help_of, make_policy
+from edge_server.scheduler import make_policy, policy_help
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def _label(parameter: str | None) -> str:
 
 def _help(policy: str) -> str:
     """The scheduler's line on the policy, without what only readers of its source need."""
-    return note(re.sub(r" \([\d.-]+\)", "", help_of(policy).split("; value:")[0]))
+    return note(re.sub(r" \([\d.-]+\)", "", policy_help(policy).split("; value:")[0]))
 
 
 def _notify(client: Any, title: str, body: str, bad: bool = False, seconds: float = NOTICE_S) -> None:

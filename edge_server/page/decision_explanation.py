@@ -18,7 +18,7 @@ from edge_server.page.colours import AGAINST, FOR
 from freshfield import payload
 
 if TYPE_CHECKING:
-    from edge_server.scheduler.learned.bandit import Decided
+    from edge_server.scheduler.learned.bandit import Decision
 
 WIDTH = 320
 # A region that decided everything is painted over by so much.
@@ -64,9 +64,9 @@ class Why:
         # The page's own thread does it: a visitor who clicks ten times waits ten times, nobody else does.
         self._asked = True
 
-    def _look(self, decided: Decided) -> None:
+    def _look(self, decided: Decision) -> None:
         """Show where in the picture of the camera with the largest share."""
-        from edge_server.scheduler.learned.explain import explain, occlusion
+        from edge_server.scheduler.learned.explain import explain, occlusion_map
 
         embed, state = self._state.embed, decided.state
         if embed is None or not state.frames:
@@ -81,7 +81,7 @@ class Why:
                 image = payload.decode(frame.payload, frame.codec, *size)
             except payload.PayloadError:
                 continue
-            regions = occlusion(decided.actor, state, decided.action, int(number), image, embed)
+            regions = occlusion_map(decided.actor, state, decided.action, int(number), image, embed)
             self._show(painted(image[..., :3], regions), frame.camera)
             return
 

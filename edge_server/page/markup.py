@@ -168,7 +168,8 @@ def why(e: Explanation) -> str:
     bars += f'<div style="height:.4em"></div>{"".join(_share(n, s, widest) for n, s in largest)}'
     return (
         f'<div style="padding:.3em .9em;font-size:.78em"><div><b>{escape(e.action)}</b> '
-        f'<span style="{_DIM}">logit {e.firmness:+.2f}, of average cameras {e.usual:+.2f}</span></div>{bars}'
+        f'<span style="{_DIM}">logit {e.logit:+.2f}, of average cameras {e.baseline_logit:+.2f}</span></div>'
+        f"{bars}"
         f'<div style="{_DIM}"><span style="color:{css(FOR)}">&#9632;</span> for it '
         f'<span style="color:{css(AGAINST)}">&#9632;</span> against it</div></div>'
     )

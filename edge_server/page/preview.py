@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fidelity.psnr import psnr
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication
 from edge_server.page import PageError, start_page
@@ -224,10 +225,8 @@ class Preview:
             )  # fmt: skip
             self.state.status_line = f"used {len(selected)} views of {len(newest)}"
             self.state.publish(publication, renderer)
-            error = float(np.mean((truth.astype(float) - shown) ** 2))
-            psnr_db = 10 * np.log10(255.0**2 / error) if error else 99.0
             self.state.scored(
-                replace(publication, psnr_db=float(psnr_db)),
+                replace(publication, psnr_db=psnr(shown, truth)),
                 Comparison(self._held_out, truth, shown, number),
             )
             number += 1

@@ -1,22 +1,17 @@
-"""Use all: every camera's newest frame, however old. The ceiling of views, and of age."""
+"""Use all: every camera's newest frame, however old. The maximum of views, and of age."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from edge_server.scheduler import Epoch, Plan
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 
 
-class UseAll:
+class UseAll(Policy):
     name = "all"
-    parameter = None
-    value: float | None = None
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
-        del value, rng  # it has neither a parameter nor chance
+        del value, rng  # no parameter, no randomness
 
-    def plan(self, epoch: Epoch) -> Plan:
-        return Plan(epoch.now_ns)
-
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         return tuple(epoch.generated_ns)

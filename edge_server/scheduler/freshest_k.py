@@ -1,28 +1,29 @@
-"""Freshest-k: a fixed number of views, the youngest there are."""
+"""Freshest-k: a fixed number of views, the youngest ones."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from edge_server.scheduler import Epoch, Plan, freshest, positive_int
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow, positive_int
 
 DEFAULT_K = 6
 
 
-class FreshestK:
+class FreshestK(Policy):
     name = "freshest-k"
     parameter = "k"
+    value: int
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
         del rng
-        self._k = positive_int(value, DEFAULT_K, "k")
+        self.value = positive_int(value, DEFAULT_K, "k")
 
-    @property
-    def value(self) -> float | None:
-        return self._k
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
+        return freshest(epoch, self.value)
 
-    def plan(self, epoch: Epoch) -> Plan:
-        return Plan(epoch.now_ns)
 
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
-        return freshest(epoch, self._k)
+def freshest(epoch: Epoch, count: int) -> tuple[str, ...]:
+    """The ``count`` cameras with the youngest frames; ties go by the cameras' own order."""
+    order = sorted(epoch.generated_ns, key=lambda c: -epoch.generated_ns[c])
+    chosen = set(order[:count])
+    return tuple(c for c in epoch.generated_ns if c in chosen)

@@ -1,35 +1,29 @@
-"""Random: a uniformly random set of views; the baseline that the thesis's figures lack."""
+"""Random: a uniformly random set of views; a baseline that the thesis's figures lack."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from edge_server.scheduler import Epoch, Plan, positive_int
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow, positive_int
 
 
-class RandomSubset:
+class RandomSubset(Policy):
     """Every non-empty subset is equally likely, or, with a value, every subset of k cameras."""
 
     name = "random"
     parameter = "k"
+    value: int | None
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
-        self._size = None if value is None else positive_int(value, 1, "k")
+        self.value = None if value is None else positive_int(value, 1, "k")
         self._rng = rng
 
-    @property
-    def value(self) -> float | None:
-        return self._size
-
-    def plan(self, epoch: Epoch) -> Plan:
-        return Plan(epoch.now_ns)
-
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         cameras = tuple(epoch.generated_ns)
         if not cameras:
             return ()
-        if self._size is not None:
-            count = min(self._size, len(cameras))
+        if self.value is not None:
+            count = min(self.value, len(cameras))
             chosen = set(self._rng.choice(len(cameras), size=count, replace=False).tolist())
             return tuple(c for i, c in enumerate(cameras) if i in chosen)
         while True:  # redrawing the empty set keeps the others equally likely

@@ -4,32 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.scheduler import Epoch, Plan, positive_int
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow, positive_int
 
 DEFAULT_K = 6
 
 
-class RoundRobin:
+class RoundRobin(Policy):
     name = "round-robin"
     parameter = "k"
+    value: int
 
     def __init__(self, value: float | None, rng: np.random.Generator) -> None:
         del rng
-        self._k = positive_int(value, DEFAULT_K, "k")
+        self.value = positive_int(value, DEFAULT_K, "k")
         self._next = 0
 
-    @property
-    def value(self) -> float | None:
-        return self._k
-
-    def plan(self, epoch: Epoch) -> Plan:
-        return Plan(epoch.now_ns)
-
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         cameras = tuple(epoch.generated_ns)
         if not cameras:
             return ()
-        count = min(self._k, len(cameras))
-        turns = {(self._next + i) % len(cameras) for i in range(count)}
+        count = min(self.value, len(cameras))
+        chosen = {(self._next + i) % len(cameras) for i in range(count)}
         self._next = (self._next + count) % len(cameras)
-        return tuple(c for i, c in enumerate(cameras) if i in turns)
+        return tuple(c for i, c in enumerate(cameras) if i in chosen)

@@ -1,32 +1,23 @@
-"""A policy whose chosen views are treated before they supervise: ``threshold+mask``, ``wait+freshen``.
+"""A policy whose selected views are treated before they supervise: ``threshold+mask``, ``wait+freshen``.
 
 The part before the + decides as it always does; the part after it is one of ``edge_server.treatments``.
 """
 
 from __future__ import annotations
 
-from edge_server.scheduler import Epoch, Plan, Policy
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 from edge_server.treatments import Treatment
 
 
-class Treated:
-    """``policy`` as it is, with a treatment for the views that it selects. name: as it was asked for."""
+class Treated(Policy):
+    """``policy`` with a treatment for the views that it selects. name: as the user wrote it."""
 
     def __init__(self, name: str, policy: Policy, treatment: Treatment) -> None:
-        self.name = name
-        self.policy = policy
-        self.treatment = treatment
+        self.name, self.policy, self.treatment = name, policy, treatment
+        self.parameter, self.value = policy.parameter, policy.value
 
-    @property
-    def parameter(self) -> str | None:
-        return self.policy.parameter
-
-    @property
-    def value(self) -> float | None:
-        return self.policy.value
-
-    def plan(self, epoch: Epoch) -> Plan:
+    def plan(self, epoch: Epoch) -> SelectionWindow:
         return self.policy.plan(epoch)
 
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
-        return self.policy.select(epoch, plan)
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
+        return self.policy.select(epoch, window)

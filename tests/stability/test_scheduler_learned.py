@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Batch, Diagnostics, Learner
 from edge_server.scheduler.learned.problem import collect
@@ -41,8 +41,8 @@ def decide_and_learn(learner: Learner, states: list[State], rewards=None) -> Dia
 
 
 def learns_on(learner: Learner, problem) -> None:
-    """What happened before has broken nothing: an easy problem is still learnt. Anything learnt from noise
-    has to be unlearnt, hence more updates than a new learner needs."""
+    """What happened before has broken nothing: an easy problem is still learned. Anything learned from noise
+    has to be unlearned, hence more updates than a new learner needs."""
     teach(learner, problem, 16)
     finite(learner)
     assert regret(learner, problem) < 0.04
@@ -98,7 +98,7 @@ def test_extreme_poses_and_embeddings(spec, part):
         states.append(replace(s, **{part: array}))
     assert np.abs(LAYOUT.batch(states)).max() <= LAYOUT.limit
     decide_and_learn(Learner(spec, 0), states)
-    fitted = LAYOUT.standardised(states)
+    fitted = LAYOUT.standardized(states)
     assert np.isfinite(fitted.batch(states)).all()
     decide_and_learn(Learner(any_of(spec, fitted), 0), states)
 
@@ -128,7 +128,7 @@ def test_constant_reward_moves_the_policy_nowhere(spec, reward):
     assert all(np.array_equal(w, learner.actor.weights[name]) for name, w in before.items())
 
 
-def test_after_a_constant_reward_one_that_varies_is_learnt():
+def test_after_a_constant_reward_one_that_varies_is_learned():
     learner, problem = Learner(Spec("select", FreshOnes.layout), 0), FreshOnes()
     for number in range(4):
         batch = collect(learner, problem, range(64 * number, 64 * number + 64))
@@ -279,6 +279,6 @@ def test_a_policy_of_extreme_weights_still_decides():
         big = replace(actor, weights={k: size * w for k, w in actor.weights.items()})
         s = state(6, np.random.default_rng(0), d=4, silent=1)
         for explore in (False, True):
-            p = Bandit(big, "bandit:test", np.random.default_rng(0), explore)
+            p = BanditPolicy(big, "bandit:test", np.random.default_rng(0), explore)
             chosen, logps = p.actor.act([s], np.random.default_rng(0) if explore else None)
             assert chosen.any() and not chosen[0, 5] and np.isfinite(logps).all()

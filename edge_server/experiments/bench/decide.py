@@ -1,6 +1,6 @@
 """How long a learnt decision takes, from the newest frames to the action, and what of it is the network.
 
-Embeddings are not computed here (``bench embed`` measures them): a decision is given them.
+FrameEmbeddings are not computed here (``bench embed`` measures them): a decision is given them.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from edge_server.experiments.common.machine_load import Usage
 from edge_server.live.buffer import BufferedFrame
-from edge_server.scheduler import Epoch
+from edge_server.scheduler import STATE_PARTS, Epoch
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.observation import observe
-from edge_server.scheduler.learned.state import PARTS, State, StateLayout
+from edge_server.scheduler.learned.state import State, StateLayout
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose, look_at
 
@@ -45,13 +45,13 @@ def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, A
 
 def _of(action: Any, n: int, repeats: int) -> dict[str, float]:
     spec = Spec(action, StateLayout(dim=DIM), () if action == "select" else OMEGAS_MS)
-    policy = Bandit(Actor(spec, networks.new_actor(spec, np.random.default_rng(0))), "bandit", _rng())
+    policy = BanditPolicy(Actor(spec, networks.init_actor(spec, np.random.default_rng(0))), "bandit", _rng())
     newest, embeddings = _rig(n), _Known(n)
     names = tuple(newest)
     generated = {c: item.generated_ns for c, item in newest.items()}
     at = [0]
 
-    def state(parts: Sequence[str] = PARTS) -> State:
+    def state(parts: Sequence[str] = STATE_PARTS) -> State:
         return observe(names, newest, at[0], embeddings, parts)
 
     def decide() -> None:
@@ -104,7 +104,7 @@ def _rig(n: int) -> dict[str, BufferedFrame]:
 
 
 class _Known:
-    """Embeddings that are there already."""
+    """FrameEmbeddings that are there already."""
 
     def __init__(self, n: int) -> None:
         self._rows = _rng().standard_normal((n, DIM)).astype(np.float32)

@@ -25,7 +25,7 @@ from edge_server.experiments.fitting.evaluate import Scored, evaluate, fit_in_sl
 from edge_server.experiments.scenes.multiview_still import synthetic
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
 from edge_server.fidelity.baselines import Baseline, baseline
-from edge_server.fidelity.images import Colour, to_unit
+from edge_server.fidelity.images import Color, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
@@ -51,7 +51,7 @@ one instant (--frame, 15 a second in a scene). Time spent on evaluation is not c
 ends it early; report, pictures and checkpoint are written all the same, and --resume goes on from there.
 """
 
-BACKGROUNDS: dict[str, Colour] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+BACKGROUNDS: dict[str, Color] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 _SCENE_SIZE = 128  # pixels a side of a scene of ours, before --scale
 # Enough to tell how far a field is from the views it was trained on, where nothing is held out.
 _SCORED_OF_TRAINING = 8

@@ -10,10 +10,10 @@ import numpy as np
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.scene import HELD_OUT, SCENES
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.fidelity.images import BLACK, Colour
+from edge_server.fidelity.images import BLACK, Color
 from edge_server.fields import View
 
-WHITE: Colour = (1.0, 1.0, 1.0)
+WHITE: Color = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Still:
     name: str
     training: tuple[View, ...]
     held_out: tuple[View, ...]
-    background: Colour = BLACK
+    background: Color = BLACK
 
     def describe(self) -> str:
         image = self.training[0].image

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.statistics import Interval, interval, paired
 from edge_server.experiments.studies.trial import Folders, Row, Trial
+from edge_server.scheduler.learned.rewards import f_w
 from freshfield.files import write_text
 
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
@@ -100,8 +101,7 @@ class Table:
 
     def __post_init__(self) -> None:
         self.rows = [
-            {**p.labels, "seed": p.trial.seed, **r, "f_w": objective(r)}
-            for p, r in zip(self.points, self.results)
+            {**p.labels, "seed": p.trial.seed, **r, "f_w": f_w(r)} for p, r in zip(self.points, self.results)
         ]
 
     def where(self, **labels: Any) -> list[Row]:
@@ -156,21 +156,6 @@ def run_study(study: Study, ask: Ask, engine: Engine) -> list[Verdict]:
     text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
     write_text(ask.out / f"{study.name}.md", text)
     return verdicts
-
-
-def objective(
-    row: Row, w_p: float = -0.02, w_s: float = 0.2, w_l: float = 0.3, w_t: float = 0.015
-) -> float | None:
-    """F_w of (6.36) and (6.37), smaller is better; ages in slots of 1 ms. None where a metric is missing.
-
-    The weights are the thesis's (6.5): its w_s = +0.2 counts a better SSIM as worse; -0.2 is what the text
-    means.
-    """
-    needed = (row.get("psnr_db"), row.get("ssim"), row.get("lpips"), row.get("aaoi_ms"))
-    if any(v is None for v in needed):
-        return None
-    psnr, ssim, lpips, age = (float(v) for v in needed)  # type: ignore[arg-type]
-    return w_p * psnr + w_s * ssim + w_l * lpips + w_t * age
 
 
 def to_win(table: Table, metric: str, **labels: Any) -> str:

@@ -20,11 +20,11 @@ from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_
 from edge_server.experiments.virtual.from_scenario import deploy
 from edge_server.experiments.virtual.virtual_deployment import Terms, VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
-from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.state import Publication
 from edge_server.report.machine import versions
-from edge_server.scheduler import read_policy
+from edge_server.scheduler import parse_policy
 from freshfield.files import write_json, write_text
 from freshfield.scenario import Scenario, ScenarioError, load
 
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metric, missing = None, None
         if config.lpips != "none":
             metric, missing = open_lpips(lpips, cast(Network, config.lpips))
-        scorer = Scorer(metric, config.noisy_truth, perceptual=listed_metric(config.metrics))
+        scorer = Scorer(metric, config.noisy_truth, perceptual=open_listed_perceptual(config.metrics))
         decisions: DecisionLog | None = None
 
         def published(publication: Publication) -> None:
@@ -178,7 +178,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     edge = dict(scenario.edge)
     if args.policy:
         try:
-            edge["policy"] = dataclasses.asdict(PolicyConfig(*read_policy(args.policy)))
+            edge["policy"] = dataclasses.asdict(PolicyConfig(*parse_policy(args.policy)))
         except ValueError as error:
             raise ScenarioError(f"--policy {error}") from None
     if args.compute:

@@ -28,7 +28,6 @@ from edge_server.live.buffer import BufferedFrame
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.ingest import FrameAdmission
 from edge_server.live.state import Publication
-from edge_server.scheduler import treatment_of
 from freshfield.clock import VirtualClock
 from freshfield.frame import Frame, FrameRejected, from_request, to_request
 from freshfield.geometry import Pose
@@ -282,7 +281,7 @@ class VirtualDeployment:
                 yield Wake(plan.wait_until_ns) if waits else _AT_ARRIVAL
             if terms.scratch:
                 updates.field.reset()
-            treated = len(selection.items) if treatment_of(updates.policy) is not None else 0
+            treated = len(selection.items) if updates.policy.treatment is not None else 0
             publishes_ns = self.clock.now_ns() + terms.compute.charge_ns(steps, treated)
             fitted = updates.fit(self._exposed_all(selection), Budget(steps=steps), publishes_ns)
             if fitted is None:

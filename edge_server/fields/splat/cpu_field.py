@@ -172,9 +172,7 @@ class SplatField:
                 image[8:16, 8 + 2 * k : 16 + 2 * k, :3] = 255
                 field.fit([View("warm-up", image, pose, camera, k * 10**8)], Budget(steps=8))
             field.render(pose, camera)
-            field._live().colors_at(
-                field.view_store.views, [np.full((1, 2), 0.5)]
-            )  # as outliers are found
+            field._live().colors_at(field.view_store.views, [np.full((1, 2), 0.5)])  # as outliers are found
 
     # --- state --------------------------------------------------------------------------------
 

@@ -6,11 +6,11 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge_server.scheduler import Policy, decision_of
+from edge_server.scheduler import Policy
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
     from edge_server.embed import EmbeddingConfig
-    from edge_server.scheduler.learned.decision_record import DecisionRecord
+    from edge_server.scheduler.learned.decision_record import DecisionWriter
 
 
 class DecisionLog:
@@ -21,18 +21,18 @@ class DecisionLog:
 
     def __init__(self, out: Path, embedding: EmbeddingConfig | None) -> None:
         self._out, self._embedding = out, embedding
-        self._record: DecisionRecord | None = None
+        self._record: DecisionWriter | None = None
 
     def record(self, policy: Policy, number: int) -> None:
         """Write the decision of update ``number``, if ``policy`` is learned and took it."""
-        decision = decision_of(policy)
+        decision = policy.last_decision
         if decision is None or decision.number != number:
             return
         if self._record is None:
-            from edge_server.scheduler.learned.decision_record import DecisionRecord
+            from edge_server.scheduler.learned.decision_record import DecisionWriter
 
             known = None if self._embedding is None else dataclasses.asdict(self._embedding)
-            self._record = DecisionRecord(self._out, known)
+            self._record = DecisionWriter(self._out, known)
         self._record.write(decision)
 
     @property

@@ -1,19 +1,18 @@
 """The scheduler that learns (thesis 5.4, 6.3): one-step decisions, rewarded by what the field then shows.
 
-    state.py         what a decision is made from (5.17, 6.33), and as numbers for a network
-    observe.py       the state of a buffer
-    spec.py          everything that defines a learner, as data
-    networks.py      actors and values, any number of cameras with one set of weights
-    distributions.py log-probabilities that hold at the edges, non-empty sets
-    ppo.py           single-step PPO (5.23, algorithm 1), contextual-bandit PPO (6.42, algorithm 2)
-    rewards.py       (5.19) and (6.36)-(6.38), term by term
-    problem.py       what there is to learn: draw a decision, be rewarded
-    environment.py   the same for gymnasium
-    decide.py        an actor that has been learnt, in numpy
-    bandit.py        a checkpoint as a policy, live and in virtual time
-    apprentice.py    one that goes on learning while it is used, on a leash; lessons.py teaches it
-    explain.py       what moved a decision
-    record.py        decisions on disk, to be explained later
+    state.py            what a decision is made from (5.17, 6.33), and as features for a network
+    observation.py      the state of a buffer
+    learner_spec.py     everything that defines a learner, as data
+    networks.py         actor and value networks; one set of weights for any number of cameras
+    distributions.py    log-probabilities that hold at the edges, non-empty sets
+    ppo.py              single-step PPO (5.23, algorithm 1), contextual-bandit PPO (6.42, algorithm 2)
+    rewards.py          (5.19) and (6.36)-(6.38), term by term
+    problem.py          the bandit problem: draw a round, get the reward of an action
+    gym_environment.py  the same for gymnasium
+    actor.py            a trained actor, in numpy
+    bandit.py           a checkpoint as a policy, live and in virtual time
+    explain.py          attributes a decision to parts of the state, cameras and image regions
+    decision_record.py  decisions on disk, to be explained later
 
-Only what learns needs torch: what decides at the edge is numpy.
+Only learning needs torch; deciding at the edge is numpy.
 """

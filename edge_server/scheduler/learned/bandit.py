@@ -1,7 +1,7 @@
 """A learner's checkpoint as a policy: ``bandit:FILE``, live and in virtual time.
 
 It decides as the checkpoint was trained to: a set of cameras at the instant of selection, a threshold, or a
-wait; by default the likeliest action, with ``explore`` one that is drawn.
+wait; by default the most probable action, with ``explore`` a sampled one.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler import Epoch, Plan, freshest
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.state import State
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
+from edge_server.scheduler.threshold import within_threshold
+from edge_server.scheduler.wait import generated_in, wait_window
 
 
 @dataclass(frozen=True)
-class Decided:
-    """What a decision saw and did, and what decided. action: (N,) bool, or an index of the omegas; logp: its
-    log-probability under the policy that took it."""
+class Decision:
+    """A learned policy's decision: number and time of its epoch, the state it saw, its action ((N,) bool, or
+    an index of the omegas), the action's log-probability, and the actor that took it."""
 
     number: int
     now_ns: int
@@ -30,64 +32,53 @@ class Decided:
     logp: float
     actor: Actor
 
-    def without_frames(self) -> Decided:
-        """The same for who keeps many: frames are large, and only explanations look at them."""
+    def without_frames(self) -> Decision:
+        """The same without the frames, which are large and only needed for explanations."""
         return replace(self, state=replace(self.state, frames={}))
 
 
-class Bandit:
-    """``actor`` as a policy. ``last`` is its newest decision, for who learns from it or explains it."""
+class BanditPolicy(Policy):
+    """``actor`` as a policy. ``last_decision`` is there to learn from or to explain."""
 
-    parameter = None
-    value: float | None = None
+    last_decision: Decision | None = None
 
     def __init__(self, actor: Actor, name: str, rng: np.random.Generator, explore: bool = False) -> None:
         self.actor = actor
         self.name = name
         self.explore = explore
-        self.last: Decided | None = None
+        self.embedding = actor.spec.layout.dim, actor.spec.layout.embedding
         self._rng = rng
 
     @staticmethod
-    def from_file(path: Path | str, rng: np.random.Generator) -> Bandit:
+    def from_file(path: Path | str, rng: np.random.Generator) -> BanditPolicy:
         """ValueError, in one line, where ``path`` is no checkpoint of a learner."""
-        return Bandit(Actor.load(path), f"bandit:{path}", rng)
+        return BanditPolicy(Actor.load(path), f"bandit:{path}", rng)
 
-    @property
-    def embedding(self) -> tuple[int, str]:
-        """Width of the embeddings that it looks at, 0 without, and whose they are."""
-        return self.actor.spec.layout.dim, self.actor.spec.layout.embedding
-
-    def plan(self, epoch: Epoch) -> Plan:
+    def plan(self, epoch: Epoch) -> SelectionWindow:
         action = self.actor.spec.action
-        if action == "select":  # at once, of what is there
-            return Plan(epoch.now_ns)
+        if action == "select":
+            return SelectionWindow()
         omega_ms = self.actor.spec.omegas_ms[int(self._decide(epoch))]
-        if action == "threshold" or omega_ms == 0.0:
-            return Plan(epoch.now_ns, omega_ms=omega_ms)
-        until = epoch.now_ns + round(omega_ms * 1e6)
-        return Plan(epoch.now_ns, omega_ms, wait_until_ns=until, generated_after_ns=epoch.now_ns)
+        return wait_window(epoch.now_ns, omega_ms) if action == "wait" else SelectionWindow(omega_ms)
 
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         if not epoch.generated_ns:
             return ()
         if self.actor.spec.action == "wait":
-            after = plan.generated_after_ns
-            return tuple(c for c, g in epoch.generated_ns.items() if after is None or g > after)
+            return generated_in(epoch, window)
         if self.actor.spec.action == "threshold":
-            assert plan.omega_ms is not None  # this policy's own plan
-            young = tuple(c for c in epoch.generated_ns if epoch.age_ms(c) <= plan.omega_ms)
-            return young or freshest(epoch, 1)
+            assert window.omega_ms is not None  # this policy's own window
+            return within_threshold(epoch, window.omega_ms)
         chosen = self._decide(epoch)
-        assert self.last is not None
-        return tuple(c for c, used in zip(self.last.state.cameras, chosen) if used)
+        assert self.last_decision is not None
+        return tuple(c for c, used in zip(self.last_decision.state.cameras, chosen) if used)
 
     def _decide(self, epoch: Epoch) -> NDArray[Any]:
         if epoch.state is None:
             raise ValueError(f"{self.name} needs to see more than ages, which is not offered here")
-        actor = self.actor  # one that learns is replaced while it decides
+        actor = self.actor  # the online trainer may replace it meanwhile
         state = epoch.state(actor.spec.layout.parts)
         actions, logps = actor.act([state], self._rng if self.explore else None)
         action = np.asarray(actions[0])
-        self.last = Decided(epoch.number, epoch.now_ns, state, action, float(logps[0]), actor)
+        self.last_decision = Decision(epoch.number, epoch.now_ns, state, action, float(logps[0]), actor)
         return action

@@ -1,7 +1,7 @@
 """Decisions on disk, so that they can be explained after a run: OUT/decisions/000123.npz.
 
-One file a decision: the state, the action, and the frames that were embedded, as they were delivered. What
-decided is written once, policy-HASH.npz. The newest decisions are kept, as many as fit.
+One file a decision: the state, the action, and the embedded frames as they were delivered. The policy is
+written once, policy-HASH.npz. Only the newest decisions are kept, as many as fit.
 """
 
 from __future__ import annotations
@@ -19,46 +19,49 @@ from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.bandit import Decided
+from edge_server.scheduler.learned.bandit import Decision
 from edge_server.scheduler.learned.state import State
 from freshfield import payload
 
 log = logging.getLogger(__name__)
 
 FOLDER = "decisions"
-MOST = 500
-MOST_BYTES = 64_000_000
+MAX_DECISIONS = 500
+MAX_BYTES = 64_000_000
 _KIND = "decision"
 
 
-class DecisionRecord:
-    """Writes decisions under ``out``. embedding: settings of the embedder, for who embeds the frames again.
-    A full disk costs decisions, counted in ``lost``, never the edge. One owner: not thread-safe."""
+class DecisionWriter:
+    """Writes decisions under ``out``. A full disk costs decisions, counted in ``lost``, never the edge. Not
+    thread-safe.
+
+    embedding: settings of the embedder, to embed the frames again. max_decisions, max_bytes: to keep on disk.
+    """
 
     def __init__(
         self,
         out: Path,
         embedding: Mapping[str, Any] | None = None,
-        most: int = MOST,
-        most_bytes: int = MOST_BYTES,
+        max_decisions: int = MAX_DECISIONS,
+        max_bytes: int = MAX_BYTES,
     ) -> None:
         self._folder = out / FOLDER
         self._embedding = dict(embedding) if embedding else None
-        self._most, self._most_bytes = most, most_bytes
-        # Decision, the policy's file, bytes of what was written for it; those of an earlier process first.
+        self._max_decisions, self._max_bytes = max_decisions, max_bytes
+        # Decision's file, policy's file, bytes written for it; those of an earlier process first.
         self._kept = deque((p, "", p.stat().st_size) for p in _numbered(self._folder))
         self._policy: tuple[Actor, str] | None = None
         self.lost = 0
 
-    def write(self, decided: Decided) -> None:
-        """Keep a decision; the oldest make room for it."""
-        path = self._folder / f"{decided.number:06d}.npz"
+    def write(self, decision: Decision) -> None:
+        """Write a decision and drop the oldest ones that no longer fit."""
+        path = self._folder / f"{decision.number:06d}.npz"
         try:
-            self._forget_from(decided.number)
-            policy, its_bytes = self._policy_of(decided.actor)
-            arrays, about = _as_arrays(decided, policy, self._embedding)
+            self._drop_from(decision.number)
+            policy, policy_bytes = self._policy_of(decision.actor)
+            arrays, about = _as_arrays(decision, policy, self._embedding)
             checkpoint.save(path, arrays, about, _KIND, durable=False)
-            self._kept.append((path, policy, path.stat().st_size + its_bytes))
+            self._kept.append((path, policy, path.stat().st_size + policy_bytes))
             self._make_room()
         except OSError as error:
             self.lost += 1
@@ -66,7 +69,7 @@ class DecisionRecord:
                 log.warning("%s: cannot be written (%s): decisions are lost", path, error.strerror or error)
 
     def _policy_of(self, actor: Actor) -> tuple[str, int]:
-        """File of the policy, and how many bytes it took to write it, which is done when it first decides."""
+        """File of the policy and its size; size 0 where it was written before."""
         size = 0
         if self._policy is None or self._policy[0] is not actor:
             digest = hashlib.sha256(repr(actor.spec.as_json()).encode())
@@ -79,14 +82,14 @@ class DecisionRecord:
             self._policy = (actor, name)
         return self._policy[1], size
 
-    def _forget_from(self, number: int) -> None:
-        """Decisions of this number and later ones are of an earlier run that used the same folder."""
+    def _drop_from(self, number: int) -> None:
+        """Drop decisions from this number on: they belong to an earlier run in the same folder."""
         while self._kept and int(self._kept[-1][0].stem) >= number:
             self._kept.pop()[0].unlink(missing_ok=True)
 
     def _make_room(self) -> None:
         while len(self._kept) > 1 and (
-            len(self._kept) > self._most or sum(size for *_, size in self._kept) > self._most_bytes
+            len(self._kept) > self._max_decisions or sum(size for *_, size in self._kept) > self._max_bytes
         ):
             path, policy, _ = self._kept.popleft()
             path.unlink(missing_ok=True)
@@ -95,23 +98,23 @@ class DecisionRecord:
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """A decision as it was kept. images: pictures of the frames that were embedded, by camera; embedding:
-    settings of what embedded them, None where nothing did."""
+class RecordedDecision:
+    """A decision read from disk. images: the embedded frames, decoded, by camera. embedding: settings of
+    their embedder; None where nothing was embedded."""
 
-    decided: Decided
+    decision: Decision
     images: dict[str, NDArray[np.uint8]]
     embedding: dict[str, Any] | None
 
 
-def read_decision(run: Path, number: int | None = None) -> Recorded:
-    """Decision ``number`` of the run in ``run``; None: the newest there is. ValueError in one line where
-    there is no such decision, or its file is damaged."""
+def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
+    """Decision ``number`` of the run in folder ``run``; None: the newest. ValueError in one line where there
+    is no such decision, or its file is damaged."""
     known = _numbered(run / FOLDER)
     if not known:
         raise ValueError(
             f"{run}: no decisions are recorded: edge-server run, and simulate with --out, keep those of a "
-            "policy that was learnt (bandit:FILE)"
+            "learned policy (bandit:FILE)"
         )
     path = known[-1] if number is None else run / FOLDER / f"{number:06d}.npz"
     if path not in known:
@@ -126,7 +129,7 @@ def read_decision(run: Path, number: int | None = None) -> Recorded:
         state = State(
             arrays["ages_ms"], arrays["poses"], arrays.get("embeddings"), arrays["reported"], cameras
         )
-        decided = Decided(
+        decision = Decision(
             int(about["number"]), int(about["now_ns"]), state, arrays["action"], float(about["logp"]), actor
         )
         images = {}
@@ -134,27 +137,27 @@ def read_decision(run: Path, number: int | None = None) -> Recorded:
             try:
                 images[camera] = payload.decode(arrays[f"frame.{camera}"].tobytes(), codec, width, height)
             except payload.PayloadError:
-                continue  # it was damaged when it was delivered: nobody saw it
+                continue  # it was delivered damaged, so that the policy did not see it
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: damaged: {error}") from None
-    return Recorded(decided, images, about["embedding"])
+    return RecordedDecision(decision, images, about["embedding"])
 
 
 def _as_arrays(
-    decided: Decided, policy: str, embedding: dict[str, Any] | None
+    decision: Decision, policy: str, embedding: dict[str, Any] | None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    s = decided.state
+    s = decision.state
     arrays: dict[str, NDArray[Any]] = {
-        "ages_ms": s.ages_ms, "poses": s.poses, "reported": s.reported, "action": decided.action,
+        "ages_ms": s.ages_ms, "poses": s.poses, "reported": s.reported, "action": decision.action,
     }  # fmt: skip
     if s.embeddings is not None:
         arrays["embeddings"] = s.embeddings
     for camera, frame in s.frames.items():
         arrays[f"frame.{camera}"] = np.frombuffer(frame.payload, np.uint8)
     about = {
-        "number": decided.number,
-        "now_ns": decided.now_ns,
-        "logp": decided.logp,
+        "number": decision.number,
+        "now_ns": decision.now_ns,
+        "logp": decision.logp,
         "cameras": list(s.cameras),
         "policy": policy,
         "embedding": embedding,
@@ -164,5 +167,5 @@ def _as_arrays(
 
 
 def _numbered(folder: Path) -> list[Path]:
-    """Decisions in a folder, oldest first."""
+    """Decisions' files in a folder, oldest first."""
     return sorted((p for p in folder.glob("*.npz") if p.stem.isdigit()), key=lambda p: int(p.stem))

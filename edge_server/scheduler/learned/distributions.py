@@ -1,12 +1,12 @@
-"""Distributions over actions, exact where probabilities touch 0 and 1: all in logarithms of odds.
+"""Distributions over actions, computed from logits so that they are exact where probabilities touch 0 and 1.
 
-A set of cameras is drawn Bernoulli each (5.20), empty sets are redrawn (K_t >= 1). What is drawn then has
-the probability conditioned on not being empty, p(a) / (1 - prod (1 - p_i)); in logits l
+A set of cameras is drawn Bernoulli each (5.20), and empty sets are redrawn (K_t >= 1). The probability of a
+set is therefore conditioned on not being empty, p(a) / (1 - prod (1 - p_i)); in logits l
 
     log p(a | not empty) = sum_{i in a} l_i - log(prod_i (1 + exp l_i) - 1),
 
 which holds where every p_i underflows: then one camera is drawn, in proportion to its odds. Cameras that have
-not reported (mask 0) cannot be drawn; where none has, the set is empty, with probability one.
+not reported (mask 0) cannot be drawn; where none has, the set is empty with probability one.
 
 ``xp`` is numpy or torch; logits, masks and actions are float64 (B, N) or, of omegas, (B, K).
 """
@@ -21,18 +21,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Below, exp(s) - 1 with s = sum log(1 + exp l) is the sum of the odds to the last digit.
+# Below it, exp(s) - 1 with s = sum log(1 + exp l) equals the sum of the odds to the last digit.
 _TINY = 1e-12
 
 
 def set_log_probability(xp: Any, logits: Any, mask: Any, chosen: Any) -> Any:
-    """(B,) log-probability of the sets ``chosen`` (1 or 0 a camera), given that they are not empty."""
+    """(B,) log-probability of the sets ``chosen`` (B, N), 1 or 0 a camera, given that they are not empty."""
     return (logits * chosen * mask).sum(axis=-1) - _log_odds_of_any(xp, logits, mask)
 
 
 def set_entropy(xp: Any, logits: Any, mask: Any) -> Any:
-    """(B,) sum of the cameras' entropies. It is what keeps exploring alive, so that the condition, which
-    couples the cameras only where nearly nothing is drawn, is left out."""
+    """(B,) sum of the cameras' entropies. As the exploration bonus it may ignore the condition, which couples
+    the cameras only where nearly nothing is drawn."""
     softplus = _softplus(xp, logits)
     return ((softplus - logits * xp.exp(logits - softplus)) * mask).sum(axis=-1)
 
@@ -49,29 +49,30 @@ def omega_entropy(xp: Any, logits: Any) -> Any:
     return -(xp.exp(logps) * logps).sum(axis=-1)
 
 
-def with_chance(xp: Any, action: str, logits: Any, share: float) -> Any:
-    """Logits of the same shape, of a policy that leaves the ``share`` of each choice to chance: 1/2 of every
-    camera where ``action`` is select, else 1/K of every omega."""
+def mix_uniform(xp: Any, action: str, logits: Any, share: float) -> Any:
+    """Logits of the mixture (1 - share) policy + share uniform: probability 1/2 for every camera where
+    ``action`` is select, else 1/K for every omega."""
     if share == 0.0:
         return logits
-    own, chance = math.log1p(-share), math.log(share)
+    own, uniform = math.log1p(-share), math.log(share)
     if action == "select":
-        even = xp.full_like(logits, chance - math.log(2.0))
-        used, left = own - _softplus(xp, -logits), own - _softplus(xp, logits)
-        return xp.logaddexp(used, even) - xp.logaddexp(left, even)
-    each = xp.full_like(logits, chance - math.log(logits.shape[-1]))
+        even = xp.full_like(logits, uniform - math.log(2.0))
+        used, unused = own - _softplus(xp, -logits), own - _softplus(xp, logits)
+        return xp.logaddexp(used, even) - xp.logaddexp(unused, even)
+    each = xp.full_like(logits, uniform - math.log(logits.shape[-1]))
     return xp.logaddexp(own + omega_log_probabilities(xp, logits), each)
 
 
-def draw_sets(logits: Array, mask: Array, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """(B, N) sets drawn from the conditioned distribution.
+def sample_sets(logits: Array, mask: Array, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """(B, N) sets from the conditioned distribution.
 
-    Camera by camera, each given that this or a later one must be drawn if none was: the distribution of
-    redrawing until the set is not empty, without redrawing for ever where all probabilities are tiny.
+    Draws camera by camera, each given that this or a later one must be drawn if none was. This is the
+    distribution of redrawing until the set is not empty, without endless redrawing where all probabilities
+    are tiny.
     """
     batch, cameras = logits.shape
     softplus = _softplus(np, logits) * mask
-    # Suffixes: of camera i and all after it.
+    # Sums over camera i and all later ones.
     s = np.cumsum(softplus[:, ::-1], axis=1)[:, ::-1]
     odds = np.logaddexp.accumulate(np.where(mask > 0, logits, -np.inf)[:, ::-1], axis=1)[:, ::-1]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -84,16 +85,15 @@ def draw_sets(logits: Array, mask: Array, rng: np.random.Generator) -> NDArray[n
     for i in range(cameras):
         chosen[:, i] = (mask[:, i] > 0) & (uniform[:, i] < np.where(none, first[:, i], later[:, i]))
         none &= ~chosen[:, i]
-    # The last camera's probability is 1 but for rounding.
+    # The last camera's probability is 1 except for rounding.
     empty = np.flatnonzero(none & (mask > 0).any(axis=1))
     last = cameras - 1 - np.argmax(mask[empty][:, ::-1] > 0, axis=1)
     chosen[empty, last] = True
     return chosen
 
 
-def likeliest_set(logits: Array, mask: Array) -> NDArray[np.bool_]:
-    """(B, N) the most probable non-empty sets: the cameras that are more likely in than out, else the
-    likeliest one."""
+def most_probable_set(logits: Array, mask: Array) -> NDArray[np.bool_]:
+    """(B, N) the most probable non-empty sets: all cameras with p > 1/2, else the most probable one."""
     chosen = (logits > 0) & (mask > 0)
     empty = np.flatnonzero(~chosen.any(axis=1) & (mask > 0).any(axis=1))
     best = np.argmax(np.where(mask[empty] > 0, logits[empty], -np.inf), axis=1)
@@ -101,8 +101,8 @@ def likeliest_set(logits: Array, mask: Array) -> NDArray[np.bool_]:
     return chosen
 
 
-def draw_omegas(logits: Array, rng: np.random.Generator) -> NDArray[np.int64]:
-    """(B,) indices drawn from the categorical; one uniform each."""
+def sample_omegas(logits: Array, rng: np.random.Generator) -> NDArray[np.int64]:
+    """(B,) indices from the categorical; one uniform number each."""
     below = np.cumsum(np.exp(omega_log_probabilities(np, logits)), axis=1)
     uniform = rng.random((len(logits), 1)) * below[:, -1:]
     return np.minimum((uniform >= below).sum(axis=1), logits.shape[1] - 1)
@@ -116,7 +116,8 @@ def _log_odds_of_any(xp: Any, logits: Any, mask: Any) -> Any:
     """(B,) log(prod (1 + exp l) - 1) over the cameras that have reported; 0 where none has."""
     some = xp.amax(mask, axis=-1)
     s = (_softplus(xp, logits) * mask).sum(axis=-1)
-    # Every branch stays finite, or torch would multiply its infinite gradient by the zero of the other one.
+    # Every branch stays finite: torch would multiply an infinite gradient by the zero of the branch not
+    # taken.
     large = s > _TINY
     enough = xp.where(large, s, 1.0 + 0.0 * s)
     exact = enough + xp.log(-xp.expm1(-enough))

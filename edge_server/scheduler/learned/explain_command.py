@@ -1,4 +1,4 @@
-"""``edge-server explain``: what moved a decision of a run."""
+"""``edge-server explain``: what moved a recorded decision of a learned policy."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.report.style import BLUE, GREY, VERMILION, figure
-from edge_server.scheduler.learned.decision_record import Recorded, read_decision
-from edge_server.scheduler.learned.explain import Embed, Explanation, explain, occlusion
+from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
+from edge_server.scheduler.learned.explain import EmbedImages, Explanation, explain, occlusion_map
 from freshfield.files import write_json
 
 DESCRIPTION = """\
-What moved a decision of a learnt policy (bandit:FILE): part of the state, camera, region of a picture.
+What moved a decision of a learned policy (bandit:FILE): part of the state, camera, region of an image.
 
-  edge-server run room --policy bandit:runs/learnt/policy.npz --out runs/room
+  edge-server run room --policy bandit:runs/learned/policy.npz --out runs/room
   edge-server explain runs/room                          # the newest decision
   edge-server explain runs/room --decision 123 --camera cam04
 
 A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out. Shares are
-Shapley values of the logit of what was done, against average cameras of the training: they sum to the whole.
-Regions are found by painting them over and embedding the picture again; that needs a policy that looks at
-pictures.
+Shapley values of the action's logit, against average cameras of the training: they sum to the difference.
+Regions are found by painting them over and embedding the image again; that needs a policy that looks at
+images.
 """
 
-# Cameras that have a bar of their own.
-SHOWN = 20
+# Cameras with a bar of their own.
+MAX_BARS = 20
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,37 +45,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     try:
         found = read_decision(args.run, args.decision)
-        decided = found.decided
-        told = explain(decided.actor, decided.state, decided.action)
-        camera = _camera(args.camera, found, told)
+        decision = found.decision
+        explanation = explain(decision.actor, decision.state, decision.action)
+        camera = _camera(args.camera, found, explanation)
         regions = None if camera is None else _regions_or_why(found, camera, asked=args.camera is not None)
-        picture = args.picture or args.run / f"decision-{decided.number:06d}.png"
-        draw(told, picture, camera, found.images.get(camera or ""), regions)
+        picture = args.picture or args.run / f"decision-{decision.number:06d}.png"
+        draw(explanation, picture, camera, found.images.get(camera or ""), regions)
         if args.json is not None:
-            write_json(args.json, _as_json(found, told, camera, regions), indent=1)
+            write_json(args.json, _as_json(found, explanation, camera, regions), indent=1)
     except ValueError as error:
         print(f"edge-server explain: {error}", file=sys.stderr)
         return 2
-    print(as_text(found, told, camera, regions))
+    print(as_text(found, explanation, camera, regions))
     print(picture)
     return 0
 
 
-def _camera(asked: str | None, found: Recorded, told: Explanation) -> str | None:
-    """Whose picture is looked at; None: there are no pictures."""
+def _camera(asked: str | None, found: RecordedDecision, explanation: Explanation) -> str | None:
+    """The camera whose image is explained; None: there are no images."""
     if asked is not None and asked not in found.images:
         there = ", ".join(found.images) or "none: this policy looks at no pictures"
         raise ValueError(f"--camera {asked}: no picture of it was kept; there are: {there}")
     if asked is not None or not found.images:
         return asked
-    share = dict(zip(told.names, np.abs(told.cameras)))
+    share = dict(zip(explanation.names, np.abs(explanation.cameras)))
     return max(found.images, key=lambda camera: share.get(camera, 0.0))
 
 
-def _regions_or_why(found: Recorded, camera: str, asked: bool) -> NDArray[np.float64] | None:
-    """What moved the decision in a picture. Where frames cannot be embedded again (the model's file is gone,
-    the extra is not installed) the rest of the explanation stands: None, said why, unless it was asked
-    for."""
+def _regions_or_why(found: RecordedDecision, camera: str, asked: bool) -> NDArray[np.float64] | None:
+    """Shares of the regions of the camera's image. Where frames cannot be embedded again (the model's file is
+    gone, the extra is not installed) this prints why and returns None, unless the user asked for the
+    camera."""
     try:
         return _regions(found, camera)
     except ValueError as error:
@@ -85,14 +85,14 @@ def _regions_or_why(found: Recorded, camera: str, asked: bool) -> NDArray[np.flo
         return None
 
 
-def _regions(found: Recorded, camera: str) -> NDArray[np.float64]:
-    decided = found.decided
-    number = decided.state.cameras.index(camera)
+def _regions(found: RecordedDecision, camera: str) -> NDArray[np.float64]:
+    decision = found.decision
+    number = decision.state.cameras.index(camera)
     embed = _embedder(found)
-    return occlusion(decided.actor, decided.state, decided.action, number, found.images[camera], embed)
+    return occlusion_map(decision.actor, decision.state, decision.action, number, found.images[camera], embed)
 
 
-def _embedder(found: Recorded) -> Embed:
+def _embedder(found: RecordedDecision) -> EmbedImages:
     if found.embedding is None:
         raise ValueError("the run does not say what embedded its frames: regions cannot be found")
     from edge_server.embed import EmbeddingConfig, make_embedder
@@ -105,22 +105,22 @@ def _embedder(found: Recorded) -> Embed:
 
 
 def as_text(
-    found: Recorded, told: Explanation, camera: str | None, regions: NDArray[np.float64] | None
+    found: RecordedDecision, e: Explanation, camera: str | None, regions: NDArray[np.float64] | None
 ) -> str:
-    """The explanation in lines."""
-    p = np.exp(found.decided.logp)
+    """The e as lines of text."""
+    p = np.exp(found.decision.logp)
     lines = [
-        f"decision {found.decided.number}: {told.action} (probability {p:.2g}, "
-        f"logit {told.firmness:+.3f}; of average cameras {told.usual:+.3f})",
+        f"decision {found.decision.number}: {e.action} (probability {p:.2g}, "
+        f"logit {e.logit:+.3f}; of average cameras {e.baseline_logit:+.3f})",
         "by part of the state",
-        *(f"  {name:12} {share:+.3f}" for name, share in told.parts.items()),
+        *(f"  {name:12} {share:+.3f}" for name, share in e.parts.items()),
         "by camera (standard error)",
     ]
-    order = np.argsort(-np.abs(told.cameras))[:SHOWN]
-    lines += [f"  {told.names[i]:12} {told.cameras[i]:+.3f} ({told.cameras_error[i]:.3f})" for i in order]
-    if len(told.cameras) > SHOWN:
-        rest = told.cameras.sum() - told.cameras[order].sum()
-        lines.append(f"  {len(told.cameras) - SHOWN} others    {rest:+.3f}")
+    order = np.argsort(-np.abs(e.cameras))[:MAX_BARS]
+    lines += [f"  {e.names[i]:12} {e.cameras[i]:+.3f} ({e.cameras_error[i]:.3f})" for i in order]
+    if len(e.cameras) > MAX_BARS:
+        rest = e.cameras.sum() - e.cameras[order].sum()
+        lines.append(f"  {len(e.cameras) - MAX_BARS} others    {rest:+.3f}")
     if camera is not None and regions is not None:
         row, column = np.unravel_index(int(np.abs(regions).argmax()), regions.shape)
         lines.append(
@@ -131,21 +131,21 @@ def as_text(
 
 
 def draw(
-    told: Explanation,
+    e: Explanation,
     path: Path,
     camera: str | None,
     image: NDArray[np.uint8] | None,
     regions: NDArray[np.float64] | None,
 ) -> None:
-    """Bars by part and by camera, and the picture with what moved the decision in it."""
+    """Draw bars by part and by camera, and the image with the shares of its regions."""
     columns = 3 if image is not None and regions is not None else 2
-    height = 1.4 + 0.16 * max(6, min(SHOWN, len(told.cameras)))
+    height = 1.4 + 0.16 * max(6, min(MAX_BARS, len(e.cameras)))
     with figure(path, 1, columns, height_inch=height) as (fig, axes):
-        fig.suptitle(f"{told.action}: logit {told.firmness:+.2f}, of average cameras {told.usual:+.2f}")
-        _bars(axes[0, 0], list(told.parts), np.array(list(told.parts.values())), None, "by part of the state")
-        order = np.argsort(-np.abs(told.cameras))[:SHOWN]
-        names = [told.names[i] for i in order]
-        _bars(axes[0, 1], names, told.cameras[order], told.cameras_error[order], "by camera")
+        fig.suptitle(f"{e.action}: logit {e.logit:+.2f}, of average cameras {e.baseline_logit:+.2f}")
+        _bars(axes[0, 0], list(e.parts), np.array(list(e.parts.values())), None, "by part of the state")
+        order = np.argsort(-np.abs(e.cameras))[:MAX_BARS]
+        names = [e.names[i] for i in order]
+        _bars(axes[0, 1], names, e.cameras[order], e.cameras_error[order], "by camera")
         if image is not None and regions is not None:
             at = axes[0, 2]
             at.imshow(image[..., :3])
@@ -159,8 +159,8 @@ def draw(
 
 def _bars(axes: Any, names: list[str], shares: NDArray, errors: NDArray | None, title: str) -> None:
     at = np.arange(len(names))
-    colours = [BLUE if share >= 0 else VERMILION for share in shares]
-    axes.barh(at, shares, xerr=errors, color=colours, ecolor=GREY, height=0.7)
+    colors = [BLUE if share >= 0 else VERMILION for share in shares]
+    axes.barh(at, shares, xerr=errors, color=colors, ecolor=GREY, height=0.7)
     axes.set_yticks(at, names)
     axes.invert_yaxis()
     axes.axvline(0.0, color=GREY, linewidth=0.8)
@@ -169,17 +169,17 @@ def _bars(axes: Any, names: list[str], shares: NDArray, errors: NDArray | None, 
 
 
 def _as_json(
-    found: Recorded, told: Explanation, camera: str | None, regions: NDArray[np.float64] | None
+    found: RecordedDecision, e: Explanation, camera: str | None, regions: NDArray[np.float64] | None
 ) -> dict[str, Any]:
     return {
-        "decision": found.decided.number,
-        "action": told.action,
-        "probability": float(np.exp(found.decided.logp)),
-        "logit": told.firmness,
-        "logit_of_average_cameras": told.usual,
-        "parts": told.parts,
-        "cameras": dict(zip(told.names, told.cameras.tolist())),
-        "cameras_standard_error": dict(zip(told.names, told.cameras_error.tolist())),
+        "decision": found.decision.number,
+        "action": e.action,
+        "probability": float(np.exp(found.decision.logp)),
+        "logit": e.logit,
+        "logit_of_average_cameras": e.baseline_logit,
+        "parts": e.parts,
+        "cameras": dict(zip(e.names, e.cameras.tolist())),
+        "cameras_standard_error": dict(zip(e.names, e.cameras_error.tolist())),
         "picture_of": camera,
         "regions": None if regions is None else regions.tolist(),
     }

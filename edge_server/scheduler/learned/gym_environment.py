@@ -1,10 +1,10 @@
-"""A problem as a gymnasium environment: bring your own learner.
+"""A bandit problem as a gymnasium environment: bring your own learner.
 
     environment = BanditEnvironment(problem, Spec("wait", layout, omegas_ms=(0, 60, 120)), cameras=18)
     stable_baselines3.PPO("MlpPolicy", environment).learn(20_000)
 
 An episode is one decision. Observations are the features of ``StateLayout``, one row a camera; actions are
-MultiBinary(N) for ``select``, Discrete(K) else. Needs the extra ``gym`` (pip install 'freshfield[gym]').
+MultiBinary(N) for ``select``, otherwise Discrete(K). Needs the extra ``gym`` (pip install 'freshfield[gym]').
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.problem import Decision, Problem
+from edge_server.scheduler.learned.problem import Problem, Round
 
 try:
     import gymnasium
@@ -25,13 +25,13 @@ except ImportError as error:
 
 
 class BanditEnvironment(gymnasium.Env):
-    """``problem`` with ``cameras`` cameras, seen and acted on as ``spec`` says.
+    """``problem`` with ``cameras`` cameras; ``spec`` defines observations and actions.
 
-    An empty set cannot be carried out (K_t >= 1): the youngest camera is used instead, and ``info`` says
-    ``forced``. What ``reset(seed)`` draws is decided by the seed; without one, the next decision follows, so
-    that all decisions of a simulated episode are used before another is simulated.
-    Where no reward could be had, learners that cannot take NaN get the mean of those so far (0 before the
-    first), which says neither good nor bad of the action, and ``info`` says ``missing``.
+    An empty set is not allowed (K_t >= 1): the youngest camera is used instead, and ``info["forced"]`` is
+    true. ``reset(seed)`` draws the round of that seed; without one the next round follows, so that all
+    decisions of a simulated episode are used before another is simulated. Where there is no reward, the mean
+    so far (0 before the first) replaces it, because most learners cannot take NaN, and ``info["missing"]`` is
+    true.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (gymnasium's own form)
@@ -48,9 +48,9 @@ class BanditEnvironment(gymnasium.Env):
             if spec.action == "select"
             else gymnasium.spaces.Discrete(len(spec.omegas_ms))
         )
-        self._decision: Decision | None = None
+        self._round: Round | None = None
         self._next: int | None = None
-        self._known, self._mean = 0, 0.0  # of the rewards so far
+        self._count, self._mean = 0, 0.0  # of the rewards so far
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -58,24 +58,24 @@ class BanditEnvironment(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None or self._next is None:
             self._next = int(self.np_random.integers(2**31))
-        self._decision = self._problem.draw(self._next)
+        self._round = self._problem.draw(self._next)
         self._next += 1
-        return self._spec.layout.features(self._decision.state), {}
+        return self._spec.layout.features(self._round.state), {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
-        if self._decision is None:
+        if self._round is None:
             raise RuntimeError("reset the environment first: an episode is one decision")
-        decision, self._decision = self._decision, None
-        state, forced = decision.state, False
+        current, self._round = self._round, None
+        state, forced = current.state, False
         if self._spec.action == "select":
             action = np.asarray(action).astype(bool) & state.reported
             if not action.any() and state.reported.any():
                 action[np.argmin(np.where(state.reported, np.nan_to_num(state.ages_ms), np.inf))] = True
                 forced = True
-        reward, terms = decision.reward(action)
+        reward, terms = current.reward(action)
         missing = not math.isfinite(reward)
         if not missing:
-            self._known += 1
-            self._mean += (float(reward) - self._mean) / self._known
+            self._count += 1
+            self._mean += (float(reward) - self._mean) / self._count
         info = {"terms": terms, "forced": forced, "missing": missing}
         return self._spec.layout.features(state), self._mean if missing else float(reward), True, False, info

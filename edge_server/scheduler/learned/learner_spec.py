@@ -7,27 +7,33 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from edge_server.scheduler.learned.state import StateLayout, whole
+from edge_server.scheduler.learned.state import StateLayout, require_int
 
 Action = Literal["select", "wait", "threshold"]
 ACTIONS: tuple[Action, ...] = ("select", "wait", "threshold")
-# A specification may come from a file of a stranger's: no network is allocated that is larger than these lead
-# to (with both networks and what Adam remembers, half a gigabyte), which is far beyond what a decision needs.
-MOST_HIDDEN = 1024
-MOST_OMEGAS = 4096
-MOST_CAMERAS = 4096
-MOST_FIRST_WEIGHTS = 2**22
+# A specification may come from an untrusted file. These bound what is allocated for it: with both networks
+# and Adam's moments half a gigabyte, far more than a decision needs.
+MAX_HIDDEN = 1024
+MAX_OMEGAS = 4096
+MAX_CAMERAS = 4096
+MAX_FIRST_WEIGHTS = 2**22
 
 
 @dataclass(frozen=True)
 class Spec:
-    """action: ``select`` chooses a set of cameras, Bernoulli each (5.18-5.20); ``wait`` and ``threshold``
-    choose one of ``omegas_ms`` (6.34, 6.39). network: ``pooled`` is one encoder for every camera and takes
-    any number of them; ``flat`` is the thesis's, one layer over ``cameras`` cameras in their order.
+    """Actions, state, network and hyperparameters of a learner.
 
-    hidden: width of all layers. start: probability of every camera before anything is learnt. The rest is
-    PPO's: clip is epsilon of (5.23); entropy and value weigh their terms; passes over a batch end early when
-    the policy has moved by ``target_kl``.
+    action: ``select`` chooses a set of cameras, Bernoulli each (5.18-5.20); ``wait`` and ``threshold`` choose
+    one of ``omegas_ms`` (6.34, 6.39).
+    layout: the features of a state.
+    network: ``pooled`` shares one encoder among any number of cameras; ``flat`` is the thesis's, one layer
+    over ``cameras`` cameras in their order.
+    hidden: width of all layers.
+    start: every camera's probability before learning.
+    learning_rate, minibatch, max_gradient: of Adam's steps; max_gradient clips the gradient's norm.
+    clip: epsilon of (5.23).
+    passes: over a batch; they end early once the policy has moved by ``target_kl`` (nats).
+    entropy, value: weights of these terms of the loss.
     """
 
     action: Action
@@ -51,8 +57,8 @@ class Spec:
             raise ValueError(f"action {self.action!r} is not known; choose one of {', '.join(ACTIONS)}")
         if (self.action == "select") != (not self.omegas_ms):
             raise ValueError(f"action {self.action}: omegas_ms belong to wait and threshold, and only there")
-        if len(self.omegas_ms) > MOST_OMEGAS:
-            raise ValueError(f"omegas_ms: expected at most {MOST_OMEGAS}, got {len(self.omegas_ms)}")
+        if len(self.omegas_ms) > MAX_OMEGAS:
+            raise ValueError(f"omegas_ms: expected at most {MAX_OMEGAS}, got {len(self.omegas_ms)}")
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))
         if not rising or not all(math.isfinite(o) and o >= 0 for o in self.omegas_ms):
             raise ValueError(f"omegas_ms: expected finite values from 0, rising, got {self.omegas_ms}")
@@ -61,12 +67,12 @@ class Spec:
         if (self.network == "flat") != (self.cameras is not None):
             raise ValueError("cameras: a flat network has a fixed number of them, a pooled one takes any")
         if self.cameras is not None:
-            whole("cameras", self.cameras, 1, MOST_CAMERAS)
-        whole("hidden", self.hidden, 1, MOST_HIDDEN)
-        whole("passes", self.passes, 1, 10_000)
-        whole("minibatch", self.minibatch, 1, 2**31)
+            require_int("cameras", self.cameras, 1, MAX_CAMERAS)
+        require_int("hidden", self.hidden, 1, MAX_HIDDEN)
+        require_int("passes", self.passes, 1, 10_000)
+        require_int("minibatch", self.minibatch, 1, 2**31)
         first = self.layout.width * (self.cameras or 1) * self.hidden
-        if first > MOST_FIRST_WEIGHTS:
+        if first > MAX_FIRST_WEIGHTS:
             raise ValueError(
                 f"a first layer of {first} weights is larger than any that is trained here: fewer cameras, a "
                 "smaller dim or hidden"

@@ -1,11 +1,10 @@
-"""Actors and values as functions of weights, written once for numpy (deciding) and torch (learning).
+"""Actor and value networks as functions of weights, written once for numpy (deciding) and torch (learning).
 
-``pooled``: one encoder for every camera, and the mean and the maximum over the cameras that have reported as
-context: any number of cameras with one set of weights, and no order among them. ``flat``: the thesis's layer
-over all cameras in their order (5.5). The first argument ``xp`` is the module, numpy or torch; all arrays
-are float64: the networks are tiny, and probabilities at the edges are not lost.
-
-Activations are tanh, so that no feature whatever makes a logit overflow.
+``pooled``: one encoder for every camera, with the mean and the maximum over the cameras that have reported as
+context. It takes any number of cameras, in any order. ``flat``: the thesis's layer over all cameras in their
+order (5.5). The first argument ``xp`` is the module, numpy or torch. All arrays are float64: the networks are
+tiny, and probabilities near 0 and 1 are not lost. Activations are tanh, so that no feature can make a logit
+overflow.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ from numpy.typing import NDArray
 from edge_server.scheduler.learned.learner_spec import Spec
 
 Weights = dict[str, Any]
-"""Name -> array of numpy or tensor of torch."""
+"""Name -> numpy array or torch tensor."""
 
-# So many cameras count as many: the scale of how many have reported.
-_MANY = np.log1p(200.0)
+# Scale of the number of cameras that have reported.
+_COUNT_SCALE = np.log1p(200.0)
 
 
-def new_actor(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
-    """Weights of an actor that prefers nothing yet: its last layer is small (as PPO is commonly started)."""
-    weights = _new_trunk(spec, rng)
+def init_actor(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+    """Initial weights of an actor without preferences: its last layer is small, as is common for PPO."""
+    weights = _init_trunk(spec, rng)
     outputs = len(spec.omegas_ms) or (spec.cameras if spec.network == "flat" else 1)
     if spec.action == "select" and spec.network == "pooled":
         weights["own"] = _orthogonal(rng, spec.hidden, spec.hidden, 1.0)
@@ -36,9 +35,9 @@ def new_actor(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.floa
     return weights
 
 
-def new_value(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
-    """Weights of a state value V (5.24); an encoder of its own, so that neither disturbs the other."""
-    return {**_new_trunk(spec, rng), "out": _orthogonal(rng, spec.hidden, 1, 0.1), "out_b": np.zeros(1)}
+def init_value(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+    """Initial weights of the state value V (5.24), which shares no layer with the actor."""
+    return {**_init_trunk(spec, rng), "out": _orthogonal(rng, spec.hidden, 1, 0.1), "out_b": np.zeros(1)}
 
 
 def logits(xp: Any, spec: Spec, weights: Weights, features: Any) -> Any:
@@ -51,12 +50,12 @@ def logits(xp: Any, spec: Spec, weights: Weights, features: Any) -> Any:
 
 
 def value(xp: Any, spec: Spec, weights: Weights, features: Any) -> Any:
-    """Features (B, N, width) to state values (B,), in units of the rewards' spread."""
+    """Features (B, N, width) to state values (B,), in units of the rewards' standard deviation."""
     return (_hidden(xp, spec, weights, features)[0] @ weights["out"] + weights["out_b"])[..., 0]
 
 
 def _hidden(xp: Any, spec: Spec, weights: Weights, features: Any, activated: bool = True) -> tuple[Any, Any]:
-    """The last hidden layer (B, hidden), and what the encoder makes of each camera (B, N, hidden)."""
+    """The last hidden layer (B, hidden) and the encoding of each camera (B, N, hidden)."""
     if spec.network == "flat":
         batch, cameras, width = features.shape
         if cameras != spec.cameras:
@@ -74,22 +73,22 @@ def _hidden(xp: Any, spec: Spec, weights: Weights, features: Any, activated: boo
 
 
 def _pooled(xp: Any, own: Any, mask: Any) -> Any:
-    """(B, 2 hidden + 1): mean and maximum over the cameras that have reported, and how many those are. Zeros
-    where none has."""
+    """(B, 2 hidden + 1): mean and maximum over the cameras that have reported, and their number. Zeros where
+    none has."""
     count = mask.sum(axis=1)
     mean = (own * mask).sum(axis=1) / xp.clip(count, 1.0, None)
-    # A tanh is above -1, so that one who has not reported is never the maximum.
+    # A tanh is above -1, so that a camera that has not reported is never the maximum.
     highest = xp.amax(xp.where(mask > 0, own, -1.0 + 0.0 * own), axis=1)
     highest = xp.where(count > 0, highest, 0.0 * highest)
-    return xp.concatenate((mean, highest, xp.log1p(count) / _MANY), axis=1)
+    return xp.concatenate((mean, highest, xp.log1p(count) / _COUNT_SCALE), axis=1)
 
 
-def _new_trunk(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
+def _init_trunk(spec: Spec, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
     hidden, width = spec.hidden, spec.layout.width
-    gain = 5.0 / 3.0  # of tanh
+    gain = 5.0 / 3.0  # for tanh
     zeros = np.zeros(hidden)
     if spec.network == "flat":
-        assert spec.cameras is not None  # Spec has seen to it
+        assert spec.cameras is not None  # checked by Spec
         return {
             "in": _orthogonal(rng, spec.cameras * width, hidden, gain), "in_b": zeros.copy(),
             "mid": _orthogonal(rng, hidden, hidden, gain), "mid_b": zeros.copy(),
@@ -105,5 +104,5 @@ def _orthogonal(rng: np.random.Generator, rows: int, columns: int, gain: float) 
     """(rows, columns) with orthonormal rows or columns, whichever are fewer, times ``gain``."""
     tall = rng.standard_normal((max(rows, columns), min(rows, columns)))
     q, r = np.linalg.qr(tall)
-    q *= np.sign(np.diag(r))  # else the signs would be the decomposition's choice
+    q *= np.sign(np.diag(r))  # otherwise the signs depend on the decomposition
     return np.ascontiguousarray(gain * (q if rows >= columns else q.T))

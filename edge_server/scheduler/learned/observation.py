@@ -1,4 +1,4 @@
-"""The state of what the edge has: ages and poses of the newest frames, embeddings where somebody asks."""
+"""The state of the edge's buffer: ages and poses of the newest frames, and their embeddings if asked for."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.live.buffer import BufferedFrame
-from edge_server.scheduler.learned.state import PARTS, POSE_WIDTH, State
+from edge_server.scheduler.learned.state import POSE_WIDTH, State
+from edge_server.scheduler.policy import STATE_PARTS
 from freshfield.geometry import quaternion_normalize
 
 # A rig of one camera, or of several at one point, has no size to scale by.
-_SMALLEST_RIG_M = 1e-6
+_MIN_RIG_RADIUS_M = 1e-6
 
 
-class Embeddings(Protocol):
-    """What computes z = F_e(frame) (6.31) and remembers it per frame (edge_server.embed)."""
+class FrameEmbeddings(Protocol):
+    """Computes z = F_e(frame) (6.31) and caches it per frame (edge_server.embed)."""
 
     def of(self, items: Sequence[BufferedFrame]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Embeddings (n, d), and (n,) which of the frames have one."""
+        """Embeddings (n, d), and a mask (n,) of the frames that have one."""
         ...
 
 
@@ -28,13 +29,15 @@ def observe(
     cameras: Sequence[str],
     newest: Mapping[str, BufferedFrame],
     now_ns: int,
-    embeddings: Embeddings | None = None,
-    parts: Sequence[str] = PARTS,
+    embeddings: FrameEmbeddings | None = None,
+    parts: Sequence[str] = STATE_PARTS,
     keep_frames: bool = False,
 ) -> State:
-    """The state at ``now_ns`` of ``cameras``, of which ``newest`` holds those that have reported. Only the
-    ``parts`` asked for are computed; poses that are not are zero, embeddings None. keep_frames: with the
-    frames that were embedded."""
+    """The state of ``cameras`` at ``now_ns``.
+
+    newest: the newest frame of each camera that has reported. parts: those to compute; otherwise poses are
+    zero and embeddings None. keep_frames: keep the embedded frames in the state.
+    """
     n = len(cameras)
     rows = [i for i, camera in enumerate(cameras) if camera in newest]
     items = [newest[cameras[i]] for i in rows]
@@ -56,13 +59,13 @@ def observe(
 
 
 def relative_poses(items: Sequence[BufferedFrame]) -> NDArray[np.float64]:
-    """(n, 6): translation from the cameras' centre in units of their mean distance from it, so that neither
-    where a rig stands nor how large it is matters; rotation vector in radians, world axes."""
+    """(n, 6): translation from the cameras' center in units of their mean distance from it, so that the rig's
+    position and size do not matter; rotation vector in radians, world axes."""
     positions = np.array([item.frame.pose.translation_m for item in items], np.float64)
-    centred = positions - positions.mean(axis=0)
-    size = float(np.linalg.norm(centred, axis=1).mean())
+    centered = positions - positions.mean(axis=0)
+    radius = float(np.linalg.norm(centered, axis=1).mean())
     q = quaternion_normalize([item.frame.pose.quaternion for item in items])
     sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
-    # Twice the half angle over its sine; 2 where there is no turn to speak of.
+    # The angle over the sine of half of it; 2 in the limit of no rotation.
     per_sine = np.where(sine > 1e-12, 2.0 * np.arctan2(sine, q[:, :1]) / np.maximum(sine, 1e-12), 2.0)
-    return np.concatenate([centred / max(size, _SMALLEST_RIG_M), per_sine * q[:, 1:]], axis=1)
+    return np.concatenate([centered / max(radius, _MIN_RIG_RADIUS_M), per_sine * q[:, 1:]], axis=1)

@@ -1,16 +1,16 @@
 """Single-step PPO (5.23, algorithm 1) and contextual-bandit PPO (6.42, algorithm 2): one learner.
 
-An episode is one decision, so that Q is the reward itself and the advantage (5.24) is r - V(s): nothing is
-discounted and nothing bootstrapped. What differs between the two algorithms is the distribution (Bernoulli a
-camera, categorical over omega), and that is the specification's.
+An episode is one decision, so that Q is the reward itself and the advantage (5.24) is r - V(s), without
+discount or bootstrapping. The two algorithms differ only in the action distribution (Bernoulli a camera,
+categorical over omega), which the specification says.
 
     learner = Learner(Spec("select", StateLayout(("age",))), seed=1)
     actions, logps = learner.act(states)
-    rewards = [...]                                  # from fields that were really fitted
+    rewards = [...]                                  # from fields that were actually fitted
     learner.update(learner.batch(states, actions, logps, rewards))
 
-Same seed and same rewards, same weights bit for bit: torch runs on one thread here (the networks are too
-small for more), random numbers are numpy's.
+Same seed and same rewards give the same weights bit for bit: torch runs on one thread (the networks are too
+small for more), and random numbers are numpy's.
 """
 
 from __future__ import annotations
@@ -30,32 +30,36 @@ from numpy.typing import NDArray
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.actor import KIND, MOST_BYTES, Actor, read_spec
+from edge_server.scheduler.learned.actor import KIND, MAX_BYTES, Actor, read_spec
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State
 
-# exp of more is no probability ratio any more; the clip has long since said what it has to say.
+# Bounds exp: larger ratios are far outside the clip anyway.
 _MAX_LOG_RATIO = 20.0
-# Advantages that differ by less than this share of the rewards' own spread are the value's error, not news:
-# they are not blown up to one.
-_LEAST_ADVANTAGE = 0.05
-# Rewards that vary by less than this share of their size, or of all rewards' spread, are constant.
+# Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
+# Normalization does not scale them up to 1.
+_MIN_ADVANTAGE_STD = 0.05
+# Rewards that vary by less than this share of their size, or of all rewards' standard deviation, are
+# constant.
 _CONSTANT = 1e-9
-# A reward further from the mean than so many spreads is an accident: it counts as this far. The spread itself
-# may grow by as much in one batch, so that a real change of scale is followed.
+# Rewards further from the mean than this many standard deviations are clipped to it. The deviation may grow
+# by the same factor in one batch, so that a real change of scale is followed.
 _OUTLIER = 10.0
-# So many decisions count in the running spread: it follows a scene or a channel that changes.
+# Decisions that count in the running statistics, which follow a scene or a channel that changes.
 _MEMORY = 4096
-# Nothing that is measured is as large; its square would overflow.
-_ABSURD = 1e100
+# No measured reward is larger; its square would overflow.
+_MAX_REWARD = 1e100
 _STREAMS = ("weights", "actions", "order")
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Decisions and what came of them. features (B, N, width); actions (B, N) bool or (B,) index of an
-    omega; logps (B,) when they were drawn; rewards (B,), NaN where none came of it. explore: share of chance
-    in how they were drawn, which is then part of the policy that is compared with it."""
+    """Decisions and their rewards.
+
+    features: (B, N, width). actions: (B, N) bool, or (B,) index of an omega. logps: (B,) log-probabilities
+    under the policy that acted. rewards: (B,), NaN where there is none. explore: uniform share of the policy
+    that acted; the learned policy is compared with it under the same share.
+    """
 
     features: NDArray[np.float64]
     actions: NDArray[Any]
@@ -69,11 +73,14 @@ class Batch:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """How an update went, in its last pass over the batch. reward: mean of those that were finite; dropped:
-    decisions whose reward or probability was no number. moved: estimate of the KL divergence from the policy
-    that acted; clipped: share of ratios outside the clip. explained: share of the rewards' variance that V
-    explained before the update (None where they do not vary). steps: in all; skipped: steps left out because
-    a gradient was not finite."""
+    """Figures of an update, in its last pass over the batch.
+
+    reward: mean of the finite ones. dropped: decisions whose reward or log-probability was not finite.
+    moved: approximate KL divergence from the policy that acted, in nats. clipped: share of ratios outside the
+    clip. gradient: norm before clipping. explained: share of the rewards' variance that V explained before
+    the update (None where they do not vary). steps: gradient steps taken. skipped: steps left out because the
+    gradient was not finite.
+    """
 
     reward: float | None
     dropped: int
@@ -89,65 +96,64 @@ class Diagnostics:
 
 
 class Learner:
-    """Learns ``spec`` from batches. Two of the same seed do the same."""
+    """Learns ``spec`` from batches, repeatably: ``seed`` determines weights, exploration and minibatches."""
 
     def __init__(self, spec: Spec, seed: int = 0) -> None:
         self.spec = spec
         self.seed = seed
-        self.taught_by: dict[str, Any] | None = None
-        """The reward that it was trained by, as the fields of ``rewards.Reward``; None: nobody said."""
+        self.reward_fields: dict[str, Any] | None = None
+        """Fields of the ``rewards.Reward`` it is trained with; None: not said."""
         self.updates = 0
         self.decisions = 0
         streams = np.random.SeedSequence(seed).spawn(len(_STREAMS))
         self._rng = {name: np.random.default_rng(s) for name, s in zip(_STREAMS, streams)}
-        actor = networks.new_actor(spec, self._rng["weights"])
-        value = networks.new_value(spec, self._rng["weights"])
+        actor = networks.init_actor(spec, self._rng["weights"])
+        value = networks.init_value(spec, self._rng["weights"])
         self._actor = {name: torch.tensor(w, requires_grad=True) for name, w in actor.items()}
         self._value = {name: torch.tensor(w, requires_grad=True) for name, w in value.items()}
         self._parameters = [*self._actor.values(), *self._value.values()]
         self._adam = torch.optim.Adam(self._parameters, lr=spec.learning_rate)
-        self._rewards = _Spread()
-        # Of all cameras that were decided on, as if they were one.
-        self._usual, self._cameras_seen = np.zeros(spec.layout.width), 0
+        self._rewards = _RunningMeanStd()
+        # Over all cameras of all decisions.
+        self._mean_features, self._cameras_seen = np.zeros(spec.layout.width), 0
 
     # --- deciding -----------------------------------------------------------------------------------
 
     @property
     def actor(self) -> Actor:
-        """What decides, as it is now: a copy in numpy that later updates do not change."""
+        """The current actor, a copy in numpy that later updates do not change."""
         weights = {name: w.detach().numpy().copy() for name, w in self._actor.items()}
-        return Actor(self.spec, weights, usual=self._usual.copy())
+        return Actor(self.spec, weights, mean_features=self._mean_features.copy())
 
-    def take(self, actor: Actor) -> None:
-        """Go on from ``actor``'s weights, such as those of an update that was shortened. ValueError where
-        they are not of this specification."""
+    def set_actor(self, actor: Actor) -> None:
+        """Continue from ``actor``'s weights. ValueError where they are not of this specification."""
         if actor.weights.keys() != self._actor.keys():
-            raise ValueError("the weights are of another network")
+            raise ValueError("the weights belong to another network")
         with torch.no_grad():
             for name, w in self._actor.items():
-                w.copy_(_as_expected(actor.weights[name], w))
+                w.copy_(_checked_tensor(actor.weights[name], w))
 
-    def forget_rewards(self) -> None:
-        """From now on rewards are of another kind: their size, and what is expected of a state, are learnt
-        anew. The policy stays as it is."""
-        self._rewards = _Spread()
-        anew = networks.new_value(self.spec, self._rng["weights"])
+    def reset_rewards(self) -> None:
+        """Start over with rewards of another kind: reset their statistics and V. The actor does not
+        change."""
+        self._rewards = _RunningMeanStd()
+        initial = networks.init_value(self.spec, self._rng["weights"])
         with torch.no_grad():
             for name, w in self._value.items():
-                w.copy_(torch.tensor(anew[name]))
+                w.copy_(torch.tensor(initial[name]))
                 self._adam.state.pop(w, None)
 
     def act(self, states: Sequence[State], explore: bool = True) -> tuple[NDArray[Any], NDArray[np.float64]]:
-        """Actions, (B, N) bool or (B,) indices of omegas, and their log-probabilities (B,). explore False:
-        the likeliest ones."""
+        """Actions, (B, N) bool or (B,) indices of omegas, and their log-probabilities (B,). Without
+        ``explore`` the most probable ones."""
         return self.actor.act(states, self._rng["actions"] if explore else None)
 
     def greedy(self, state: State) -> NDArray[Any]:
-        """The likeliest action: (N,) bool, or an index of the omegas as an array of no dimension."""
+        """The most probable action: (N,) bool, or an index of the omegas as a 0-d array."""
         return np.asarray(self.actor.act([state], None)[0][0])
 
     def value(self, states: Sequence[State]) -> NDArray[np.float64]:
-        """V (B,), in units of the reward."""
+        """V (B,), in the reward's unit."""
         weights = {name: w.detach().numpy() for name, w in self._value.items()}
         found = networks.value(np, self.spec, weights, self.spec.layout.batch(states))
         return self._rewards.mean + self._rewards.scale * found
@@ -160,37 +166,36 @@ class Learner:
         rewards: Sequence[float | None] | NDArray[np.float64],
         explore: float = 0.0,
     ) -> Batch:
-        """What ``update`` learns from; a reward of None is one that could not be had. explore: as in
-        ``Batch``."""
+        """The batch for ``update``; arguments as in ``Batch``, a missing reward may be None."""
         found = np.array([np.nan if r is None else r for r in rewards], np.float64)
         return Batch(self.spec.layout.batch(states), np.asarray(actions), np.asarray(logps), found, explore)
 
     # --- learning -----------------------------------------------------------------------------------
 
     def update(self, batch: Batch) -> Diagnostics:
-        """Improve the policy by one batch. Decisions whose reward is no number are left out; a batch of
-        nothing else changes nothing."""
+        """Improve the policy by one batch. Decisions without a finite reward are dropped; a batch of only
+        such decisions changes nothing."""
         # NaN compares as False.
-        usable = (np.abs(batch.rewards) < _ABSURD) & np.isfinite(batch.logps)
+        usable = (np.abs(batch.rewards) < _MAX_REWARD) & np.isfinite(batch.logps)
         dropped = int((~usable).sum())
         if not usable.any():
             return Diagnostics(None, dropped, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, None, 0, 0)
         rewards = batch.rewards[usable]
         mean = float(rewards.mean())
-        rewards = self._rewards.bounded(rewards)
+        rewards = self._rewards.clipped(rewards)
         self._rewards.add(rewards)
         self.updates += 1
         self.decisions += len(rewards)
         cameras = batch.features[usable][batch.features[usable][..., -1] > 0]
         if len(cameras):
             self._cameras_seen += len(cameras)
-            self._usual += (cameras - self._usual).sum(axis=0) / self._cameras_seen
+            self._mean_features += (cameras - self._mean_features).sum(axis=0) / self._cameras_seen
         with _one_thread():
             done = self._passes(
                 torch.tensor(batch.features[usable]),
                 torch.tensor(batch.actions[usable]),
                 torch.tensor(batch.logps[usable]),
-                torch.tensor(self._rewards.standardised(rewards)),
+                torch.tensor(self._rewards.standardized(rewards)),
                 batch.explore,
             )
         return Diagnostics(mean, dropped, **done)
@@ -203,16 +208,16 @@ class Learner:
         rewards: torch.Tensor,
         explore: float,
     ) -> dict[str, Any]:
-        """Passes over the batch in minibatches, until the policy has moved far enough."""
+        """Pass over the batch in minibatches until the policy has moved by ``target_kl``."""
         spec = self.spec
         with torch.no_grad():
-            expected = networks.value(torch, spec, self._value, features)
+            baseline = networks.value(torch, spec, self._value, features)
         spread = rewards.std(correction=0).item()
-        left = (rewards - expected).std(correction=0).item()
+        left = (rewards - baseline).std(correction=0).item()
         varies = spread > _CONSTANT
         explained = 1.0 - (left / spread) ** 2 if varies else None
-        # Where nothing that was done made a difference, what is left is the value's error.
-        advantages = self._advantages(rewards - expected) if varies else torch.zeros_like(rewards)
+        # Where no action made a difference, only errors of V remain.
+        advantages = self._normalized_advantages(rewards - baseline) if varies else torch.zeros_like(rewards)
         steps, skipped = 0, 0
         seen: list[tuple[float, ...]] = []
         for _ in range(spec.passes):
@@ -240,11 +245,12 @@ class Learner:
             "skipped": skipped,
         }  # fmt: skip
 
-    def _advantages(self, raw: torch.Tensor) -> torch.Tensor:
-        """(B,) with mean 0 and, unless they are next to nothing, spread 1. ``raw`` is in units of the
-        rewards' spread."""
-        centred = raw - raw.mean()
-        return centred / torch.clamp(centred.std(correction=0), min=_LEAST_ADVANTAGE)
+    @staticmethod
+    def _normalized_advantages(raw: torch.Tensor) -> torch.Tensor:
+        """(B,) with mean 0 and, unless nearly constant, standard deviation 1. ``raw`` is in units of the
+        rewards' standard deviation."""
+        centered = raw - raw.mean()
+        return centered / torch.clamp(centered.std(correction=0), min=_MIN_ADVANTAGE_STD)
 
     def _loss(
         self,
@@ -255,10 +261,10 @@ class Learner:
         rewards: torch.Tensor,
         explore: float,
     ) -> tuple[torch.Tensor, tuple[float, ...]]:
-        """The negative of (5.23), (6.42) with the value's error and the entropy, and figures to report."""
+        """The loss, (5.23) or (6.42) negated with V's error and the entropy bonus, and figures to report."""
         spec = self.spec
         logits = networks.logits(torch, spec, self._actor, features)
-        logits = d.with_chance(torch, spec.action, logits, explore)
+        logits = d.mix_uniform(torch, spec.action, logits, explore)
         now, entropy = log_probability(spec, logits, features, actions)
         log_ratio = torch.clamp(now - logps, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)
         ratio = torch.exp(log_ratio)
@@ -267,7 +273,7 @@ class Learner:
         error = networks.value(torch, spec, self._value, features) - rewards
         value_loss = (error * error).mean()
         loss = policy_loss + spec.value * value_loss - spec.entropy * entropy.mean()
-        # Never negative, and of less variance than -log ratio.
+        # This KL estimate is never negative and varies less than -log ratio.
         moved = (torch.expm1(log_ratio) - log_ratio).mean()
         outside = ((ratio - 1.0).abs() > spec.clip).double().mean()
         figures = (policy_loss, value_loss, entropy.mean(), moved, outside)
@@ -276,10 +282,10 @@ class Learner:
     # --- keeping ------------------------------------------------------------------------------------
 
     def save(self, path: Path | str) -> None:
-        """Everything, so that a learner loaded from ``path`` goes on bit for bit. Atomic; OSError where it
-        cannot be written."""
+        """Write everything, so that a learner loaded from ``path`` continues bit for bit. Atomic; OSError
+        where it cannot be written."""
         arrays = {f"actor.{name}": w.detach().numpy() for name, w in self._actor.items()}
-        arrays["usual"] = self._usual
+        arrays["usual"] = self._mean_features
         arrays |= {f"value.{name}": w.detach().numpy() for name, w in self._value.items()}
         for i, parameter in enumerate(self._parameters):
             for name, kept in self._adam.state.get(parameter, {}).items():
@@ -287,7 +293,7 @@ class Learner:
         about = {
             "spec": self.spec.as_json(),
             "seed": self.seed,
-            "taught_by": self.taught_by,
+            "taught_by": self.reward_fields,
             "updates": self.updates,
             "decisions": self.decisions,
             "cameras_seen": self._cameras_seen,
@@ -299,12 +305,12 @@ class Learner:
     @staticmethod
     def load(path: Path | str) -> Learner:
         """A learner as ``save`` left it. checkpoint.CheckpointError (a ValueError) for anything else."""
-        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=MOST_BYTES)
+        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=MAX_BYTES)
         spec = read_spec(path, about)
         if "seed" not in about:
             raise checkpoint.CheckpointError(
-                f"{path}: a policy and nothing that it could go on learning with: take the policy.npz of "
-                "edge-server train-scheduler, or the learnt.npz of a run that learnt"
+                f"{path}: holds only a policy, and learning cannot resume from it: take the policy.npz of "
+                "edge-server train-scheduler, or the learnt.npz of a run with --learn"
             )
         try:
             learner = Learner(spec, int(about["seed"]))
@@ -317,23 +323,23 @@ class Learner:
         with torch.no_grad():
             for part, weights in (("actor", self._actor), ("value", self._value)):
                 for name, w in weights.items():
-                    w.copy_(_as_expected(arrays[f"{part}.{name}"], w))
+                    w.copy_(_checked_tensor(arrays[f"{part}.{name}"], w))
         for i, parameter in enumerate(self._parameters):
-            if f"adam.{i}.step" in arrays:  # before the first update Adam remembers nothing
+            if f"adam.{i}.step" in arrays:  # before the first update Adam has no moments
                 step = np.asarray(arrays[f"adam.{i}.step"], np.float32)
                 mean, square = (
-                    _as_expected(arrays[f"adam.{i}.{n}"], parameter) for n in ("exp_avg", "exp_avg_sq")
+                    _checked_tensor(arrays[f"adam.{i}.{n}"], parameter) for n in ("exp_avg", "exp_avg_sq")
                 )
                 if step.shape != () or not 1.0 <= step < np.inf or (square < 0.0).any():
-                    raise ValueError("what Adam remembers is not what it can have written")
+                    raise ValueError("Adam's moments are invalid")
                 self._adam.state[parameter] = {
                     "step": torch.tensor(step), "exp_avg": mean, "exp_avg_sq": square
                 }  # fmt: skip
-        self.taught_by = about.get("taught_by")
-        self._usual = _as_expected(arrays["usual"], torch.tensor(self._usual)).numpy()
+        self.reward_fields = about.get("taught_by")
+        self._mean_features = _checked_tensor(arrays["usual"], torch.tensor(self._mean_features)).numpy()
         self._cameras_seen = int(about["cameras_seen"])
         self.updates, self.decisions = int(about["updates"]), int(about["decisions"])
-        self._rewards = _Spread.from_json(about["rewards"])
+        self._rewards = _RunningMeanStd.from_json(about["rewards"])
         for name, rng in self._rng.items():
             rng.bit_generator.state = json.loads(about["streams"][name])
 
@@ -341,7 +347,7 @@ class Learner:
 def log_probability(
     spec: Spec, logits: torch.Tensor, features: torch.Tensor, actions: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-probabilities (B,) of actions, and the entropies (B,) of what they were drawn from."""
+    """Log-probabilities (B,) of actions, and the entropies (B,) of their distributions."""
     if spec.action == "select":
         mask = features[..., -1]
         chosen = actions.to(logits.dtype)
@@ -350,15 +356,15 @@ def log_probability(
     return logps[torch.arange(len(actions)), actions], d.omega_entropy(torch, logits)
 
 
-def _as_expected(array: NDArray[Any], like: torch.Tensor) -> torch.Tensor:
+def _checked_tensor(array: NDArray[Any], like: torch.Tensor) -> torch.Tensor:
     if array.shape != tuple(like.shape) or array.dtype != np.float64 or not np.isfinite(array).all():
-        raise ValueError(f"weights of shape {array.shape} where finite ones of {tuple(like.shape)} belong")
+        raise ValueError(f"weights of shape {array.shape}, expected finite ones of {tuple(like.shape)}")
     return torch.tensor(array)
 
 
-class _Spread:
-    """Running mean and variance of the last some thousand rewards (Chan's update): V learns rewards in these
-    units, whatever the weights of the reward are."""
+class _RunningMeanStd:
+    """Running mean and variance of the last few thousand rewards (Chan's update). V learns rewards in these
+    units, whatever the weights of the reward."""
 
     def __init__(self, count: int = 0, mean: float = 0.0, variance: float = 0.0) -> None:
         self.count, self.mean, self.variance = count, mean, variance
@@ -372,13 +378,13 @@ class _Spread:
 
     @property
     def scale(self) -> float:
-        """Standard deviation; 1 where nothing has varied yet."""
+        """Standard deviation; 1 while nothing has varied."""
         spread = float(np.sqrt(self.variance))
         return spread if spread > _CONSTANT * abs(self.mean) else 1.0
 
-    def bounded(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``values`` without accidents, as far as can be told from those before; of the first ones, from
-        their median and its quartiles."""
+    def clipped(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``values`` without outliers, judged by earlier ones; the first batch by its own median and
+        quartiles."""
         middle, spread = self.mean, self.scale
         if not self.count:
             low, middle, high = np.percentile(values, (25, 50, 75))
@@ -387,16 +393,16 @@ class _Spread:
             return values
         return np.clip(values, middle - _OUTLIER * spread, middle + _OUTLIER * spread)
 
-    def standardised(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def standardized(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         return (values - self.mean) / self.scale
 
     @staticmethod
-    def from_json(data: dict[str, Any]) -> _Spread:
+    def from_json(data: dict[str, Any]) -> _RunningMeanStd:
         """ValueError for what ``as_json`` cannot have written."""
         count, mean, variance = int(data["count"]), float(data["mean"]), float(data["variance"])
         if not (0 <= count <= _MEMORY and math.isfinite(mean) and 0.0 <= variance < math.inf):
             raise ValueError(f"rewards of mean {mean} and variance {variance}, {count} of them")
-        return _Spread(count, mean, variance)
+        return _RunningMeanStd(count, mean, variance)
 
     def as_json(self) -> dict[str, Any]:
         return {"count": self.count, "mean": self.mean, "variance": self.variance}
@@ -404,7 +410,7 @@ class _Spread:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Sums in one order, whatever the machine; and no threads that compete with the field's."""
+    """Sum in one order on any machine, without threads that compete with the field's."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

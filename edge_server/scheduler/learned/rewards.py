@@ -1,26 +1,29 @@
-"""What a decision was worth: (5.19) for sets of views, (6.36)-(6.38) for waiting, every term apart.
+"""The reward of a decision: (5.19) for sets of views, (6.36)-(6.38) for waiting, term by term.
 
     reward = make_reward("corrected", fidelity="moving")
     found = reward.of(publication)          # anything with psnr_db, psnr_moving_db, ssim, lpips, aaoi_ms
     found.total, found.terms, found.missing
 
-(6.38) is r = -F_w, F_w = w_t age + w_p PSNR + w_s SSIM + w_l LPIPS. The thesis (6.5) prints w_p = -0.02,
-w_s = +0.2, w_l = 0.3, w_t = 0.015 a millisecond: with w_s positive a better SSIM makes F_w larger and the
-reward smaller, against (6.36)'s own purpose. The preset ``thesis`` keeps the printed value, so that its
-figures can be repeated; ``corrected`` turns the sign and is the default.
+(6.38) is r = -F_w. The thesis (6.5) prints w_s = +0.2: a better SSIM then makes F_w larger and the reward
+smaller, against (6.36)'s own purpose. The preset ``thesis`` keeps the printed sign, so that its figures can
+be repeated; ``corrected`` turns it and is the default.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
+
+# Weights of (6.37) as 6.5 prints them: PSNR a dB, SSIM, LPIPS, age a millisecond.
+W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
 
 TERMS = ("psnr", "ssim", "distance", "age", "views")
 
 
 class Scored(Protocol):
-    """A score, as far as a reward looks at it: ``fidelity.scorer.Score`` and ``state.Publication`` are."""
+    """What a reward needs of a score; ``fidelity.scorer.Score`` and ``live.state.Publication`` have it."""
 
     @property
     def psnr_db(self) -> float | None: ...
@@ -33,10 +36,13 @@ class Scored(Protocol):
 
 
 @dataclass(frozen=True)
-class Rewarded:
-    """total: sum of the terms that are known, None if none is. terms: weight times value by name, None for
-    one whose metric is missing. missing: names of those; a total that lacks a term is not comparable with
-    one that does not, so whoever learns from both says so or leaves it out (``complete``)."""
+class RewardTerms:
+    """A reward, term by term.
+
+    total: sum of the known terms; None if none is known. Totals are comparable only where they are
+    ``complete``.
+    terms: weight times value by name; None where the metric is missing.
+    """
 
     total: float | None
     terms: dict[str, float | None]
@@ -52,13 +58,13 @@ class Rewarded:
 
 @dataclass(frozen=True)
 class Reward:
-    """Weights of what is good (positive) and bad (negative): psnr a dB, ssim and distance a unit, age a
-    millisecond of aAoI (6.35), views a view used: what sending, decoding and fitting it costs, for which the
-    thesis has no term. A weight of zero is no term.
+    """Weights of the metrics, positive where more is better. A weight of zero is no term.
 
-    fidelity: PSNR of the ``whole`` image or of its ``moving`` pixels; a mostly static scene hides from the
-    whole image what age costs. SSIM and the distance are always of the whole image. distance_is: ``lpips``,
-    or ``perceptual``, the stand-in where no LPIPS weights are installed; the term carries its name.
+    psnr: a dB. ssim, distance: a unit. age: a millisecond of aAoI (6.35). views: a used view, for the cost of
+    sending, decoding and fitting it; the thesis has no such term.
+    fidelity: PSNR of the ``whole`` image or of its ``moving`` pixels; in a mostly static scene the whole
+    image hides the cost of age. SSIM and the distance are always of the whole image.
+    distance_is: ``lpips``, or ``perceptual``, the stand-in without LPIPS weights; the term carries its name.
     """
 
     name: str
@@ -78,10 +84,12 @@ class Reward:
         if self.distance_is not in ("lpips", "perceptual"):
             raise ValueError(f"reward {self.name}: distance_is lpips or perceptual, not {self.distance_is!r}")
 
-    def of(self, score: Scored, aaoi_ms: float | None = None, perceptual: float | None = None) -> Rewarded:
-        """The reward of a score. aaoi_ms: mean age of the views used, at the present; None takes the score's
-        own, where it has one (a publication does), and so does perceptual, the stand-in distance. A metric
-        that is None or not finite is missing."""
+    def of(self, score: Scored, aaoi_ms: float | None = None, perceptual: float | None = None) -> RewardTerms:
+        """The reward of a score.
+
+        aaoi_ms: mean age of the used views at the present. perceptual: the stand-in distance. None takes the
+        score's own, where it has one (a publication does). A metric that is None or not finite is missing.
+        """
         if aaoi_ms is None:
             aaoi_ms = getattr(score, "aaoi_ms", None)
         if perceptual is None:
@@ -101,15 +109,28 @@ class Reward:
             if weight != 0.0
         }
         known = [term for term in terms.values() if term is not None]
-        return Rewarded(math.fsum(known) if known else None, terms)
+        return RewardTerms(math.fsum(known) if known else None, terms)
 
 
-# Name -> reward. ``set``: (5.19) with the weights of 5.6.2; the others: -F_w with those of 6.5.
+# Name -> reward. ``set``: (5.19) with the weights of 5.6.2; the others: -F_w (6.38).
 REWARDS = {
     "set": Reward("set", psnr=0.02, ssim=0.5, distance=-1.0),
-    "thesis": Reward("thesis", psnr=0.02, ssim=-0.2, distance=-0.3, age=-0.015),
-    "corrected": Reward("corrected", psnr=0.02, ssim=0.2, distance=-0.3, age=-0.015),
+    "thesis": Reward("thesis", psnr=-W_P, ssim=-W_S, distance=-W_L, age=-W_T),
+    "corrected": Reward("corrected", psnr=-W_P, ssim=W_S, distance=-W_L, age=-W_T),
 }
+
+
+def f_w(row: Mapping[str, Any]) -> float | None:
+    """F_w of (6.36) and (6.37) as printed, smaller is better; ages in slots of 1 ms. None where a metric is
+    missing.
+
+    row: with psnr_db, ssim, lpips and aaoi_ms.
+    """
+    metrics = [row.get(name) for name in ("psnr_db", "ssim", "lpips", "aaoi_ms")]
+    if any(value is None for value in metrics):
+        return None
+    psnr, ssim, lpips, age = (float(value) for value in metrics)  # type: ignore[arg-type]  # None was excluded
+    return W_P * psnr + W_S * ssim + W_L * lpips + W_T * age
 
 
 def make_reward(
@@ -118,8 +139,8 @@ def make_reward(
     distance_is: Literal["lpips", "perceptual"] = "lpips",
     **weights: float,
 ) -> Reward:
-    """The named preset; ``weights`` (psnr, ssim, distance, age) replace some of its own. ValueError says
-    what there is."""
+    """The preset ``name``, with ``weights`` (by the names in ``TERMS``) in place of its own. ValueError for
+    an unknown name lists the known ones."""
     if name not in REWARDS:
         raise ValueError(f"reward {name!r} is not known; choose one of {', '.join(REWARDS)}")
     if unknown := set(weights) - set(TERMS):
@@ -128,7 +149,7 @@ def make_reward(
     return replace(preset, **weights)  # type: ignore[arg-type] # names were checked above
 
 
-def available(reward: Reward, lpips_missing: str | None) -> Reward:
-    """``reward`` without its term of distance where LPIPS cannot be had: a reward that always lacks a term
-    would teach nothing."""
+def without_missing_lpips(reward: Reward, lpips_missing: str | None) -> Reward:
+    """``reward`` without its LPIPS term where LPIPS is missing: nothing can be learned from rewards that are
+    never complete."""
     return replace(reward, distance=0.0) if lpips_missing and reward.distance_is == "lpips" else reward

@@ -1,7 +1,7 @@
 """What a decision is made from: semantics, ages and poses of all cameras, s_t = [Z Delta P] (6.33).
 
-``State`` is as measured; ``StateLayout`` makes it numbers for a network: finite whatever is measured, the
-same scale for every part, and zeros with a cleared bit for a camera that never reported.
+``State`` holds measured values; ``StateLayout`` turns them into features for a network: always finite, the
+same scale for every part, and zeros with a cleared mask bit for a camera that never reported.
 """
 
 from __future__ import annotations
@@ -13,31 +13,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler import STATE_PARTS
+from edge_server.scheduler.policy import STATE_PARTS
 
 if TYPE_CHECKING:
     from freshfield.frame import Frame
 
-PARTS = STATE_PARTS
 POSE_WIDTH = 6
-# The widest embedding that can be configured (edge_server.embed).
-MOST_DIM = 4096
-# Features stay within this many of their usual spread: what lies beyond is a broken value, not information.
+# The widest configurable embedding (edge_server.embed).
+MAX_DIM = 4096
+# Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
 _FEATURE_LIMIT = 8.0
-# A feature that hardly varies where it was standardised says nothing; it must not be blown up to noise.
-_SMALLEST_SPREAD = 1e-3
+# A feature that hardly varied where it was standardized says nothing; scaling must not turn it into noise.
+_MIN_SPREAD = 1e-3
 
 
 @dataclass(frozen=True)
 class State:
     """The cameras at one instant, one row each, whether they have reported or not.
 
-    ages_ms (N,): age of the newest frame (5.5), any value where nothing was reported. poses (N, 6):
-    translation from the rig's centre in units of its size, then the rotation vector in radians. embeddings
-    (N, d): of the newest frames (6.31), rows that are not finite count as unknown; None: nobody computed
-    them. reported (N,): whether there is a newest frame. cameras: names of the rows, where they have some.
-    frames: those frames themselves, still encoded, by camera, for who explains a decision; none unless asked
-    for.
+    ages_ms: (N,) age of the newest frame (5.5); any value where nothing was reported.
+    poses: (N, 6) translation from the rig's center in units of its size, then the rotation vector in radians.
+    embeddings: (N, d) of the newest frames (6.31); rows that are not finite are unknown; None: not computed.
+    reported: (N,) whether there is a newest frame.
+    cameras: names of the rows; may be empty.
+    frames: the newest frames by camera, still encoded, for explanations; empty unless asked for.
     """
 
     ages_ms: NDArray[np.float64]
@@ -66,10 +65,14 @@ class State:
 class StateLayout:
     """Which parts a network sees, and their scales.
 
-    parts: any of ``PARTS``. dim: width d of an embedding, 0 without semantics. age_scale_ms: ages enter as
-    log(1 + age / scale), fine where ages differ by a frame, coarse where they are hopeless; oldest_ms: where
-    that ends. centre, spread (d,): of embeddings, from ``standardised``; empty: they are used as they are.
-    embedding: name of the embedder whose they are, for who installs a policy; empty: not said.
+    parts: any of ``STATE_PARTS``.
+    dim: width d of an embedding; 0 without semantics.
+    age_scale_ms: ages enter as log(1 + age / scale): fine where ages differ by a frame, coarse for very old
+    ones.
+    oldest_ms: ages are clipped to it.
+    centre, spread: (d,) mean and standard deviation of embeddings, from ``standardized``; empty: used
+    unscaled.
+    embedding: name of the embedder the policy was trained with; empty: not said.
     """
 
     parts: tuple[str, ...] = ("age", "pose", "semantics")
@@ -81,11 +84,13 @@ class StateLayout:
     embedding: str = ""
 
     def __post_init__(self) -> None:
-        if unknown := set(self.parts) - set(PARTS):
-            raise ValueError(f"state: no part is called {', '.join(unknown)}; there are {', '.join(PARTS)}")
+        if unknown := set(self.parts) - set(STATE_PARTS):
+            raise ValueError(
+                f"state: no part is called {', '.join(unknown)}; there are {', '.join(STATE_PARTS)}"
+            )
         if not self.parts:
-            raise ValueError(f"state: no parts; choose some of {', '.join(PARTS)}")
-        whole("state: dim", self.dim, 0, MOST_DIM)
+            raise ValueError(f"state: no parts; choose some of {', '.join(STATE_PARTS)}")
+        require_int("state: dim", self.dim, 0, MAX_DIM)
         if ("semantics" in self.parts) != (self.dim > 0):
             raise ValueError(f"state: dim {self.dim} with parts {', '.join(self.parts)}: semantics has a dim")
         if not (0 < self.age_scale_ms < np.inf and 0 < self.oldest_ms < np.inf):
@@ -97,10 +102,10 @@ class StateLayout:
 
     @property
     def columns(self) -> dict[str, slice]:
-        """Columns of every part that there is; the last column of all is the mask bit."""
+        """Columns of every part in use. The last column of all is the mask bit."""
         widths = {"semantics": self.dim, "age": 1, "pose": POSE_WIDTH}
         out, at = {}, 0
-        for part in PARTS:
+        for part in STATE_PARTS:
             if part in self.parts:
                 out[part] = slice(at, at + widths[part])
                 at += widths[part]
@@ -108,17 +113,17 @@ class StateLayout:
 
     @property
     def width(self) -> int:
-        """Columns in all: of the parts, and one that is 1 for a camera that has reported."""
+        """Number of columns: those of the parts, and the mask bit, 1 for a camera that has reported."""
         return max(columns.stop for columns in self.columns.values()) + 1
 
     @property
     def limit(self) -> float:
-        """No feature is further from zero."""
+        """Largest magnitude of a feature."""
         return max(_FEATURE_LIMIT, float(np.log1p(self.oldest_ms / self.age_scale_ms)))
 
     def features(self, state: State) -> NDArray[np.float64]:
-        """(N, width), finite for any state. A camera whose age is no number counts as one that never
-        reported. ValueError where semantics are wanted and the state has none, or of another width."""
+        """(N, width), finite for any state. A camera whose age is NaN counts as one that never reported.
+        ValueError where semantics are needed and the state has none, or of another width."""
         known = state.reported & ~np.isnan(state.ages_ms)
         out = np.zeros((len(state), self.width))
         for part, columns in self.columns.items():
@@ -128,17 +133,17 @@ class StateLayout:
         return out
 
     def batch(self, states: Sequence[State]) -> NDArray[np.float64]:
-        """(B, N, width) of states with up to N cameras; those with fewer end in cameras that never
-        reported."""
+        """(B, N, width) of states with up to N cameras, padded with cameras that never reported."""
         n = max((len(state) for state in states), default=0)
         out = np.zeros((len(states), n, self.width))
         for row, state in zip(out, states):
             row[: len(state)] = self.features(state)
         return out
 
-    def standardised(self, states: Sequence[State]) -> StateLayout:
-        """The layout whose embeddings have mean 0 and spread 1 over the cameras of ``states``: what all
-        frames have in common says nothing about a decision. Itself without semantics or embeddings."""
+    def standardized(self, states: Sequence[State]) -> StateLayout:
+        """The layout whose embeddings have mean 0 and standard deviation 1 over the cameras of ``states``:
+        what all frames share says nothing about a decision. Returns itself without semantics or
+        embeddings."""
         if "semantics" not in self.parts:
             return self
         found = [s.embeddings[s.reported] for s in states if s.embeddings is not None]
@@ -146,11 +151,11 @@ class StateLayout:
         rows = rows[np.isfinite(rows).all(axis=1)]
         if len(rows) < 2:
             return self
-        spread = np.maximum(rows.std(axis=0), _SMALLEST_SPREAD * max(1.0, float(np.abs(rows).max())))
+        spread = np.maximum(rows.std(axis=0), _MIN_SPREAD * max(1.0, float(np.abs(rows).max())))
         return replace(self, centre=tuple(rows.mean(axis=0).tolist()), spread=tuple(spread.tolist()))
 
     def _age(self, state: State) -> NDArray[np.float64]:
-        # A camera whose clock is ahead is as fresh as can be. NaN rows are masked by the caller.
+        # A camera whose clock is ahead has age 0. NaN rows are masked by the caller.
         ages = np.clip(np.nan_to_num(state.ages_ms, nan=0.0, posinf=self.oldest_ms), 0.0, self.oldest_ms)
         return np.log1p(ages / self.age_scale_ms)[:, None]
 
@@ -160,7 +165,7 @@ class StateLayout:
 
     def _semantics(self, state: State) -> NDArray[np.float64]:
         if state.embeddings is None:
-            raise ValueError("state: semantics are wanted, but nothing computes embeddings here")
+            raise ValueError("state: semantics are needed, but nothing computes embeddings here")
         if state.embeddings.shape[1] != self.dim:
             raise ValueError(f"state: embeddings of width {state.embeddings.shape[1]}, expected {self.dim}")
         z = state.embeddings.astype(np.float64)
@@ -169,12 +174,13 @@ class StateLayout:
         if self.centre:
             z = (z - np.array(self.centre)) / np.array(self.spread)
             z[unknown] = 0.0
-        # All of an embedding weighs at the start as much as one other feature, or d of them drown the age.
+        # A whole embedding initially weighs as much as one other feature; otherwise its d features drown the
+        # age.
         return np.clip(z, -_FEATURE_LIMIT, _FEATURE_LIMIT) / np.sqrt(self.dim)
 
 
-def whole(name: str, value: object, least: int, most: int) -> None:
-    """ValueError where ``value`` is not a whole number within ``least`` and ``most``, as which a file may
-    have it: 64.0 is none."""
+def require_int(name: str, value: object, least: int, most: int) -> None:
+    """ValueError unless ``value``, as a file may hold it, is an int from ``least`` to ``most``; 64.0 is
+    not."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {value!r}")

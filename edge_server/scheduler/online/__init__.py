@@ -1,1 +1,1 @@
-"""A learned policy that keeps learning while it is used."""
+"""Keeps a learned policy learning while it is used."""

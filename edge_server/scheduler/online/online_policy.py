@@ -1,16 +1,15 @@
-"""A learnt policy that goes on learning while it is used (``edge-server run --learn``), on a leash.
+"""A learned policy that goes on learning while it is used (``edge-server run --learn``), within limits.
 
-Three things keep it from doing harm. A **trust region**: an update moves it by no more than its
-specification's ``target_kl``, and all updates together by no more than ``bound`` from the policy that was
-loaded, over the states of the batch; what would go further is shortened. A **fixed policy beside it** takes a
-random share of the decisions, a small one until there is a suspicion, so that both are estimated fairly. And
-a **fall-back**: once the fixed policy is better beyond doubt (``verdict``), it is the one that decides, and
-the learnt one gets the small share, from which it learns on, less sure of itself than it was.
+Three things keep it from doing harm. A **trust region**: over the states of a batch, an update moves it by at
+most its specification's ``target_kl``, and all updates together by at most ``max_kl`` from the loaded policy;
+an update that goes further is shortened. A **fixed policy beside it** takes a random share of the decisions,
+small until there is a suspicion, so that both are estimated fairly. And a **fallback**: once
+``sequential_test`` finds the fixed policy better, that one decides, and the learned one gets the small share,
+from which it learns on with softened preferences.
 
-What a reward is live is not what it was in training, where it may have been the difference to another action
-of the same decision: what the learner knew of rewards' size, and what it expected of a state, begins anew.
-
-The rewards come from a held-out camera, later than the decisions; nothing waits for them.
+Live rewards differ from those of training, which may have been differences to another action of the same
+decision: reward statistics and state values therefore start over. The rewards come from a held-out camera,
+later than the decisions; nothing waits for them.
 """
 
 from __future__ import annotations
@@ -26,191 +25,195 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler import BANDIT, Epoch, Plan, Policy
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.bandit import Bandit, Decided
+from edge_server.scheduler.learned.bandit import BanditPolicy, Decision
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.online.sequential_test import Judge
+from edge_server.scheduler.online.sequential_test import SequentialTest
+from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
+from edge_server.scheduler.registry import policy_label
 
 log = logging.getLogger(__name__)
 
-# Decisions whose reward may still come; a score that comes later than this is of no use.
-_OPEN = 256
-# What is left of a policy's preferences (its logits) when it has been found wanting: one that is sure of what
-# was right yesterday never tries anything else, and would learn nothing.
-_SOFTENED = 0.25
-# So often an update that goes too far is halved before it is given up.
-_HALVINGS = 6
+# Decisions kept while their reward may still come; later rewards are dropped.
+_MAX_PENDING = 256
+# Factor on the logits of a policy that was found worse: a policy that is sure of what was right yesterday
+# never tries anything else, and would learn nothing.
+_SOFTENING = 0.25
+# An update that goes too far is halved this often before it is given up.
+_MAX_HALVINGS = 6
 
 
 @dataclass(frozen=True)
-class Leash:
-    """share: of the decisions that goes to whoever does not decide; half while there is a suspicion. batch:
-    decisions of one update. bound: mean KL divergence in nats, from the policy that was loaded (or, after a
-    fall-back, from what it was softened to), that learning may not exceed. explore: share of chance in every
-    action, however sure the policy is. settle: first decisions that nobody is judged by: whatever is chosen,
-    a field that begins with nothing becomes better. false_every: decisions between two changes of who decides
-    that were not called for, at least, on average."""
+class OnlineSettings:
+    """Limits of learning while deciding.
+
+    share: of the decisions for the policy that is not in charge; half while there is a suspicion.
+    batch: decisions of one update.
+    max_kl: mean KL divergence in nats that learning may not exceed, from the loaded policy or, after a
+    fallback, from the softened one.
+    explore: uniform share of every action, however sure the policy is.
+    warmup: first decisions that do not count in the comparison: a field that starts from nothing improves
+    whatever is chosen.
+    false_alarm_every: average number of decisions between two unwarranted switches, at least.
+    """
 
     share: float = 0.15
     batch: int = 32
-    bound: float = 1.0
+    max_kl: float = 1.0
     explore: float = 0.02
-    settle: int = 30
-    false_every: float = 20_000.0
+    warmup: int = 30
+    false_alarm_every: float = 20_000.0
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.share <= 0.5 and self.batch >= 1 and 0.0 < self.bound < math.inf):
-            raise ValueError("leash: share in (0, 0.5], batch from 1, bound positive and finite")
-        if not (0.0 <= self.explore < 1.0 and self.settle >= 0 and 1.0 < self.false_every < math.inf):
-            raise ValueError("leash: explore from 0, below 1, settle from 0, false_every above 1 and finite")
+        if not (0.0 < self.share <= 0.5 and self.batch >= 1 and 0.0 < self.max_kl < math.inf):
+            raise ValueError("online: share in (0, 0.5], batch from 1, max_kl positive and finite")
+        if not (0.0 <= self.explore < 1.0 and self.warmup >= 0 and 1.0 < self.false_alarm_every < math.inf):
+            raise ValueError("online: explore in [0, 1), warmup from 0, false_alarm_every above 1 and finite")
 
 
 @dataclass(frozen=True)
-class Exploring(Actor):
-    """An actor whose every action has a share ``explore`` of chance: as logits, so that the probability it
-    tells is the one that it acts with."""
+class ExploringActor(Actor):
+    """An actor with a uniform share ``explore`` of every action. The share is part of the logits, so that the
+    log-probabilities it returns are those it acts with."""
 
     explore: float = 0.0
 
     def logits(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        return d.with_chance(np, self.spec.action, super().logits(features), self.explore)
+        return d.mix_uniform(np, self.spec.action, super().logits(features), self.explore)
 
 
 @dataclass(frozen=True)
-class _Waiting:
-    """A decision whose reward may still come. decided: None where the fixed policy took it. probability: with
-    which it would have gone to the learnt one."""
+class _Pending:
+    """A decision whose reward may still come. decision: None where the fixed policy took it. probability:
+    with which it would have gone to the learned one."""
 
-    decided: Decided | None
+    decision: Decision | None
     probability: float
 
 
-class Apprentice:
-    """A policy (``scheduler.Policy``) made of two: ``learner``'s, which explores and learns, and ``fixed``.
+class OnlinePolicy(Policy):
+    """A policy made of two: ``learner``'s, which explores and learns, and ``fixed``.
 
-    learner becomes its own. rng: of who decides and of exploration. ``plan`` and ``select`` belong to the
-    loop's thread, ``learn`` to one other, ``scored`` and ``status`` to any.
+    learner: owned by this policy from now on. rng: of who decides, and of exploration. Threads: ``plan`` and
+    ``select`` belong to the loop's, ``learn`` to one other, ``add_reward`` and ``status`` to any.
     """
 
-    parameter = None
-    value: float | None = None
-
     def __init__(
-        self, learner: Learner, fixed: Policy, name: str, rng: np.random.Generator, leash: Leash | None = None
+        self,
+        learner: Learner,
+        fixed: Policy,
+        name: str,
+        rng: np.random.Generator,
+        settings: OnlineSettings | None = None,
     ) -> None:
         self.name = name
         self.fixed = fixed
-        self.leash = leash or Leash()
+        self.settings = settings or OnlineSettings()
         self.updates = 0
         self.shortened = 0
         """Updates that would have left the trust region."""
-        self.moved = 0.0
-        """KL divergence of what has been learnt from what was loaded, over the last batch."""
+        self.kl_from_loaded = 0.0
+        """KL divergence of the learned policy from the loaded one, over the last batch."""
         self.fallen_back = False
-        learner.forget_rewards()
+        self.verdict = ""
+        """The last result of the comparison, in words."""
+        learner.reset_rewards()
         self._learner = learner
         self._loaded = learner.actor
-        self._bandit = Bandit(self._exploring(self._loaded), name, rng, explore=True)
+        self._bandit = BanditPolicy(self._exploring(self._loaded), name, rng, explore=True)
+        self.embedding = self._bandit.embedding
         self._soften = False
         self._rng = rng
         self._lock = threading.Lock()
         self._first: int | None = None  # number of the first decision
-        self.verdict = ""
-        """What was last found of the two, for people."""
         self._policy: Policy = fixed
         self._probability = 1.0
-        self._open: OrderedDict[int, _Waiting] = OrderedDict()
-        self._ready: deque[tuple[Decided, float]] = deque(maxlen=4 * self.leash.batch)
-        self._judge = Judge(better=False, false_every=self.leash.false_every)
+        self._pending: OrderedDict[int, _Pending] = OrderedDict()
+        self._rewarded: deque[tuple[Decision, float]] = deque(maxlen=4 * self.settings.batch)
+        self._test = SequentialTest(better=False, false_alarm_every=self.settings.false_alarm_every)
 
     @property
-    def embedding(self) -> tuple[int, str]:
-        """Width of the embeddings that it looks at, 0 without, and whose they are."""
-        return self._bandit.embedding
-
-    @property
-    def last(self) -> Decided | None:
-        """The newest decision that the learnt policy took; later ones may have been the fixed one's."""
-        return self._bandit.last
+    def last_decision(self) -> Decision | None:
+        """The newest decision of the learned policy; the fixed one may have taken later ones."""
+        return self._bandit.last_decision
 
     # --- deciding -----------------------------------------------------------------------------------
 
-    def plan(self, epoch: Epoch) -> Plan:
+    def plan(self, epoch: Epoch) -> SelectionWindow:
         if self._first is None:
             self._first = epoch.number
         with self._lock:
-            share = 0.5 if self._judge.suspects else self.leash.share
+            share = 0.5 if self._test.is_suspicious else self.settings.share
             self._probability = share if self.fallen_back else 1.0 - share
-        learnt = bool(self._rng.random() < self._probability)
-        self._policy = self._bandit if learnt else self.fixed
+        learned = bool(self._rng.random() < self._probability)
+        self._policy = self._bandit if learned else self.fixed
         return self._policy.plan(epoch)
 
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
-        cameras = self._policy.select(epoch, plan)
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
+        cameras = self._policy.select(epoch, window)
         if cameras:
             with self._lock:
-                decided = self._bandit.last if self._policy is self._bandit else None
-                decided = decided.without_frames() if decided else None
-                self._open[epoch.number] = _Waiting(decided, self._probability)
-                while len(self._open) > _OPEN:
-                    self._open.popitem(last=False)
+                decision = self._bandit.last_decision if self._policy is self._bandit else None
+                decision = decision.without_frames() if decision else None
+                self._pending[epoch.number] = _Pending(decision, self._probability)
+                while len(self._pending) > _MAX_PENDING:
+                    self._pending.popitem(last=False)
         return cameras
 
     # --- learning -----------------------------------------------------------------------------------
 
-    def scored(self, number: int, reward: float | None) -> bool:
-        """The update of decision ``number`` was rewarded, or cannot be (None). Whether there is now enough
+    def add_reward(self, number: int, reward: float | None) -> bool:
+        """Take the reward of decision ``number``; None: there is none. Returns whether there is now a batch
         to ``learn`` from."""
         with self._lock:
-            if number not in self._open:
+            if number not in self._pending:
                 return False
-            found = self._open.pop(number)
-            settled = number - (self._first or 0) >= self.leash.settle
-            if settled and reward is not None and math.isfinite(reward):
-                if found.decided is not None:
-                    self._ready.append((found.decided, reward))
-                if self._judge.saw(found.decided is not None, found.probability, reward):
-                    self._change_over()
-            return len(self._ready) >= self.leash.batch
+            pending = self._pending.pop(number)
+            counts = number - (self._first or 0) >= self.settings.warmup
+            if counts and reward is not None and math.isfinite(reward):
+                if pending.decision is not None:
+                    self._rewarded.append((pending.decision, reward))
+                if self._test.update(pending.decision is not None, pending.probability, reward):
+                    self._switch()
+            return len(self._rewarded) >= self.settings.batch
 
     def learn(self) -> dict[str, Any] | None:
-        """Update from what has been rewarded, if that is a batch; what came of it, for a log."""
+        """Update from a batch of rewarded decisions, if there is one; returns figures for a log."""
         with self._lock:
-            if len(self._ready) < self.leash.batch:
+            if len(self._rewarded) < self.settings.batch:
                 return None
-            ready = [self._ready.popleft() for _ in range(self.leash.batch)]
+            rewarded = [self._rewarded.popleft() for _ in range(self.settings.batch)]
             soften, self._soften = self._soften, False
         if soften:
             self._loaded = _softened(self._learner.actor)
-            self._learner.take(self._loaded)
-        states = [decided.state for decided, _ in ready]
+            self._learner.set_actor(self._loaded)
         batch = self._learner.batch(
-            states,
-            np.stack([decided.action for decided, _ in ready]),
-            np.array([decided.logp for decided, _ in ready]),
-            [reward for _, reward in ready],
-            explore=self.leash.explore,
+            [decision.state for decision, _ in rewarded],
+            np.stack([decision.action for decision, _ in rewarded]),
+            np.array([decision.logp for decision, _ in rewarded]),
+            [reward for _, reward in rewarded],
+            explore=self.settings.explore,
         )
         before = self._learner.actor
-        told = self._learner.update(batch)
-        actor, shortened = self._held_back(before, self._learner.actor, batch.features)
+        diagnostics = self._learner.update(batch)
+        actor, shortened = self._within_trust_region(before, self._learner.actor, batch.features)
         if shortened:
-            self._learner.take(actor)
+            self._learner.set_actor(actor)
         with self._lock:
             self._bandit.actor = self._exploring(actor)
             self.updates += 1
             self.shortened += shortened
-            self.moved = divergence(self._loaded, actor, batch.features)
+            self.kl_from_loaded = mean_kl(self._loaded, actor, batch.features)
         return {
-            "update": self.updates, "decisions": len(ready), "reward": told.reward,
-            "kl_from_acted": told.moved, "step_kl": divergence(before, actor, batch.features),
-            "kl_from_loaded": self.moved, "shortened": shortened, "fallen_back": self.fallen_back,
+            "update": self.updates, "decisions": len(rewarded), "reward": diagnostics.reward,
+            "kl_from_acted": diagnostics.moved, "step_kl": mean_kl(before, actor, batch.features),
+            "kl_from_loaded": self.kl_from_loaded, "shortened": shortened, "fallen_back": self.fallen_back,
         }  # fmt: skip
 
     def save(self, path: Path | str) -> None:
-        """What has been learnt, as a checkpoint for ``bandit:FILE``. OSError where it cannot be written."""
+        """Write what has been learned, as a checkpoint for ``bandit:FILE``. OSError where it cannot be
+        written."""
         self._learner.save(path)
 
     # --- what people see ----------------------------------------------------------------------------
@@ -218,62 +221,71 @@ class Apprentice:
     def status(self) -> dict[str, Any]:
         """For edge.json and the page."""
         with self._lock:
-            mine, other = self._judge.estimates
+            learned, other = self._test.estimates
         return {
-            "updates": self.updates, "shortened": self.shortened, "kl_from_loaded": self.moved,
-            "kl_bound": self.leash.bound, "fallen_back": self.fallen_back, "fixed": name_of(self.fixed),
-            "verdict": self.verdict,
-            "learnt_reward": vars(mine), "fixed_reward": vars(other),
+            "updates": self.updates, "shortened": self.shortened, "kl_from_loaded": self.kl_from_loaded,
+            "kl_bound": self.settings.max_kl, "fallen_back": self.fallen_back,
+            "fixed": policy_label(self.fixed), "verdict": self.verdict,
+            "learnt_reward": vars(learned), "fixed_reward": vars(other),
         }  # fmt: skip
 
-    def told(self) -> str:
-        """One line for people."""
+    def summary(self) -> str:
+        """The status in one line for people."""
         with self._lock:
-            mine, other = self._judge.estimates
-        who = "the learnt policy decides"
+            learned, other = self._test.estimates
+        who = "the learned policy decides"
         if self.fallen_back:
-            who = f"fallen back, the learnt policy was {self.verdict}"
-        return f"learning: {who}; reward {mine}, {name_of(self.fixed)} {other}; {self.updates} updates"
+            who = f"fallen back, the learned policy was {self.verdict}"
+        return (
+            f"learning: {who}; reward {learned}, {policy_label(self.fixed)} {other}; {self.updates} updates"
+        )
 
     # --- inside -------------------------------------------------------------------------------------
 
-    def _change_over(self) -> None:
-        """The other one decides from now on; the caller holds the lock."""
-        worse = not self._judge.better
-        mine, other = self._judge.estimates
-        found = "worse" if worse else "better"
-        self.verdict = f"{found} than {name_of(self.fixed)} (of late {mine}, {name_of(self.fixed)} {other})"
+    def _switch(self) -> None:
+        """Put the other policy in charge; the caller holds the lock."""
+        worse = not self._test.better
+        learned, other = self._test.estimates
+        label = policy_label(self.fixed)
+        self.verdict = f"{'worse' if worse else 'better'} than {label} (of late {learned}, {label} {other})"
         self.fallen_back = self._soften = worse
-        # What they have earned until now has been judged.
-        self._judge = Judge(better=worse, false_every=self.leash.false_every)
-        log.info("the learnt policy is %s: %s", self.verdict, "fallen back" if worse else "it decides again")
+        # A new test: the rewards so far have been used.
+        self._test = SequentialTest(better=worse, false_alarm_every=self.settings.false_alarm_every)
+        log.info("the learned policy is %s: %s", self.verdict, "fallen back" if worse else "it decides again")
 
     def _exploring(self, actor: Actor) -> Actor:
-        return Exploring(actor.spec, actor.weights, self.leash.explore, usual=actor.usual)
+        return ExploringActor(
+            actor.spec, actor.weights, self.settings.explore, mean_features=actor.mean_features
+        )
 
-    def _held_back(self, before: Actor, after: Actor, features: NDArray[np.float64]) -> tuple[Actor, bool]:
-        """``after`` if it is in the trust region, else the farthest of a few points on the way to it that is,
-        else ``before``."""
-        if self._trusted(before, after, features):
+    def _within_trust_region(
+        self, before: Actor, after: Actor, features: NDArray[np.float64]
+    ) -> tuple[Actor, bool]:
+        """``after``, or the farthest point on the way to it, by repeated halving, that is within the trust
+        region; at worst ``before``. And whether the step was shortened."""
+        if self._is_trusted(before, after, features):
             return after, False
         part = 1.0
-        for _ in range(_HALVINGS):
+        for _ in range(_MAX_HALVINGS):
             part *= 0.5
             weights = {n: w + part * (after.weights[n] - w) for n, w in before.weights.items()}
             between = replace(after, weights=weights)
-            if self._trusted(before, between, features):
+            if self._is_trusted(before, between, features):
                 return between, True
         return before, True
 
-    def _trusted(self, before: Actor, after: Actor, features: NDArray[np.float64]) -> bool:
-        """Of the policies without their share of chance, which makes what acts differ less, never more."""
-        step, whole = divergence(before, after, features), divergence(self._loaded, after, features)
-        return step <= after.spec.target_kl and whole <= self.leash.bound
+    def _is_trusted(self, before: Actor, after: Actor, features: NDArray[np.float64]) -> bool:
+        """Without the uniform share, which only brings policies closer together."""
+        step, total = mean_kl(before, after, features), mean_kl(self._loaded, after, features)
+        return step <= after.spec.target_kl and total <= self.settings.max_kl
 
 
-def divergence(reference: Actor, actor: Actor, features: NDArray[np.float64]) -> float:
-    """Mean KL divergence KL(reference || actor) over states, in nats: of the categorical, or summed over the
-    cameras' Bernoullis (the condition K_t >= 1 aside, which hardly ever decides)."""
+def mean_kl(reference: Actor, actor: Actor, features: NDArray[np.float64]) -> float:
+    """Mean over states of KL(reference || actor) in nats.
+
+    Of the categorical, or summed over the cameras' Bernoullis; the condition K_t >= 1, which hardly ever
+    matters, is ignored. features: (B, N, width).
+    """
     p, q = reference.logits(features), actor.logits(features)
     if reference.spec.action == "select":
         share = 1.0 / (1.0 + np.exp(-np.clip(p, -500.0, 500.0)))
@@ -286,12 +298,5 @@ def divergence(reference: Actor, actor: Actor, features: NDArray[np.float64]) ->
 
 
 def _softened(actor: Actor) -> Actor:
-    last = {name: _SOFTENED * actor.weights[name] for name in ("out", "out_b")}
+    last = {name: _SOFTENING * actor.weights[name] for name in ("out", "out_b")}
     return replace(actor, weights={**actor.weights, **last})
-
-
-def name_of(policy: Policy) -> str:
-    """As people type it."""
-    if policy.name.startswith(BANDIT) or policy.value is None:
-        return policy.name
-    return f"{policy.name}:{policy.value:g}"

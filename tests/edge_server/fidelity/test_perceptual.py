@@ -21,7 +21,7 @@ from edge_server.fidelity.perceptual import (
     Perceptual,
     open_perceptual,
 )
-from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 
 RNG = np.random.default_rng(8)
 
@@ -121,11 +121,11 @@ def test_missing_and_damaged_files_give_one_reason(tmp_path):
 
 def test_a_score_has_it_only_where_it_is_listed_and_never_as_lpips():
     a, b = picture(), picture()[:, ::-1]
-    without = Scorer(perceptual=listed_metric(())).score("c", a, 0, b, 0)
-    listed = Scorer(perceptual=listed_metric(("perceptual",))).score("c", a, 0, b, 0)
+    without = Scorer(perceptual=open_listed_perceptual(())).score("c", a, 0, b, 0)
+    listed = Scorer(perceptual=open_listed_perceptual(("perceptual",))).score("c", a, 0, b, 0)
     assert without.perceptual is None and without.lpips is None
     assert listed.perceptual is not None and listed.perceptual > 0 and listed.lpips is None
-    small = Scorer(perceptual=listed_metric(("perceptual",))).score("c", a[:12], 0, b[:12], 0)
+    small = Scorer(perceptual=open_listed_perceptual(("perceptual",))).score("c", a[:12], 0, b[:12], 0)
     assert small.perceptual is None
 
 

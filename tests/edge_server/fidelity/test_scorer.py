@@ -7,7 +7,7 @@ import pytest
 
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
-from edge_server.fidelity.scorer import PENDING, Scorer, mean_score
+from edge_server.fidelity.scorer import MAX_PENDING, Scorer, mean_score
 from tests.conftest import data_dir
 
 MS = 1_000_000
@@ -76,7 +76,7 @@ def test_renderings_that_never_find_a_truth_do_not_pile_up():
     scorer = Scorer(period_ms=40)
     for i in range(100):
         scorer.publish("h", np.zeros((48, 48, 3), np.float32), i * MS)
-    assert scorer.unscored == 100 - PENDING
+    assert scorer.unscored == 100 - MAX_PENDING
 
 
 def test_a_slow_publication_still_finds_its_truth_and_its_motion():

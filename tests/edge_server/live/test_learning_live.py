@@ -12,13 +12,14 @@ import pytest
 from edge_server.cli import main
 from edge_server.config import LearnConfig, PolicyConfig, read_config
 from edge_server.live.server import EdgeServer, ServerOptions
-from edge_server.scheduler import read_policy
+from edge_server.scheduler import parse_policy
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import make_reward
 from edge_server.scheduler.learned.state import StateLayout
-from edge_server.scheduler.online.online_policy import Leash, name_of
+from edge_server.scheduler.online.online_policy import OnlineSettings
+from edge_server.scheduler.registry import policy_label
 from freshfield.scenario import ScenarioError
 from tests.edge_server.fields_for_tests import TINY
 from tests.edge_server.live.test_server import Feed, tiny_scenario, until
@@ -34,13 +35,14 @@ def policy(tmp_path):
 
 def server(tmp_path, policy, held_out=("cam00",), port=None, learn=None) -> EdgeServer:
     what = tiny_scenario(tmp_path, held_out)
-    config = replace(read_config(what), policy=PolicyConfig(*read_policy(policy)), learn=learn)
+    config = replace(read_config(what), policy=PolicyConfig(*parse_policy(policy)), learn=learn)
     options = ServerOptions(f"127.0.0.1:{port or free_port()}", tmp_path / "out")
     return EdgeServer(what, config, options)
 
 
 def test_it_decides_learns_and_leaves_what_it_learned(tmp_path, policy, monkeypatch):
-    monkeypatch.setattr("edge_server.scheduler.online.online_policy.Leash", lambda: Leash(batch=3, settle=2))
+    settings = OnlineSettings(batch=3, warmup=2)
+    monkeypatch.setattr("edge_server.scheduler.online.online_policy.OnlineSettings", lambda: settings)
     port = free_port()
     edge = server(tmp_path, f"bandit:{policy}", port=port, learn=LearnConfig("set", "threshold:200"))
     assert edge.state.policies[0] == f"bandit:{policy}" == edge.state.controls.policy
@@ -50,7 +52,7 @@ def test_it_decides_learns_and_leaves_what_it_learned(tmp_path, policy, monkeypa
     feed.start()
     try:
         until(lambda: edge.status()["learning"]["updates"] >= 2)
-        assert "learning: the learnt policy decides" in edge.state.learning()
+        assert "learning: the learned policy decides" in edge.state.learning()
         edge.state.set_policy("all", None)
         assert edge.state.learning() == ""
         edge.state.set_policy(f"bandit:{policy}", None)
@@ -83,11 +85,11 @@ def test_a_policy_that_cannot_learn_is_refused_in_one_line(held_out, name, said,
 
 def test_a_policy_learns_on_by_the_reward_it_was_trained_by_or_says_what_is_missing(tmp_path, policy):
     learner = Learner.load(policy)
-    learner.taught_by = asdict(make_reward("set", "moving", distance=-0.25))
+    learner.reward_fields = asdict(make_reward("set", "moving", distance=-0.25))
     learner.save(policy)
     by = server(tmp_path, f"bandit:{policy}", learn=LearnConfig()).trainer.reward
     assert (by.name, by.fidelity) == ("set", "moving") and by.distance in (-0.25, 0.0)
-    learner.taught_by = asdict(make_reward("set", distance_is="perceptual"))
+    learner.reward_fields = asdict(make_reward("set", distance_is="perceptual"))
     learner.save(policy)
     with pytest.raises(ScenarioError, match=r"edge.metrics: \[perceptual\]"):
         server(tmp_path, f"bandit:{policy}", learn=LearnConfig())
@@ -129,7 +131,7 @@ def test_a_file_that_only_decides_is_named_once_and_not_called_damaged(tmp_path,
     Actor.load(policy).save(decides)
     file = on_disk(tmp_path)
     said = refused(capsys, file, "--policy", f"bandit:{decides}", "--learn", "--out", str(tmp_path / "out"))
-    assert "nothing that it could go on learning with" in said and "damaged" not in said
+    assert "learning cannot resume from it" in said and "damaged" not in said
     assert said.count(file) == 1 and said.count(str(decides)) == 1
 
 
@@ -157,7 +159,7 @@ def test_a_scenario_says_that_its_policy_learns_and_the_command_has_the_last_wor
         return
     name, _, on = reward.partition(":")
     assert (trainer.reward.name, trainer.reward.fidelity) == (name, on or "whole")
-    assert name_of(trainer.apprentice.fixed) == fallback
+    assert policy_label(trainer.policy.fixed) == fallback
 
 
 def test_a_scenario_with_a_mistyped_key_of_learning_is_refused(tmp_path, policy, capsys):

@@ -58,10 +58,10 @@ def test_it_decides_by_what_cameras_see_and_every_decision_can_be_explained(tmp_
         thread.join(20)
         feed.stop()
     found = read_decision(tmp_path / "out", 1)
-    used = [c for c, chosen in zip(found.decided.state.cameras, found.decided.action) if chosen]
+    used = [c for c, chosen in zip(found.decision.state.cameras, found.decision.action) if chosen]
     published = next(p for p in server.state.publications() if p.number == 1)
     assert list(published.selected) == used
-    assert np.isfinite(found.decided.state.embeddings).any()
+    assert np.isfinite(found.decision.state.embeddings).any()
     assert explain([str(tmp_path / "out"), "--decision", "1"]) == 0
     assert "in the picture of" in capsys.readouterr().out
 

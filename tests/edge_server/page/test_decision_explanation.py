@@ -13,7 +13,7 @@ from edge_server.page.colours import AGAINST, FOR, css
 from edge_server.page.decision_explanation import WIDTH, Why, painted
 from edge_server.scheduler.learned.explain import explain
 from tests.edge_server.page.test_page import bare_state
-from tests.edge_server.scheduler.learned.test_decision_record import decided
+from tests.edge_server.scheduler.learned.test_decision_record import a_decision
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_it_is_hidden_while_nothing_was_learnt(gui):
 
 
 def test_a_decision_is_explained_once(gui):
-    state, now = bare_state(), decided(3)
+    state, now = bare_state(), a_decision(3)
     asked = []
     state.decision = lambda: asked.append(1) or now
     why = Why(gui, state)
@@ -45,14 +45,14 @@ def test_a_decision_is_explained_once(gui):
     why._text.content = "kept"
     why.refresh()
     assert why._text.content == "kept"
-    now = decided(4)
+    now = a_decision(4)
     why.refresh()
     assert "views" in why._text.content
     assert not why._button.visible  # nothing embeds here
 
 
 def test_regions_are_shown_when_somebody_asks(gui):
-    state, now = bare_state(), decided(3)
+    state, now = bare_state(), a_decision(3)
     state.decision, state.embed = lambda: now, colours
     why = Why(gui, state)
     why.refresh()
@@ -64,7 +64,7 @@ def test_regions_are_shown_when_somebody_asks(gui):
 
 
 def test_a_picture_that_cannot_be_decoded_is_passed_over(gui):
-    given = decided(3)
+    given = a_decision(3)
     frames = {c: replace(f, payload=b"\xff\xd8 nothing") for c, f in given.state.frames.items()}
     now = replace(given, state=replace(given.state, frames=frames))
     state = bare_state()
@@ -76,7 +76,7 @@ def test_a_picture_that_cannot_be_decoded_is_passed_over(gui):
 
 
 def test_the_text_names_what_counted_and_escapes_what_came_from_outside():
-    given = decided(1)
+    given = a_decision(1)
     found = explain(given.actor, given.state, given.action)
     html = markup.why(replace(found, names=("<b>x", *found.names[1:])))
     assert "<b>x" not in html and "&lt;b&gt;x" in html

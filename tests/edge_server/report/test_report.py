@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 
@@ -240,3 +241,27 @@ def test_a_deadline_is_told_with_the_share_of_updates_that_met_it():
     told = updates(series, {"deadline_ms": 100.0})
     assert (told["deadline_ms"], told["met_share"]) == (100.0, 0.75)
     assert "deadline_ms" not in updates(series, {})
+
+
+def test_the_stand_in_distance_is_never_shown_as_lpips(tmp_path, monkeypatch):
+    """Where LPIPS is missing, tiles, table and figure name the distance that took its place."""
+    from edge_server.report.figures import draw_fidelity
+    from edge_server.report.html import render_html
+
+    write_run(tmp_path)
+    report = build_report(tmp_path)
+    for values in (report["fidelity"]["final"], report["fidelity"]["mean"]):
+        values |= {"lpips": None, "perceptual": 0.4321}
+    page = render_html(report, {})
+    assert "<b>0.432</b><span>perceptual (not LPIPS)</span>" in page
+    heads = re.findall(r"<th[^>]*>([^<]*)</th>", page)
+    assert [head for head in heads if "LPIPS" in head] == ["LPIPS-alex", "perceptual (not LPIPS)"]
+
+    labels: list[str] = []
+    monkeypatch.setattr(
+        "matplotlib.axes.Axes.legend", lambda axes, **_: labels.extend(axes.get_legend_handles_labels()[1])
+    )
+    for row in report["fidelity"]["series"]:
+        row["perceptual"], row["lpips"] = row["lpips"], None
+    assert draw_fidelity(report, read_records(tmp_path), tmp_path / "fidelity.png")
+    assert [label for label in labels if "LPIPS" in label] == ["perceptual, not LPIPS (lower is better)"]

@@ -40,10 +40,10 @@ def test_threshold_takes_the_freshest_when_none_is_young_enough():
 
 def test_wait_counts_only_what_was_generated_after_the_decision():
     policy = make_policy("wait", 60, np.random.default_rng(0))
-    plan = policy.plan(AT)
-    assert (plan.wait_until_ns, plan.generated_after_ns) == (260 * MS, 200 * MS)
-    assert policy.select(epoch(260, a=200, b=201, c=259, d=10), plan) == ("b", "c")
-    assert policy.select(epoch(260, a=190, b=80), plan) == ()  # the wait goes on
+    window = policy.plan(AT)
+    assert (window.wait_until_ns, window.generated_after_ns) == (260 * MS, 200 * MS)
+    assert policy.select(epoch(260, a=200, b=201, c=259, d=10), window) == ("b", "c")
+    assert policy.select(epoch(260, a=190, b=80), window) == ()  # the wait goes on
 
 
 def test_wait_of_zero_uses_the_buffer_as_it_is():
@@ -91,9 +91,9 @@ def test_every_policy_selects_known_cameras_once_and_at_least_one(name, ages, no
     generated = {f"c{i}": now - round(a * MS) for i, a in enumerate(ages)}
     policy = make_policy(name, None, np.random.default_rng(0))
     at = Epoch(now, 0, generated)
-    plan = policy.plan(at)
-    assert plan.wait_until_ns <= now + 1000 * MS
-    chosen = policy.select(at, plan)
+    window = policy.plan(at)
+    assert window.wait_until_ns <= now + 1000 * MS
+    chosen = policy.select(at, window)
     assert len(set(chosen)) == len(chosen) and set(chosen) <= set(generated)
     # omega-wait may go on waiting: nothing was generated after the decision yet.
     assert bool(chosen) == bool(generated) or name in ("wait", "wait-flush")

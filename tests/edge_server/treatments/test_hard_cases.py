@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.supervision import check_view
-from edge_server.scheduler import TREATMENTS, make_policy, treatment_of
+from edge_server.scheduler import TREATMENTS, make_policy
 from freshfield.geometry import look_at
 from tests.edge_server.treatments.pictures import HEIGHT, MS, POSE, WIDTH, picture, seen, view
 
@@ -18,7 +18,7 @@ FRESH = seen(2000.0, "cam09")  # a young view, so that the others are stale
 
 def treat(name: str, now, before, at_ms: float = 2000.0):
     """The treated view. The treatment must not change its arguments."""
-    treatment = treatment_of(make_policy(name, None, np.random.default_rng(0)))
+    treatment = make_policy(name, None, np.random.default_rng(0)).treatment
     images = [v.image.copy() for v in (now, before) if v is not None]
     earlier = {} if before is None else {now.camera: before}
     out, beside = treatment.treat([now, FRESH], earlier, round(at_ms * MS))
@@ -124,4 +124,4 @@ def test_one_result_whatever_the_threads(name):
 
 def test_no_views_no_work():
     for name in TREATMENTS:
-        assert treatment_of(make_policy(name, None, np.random.default_rng(0))).treat([], {}, 0) == []
+        assert make_policy(name, None, np.random.default_rng(0)).treatment.treat([], {}, 0) == []

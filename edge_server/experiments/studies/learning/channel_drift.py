@@ -20,12 +20,12 @@ from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.trainer import Course
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler import Policy
-from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.state import StateLayout
-from edge_server.scheduler.online.online_policy import Apprentice, Leash
+from edge_server.scheduler.online.online_policy import OnlinePolicy, OnlineSettings
 
 EPISODES = {True: 40, False: 600}
 # Of one run, before and after the change.
@@ -124,15 +124,15 @@ def _one_run(school: School, name: str, change: Change, training: int, run: int)
     rng = np.random.default_rng([run, 7])
     policies: dict[str, Policy] = {
         "fixed": fixed(rng),
-        "learnt": Bandit(home.actor, "learnt", rng),
-        "still learning": Apprentice(
+        "learnt": BanditPolicy(home.actor, "learnt", rng),
+        "still learning": OnlinePolicy(
             Learner.load(home.folder / "policy.npz"),
             fixed(rng),
             "still learning",
             rng,
-            Leash(settle=0),  # as it is shipped, but for its first look at a deployment
+            OnlineSettings(warmup=0),  # as it is shipped, but for its first look at a deployment
         ),
-        "learnt afterwards": Bandit(there.actor, "learnt afterwards", rng),
+        "learnt afterwards": BanditPolicy(there.actor, "learnt afterwards", rng),
     }
     rewards: Rewards = {policy: [] for policy in POLICIES}
     number = 0
@@ -158,9 +158,9 @@ def _decide(
         found = [reward.of(outcome) for outcome in school.crew.evaluate(of, asked)]
         return [r.total if r.complete else None for r in found]
 
-    if isinstance(policy, Apprentice):
+    if isinstance(policy, OnlinePolicy):
         for k, total in enumerate(totals(setting)):
-            if policy.scored(first + k, total):
+            if policy.add_reward(first + k, total):
                 policy.learn()
     return [np.nan if total is None else total for total in totals(setting.judged)]
 

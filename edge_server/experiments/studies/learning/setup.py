@@ -29,7 +29,7 @@ from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.trainer import Course, Row, read_log, train
 from edge_server.experiments.training.scheduler.workers import Crew
 from edge_server.experiments.virtual.from_scenario import exact_scene
-from edge_server.scheduler import Epoch, Plan
+from edge_server.scheduler import Epoch, Policy, SelectionWindow
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
 from freshfield.files import write_json
@@ -102,7 +102,7 @@ def room(
     return Setting(scenario, report=report, **{"steps": 50 if more.get("scratch") else 20, **more})
 
 
-class Nearest:
+class Nearest(Policy):
     """The k cameras that stand nearest to those that reward, whatever their age: what can be won by knowing
     from where the reward comes, without looking at the state."""
 
@@ -110,7 +110,7 @@ class Nearest:
     parameter = "k"
 
     def __init__(self, setting: Setting, k: int) -> None:
-        self.value: float | None = float(k)
+        self.value = float(k)
         source = cast(WorldConfig, source_config(setting.scenario))
         scene, _ = exact_scene(setting.scenario, source)
         stand = {camera: pose[:3, 3] for camera, (_, pose) in scene.cameras.items()}
@@ -121,10 +121,7 @@ class Nearest:
         self._order = sorted(far, key=lambda c: far[c])
         self._k = k
 
-    def plan(self, epoch: Epoch) -> Plan:
-        return Plan(epoch.now_ns)
-
-    def select(self, epoch: Epoch, plan: Plan) -> tuple[str, ...]:
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
         near = set([c for c in self._order if c in epoch.generated_ns][: self._k])
         return tuple(c for c in epoch.generated_ns if c in near)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.training.scheduler.episode import Choice, Moment
-from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, treatment_of
+from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy
 from edge_server.scheduler.learned.learner_spec import Spec
 
 Maker = Callable[[np.random.Generator], Policy]
@@ -31,7 +31,7 @@ def choose(policy: Policy, moment: Moment, number: int | None = None) -> Choice:
             break
         at_ns = arrives_ns
         cameras = policy.select(_epoch(moment, at_ns, number), plan)
-    treatment = treatment_of(policy)
+    treatment = policy.treatment
     return Choice(tuple(cameras), at_ns, treatment.name if treatment else "")
 
 

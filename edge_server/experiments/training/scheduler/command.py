@@ -23,10 +23,11 @@ from edge_server.experiments.training.scheduler.trainer import REPORTS, Course, 
 from edge_server.experiments.training.scheduler.workers import Crew
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names
+from edge_server.scheduler import STATE_PARTS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
-from edge_server.scheduler.learned.rewards import REWARDS, Reward, available, make_reward
-from edge_server.scheduler.learned.state import PARTS, StateLayout
+from edge_server.scheduler.learned.rewards import REWARDS, Reward, make_reward, without_missing_lpips
+from edge_server.scheduler.learned.state import StateLayout
 from freshfield.files import write_json
 from freshfield.scenario import Scenario, ScenarioError, load
 
@@ -204,7 +205,7 @@ def reward_of(
     missing: str | None = "the scenario's edge.lpips is none"
     if network != "none":
         _, missing = open_lpips(lpips_folder, network)  # type: ignore[arg-type]
-    found = available(reward, missing)
+    found = without_missing_lpips(reward, missing)
     return found, None if found == reward else f"the reward has no term of distance: {missing}"
 
 
@@ -254,9 +255,11 @@ def _omegas(args: argparse.Namespace) -> tuple[float, ...] | None:
 
 def _parts(text: str) -> tuple[str, ...]:
     asked = set(text.split(","))
-    if unknown := asked - set(PARTS):
-        raise ValueError(f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(PARTS)}")
-    return tuple(part for part in PARTS if part in asked)
+    if unknown := asked - set(STATE_PARTS):
+        raise ValueError(
+            f"--parts: there is no {', '.join(sorted(unknown))}; choose of {', '.join(STATE_PARTS)}"
+        )
+    return tuple(part for part in STATE_PARTS if part in asked)
 
 
 def _check(args: argparse.Namespace, course: Course) -> None:
@@ -300,7 +303,10 @@ def _parser() -> argparse.ArgumentParser:
         "else one of the training cameras]")  # fmt: skip
     add("--same-motion", action="store_true", help="the scene's own motion in every episode")
     add(
-        "--parts", default="age,pose", metavar="P,...", help=f"of the state: {', '.join(PARTS)} [%(default)s]"
+        "--parts",
+        default="age,pose",
+        metavar="P,...",
+        help=f"of the state: {', '.join(STATE_PARTS)} [%(default)s]",
     )
     add("--omegas", metavar="MS,...", help="what threshold and wait choose from")
     add("--network", choices=("pooled", "flat"), default="pooled",

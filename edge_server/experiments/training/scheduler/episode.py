@@ -28,13 +28,13 @@ from edge_server.experiments.virtual.from_scenario import deploy, exact_scene, t
 from edge_server.experiments.virtual.truth import ExactTruth
 from edge_server.experiments.virtual.virtual_deployment import Terms, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
-from edge_server.fidelity.scorer import Scorer, listed_metric
+from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.live.buffer import BufferedFrame, FrameBuffer
 from edge_server.live.view_decoder import ViewDecoder
-from edge_server.scheduler import make_policy, treatment_of
-from edge_server.scheduler.learned.observation import Embeddings, observe
+from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.observation import FrameEmbeddings, observe
 from edge_server.scheduler.learned.state import State
 from freshfield.frame import Frame
 from freshfield.scenario import Scenario, ScenarioError
@@ -175,7 +175,7 @@ class Ground:
             if scene.moving and effects is NO_EFFECTS and not self._moving:
                 self._period_ns = round(scene.period_s * 1e9)
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips, edge.lpips)[0]  # type: ignore[arg-type]
-        self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=listed_metric(edge.metrics))
+        self._scorer = Scorer(lpips, edge.noisy_truth, perceptual=open_listed_perceptual(edge.metrics))
         self.setting, self.folders = setting, folders
         self._shared = None if self._moving else self._stage(scenario)
         self._field: tuple[int, Field] | None = None
@@ -195,7 +195,7 @@ class Ground:
         """The pictures of an episode."""
         return self._shared or self._stage(self.scenario(seed))
 
-    def embeddings(self) -> Embeddings | None:
+    def embeddings(self) -> FrameEmbeddings | None:
         """Of one episode: frames of the same number are other pictures in the next."""
         if self._embedder is None:
             return None
@@ -297,7 +297,7 @@ class Episode:
             before = moment.earlier(choice.at_ns)
             earlier = self._decoded([before[c] for c in choice.cameras if c in before])
             by_camera = {view.camera: view for view in earlier}
-            treatment = treatment_of(make_policy(choice.treatment, None, np.random.default_rng(0)))
+            treatment = make_policy(choice.treatment, None, np.random.default_rng(0)).treatment
             assert treatment is not None
             shown = treatment.treat(views, by_camera, published_ns)
         field = self._ground.field(self.seed)

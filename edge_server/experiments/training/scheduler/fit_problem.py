@@ -2,7 +2,7 @@
 
 with Crew(folders) as crew:
     problem = FitProblem(setting, Spec("select"), make_reward("set"), crew)
-    environment = ...                      # scheduler.learned.environment, with gymnasium's interface
+    environment = ...                      # scheduler.learned.gym_environment, with gymnasium's interface
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class FitProblem:
 
 @dataclass(frozen=True)
 class FitDecision:
-    """``scheduler.learned.problem.Decision``."""
+    """``scheduler.learned.problem.Round``."""
 
     problem: FitProblem
     moment: Moment

@@ -24,7 +24,7 @@ from edge_server.experiments.training.scheduler.episode import Moment, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.workers import Crew, Progress
 from edge_server.scheduler.learned.learner_spec import Spec
-from edge_server.scheduler.learned.rewards import Reward, Rewarded
+from edge_server.scheduler.learned.rewards import Reward, RewardTerms
 from freshfield.files import write_json, write_text
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable
         for name in ("policy.npz", *REPORTS):
             (out / name).unlink(missing_ok=True)
         learner = _new_learner(setting, course, crew)
-    learner.taught_by = dataclasses.asdict(course.reward)
+    learner.reward_fields = dataclasses.asdict(course.reward)
     for number in range(first, course.batches):
         at = time.monotonic()
         row = _one_batch(setting, course, crew, learner, number, say)
@@ -161,7 +161,7 @@ def told_now_and_then(say: Callable[[str], None], what: str) -> Progress:
     return told
 
 
-def _why_not(outcomes: list[Outcome], found: list[Rewarded]) -> str:
+def _why_not(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
     """Why not one of these has a reward, and what to do."""
     if not any(outcome.views for outcome in outcomes):
         return "nothing had arrived at any decision of the first batch: look at the scenario's channel"
@@ -197,7 +197,7 @@ def _new_learner(setting: Setting, course: Course, crew: Crew) -> Learner:
     spec = course.spec
     if "semantics" in spec.layout.parts and not spec.layout.centre:
         first: list[Moment] = [m for e in crew.draw(setting, course.seeds(0)) for m in e]
-        spec = dataclasses.replace(spec, layout=spec.layout.standardised([m.state for m in first]))
+        spec = dataclasses.replace(spec, layout=spec.layout.standardized([m.state for m in first]))
     return Learner(spec, course.seed)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from edge_server.experiments.studies.command import LEARNING, STUDIES, main, make_study
 from edge_server.experiments.studies.engine import Engine
-from edge_server.experiments.studies.study import Ask, Point, Table, objective, run_study
+from edge_server.experiments.studies.study import Ask, Point, Table, run_study
 from edge_server.experiments.studies.trial import Folders
 from edge_server.scheduler import make_policy
 
@@ -212,14 +212,6 @@ def test_phase_says_what_can_be_won_and_by_whom(tmp_path: Path):
     trade, mask, freshen = ({v.verdict for v in found[i::3]} for i in range(3))
     assert (trade, mask, freshen) == ({"does not hold"}, {"does not hold"}, {"holds"})
     assert (tmp_path / "phase-room.png").exists()
-
-
-def test_f_w_with_the_thesis_weights():
-    """-.02 * 30 + .2 * .8 + .3 * .25 + .015 * 40, and none where LPIPS is missing."""
-    row = {"psnr_db": 30.0, "ssim": 0.8, "lpips": 0.25, "aaoi_ms": 40.0}
-    assert objective(row) == pytest.approx(0.235)
-    assert objective(row, w_s=-0.2) == pytest.approx(-0.085)
-    assert objective({**row, "lpips": None}) is None
 
 
 def test_a_table_selects_by_labels():

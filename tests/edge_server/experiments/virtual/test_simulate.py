@@ -69,7 +69,7 @@ def test_what_a_learnt_policy_decided_can_be_explained_as_of_a_live_run(tmp_path
     assert "in virtual time nobody learns" in capsys.readouterr().err
     lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     for number in (0, lines[-1]["number"]):
-        decided = read_decision(out, number).decided
+        decided = read_decision(out, number).decision
         used = [c for c, chosen in zip(decided.state.cameras, decided.action) if chosen]
         assert lines[number]["selected"] == used
     assert explain([str(out)]) == 0

@@ -10,8 +10,8 @@ import pytest
 from edge_server.config import read_config
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
-from edge_server.scheduler import Epoch, help_of, make_live_policy, make_policy, read_policy
-from edge_server.scheduler.learned.bandit import Bandit
+from edge_server.scheduler import Epoch, make_live_policy, make_policy, parse_policy, policy_help
+from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import State, StateLayout
@@ -30,7 +30,7 @@ def policy(action, favourite=None, **layout):
     actor = learner.actor
     if favourite is not None:
         actor = replace(actor, weights={**actor.weights, "out_b": 9.0 * np.eye(len(OMEGAS_MS))[favourite]})
-    return Bandit(actor, "bandit:test", np.random.default_rng(0))
+    return BanditPolicy(actor, "bandit:test", np.random.default_rng(0))
 
 
 def epoch(now_ms, **generated_ms):
@@ -74,7 +74,7 @@ def test_a_set_is_chosen_when_views_are_selected_and_is_never_empty():
         p.actor = replace(actor, weights={**actor.weights, "out_b": np.array([bias])})
         chosen = p.select(epoch(100, a=50, b=0), p.plan(AT))
         assert set(chosen) == expected if expected else len(chosen) == 1
-    assert p.last is not None and p.last.now_ns == 100 * MS and p.last.number == 7
+    assert p.last_decision is not None and p.last_decision.now_ns == 100 * MS and p.last_decision.number == 7
 
 
 def test_nothing_is_selected_while_nothing_is_there():
@@ -86,7 +86,7 @@ def test_nothing_is_selected_while_nothing_is_there():
 def test_exploring_draws_and_repeats_with_its_seed():
     def drawn(seed):
         p = policy("select")
-        p = Bandit(p.actor, p.name, np.random.default_rng(seed), explore=True)
+        p = BanditPolicy(p.actor, p.name, np.random.default_rng(seed), explore=True)
         return [p.select(AT, p.plan(AT)) for _ in range(20)]
 
     assert drawn(1) == drawn(1) != drawn(2)
@@ -98,7 +98,7 @@ def test_it_is_made_by_name(tmp_path):
     name = f"bandit:{tmp_path / 'p.npz'}"
     for make in (make_policy, make_live_policy):
         assert make(name, None, np.random.default_rng(0)).name == name
-    assert "learnt" in help_of(name)
+    assert "learned" in policy_help(name)
     with pytest.raises(ValueError, match="no value"):
         make_policy(name, 3.0, np.random.default_rng(0))
     with pytest.raises(ValueError, match="no such"):
@@ -107,9 +107,9 @@ def test_it_is_made_by_name(tmp_path):
 
 def test_a_file_is_relative_to_where_it_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert read_policy("bandit:runs/p.npz") == (f"bandit:{tmp_path}/runs/p.npz", None)
-    assert read_policy("bandit:/a:b.npz") == ("bandit:/a:b.npz", None)
-    assert read_policy("threshold:120") == ("threshold", 120.0)
+    assert parse_policy("bandit:runs/p.npz") == (f"bandit:{tmp_path}/runs/p.npz", None)
+    assert parse_policy("bandit:/a:b.npz") == ("bandit:/a:b.npz", None)
+    assert parse_policy("threshold:120") == ("threshold", 120.0)
     data = {"name": "tiny", "seed": 3, "cameras": {"count": 3}, "edge": {"policy": {"name": "bandit:p.npz"}}}
     made = scenario.parse(data, tmp_path / "there" / "tiny.yaml")
     assert read_config(made).policy.name == f"bandit:{tmp_path}/there/p.npz"
@@ -142,8 +142,8 @@ def test_the_loop_shows_a_policy_the_state_of_its_buffer():
     p = policy("select", parts=("age", "semantics"), dim=1)
     u = updates(p, Brightness())
     selection = u.select(u.plan(60 * MS), 60 * MS)
-    assert selection is not None and p.last is not None
-    s = p.last.state
+    assert selection is not None and p.last_decision is not None
+    s = p.last_decision.state
     np.testing.assert_array_equal(s.ages_ms, [60, np.nan, 50])
     assert s.embeddings is not None and np.isnan(s.embeddings[1]).all()
     assert 40 < s.embeddings[0, 0] < s.embeddings[2, 0] < 100  # frames grow brighter with their number

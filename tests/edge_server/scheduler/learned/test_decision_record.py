@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.bandit import Decided
-from edge_server.scheduler.learned.decision_record import FOLDER, DecisionRecord, read_decision
+from edge_server.scheduler.learned.bandit import Decision
+from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import StateLayout
@@ -18,12 +18,12 @@ from tests.edge_server.scheduler.learned.problems import state
 LAYOUT = StateLayout(("age", "pose", "semantics"), dim=3)
 
 
-def decided(number=0, seed=0, n=4):
+def a_decision(number=0, seed=0, n=4):
     actor = Learner(Spec("select", LAYOUT), seed).actor
     s = state(n, np.random.default_rng(number), d=3, silent=1)
     s = replace(s, frames={c: frame(c, sequence=number) for c in s.cameras[:2]})
     actions, logps = actor.act([s])
-    return Decided(number, 10**9 * number, s, actions[0], float(logps[0]), actor)
+    return Decision(number, 10**9 * number, s, actions[0], float(logps[0]), actor)
 
 
 def names(folder, pattern="*.npz"):
@@ -31,10 +31,10 @@ def names(folder, pattern="*.npz"):
 
 
 def test_a_decision_comes_back_as_it_was(tmp_path):
-    given = decided(7)
-    DecisionRecord(tmp_path, {"model": "default", "dim": 3}).write(given)
+    given = a_decision(7)
+    DecisionWriter(tmp_path, {"model": "default", "dim": 3}).write(given)
     found = read_decision(tmp_path, 7)
-    back = found.decided
+    back = found.decision
     assert (back.number, back.now_ns, back.logp) == (given.number, given.now_ns, given.logp)
     np.testing.assert_array_equal(back.action, given.action)
     for name in ("ages_ms", "poses", "embeddings", "reported"):
@@ -48,63 +48,63 @@ def test_a_decision_comes_back_as_it_was(tmp_path):
 
 
 def test_the_newest_is_found_without_its_number(tmp_path):
-    record = DecisionRecord(tmp_path)
+    record = DecisionWriter(tmp_path)
     for number in (9, 10, 11):
-        record.write(decided(number))
-    assert read_decision(tmp_path).decided.number == 11
+        record.write(a_decision(number))
+    assert read_decision(tmp_path).decision.number == 11
 
 
 def test_the_oldest_make_room_and_with_them_policies_that_nobody_needs(tmp_path):
-    record = DecisionRecord(tmp_path, most=3)
+    record = DecisionWriter(tmp_path, max_decisions=3)
     for number in range(6):
-        record.write(decided(number, seed=number // 3))
+        record.write(a_decision(number, seed=number // 3))
     folder = tmp_path / FOLDER
     assert names(folder, "0*") == ["000003.npz", "000004.npz", "000005.npz"]
     assert len(names(folder, "policy-*")) == 1
-    again = DecisionRecord(tmp_path, most=3)  # another process of the same run goes on
-    again.write(decided(6))
+    again = DecisionWriter(tmp_path, max_decisions=3)  # another process of the same run goes on
+    again.write(a_decision(6))
     assert names(folder, "0*") == ["000004.npz", "000005.npz", "000006.npz"]
 
 
 def test_a_run_that_begins_anew_in_the_same_folder_forgets_the_earlier_one(tmp_path):
-    first = DecisionRecord(tmp_path, most=4)
+    first = DecisionWriter(tmp_path, max_decisions=4)
     for number in range(4):
-        first.write(decided(number))
-    again = DecisionRecord(tmp_path, most=4)
-    again.write(decided(0, seed=1))
-    again.write(decided(1, seed=1))
+        first.write(a_decision(number))
+    again = DecisionWriter(tmp_path, max_decisions=4)
+    again.write(a_decision(0, seed=1))
+    again.write(a_decision(1, seed=1))
     assert names(tmp_path / FOLDER, "0*") == ["000000.npz", "000001.npz"]
-    newest, other = read_decision(tmp_path).decided, decided(1, seed=1)
+    newest, other = read_decision(tmp_path).decision, a_decision(1, seed=1)
     assert newest.number == 1
     np.testing.assert_array_equal(newest.actor.weights["in"], other.actor.weights["in"])
 
 
 def test_bytes_are_bounded_but_the_newest_always_stays(tmp_path):
-    record = DecisionRecord(tmp_path, most_bytes=1)
+    record = DecisionWriter(tmp_path, max_bytes=1)
     for number in range(3):
-        record.write(decided(number))
+        record.write(a_decision(number))
     assert names(tmp_path / FOLDER, "0*") == ["000002.npz"]
 
 
 def test_what_cannot_be_written_is_counted(tmp_path):
     (tmp_path / FOLDER).write_text("a file where the folder should be")
-    record = DecisionRecord(tmp_path)
-    record.write(decided(0))
-    record.write(decided(1))
+    record = DecisionWriter(tmp_path)
+    record.write(a_decision(0))
+    record.write(a_decision(1))
     assert record.lost == 2
 
 
 def test_what_is_not_there_is_said(tmp_path):
     with pytest.raises(ValueError, match=r"no decisions are recorded: .*simulate .*bandit:FILE"):
         read_decision(tmp_path)
-    DecisionRecord(tmp_path).write(decided(5))
+    DecisionWriter(tmp_path).write(a_decision(5))
     with pytest.raises(ValueError, match="decision 4 is not recorded; from 5 to 5"):
         read_decision(tmp_path, 4)
 
 
 def test_damage_is_named(tmp_path):
-    record = DecisionRecord(tmp_path)
-    record.write(decided(0))
+    record = DecisionWriter(tmp_path)
+    record.write(a_decision(0))
     path = tmp_path / FOLDER / "000000.npz"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -117,7 +117,7 @@ def test_damage_is_named(tmp_path):
 
 
 def test_a_frame_that_was_damaged_on_the_way_has_no_picture(tmp_path):
-    given = decided(0)
+    given = a_decision(0)
     broken = {**given.state.frames, "cam01": frame("cam01", payload=b"\xff\xd8 nothing")}
-    DecisionRecord(tmp_path).write(replace(given, state=replace(given.state, frames=broken)))
+    DecisionWriter(tmp_path).write(replace(given, state=replace(given.state, frames=broken)))
     assert list(read_decision(tmp_path, 0).images) == ["cam00"]

@@ -10,11 +10,11 @@ import torch
 
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned.distributions import (
-    draw_omegas,
-    draw_sets,
-    likeliest_set,
+    most_probable_set,
     omega_entropy,
     omega_log_probabilities,
+    sample_omegas,
+    sample_sets,
     set_entropy,
     set_log_probability,
 )
@@ -79,8 +79,8 @@ def test_with_nobody_there_the_empty_set_is_certain():
     logp.sum().backward()
     assert logp.item() == 0.0
     assert logits.grad is not None and not logits.grad.any()
-    assert not draw_sets(zero, zero, np.random.default_rng(0)).any()
-    assert not likeliest_set(zero, zero).any()
+    assert not sample_sets(zero, zero, np.random.default_rng(0)).any()
+    assert not most_probable_set(zero, zero).any()
 
 
 @pytest.mark.parametrize("scale", [1.0, 30.0, 800.0, 1e4])
@@ -109,7 +109,7 @@ def test_gradients_are_finite_and_those_of_finite_differences(scale):
 def test_sets_are_drawn_as_often_as_their_probability_says(logits):
     logits = np.array(logits)
     count = 20_000
-    drawn = draw_sets(np.tile(logits, (count, 1)), np.ones((count, 4)), np.random.default_rng(5))
+    drawn = sample_sets(np.tile(logits, (count, 1)), np.ones((count, 4)), np.random.default_rng(5))
     assert drawn.any(axis=1).all()
     codes = drawn @ (1 << np.arange(4))
     seen = np.bincount(codes, minlength=16)[ALL.astype(int) @ (1 << np.arange(4))] / count
@@ -117,13 +117,13 @@ def test_sets_are_drawn_as_often_as_their_probability_says(logits):
     assert (np.abs(seen - p) < 4.5 * np.sqrt(p * (1 - p) / count) + 1e-9).all()
 
 
-def test_the_likeliest_set_is_the_likeliest_of_all():
+def test_the_most_probable_set_is_the_likeliest_of_all():
     rng = np.random.default_rng(6)
     for shift in (-3.0, 0.0, 3.0):
         for _ in range(50):
             logits = rng.standard_normal(4) + shift
             best = ALL[np.argmax(every_set(logits))]
-            found = likeliest_set(logits[None], np.ones((1, 4)))[0]
+            found = most_probable_set(logits[None], np.ones((1, 4)))[0]
             np.testing.assert_array_equal(found, best > 0)
 
 
@@ -140,11 +140,11 @@ def test_entropy_of_sets_and_of_omegas():
 
 def test_omegas_are_drawn_as_often_as_their_probability_says():
     logits = np.array([0.0, 1.0, -2.0])
-    drawn = draw_omegas(np.tile(logits, (20_000, 1)), np.random.default_rng(7))
+    drawn = sample_omegas(np.tile(logits, (20_000, 1)), np.random.default_rng(7))
     p = np.exp(omega_log_probabilities(np, logits[None]))[0]
     seen = np.bincount(drawn, minlength=3) / len(drawn)
     assert (np.abs(seen - p) < 4.5 * np.sqrt(p * (1 - p) / len(drawn))).all()
-    certain = draw_omegas(np.tile([-1e4, 0.0, -1e4], (100, 1)), np.random.default_rng(8))
+    certain = sample_omegas(np.tile([-1e4, 0.0, -1e4], (100, 1)), np.random.default_rng(8))
     assert (certain == 1).all()
 
 
@@ -152,7 +152,7 @@ def test_numpy_and_torch_agree():
     rng = np.random.default_rng(9)
     logits, mask = 5.0 * rng.standard_normal((40, 4)), (rng.random((40, 4)) < 0.8).astype(float)
     mask[:, 0] = 1.0
-    chosen = draw_sets(logits, mask, rng).astype(float)
+    chosen = sample_sets(logits, mask, rng).astype(float)
     found = set_log_probability(np, logits, mask, chosen)
     other = set_log_probability(torch, *(torch.tensor(a) for a in (logits, mask, chosen)))
     np.testing.assert_allclose(found, other.numpy(), rtol=1e-12, atol=1e-12)
@@ -161,9 +161,9 @@ def test_numpy_and_torch_agree():
 @pytest.mark.parametrize("action", ["select", "wait"])
 def test_with_a_share_of_chance_no_probability_touches_0_or_1_and_gradients_stay_finite(action):
     logits = np.array([[-1e4, -40.0, 0.0, 40.0, 1e4], [0.3, -2.0, 1.0, 0.0, 5.0]])
-    found = d.with_chance(np, action, logits, 0.02)
+    found = d.mix_uniform(np, action, logits, 0.02)
     given = torch.tensor(logits, requires_grad=True)
-    same = d.with_chance(torch, action, given, 0.02)
+    same = d.mix_uniform(torch, action, given, 0.02)
     same.sum().backward()
     np.testing.assert_allclose(same.detach().numpy(), found, rtol=1e-12)
     assert torch.isfinite(given.grad).all()
@@ -172,4 +172,4 @@ def test_with_a_share_of_chance_no_probability_touches_0_or_1_and_gradients_stay
     if action == "wait":
         own = np.exp(logits - np.logaddexp.reduce(logits, axis=1, keepdims=True))
     np.testing.assert_allclose(p, 0.98 * own + 0.02 / (2 if action == "select" else 5), rtol=1e-9)
-    assert d.with_chance(np, action, logits, 0.0) is logits
+    assert d.mix_uniform(np, action, logits, 0.0) is logits

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.explain import explain, firmness, occlusion
+from edge_server.scheduler.learned.explain import action_logit, explain, occlusion_map
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import StateLayout
@@ -23,7 +23,7 @@ def untaught(action, seed=0):
     return replace(
         actor,
         weights={**actor.weights, "out": 50.0 * actor.weights["out"]},
-        usual=rng.standard_normal(LAYOUT.width),
+        mean_features=rng.standard_normal(LAYOUT.width),
     )
 
 
@@ -33,22 +33,22 @@ def test_shares_sum_to_the_whole(action, n, silent):
     actor, s = untaught(action), state(n, np.random.default_rng(n), d=3, silent=silent)
     chosen = actor.act([s])[0][0]
     found = explain(actor, s, chosen, pairs=4)
-    assert sum(found.parts.values()) == pytest.approx(found.firmness - found.usual, abs=1e-9)
-    assert found.cameras.sum() == pytest.approx(found.firmness - found.usual, abs=1e-9)
+    assert sum(found.parts.values()) == pytest.approx(found.logit - found.baseline_logit, abs=1e-9)
+    assert found.cameras.sum() == pytest.approx(found.logit - found.baseline_logit, abs=1e-9)
     assert set(found.parts) == {"age", "pose", "semantics"}
     assert not found.cameras[n - silent :].any()
-    assert abs(found.firmness - found.usual) > 1e-3
+    assert abs(found.logit - found.baseline_logit) > 1e-3
 
 
 def test_the_logit_explained_is_that_of_the_action():
     actor, s = untaught("wait"), state(5, np.random.default_rng(0), d=3)
     x = LAYOUT.features(s)[None]
     (best,), (logp,) = actor.act([s])
-    assert firmness(actor, x, best)[0] == pytest.approx(np.log(np.exp(logp) / (1 - np.exp(logp))))
+    assert action_logit(actor, x, best)[0] == pytest.approx(np.log(np.exp(logp) / (1 - np.exp(logp))))
     chooser = untaught("select")
     own = chooser.logits(x)
-    assert firmness(chooser, x, own[0] > 0)[0] == pytest.approx(np.abs(own).sum())
-    assert firmness(chooser, x, own[0] < 0)[0] == pytest.approx(-np.abs(own).sum())
+    assert action_logit(chooser, x, own[0] > 0)[0] == pytest.approx(np.abs(own).sum())
+    assert action_logit(chooser, x, own[0] < 0)[0] == pytest.approx(-np.abs(own).sum())
 
 
 def test_cameras_of_two_are_exact():
@@ -57,10 +57,10 @@ def test_cameras_of_two_are_exact():
     chosen = actor.act([s])[0][0]
     found = explain(actor, s, chosen, pairs=3)
     np.testing.assert_allclose(found.cameras_error, 0.0, atol=1e-12)
-    x, usual = LAYOUT.features(s), np.tile(actor.usual, (2, 1))
+    x, usual = LAYOUT.features(s), np.tile(actor.mean_features, (2, 1))
     usual[:, -1] = 1.0
     only = np.stack([np.stack([x[0], usual[1]]), np.stack([usual[0], x[1]]), usual, x])
-    a, b, none, both = firmness(actor, only, chosen)
+    a, b, none, both = action_logit(actor, only, chosen)
     np.testing.assert_allclose(found.cameras, [0.5 * (a - none + both - b), 0.5 * (b - none + both - a)])
 
 
@@ -109,7 +109,7 @@ def test_the_region_that_differs_is_the_one_that_moved_it():
     z = s.embeddings.copy()
     z[1] = brightness([image])[0]
     s = replace(s, embeddings=z)
-    found = occlusion(actor, s, actor.act([s])[0][0], 1, image, brightness)
+    found = occlusion_map(actor, s, actor.act([s])[0][0], 1, image, brightness)
     assert np.unravel_index(np.abs(found).argmax(), found.shape) == (5, 2)
     assert np.abs(np.delete(found.ravel(), 5 * 8 + 2)).max() == 0.0
 
@@ -117,11 +117,11 @@ def test_the_region_that_differs_is_the_one_that_moved_it():
 def test_a_picture_smaller_than_the_grid_is_no_problem():
     actor, s = untaught("wait"), state(2, np.random.default_rng(4), d=3)
     tiny = np.zeros((3, 5, 3), np.uint8)
-    assert np.isfinite(occlusion(actor, s, 0, 0, tiny, brightness)).all()
+    assert np.isfinite(occlusion_map(actor, s, 0, 0, tiny, brightness)).all()
 
 
 def test_a_policy_that_looks_at_no_pictures_says_so():
     learner = Learner(Spec("select", FreshOnes.layout), 0)
     s = state(3, np.random.default_rng(0))
     with pytest.raises(ValueError, match="no pictures"):
-        occlusion(learner.actor, s, learner.greedy(s), 0, np.zeros((8, 8, 3), np.uint8), brightness)
+        occlusion_map(learner.actor, s, learner.greedy(s), 0, np.zeros((8, 8, 3), np.uint8), brightness)

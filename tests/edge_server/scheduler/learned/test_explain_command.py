@@ -8,21 +8,21 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.bandit import Decided
-from edge_server.scheduler.learned.decision_record import DecisionRecord
+from edge_server.scheduler.learned.bandit import Decision
+from edge_server.scheduler.learned.decision_record import DecisionWriter
 from edge_server.scheduler.learned.explain_command import main
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
-from tests.edge_server.scheduler.learned.test_decision_record import decided
+from tests.edge_server.scheduler.learned.test_decision_record import a_decision
 
 
 def ages_only(run):
     actor = Learner(Spec("wait", StateLayout(("age",)), OMEGAS_MS), 0).actor
     s = state(3, np.random.default_rng(0))
     (action,), (logp,) = actor.act([s])
-    DecisionRecord(run).write(Decided(4, 0, s, np.asarray(action), float(logp), actor))
+    DecisionWriter(run).write(Decision(4, 0, s, np.asarray(action), float(logp), actor))
 
 
 def test_a_decision_by_ages_is_explained(tmp_path, capsys):
@@ -46,7 +46,7 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
 
     model = detector(tmp_path / "d.onnx")
     embedding = {"model": str(model), "dim": 3, "provider": "cpu"}
-    DecisionRecord(tmp_path, embedding).write(decided(2))
+    DecisionWriter(tmp_path, embedding).write(a_decision(2))
     asked = [str(tmp_path), "--decision", "2", "--camera", "cam01", "--json", str(tmp_path / "e.json")]
     assert main(asked) == 0
     assert "in the picture of cam01 most by the region in row" in capsys.readouterr().out
@@ -65,7 +65,7 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
 def test_where_frames_cannot_be_embedded_again_the_rest_is_told(embedding, says, tmp_path, capsys):
     pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
     pytest.importorskip("onnx", reason="the extra embed is not installed")
-    DecisionRecord(tmp_path, embedding).write(decided(2))
+    DecisionWriter(tmp_path, embedding).write(a_decision(2))
     assert main([str(tmp_path), "--json", str(tmp_path / "e.json")]) == 0
     told = capsys.readouterr()
     assert "by part of the state" in told.out and "in the picture" not in told.out

@@ -18,7 +18,7 @@ WAIT = Spec("wait", LAYOUT, OMEGAS_MS)
 
 def actor(spec, seed=0):
     """Weights with a last layer large enough that outputs differ."""
-    weights = networks.new_actor(spec, np.random.default_rng(seed))
+    weights = networks.init_actor(spec, np.random.default_rng(seed))
     return {**weights, "out": 100.0 * weights["out"]}
 
 
@@ -34,7 +34,7 @@ def test_one_set_of_weights_takes_any_number_of_cameras(spec, n):
     assert found.shape == ((5, n) if spec.action == "select" else (5, len(OMEGAS_MS)))
     assert np.isfinite(found).all()
     assert networks.value(
-        np, spec, networks.new_value(spec, np.random.default_rng(0)), features(n)
+        np, spec, networks.init_value(spec, np.random.default_rng(0)), features(n)
     ).shape == (5,)
 
 
@@ -82,9 +82,9 @@ def test_a_flat_network_says_that_it_has_another_number_of_cameras():
 
 
 @pytest.mark.parametrize("start", [0.1, 0.5, 0.9])
-def test_before_anything_is_learnt_every_camera_has_the_probability_asked_for(start):
+def test_before_anything_is_learned_every_camera_has_the_probability_asked_for(start):
     spec = Spec("select", LAYOUT, start=start)
-    weights = networks.new_actor(spec, np.random.default_rng(0))
+    weights = networks.init_actor(spec, np.random.default_rng(0))
     p = 1.0 / (1.0 + np.exp(-networks.logits(np, spec, weights, features(18))))
     assert np.abs(p - start).max() < 0.03
 
@@ -106,7 +106,7 @@ def test_before_anything_is_learnt_every_camera_has_the_probability_asked_for(st
         ({"action": "select", "entropy": -1.0}, "not negative"),
     ],
 )
-def test_what_cannot_be_learnt_is_refused(words, says):
+def test_what_cannot_be_learned_is_refused(words, says):
     with pytest.raises(ValueError, match=says):
         Spec(**words)
 

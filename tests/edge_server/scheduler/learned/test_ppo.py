@@ -4,13 +4,15 @@ in a checkpoint."""
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.actor import MOST_BYTES, Actor
+from edge_server.scheduler.learned.actor import MAX_BYTES, Actor
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.problem import collect
@@ -27,7 +29,7 @@ def select(**more) -> Spec:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_sets_are_learnt_in_512_decisions(seed):
+def test_sets_are_learned_in_512_decisions(seed):
     """A random set loses .35, an untrained network .01 to .6 of a gain of .5; noise of a reward is .1."""
     learner = Learner(select(), seed)
     teach(learner, FreshOnes(), 8)
@@ -35,20 +37,20 @@ def test_sets_are_learnt_in_512_decisions(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_omegas_are_learnt_in_512_decisions(seed):
+def test_omegas_are_learned_in_512_decisions(seed):
     """A random omega loses .104 here, the best fixed one .05."""
     learner = Learner(Spec("wait", Waits().layout, OMEGAS_MS), seed)
     teach(learner, Waits(), 8)
     assert regret(learner, Waits()) < 0.02
 
 
-def test_no_fixed_omega_is_as_good_as_what_was_learnt():
+def test_no_fixed_omega_is_as_good_as_what_was_learned():
     drawn = [Waits().draw(10**6 + i) for i in range(300)]
     fixed = min(np.mean([d.regret(k) for d in drawn]) for k in range(len(OMEGAS_MS)))
     assert fixed > 0.04
 
 
-def test_what_cameras_see_is_learnt_from_embeddings():
+def test_what_cameras_see_is_learned_from_embeddings():
     problem = Waits(semantic=True)
     learner = Learner(Spec("threshold", problem.layout, OMEGAS_MS), 0)
     teach(learner, problem, 8)
@@ -61,7 +63,7 @@ def test_a_flat_network_learns_as_the_thesis_has_it():
     assert regret(learner, FreshOnes()) < 0.05
 
 
-def test_what_was_learnt_with_six_cameras_holds_for_eleven_and_with_silent_ones():
+def test_what_was_learned_with_six_cameras_holds_for_eleven_and_with_silent_ones():
     learner = Learner(select(), 0)
     teach(learner, FreshOnes(), 8)
     assert regret(learner, FreshOnes(cameras=11)) < 0.03
@@ -176,7 +178,7 @@ def test_a_file_that_is_no_whole_checkpoint_is_refused_in_one_line(tmp_path, wha
 
 
 @pytest.mark.parametrize("name", ["adam.0.exp_avg", "adam.3.exp_avg_sq", "usual", "value.mid"])
-def test_a_checkpoint_that_could_not_be_learnt_from_is_refused(tmp_path, name):
+def test_a_checkpoint_that_could_not_be_learned_from_is_refused(tmp_path, name):
     learner = Learner(select(), 0)
     teach(learner, FreshOnes(), 1)
     path = save(learner, tmp_path / "policy.npz")
@@ -271,7 +273,7 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path):
 def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path):
     path = tmp_path / "policy.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed, packed.open("actor.in.npy", "w") as file:
-        for _ in range(MOST_BYTES // 2**20 + 1):
+        for _ in range(MAX_BYTES // 2**20 + 1):
             file.write(bytes(2**20))
     assert path.stat().st_size < 2**20
     with pytest.raises(checkpoint.CheckpointError, match="unpacked it has"):
@@ -280,7 +282,7 @@ def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path):
 
 def test_what_only_decides_says_so_to_who_wants_it_to_learn(tmp_path):
     Learner(select(), 0).actor.save(tmp_path / "policy.npz")
-    with pytest.raises(checkpoint.CheckpointError, match="nothing that it could go on learning") as refused:
+    with pytest.raises(checkpoint.CheckpointError, match="learning cannot resume from it") as refused:
         Learner.load(tmp_path / "policy.npz")
     assert "damaged" not in str(refused.value)
 
@@ -297,6 +299,21 @@ def test_diagnostics_say_what_an_update_did():
     assert told.steps >= 1 and told.gradient > 0
     assert 0.0 <= told.clipped <= 1.0 and told.moved >= 0.0
     assert told.entropy == pytest.approx(6 * np.log(2), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "spec", [select(start=0.9), Spec("wait", Waits().layout, OMEGAS_MS)], ids=lambda s: s.action
+)
+def test_the_entropy_bonus_raises_the_entropy(spec):
+    """Of equal rewards only the entropy's gradient is left in the policy: its sign decides where it moves."""
+    learner = Learner(replace(spec, entropy=0.1), 0)
+    with torch.no_grad():
+        learner._actor["out_b"] += torch.tensor([2.0] + [0.0] * (len(learner._actor["out_b"]) - 1))
+    found = []
+    for _ in range(5):
+        batch = replace(collect(learner, FreshOnes(), range(64)), rewards=np.ones(64))
+        found.append(learner.update(batch).entropy)
+    assert found[-1] > found[0] + 0.05
 
 
 def test_a_pass_ends_when_the_policy_has_moved_far_enough():

@@ -9,7 +9,7 @@ import pytest
 from edge_server.experiments.training.scheduler.episode import Outcome
 from edge_server.fidelity.scorer import Score
 from edge_server.live.state import Publication
-from edge_server.scheduler.learned.rewards import REWARDS, make_reward
+from edge_server.scheduler.learned.rewards import REWARDS, f_w, make_reward
 
 
 def score(psnr_db=25.0, psnr_moving_db=20.0, ssim=0.9, lpips=0.2):
@@ -24,10 +24,13 @@ def test_the_reward_of_sets_is_519():
 
 
 def test_the_reward_of_waiting_is_minus_f_w():
-    f_w = 0.015 * 60 - 0.02 * 25 + 0.2 * 0.9 + 0.3 * 0.2  # (6.36), (6.37) as printed
-    assert make_reward("thesis").of(score(), aaoi_ms=60.0).total == pytest.approx(-f_w)
+    expected = 0.015 * 60 - 0.02 * 25 + 0.2 * 0.9 + 0.3 * 0.2  # (6.36), (6.37) as printed
+    row = {"psnr_db": 25.0, "ssim": 0.9, "lpips": 0.2, "aaoi_ms": 60.0}
+    assert f_w(row) == pytest.approx(expected)
+    assert f_w({**row, "lpips": None}) is None
+    assert make_reward("thesis").of(score(), aaoi_ms=60.0).total == pytest.approx(-expected)
     corrected = make_reward().of(score(), aaoi_ms=60.0)
-    assert corrected.total == pytest.approx(-f_w + 2 * 0.2 * 0.9)
+    assert corrected.total == pytest.approx(-expected + 2 * 0.2 * 0.9)
     assert corrected.terms["age"] == pytest.approx(-0.9)
 
 

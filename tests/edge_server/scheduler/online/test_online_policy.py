@@ -1,4 +1,4 @@
-"""A learnt policy that goes on learning: it follows a change, stays on its leash, falls back and returns."""
+"""A learned policy that goes on learning: it follows a change, stays on its leash, falls back and returns."""
 
 from __future__ import annotations
 
@@ -16,9 +16,14 @@ from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import make_reward
 from edge_server.scheduler.learned.state import StateLayout
-from edge_server.scheduler.online.online_policy import Apprentice, Exploring, Leash, divergence
-from edge_server.scheduler.online.online_trainer import Lessons, of_training, open_lessons, reward_for
-from edge_server.scheduler.online.sequential_test import LEAST
+from edge_server.scheduler.online.online_policy import ExploringActor, OnlinePolicy, OnlineSettings, mean_kl
+from edge_server.scheduler.online.online_trainer import (
+    OnlineTrainer,
+    choose_reward,
+    open_online_trainer,
+    training_summary,
+)
+from edge_server.scheduler.online.sequential_test import MIN_REWARDS
 from tests.edge_server.scheduler.learned.problems import state
 
 OMEGAS = (20.0, 80.0, 320.0)
@@ -30,9 +35,9 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def leash(**more) -> Leash:
+def settings(**more) -> OnlineSettings:
     """Judged from the first decision on."""
-    return Leash(**{"settle": 0, **more})
+    return OnlineSettings(**{"warmup": 0, **more})
 
 
 def taught(worth, updates: int = 25) -> Learner:
@@ -53,16 +58,16 @@ def epoch(number: int) -> Epoch:
     return Epoch(now_ns, number, generated, lambda parts=(): seen)
 
 
-def use(apprentice: Apprentice, worth, count: int, first: int = 0) -> list[float]:
+def use(policy: OnlinePolicy, worth, count: int, first: int = 0) -> list[float]:
     """Decide ``count`` times, each rewarded by the omega that was used."""
     used = []
     for number in range(first, first + count):
         at = epoch(number)
-        plan = apprentice.plan(at)
-        assert apprentice.select(at, plan)
+        plan = policy.plan(at)
+        assert policy.select(at, plan)
         used.append(plan.omega_ms)
-        if apprentice.scored(number, worth(plan.omega_ms) + 0.05 * float(rng(number).standard_normal())):
-            apprentice.learn()
+        if policy.add_reward(number, worth(plan.omega_ms) + 0.05 * float(rng(number).standard_normal())):
+            policy.learn()
     return used
 
 
@@ -74,80 +79,84 @@ def long(omega: float) -> float:
     return omega / 100.0
 
 
-def test_it_falls_back_when_what_pays_has_changed_and_returns_once_it_has_learnt():
+def test_it_falls_back_when_what_pays_has_changed_and_returns_once_it_has_learned():
     fixed = make_policy("threshold", 80.0, rng())
-    apprentice = Apprentice(taught(short), fixed, "bandit:x", rng(2), leash(share=0.3, bound=50.0))
-    before = use(apprentice, short, 150)
-    assert not apprentice.fallen_back and np.mean(before) < 60.0
-    drifted = use(apprentice, long, 250, 150)
-    assert "worse than threshold:80" in apprentice.told()
-    assert apprentice.fallen_back and np.mean(drifted[-50:]) > np.mean(before)
+    policy = OnlinePolicy(taught(short), fixed, "bandit:x", rng(2), settings(share=0.3, max_kl=50.0))
+    before = use(policy, short, 150)
+    assert not policy.fallen_back and np.mean(before) < 60.0
+    drifted = use(policy, long, 250, 150)
+    assert "worse than threshold:80" in policy.summary()
+    assert policy.fallen_back and np.mean(drifted[-50:]) > np.mean(before)
     for number in range(400, 4000, 100):
-        use(apprentice, long, 100, number)
-        if not apprentice.fallen_back:
+        use(policy, long, 100, number)
+        if not policy.fallen_back:
             break
-    assert not apprentice.fallen_back
-    assert np.mean(use(apprentice, long, 100, 4000)) > 200.0
+    assert not policy.fallen_back
+    assert np.mean(use(policy, long, 100, 4000)) > 200.0
 
 
 def test_the_trust_region_holds_whatever_is_rewarded():
-    apprentice = Apprentice(
+    policy = OnlinePolicy(
         Learner(SPEC, 1),
         make_policy("threshold", 80.0, rng()),
         "bandit:x",
         rng(2),
-        leash(bound=0.2, batch=16),
+        settings(max_kl=0.2, batch=16),
     )
     for first in range(0, 600, 50):
-        use(apprentice, long, 50, first)
-        assert apprentice.moved <= 0.2
-    assert apprentice.updates > 10 and apprentice.shortened > 0
-    free = Apprentice(
+        use(policy, long, 50, first)
+        assert policy.kl_from_loaded <= 0.2
+    assert policy.updates > 10 and policy.shortened > 0
+    free = OnlinePolicy(
         Learner(replace(SPEC, target_kl=50.0), 1),
         make_policy("threshold", 80.0, rng()),
         "bandit:x",
         rng(2),
-        leash(bound=50.0, batch=16),
+        settings(max_kl=50.0, batch=16),
     )
     use(free, long, 600)
-    assert free.moved > 0.2 and free.shortened == 0
+    assert free.kl_from_loaded > 0.2 and free.shortened == 0
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_one_update_moves_it_no_further_than_the_specification_says(seed: int):
     spec = replace(SPEC, learning_rate=3e-2)
-    apprentice = Apprentice(
-        Learner(spec, seed), make_policy("threshold", 80.0, rng()), "b", rng(2), leash(bound=50.0, batch=16)
+    policy = OnlinePolicy(
+        Learner(spec, seed),
+        make_policy("threshold", 80.0, rng()),
+        "b",
+        rng(2),
+        settings(max_kl=50.0, batch=16),
     )
     steps = []
     for number in range(400):
         at = epoch(number)
-        plan = apprentice.plan(at)
-        apprentice.select(at, plan)
-        if apprentice.scored(number, (long if number < 200 else short)(plan.omega_ms)):
-            before = apprentice._learner.actor
-            told = apprentice.learn()
+        plan = policy.plan(at)
+        policy.select(at, plan)
+        if policy.add_reward(number, (long if number < 200 else short)(plan.omega_ms)):
+            before = policy._learner.actor
+            told = policy.learn()
             batch = spec.layout.batch([epoch(k).state() for k in range(number + 1)])
-            steps.append(divergence(before, apprentice._learner.actor, batch))
+            steps.append(mean_kl(before, policy._learner.actor, batch))
             assert told["step_kl"] <= spec.target_kl
-    assert len(steps) > 10 and apprentice.shortened > 0
+    assert len(steps) > 10 and policy.shortened > 0
     assert np.mean(steps) > 0.1 * spec.target_kl, "it is held back, not held"
 
 
 @pytest.mark.parametrize(("action", "cameras"), [("select", 18), ("select", 200), ("threshold", 18)])
 def test_it_is_compared_with_what_acted_chance_included(action: str, cameras: int):
-    """In the first pass nothing has been learnt yet: a policy that is nearly sure has moved by nothing."""
+    """In the first pass nothing has been learned yet: a policy that is nearly sure has moved by nothing."""
     spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, start=0.99, passes=1)
-    apprentice = Apprentice(Learner(spec, 1), make_policy("all", None, rng()), "b", rng(3), leash(batch=32))
+    policy = OnlinePolicy(Learner(spec, 1), make_policy("all", None, rng()), "b", rng(3), settings(batch=32))
     for number in range(60):
         seen = state(cameras, rng(number))
         now_ns = 10**12 + number * 100 * MS
         generated = {c: now_ns - round(a * MS) for c, a in zip(seen.cameras, seen.ages_ms)}
         at = Epoch(now_ns, number, generated, lambda parts=(), seen=seen: seen)
-        apprentice.select(at, apprentice.plan(at))
-        if apprentice.scored(number, float(rng(number).standard_normal())):
+        policy.select(at, policy.plan(at))
+        if policy.add_reward(number, float(rng(number).standard_normal())):
             break
-    told = apprentice.learn()
+    told = policy.learn()
     assert told is not None and told["kl_from_acted"] == pytest.approx(0.0, abs=1e-12)
 
 
@@ -162,18 +171,18 @@ def test_what_was_trained_on_differences_learns_live_wherever_the_rewards_zero_l
             learner.update(learner.batch(states, actions, logps, found - found.mean()))
         return learner
 
-    learnt = []
+    learned = []
     for zero in (0.0, -1.2, 30.0):
         fixed = make_policy("threshold", 80.0, rng())
-        apprentice = Apprentice(trained(), fixed, "b", rng(2), leash(bound=50.0))
-        use(apprentice, lambda omega, zero=zero: zero + 0.3 * (omega == 320.0), 200)
-        assert apprentice.updates >= 4
-        learnt.append(apprentice._bandit.actor)
+        policy = OnlinePolicy(trained(), fixed, "b", rng(2), settings(max_kl=50.0))
+        use(policy, lambda omega, zero=zero: zero + 0.3 * (omega == 320.0), 200)
+        assert policy.updates >= 4
+        learned.append(policy._bandit.actor)
     share = [np.bincount(a.act([state(5, rng(k)) for k in range(400)], rng(9))[0], minlength=3)[2] / 400
-             for a in (trained().actor, *learnt)]  # fmt: skip
+             for a in (trained().actor, *learned)]  # fmt: skip
     assert share[1] > 1.5 * share[0] and share[2] == share[3] == share[1]
-    for other in learnt[1:]:
-        assert all(np.allclose(w, other.weights[n], atol=1e-6) for n, w in learnt[0].weights.items())
+    for other in learned[1:]:
+        assert all(np.allclose(w, other.weights[n], atol=1e-6) for n, w in learned[0].weights.items())
 
 
 @pytest.mark.parametrize("fallen_back", [False, True])
@@ -181,21 +190,21 @@ def test_who_decides_is_not_changed_by_chance(fallen_back: bool):
     """Rewards that nobody has a hand in, and that stay high or low for a while, as those of a field do."""
     fixed = make_policy("threshold", 80.0, rng())
     for seed in range(6):
-        apprentice = Apprentice(Learner(SPEC, 1), fixed, "b", rng(seed), leash(batch=10**6))
+        policy = OnlinePolicy(Learner(SPEC, 1), fixed, "b", rng(seed), settings(batch=10**6))
         if fallen_back:
-            apprentice._change_over()
+            policy._switch()
         noise, found = rng(100 + seed), 0.0
         for number in range(600):
             at = epoch(number)
-            apprentice.select(at, apprentice.plan(at))
+            policy.select(at, policy.plan(at))
             found = 0.8 * found + 0.6 * float(noise.standard_normal())
-            apprentice.scored(number, found)
-            assert apprentice.fallen_back is fallen_back
+            policy.add_reward(number, found)
+            assert policy.fallen_back is fallen_back
 
 
 def test_the_same_seed_does_the_same_and_saves_what_goes_on(tmp_path: Path):
     made = [
-        Apprentice(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash())
+        OnlinePolicy(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings())
         for _ in range(2)
     ]
     first, second = (use(a, long, 200) for a in made)
@@ -206,34 +215,34 @@ def test_the_same_seed_does_the_same_and_saves_what_goes_on(tmp_path: Path):
 
 
 def test_late_missing_and_broken_rewards_teach_nothing_and_harm_nothing():
-    apprentice = Apprentice(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash())
-    before = apprentice._bandit.actor.weights
+    policy = OnlinePolicy(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings())
+    before = policy._bandit.actor.weights
     for number in range(200):
         at = epoch(number)
-        apprentice.select(at, apprentice.plan(at))
-        assert not apprentice.scored(number, (None, np.nan, np.inf)[number % 3])
-        assert not apprentice.scored(number, 1.0)  # twice
-    assert apprentice.learn() is None and not apprentice.scored(10**6, 1.0)
-    assert all(np.array_equal(w, before[n]) for n, w in apprentice._bandit.actor.weights.items())
-    assert apprentice.status()["learnt_reward"]["count"] == 0 and "not known yet" in apprentice.told()
+        policy.select(at, policy.plan(at))
+        assert not policy.add_reward(number, (None, np.nan, np.inf)[number % 3])
+        assert not policy.add_reward(number, 1.0)  # twice
+    assert policy.learn() is None and not policy.add_reward(10**6, 1.0)
+    assert all(np.array_equal(w, before[n]) for n, w in policy._bandit.actor.weights.items())
+    assert policy.status()["learnt_reward"]["count"] == 0 and "not known yet" in policy.summary()
 
 
 def test_nobody_is_judged_by_a_field_that_only_begins():
     fixed = make_policy("threshold", 80.0, rng())
-    apprentice = Apprentice(taught(short), fixed, "b", rng(2), Leash(settle=50))
-    use(apprentice, long, 50, 1000)  # an edge that was restarted goes on counting
-    assert apprentice.status()["learnt_reward"]["count"] == apprentice.status()["fixed_reward"]["count"] == 0
-    use(apprentice, long, 30, 1050)
-    counts = [apprentice.status()[f"{who}_reward"]["count"] for who in ("learnt", "fixed")]
+    policy = OnlinePolicy(taught(short), fixed, "b", rng(2), OnlineSettings(warmup=50))
+    use(policy, long, 50, 1000)  # an edge that was restarted goes on counting
+    assert policy.status()["learnt_reward"]["count"] == policy.status()["fixed_reward"]["count"] == 0
+    use(policy, long, 30, 1050)
+    counts = [policy.status()[f"{who}_reward"]["count"] for who in ("learnt", "fixed")]
     assert sum(counts) == 30
 
 
 def test_no_verdict_on_a_few_decisions():
-    apprentice = Apprentice(
-        taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash(share=0.5)
+    policy = OnlinePolicy(
+        taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings(share=0.5)
     )
-    use(apprentice, long, LEAST)  # of both together: too few of either
-    assert not apprentice.fallen_back
+    use(policy, long, MIN_REWARDS)  # of both together: too few of either
+    assert not policy.fallen_back
 
 
 @pytest.mark.parametrize("action", ["select", "threshold"])
@@ -255,26 +264,26 @@ def test_divergence_is_the_one_of_torch_and_finite_at_the_edges(action):
                 torch.distributions.Categorical(logits=p), torch.distributions.Categorical(logits=q)
             ).mean()
         )
-    assert divergence(a, b, features) == pytest.approx(expected, rel=1e-9) and expected > 1e-4
-    assert divergence(a, a, features) == pytest.approx(0.0, abs=1e-12)
+    assert mean_kl(a, b, features) == pytest.approx(expected, rel=1e-9) and expected > 1e-4
+    assert mean_kl(a, a, features) == pytest.approx(0.0, abs=1e-12)
     far = Actor(spec, {**b.weights, "out_b": np.full_like(b.weights["out_b"], 1e4)})
-    assert np.isfinite(divergence(a, far, features))
+    assert np.isfinite(mean_kl(a, far, features))
 
 
 def test_the_reward_and_the_fall_back_are_those_of_the_training(tmp_path: Path):
     taught(short, 1).save(tmp_path / "policy.npz")
     summary = {"reward_name": "thesis", "on": "moving", "best_fixed": "threshold:150"}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
-    lessons = open_lessons(tmp_path / "policy.npz", "", "", rng(), None, tmp_path)
-    assert lessons.reward == make_reward("thesis", fidelity="moving")
-    assert (lessons.apprentice.fixed.name, lessons.apprentice.fixed.value) == ("threshold", 150.0)
-    given = open_lessons(tmp_path / "policy.npz", "set", "all", rng(), "no weights", tmp_path)
-    assert given.reward == make_reward("set", distance=0.0) and given.apprentice.fixed.name == "all"
-    assert of_training(Path("nowhere/x.npz")) == {}
-    assert reward_for("select", "", Path("nowhere/x.npz"), None).name == "set"
+    trainer = open_online_trainer(tmp_path / "policy.npz", "", "", rng(), None, tmp_path)
+    assert trainer.reward == make_reward("thesis", fidelity="moving")
+    assert (trainer.policy.fixed.name, trainer.policy.fixed.value) == ("threshold", 150.0)
+    given = open_online_trainer(tmp_path / "policy.npz", "set", "all", rng(), "no weights", tmp_path)
+    assert given.reward == make_reward("set", distance=0.0) and given.policy.fixed.name == "all"
+    assert training_summary(Path("nowhere/x.npz")) == {}
+    assert choose_reward("select", "", Path("nowhere/x.npz"), None).name == "set"
     for bad, said in ((("nonsense", ""), "nonsense"), (("set", "threshold:x"), "fallback: ")):
         with pytest.raises(ValueError, match=said):
-            open_lessons(tmp_path / "policy.npz", *bad, rng(), None, tmp_path)
+            open_online_trainer(tmp_path / "policy.npz", *bad, rng(), None, tmp_path)
 
 
 class Score:
@@ -285,21 +294,23 @@ class Score:
 
 
 def test_lessons_are_given_on_a_thread_of_their_own_and_written_down(tmp_path: Path):
-    apprentice = Apprentice(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), leash(batch=8))
+    policy = OnlinePolicy(
+        taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings(batch=8)
+    )
     reward = make_reward("corrected", psnr=0.0, ssim=0.0, distance=0.0, age=-0.01)
-    lessons = Lessons(apprentice, reward, tmp_path)
-    lessons.start()
+    trainer = OnlineTrainer(policy, reward, tmp_path)
+    trainer.start()
     for number in range(40):
         at = epoch(number)
-        plan = apprentice.plan(at)
-        apprentice.select(at, plan)
-        lessons.scored(number, Score(plan.omega_ms))
+        plan = policy.plan(at)
+        policy.select(at, plan)
+        trainer.add_score(number, Score(plan.omega_ms))
     for _ in range(200):
-        if apprentice.updates:
+        if policy.updates:
             break
         threading_wait()
-    lessons.stop()
-    lessons.close()
+    trainer.stop()
+    trainer.close()
     lines = [json.loads(line) for line in (tmp_path / "learning.jsonl").read_text().splitlines()]
     assert lines and lines[0]["update"] == 1 and lines[0]["decisions"] == 8
     assert Learner.load(tmp_path / "learnt.npz").updates > 25
@@ -313,7 +324,7 @@ def test_chance_has_its_share_in_every_action_and_the_probability_told_is_the_tr
     if action == "wait":
         weights["out_b"][1:] = 0.0
     seen = state(4, rng(1))
-    sure, chance = Actor(spec, weights), Exploring(spec, weights, 0.2)
+    sure, chance = Actor(spec, weights), ExploringActor(spec, weights, 0.2)
     draws = np.array([chance.act([seen], rng(k))[0][0] for k in range(600)])
     assert len({str(sure.act([seen], rng(k))[0][0]) for k in range(50)}) == 1
     if action == "select":

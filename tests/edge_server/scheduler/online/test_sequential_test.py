@@ -7,35 +7,37 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from edge_server.scheduler.online.sequential_test import LEAST, WINDOW, Estimate, Judge
+from edge_server.scheduler.online.sequential_test import MIN_REWARDS, WINDOW, Estimate, SequentialTest
 
 Rewards = Callable[[bool, float], float]
 """Who decided, and the noise of the moment -> what came of it."""
 
 
-def decisions(judge: Judge, rewards: Rewards, count: int, seed: int = 0, rho: float = 0.0) -> int | None:
+def decisions(
+    test: SequentialTest, rewards: Rewards, count: int, seed: int = 0, rho: float = 0.0
+) -> int | None:
     """Decisions until the verdict; None: there was none. rho: of the noise with the noise before."""
     rng = np.random.default_rng([5, seed])
     noise = 0.0
     for number in range(count):
-        other = 0.5 if judge.suspects else 0.15
-        probability = other if judge.better else 1.0 - other
-        learnt = bool(rng.random() < probability)
+        other = 0.5 if test.is_suspicious else 0.15
+        probability = other if test.better else 1.0 - other
+        learned = bool(rng.random() < probability)
         noise = rho * noise + np.sqrt(1.0 - rho * rho) * float(rng.standard_normal())
-        if judge.saw(learnt, probability, rewards(learnt, noise)):
+        if test.update(learned, probability, rewards(learned, noise)):
             return number + 1
     return None
 
 
 SAME: dict[str, tuple[Rewards, float]] = {
-    "independent": (lambda learnt, noise: noise, 0.0),
-    "staying": (lambda learnt, noise: noise, 0.8),
-    "nearly standing": (lambda learnt, noise: noise, 0.99),
-    "the fixed one varies more": (lambda learnt, noise: noise * (1.0 if learnt else 4.0), 0.5),
-    "the learnt one varies more": (lambda learnt, noise: noise * (4.0 if learnt else 1.0), 0.5),
-    "accidents": (lambda learnt, noise: noise if abs(noise) < 2.0 else 1e9 * noise, 0.0),
-    "constant": (lambda learnt, noise: 0.7, 0.0),
-    "two values": (lambda learnt, noise: float(noise > 1.0), 0.0),
+    "independent": (lambda learned, noise: noise, 0.0),
+    "staying": (lambda learned, noise: noise, 0.8),
+    "nearly standing": (lambda learned, noise: noise, 0.99),
+    "the fixed one varies more": (lambda learned, noise: noise * (1.0 if learned else 4.0), 0.5),
+    "the learned one varies more": (lambda learned, noise: noise * (4.0 if learned else 1.0), 0.5),
+    "accidents": (lambda learned, noise: noise if abs(noise) < 2.0 else 1e9 * noise, 0.0),
+    "constant": (lambda learned, noise: 0.7, 0.0),
+    "two values": (lambda learned, noise: float(noise > 1.0), 0.0),
 }
 
 
@@ -45,7 +47,7 @@ def test_equal_policies_are_hardly_ever_told_apart(name: str, better: bool):
     """In 2000 decisions of 20000 there is a verdict in a tenth of all runs at most, by a generous bound. Two
     intervals of 95 % are apart in most runs of this length."""
     rewards, rho = SAME[name]
-    found = [decisions(Judge(better, 20_000.0), rewards, 2000, seed, rho) for seed in range(5)]
+    found = [decisions(SequentialTest(better, 20_000.0), rewards, 2000, seed, rho) for seed in range(5)]
     assert found == [None] * 5
 
 
@@ -54,34 +56,36 @@ def test_equal_policies_are_hardly_ever_told_apart(name: str, better: bool):
 def test_a_difference_is_found_the_sooner_the_larger_it_is(gap: float, most: int, better: bool):
     gap = gap if better else -gap
     for seed in range(5):
-        found = decisions(Judge(better, 20_000.0), lambda a, x: x + gap * a, 2000, seed, 0.5)
+        found = decisions(SequentialTest(better, 20_000.0), lambda a, x: x + gap * a, 2000, seed, 0.5)
         assert found is not None and found < most
-        assert decisions(Judge(not better, 20_000.0), lambda a, x: x + gap * a, 500, seed, 0.5) is None
+        assert (
+            decisions(SequentialTest(not better, 20_000.0), lambda a, x: x + gap * a, 500, seed, 0.5) is None
+        )
 
 
 def test_what_was_good_for_long_is_no_excuse():
-    judge = Judge(False, 20_000.0)
-    assert decisions(judge, lambda a, x: x + 2.0 * a, 3000) is None
-    found = decisions(judge, lambda a, x: x - 2.0 * a, 300, 1)
+    test = SequentialTest(False, 20_000.0)
+    assert decisions(test, lambda a, x: x + 2.0 * a, 3000) is None
+    found = decisions(test, lambda a, x: x - 2.0 * a, 300, 1)
     assert found is not None
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
 def test_neither_the_unit_nor_the_zero_of_a_reward_matters(unit: float):
     found = {
-        decisions(Judge(False, 1000.0), lambda a, x, zero=zero: unit * (x - a + zero), 500)
+        decisions(SequentialTest(False, 1000.0), lambda a, x, zero=zero: unit * (x - a + zero), 500)
         for zero in (0.0, -7.0)
     }
     assert len(found) == 1 and None not in found
 
 
 def test_the_estimates_are_of_the_same_last_decisions():
-    judge = Judge(False, 1e6)
+    test = SequentialTest(False, 1e6)
     for number in range(WINDOW + 30):
-        judge.saw(number % 2 == 0, 0.5, float(number))
-    mine, other = judge.estimates
+        test.update(number % 2 == 0, 0.5, float(number))
+    mine, other = test.estimates
     assert mine.count == other.count == WINDOW // 2
     assert (mine.mean, other.mean) == (89.0, 90.0)
-    few = Estimate.of([1.0] * (LEAST - 1))
+    few = Estimate.of([1.0] * (MIN_REWARDS - 1))
     assert (few.mean, few.half, str(few)) == (1.0, None, "1.000")
     assert str(Estimate.of([])) == "not known yet" and "+-" in str(mine)

@@ -32,7 +32,7 @@ from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.problem import collect
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import StateLayout
-from edge_server.scheduler.online.online_trainer import reward_for
+from edge_server.scheduler.online.online_trainer import choose_reward
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
 
 REWARD = make_reward("set", distance=0.0)
@@ -228,7 +228,7 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     assert (kept["rewarded_from"], kept["judged_from"], kept["motions"]) == (["cam00"], ["cam03"], True)
     # The scenario asks for no LPIPS, so that the reward has no such term, wherever weights lie about.
     learner = Learner.load(out / "policy.npz")
-    assert learner.taught_by["name"] == "corrected" and learner.taught_by["distance"] == 0.0
+    assert learner.reward_fields["name"] == "corrected" and learner.reward_fields["distance"] == 0.0
     for name in ("training.csv", "training.png", "contest.csv", "policy.npz"):
         assert (out / name).stat().st_size > 0
     policy = make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))
@@ -301,11 +301,11 @@ def test_a_stand_in_distance_is_measured_learnt_from_and_kept_for_live_use(tmp_p
     assert "teaches to ignore how old views are" in " ".join(capsys.readouterr().out.split())
     (row,) = read_log(out)
     assert row["term_perceptual"] == pytest.approx(-row["perceptual"])
-    known = Learner.load(out / "policy.npz").taught_by
-    by = reward_for("select", "", out / "policy.npz", "no weights", known)
+    known = Learner.load(out / "policy.npz").reward_fields
+    by = choose_reward("select", "", out / "policy.npz", "no weights", known)
     assert by == make_reward("set", distance_is="perceptual")
     with pytest.raises(ValueError, match="its reward"):
-        reward_for("select", "", out / "policy.npz", None, {"name": "set", "sweets": 1.0})
+        choose_reward("select", "", out / "policy.npz", None, {"name": "set", "sweets": 1.0})
 
 
 def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: Path):

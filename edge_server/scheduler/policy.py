@@ -1,0 +1,107 @@
+"""What a policy is: it looks at a decision epoch and selects the views of the next update.
+
+A decision has two halves, because a policy may wait in between: ``plan`` runs at the decision epoch and says
+how long to wait, ``select`` then picks cameras from what is in the buffer. Both are pure functions of their
+arguments (and of the policy's own seeded stream), so that live and virtual time share them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:  # loaded only by the policies that need them
+    from edge_server.scheduler.learned.bandit import Decision
+    from edge_server.scheduler.learned.state import State
+    from edge_server.treatments import Treatment
+
+STATE_PARTS = ("semantics", "age", "pose")
+"""Parts of the state that a learned policy may look at, in the order of (6.33)."""
+
+
+class Observer(Protocol):
+    """Computes the state of all cameras when it is called, and only the ``parts`` asked for."""
+
+    def __call__(self, parts: Sequence[str] = STATE_PARTS) -> State: ...
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """What a policy may look at.
+
+    now_ns: time of the decision on the edge's clock. number: counts the epochs. generated_ns: generation time
+    of the newest frame of every camera that has reported; others are missing. state: of all cameras, with
+    poses and embeddings, for policies that look at more than ages; None where it is not available.
+    """
+
+    now_ns: int
+    number: int
+    generated_ns: Mapping[str, int]
+    state: Observer | None = None
+
+    def age_ms(self, camera: str) -> float:
+        return (self.now_ns - self.generated_ns[camera]) / 1e6
+
+
+@dataclass(frozen=True)
+class SelectionWindow:
+    """The first half of a decision: when to select, and which frames qualify.
+
+    omega_ms: shown to people; None for policies without one. wait_until_ns: earliest instant of selection.
+    generated_after_ns: only frames generated later qualify (omega-wait); None admits all. flush: abort what
+    is in transit at the decision.
+    """
+
+    omega_ms: float | None = None
+    wait_until_ns: int = 0
+    generated_after_ns: int | None = None
+    flush: bool = False
+
+
+class Policy:
+    """Base of all policies. A subclass sets ``name`` and implements ``select``; the rest are defaults.
+
+    parameter: name and unit of the one value a user may set, such as ``omega_ms``; None if there is none.
+    value: that value. treatment: applied to the selected views before they supervise the field. embedding:
+    width of the embeddings it decides by (0: it needs none) and the name of their embedder (empty: not said).
+    """
+
+    name: str
+    parameter: str | None = None
+    value: float | None = None
+    treatment: Treatment | None = None
+    embedding: tuple[int, str] = (0, "")
+
+    @property
+    def last_decision(self) -> Decision | None:
+        """The newest decision of a learned policy; None before the first, and for all other policies."""
+        return None
+
+    def plan(self, epoch: Epoch) -> SelectionWindow:
+        """By default, select at once from everything in the buffer."""
+        return SelectionWindow()
+
+    def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
+        """Cameras to use, at least one if any qualifies (K_t >= 1). Empty: keep waiting."""
+        raise NotImplementedError
+
+
+def positive_int(value: float | None, default: int, name: str) -> int:
+    """``value`` as a count of at least one, or ValueError naming the parameter."""
+    if value is None:
+        return default
+    if value != int(value) or value < 1:
+        raise ValueError(f"{name}: expected a whole number from 1, got {value:g}")
+    return int(value)
+
+
+def non_negative(value: float | None, default: float, name: str) -> float:
+    """``value`` as a finite number of at least zero, or ValueError naming the parameter."""
+    if value is None:
+        return default
+    if not np.isfinite(value) or value < 0:
+        raise ValueError(f"{name}: expected zero or more, got {value:g}")
+    return float(value)

@@ -1,0 +1,141 @@
+"""Policies by name, as people write them: ``threshold:120``, ``wait+freshen``, ``bandit:FILE``.
+
+Adding a policy takes one file in this folder and a line in ``POLICIES``. A name may go on with a treatment of
+the selected views: ``threshold+freshen`` (``edge_server.treatments``, a line in ``TREATMENTS``); a
+treatment's name alone treats all views. ``bandit:FILE`` is a learned policy
+(``edge_server.scheduler.learned``).
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+
+from edge_server.scheduler.policy import Policy
+
+# name -> (module, class, one line of help)
+POLICIES: dict[str, tuple[str, str, str]] = {
+    "all": ("all", "UseAll", "every camera's newest frame, however old"),
+    "periodic": ("periodic", "Periodic", "use all, at fixed instants; value: period_ms"),
+    "random": ("random", "RandomSubset", "a uniformly random non-empty set; value: k fixes its size"),
+    "round-robin": ("round_robin", "RoundRobin", "the next k cameras in turn; value: k"),
+    "freshest-k": ("freshest_k", "FreshestK", "the k youngest frames; value: k"),
+    "age-driven": ("age_driven", "AgeDriven", "the largest set whose mean age is minimal"),
+    "threshold": ("threshold", "Threshold", "frames no older than omega (6.12-6.14); value: omega_ms"),
+    "wait": ("wait", "Wait", "wait omega, use only frames generated meanwhile (6.15-6.17); value: omega_ms"),
+    "wait-flush": ("wait", "WaitFlush", "as wait, what is on its way at the decision broken off (6.5)"),
+}
+
+
+# name -> (module, class, one line of help)
+TREATMENTS: dict[str, tuple[str, str, str]] = {
+    "mask": ("motion_mask", "MotionMask", "of stale views, pixels that were moving count for less"),
+    "freshen": ("flow_warp", "FlowWarp", "stale views are carried forward to now by their optical flow"),
+}
+
+# Prefix of a learned policy: the path of a learner's checkpoint follows.
+BANDIT = "bandit:"
+
+# A live edge cannot take back what the network carries; virtual time can, to show what the thesis assumes.
+VIRTUAL_ONLY = ("wait-flush",)
+# The choices shown to people; any other combination may be typed.
+OFFERED: tuple[str, ...] = (
+    *(policy for policy in POLICIES if policy not in VIRTUAL_ONLY), *TREATMENTS,
+    *(f"{policy}+{treatment}" for policy in ("threshold", "wait", "freshest-k") for treatment in TREATMENTS),
+)  # fmt: skip
+
+
+def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
+    """The named policy, whose module is imported only now.
+
+    name: as in ``POLICIES``, or POLICY+TREATMENT, TREATMENT, bandit:FILE. value: of its parameter; None takes
+    the default. rng: for policies that draw. ValueError for an unknown name or a value out of range, with the
+    choices.
+    """
+    if name.startswith(BANDIT):
+        if value is not None:
+            raise ValueError(f"policy {name!r}: a learned policy has no value to set")
+        from edge_server.scheduler.learned.bandit import BanditPolicy
+
+        return BanditPolicy.from_file(name.removeprefix(BANDIT), rng)
+    base, treatment = _split(name)
+    if base not in POLICIES or name.endswith("+"):
+        wrong = name if base in POLICIES else base
+        raise ValueError(
+            f"policy {wrong!r} is not known; choose one of {', '.join((*POLICIES, *TREATMENTS))}, "
+            "or join a policy and a treatment, as in threshold+freshen; a learned one is bandit:FILE"
+        )
+    module, cls, _ = POLICIES[base]
+    policy: Policy = getattr(importlib.import_module(f"edge_server.scheduler.{module}"), cls)(value, rng)
+    if not treatment:
+        return policy
+    if treatment not in TREATMENTS:
+        raise ValueError(
+            f"policy {name!r}: there is no treatment {treatment!r}; after the + choose one of "
+            f"{', '.join(TREATMENTS)}"
+        )
+    from edge_server.scheduler.treated import Treated
+
+    module, cls, _ = TREATMENTS[treatment]
+    return Treated(name, policy, getattr(importlib.import_module(f"edge_server.treatments.{module}"), cls)())
+
+
+def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
+    """``make_policy`` for a live edge. Raises ValueError also for what only virtual time can do."""
+    if _split(name)[0] in VIRTUAL_ONLY:
+        raise ValueError(
+            f"policy {name!r} breaks off what the network carries, which a live edge cannot: it runs in "
+            "virtual time only (edge-server simulate, edge-server study); live, use wait"
+        )
+    return make_policy(name, value, rng)
+
+
+def parse_policy(text: str) -> tuple[str, float | None]:
+    """Name and value of a policy as people type it: ``threshold:120``, ``all``, ``bandit:FILE`` with FILE
+    relative to the working directory. ValueError where the value is not a number."""
+    if text.startswith(BANDIT):
+        return resolve_checkpoint(text, Path()), None
+    name, _, value = text.partition(":")
+    try:
+        return name, float(value) if value else None
+    except ValueError:
+        raise ValueError(f"{text}: {value!r} is not a number") from None
+
+
+def policy_label(policy: Policy) -> str:
+    """The policy as people type it; the inverse of ``parse_policy``."""
+    if policy.name.startswith(BANDIT) or policy.value is None:
+        return policy.name
+    return f"{policy.name}:{policy.value:g}"
+
+
+def resolve_checkpoint(name: str, folder: Path) -> str:
+    """``bandit:FILE`` with FILE, relative to ``folder``, made absolute; any other policy's name as it is."""
+    if not name.startswith(BANDIT):
+        return name
+    return BANDIT + str((folder / Path(name.removeprefix(BANDIT)).expanduser()).absolute())
+
+
+def policy_help(name: str) -> str:
+    """One line on a policy; empty for an unknown one."""
+    if name.startswith(BANDIT):
+        return "a learned policy (edge-server train-scheduler)"
+    base, treatment = _split(name)
+    if base not in POLICIES or (treatment and treatment not in TREATMENTS):
+        return ""
+    line = POLICIES[base][2]
+    if not treatment:
+        return line
+    what, _, parameter = line.partition("; value:")
+    both = TREATMENTS[treatment][2] if name in TREATMENTS else f"{what}; {TREATMENTS[treatment][2]}"
+    return f"{both}; value:{parameter}" if parameter else both
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Policy and treatment (empty: none) that ``name`` asks for."""
+    if name in TREATMENTS:
+        return "all", name
+    base, _, treatment = name.partition("+")
+    return base, treatment
