@@ -85,10 +85,10 @@ def _add_run(commands: Any) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from channel_emu.live import trace
     from channel_emu.live.camera_lane import HardLimit
     from channel_emu.live.frame_proxy import EmulatorFailed, Proxy, ProxyOptions
     from channel_emu.live.priority import raise_priority
+    from channel_emu.model import trace
 
     plan = scenario.load(args.scenario, args.seed)
     config = channel_from_mapping(plan.channel, f"{plan.path}: channel")
@@ -224,9 +224,10 @@ def _add_replay(commands: Any) -> None:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from channel_emu.live.trace import compare, read
+    from channel_emu.model import trace
+    from channel_emu.virtual.replay import compare
 
-    result = compare(read(args.trace))
+    result = compare(trace.read(args.trace))
     if args.json:
         print(json.dumps(result))
     else:
@@ -260,10 +261,10 @@ def _add_proxy(commands: Any) -> None:
 
 
 def _proxy(args: argparse.Namespace) -> int:
-    from channel_emu.live import trace
     from channel_emu.live.camera_lane import HardLimit
     from channel_emu.live.generic_proxy import GenericOptions, GenericProxy, Report, show
     from channel_emu.live.priority import raise_priority
+    from channel_emu.model import trace
 
     config = _config_of(args)
     if args.hard_limit_ms is not None:

@@ -44,8 +44,8 @@ from typing import Any, TypeVar
 
 import pytest
 
-from channel_emu.live import trace as traces
 from channel_emu.live.generic_proxy import GenericOptions, GenericProxy, Report, show
+from channel_emu.model import trace as traces
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from freshfield.transport import Transport
 

@@ -29,9 +29,9 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from channel_emu.live import trace
 from channel_emu.live.priority import raise_priority
 from channel_emu.live.wire import header_of
+from channel_emu.model import trace
 from freshfield.clock import WallClock
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from channel_emu.live.histogram import Histogram
-from channel_emu.live.trace import ReplayLink, TraceWriter
+from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.upstream import Outgoing, Upstream
 from channel_emu.live.wire import damaged
 from channel_emu.model.link import Event, Kind, Link, Transit
+from channel_emu.model.trace import TraceWriter
 from freshfield.clock import Clock
 from freshfield.ledger import Ledger
 from freshfield.v1 import frames_pb2 as pb

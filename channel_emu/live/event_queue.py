@@ -6,8 +6,8 @@ import heapq
 from collections.abc import Callable
 from typing import Protocol
 
+from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.timer import LoopTimer
-from channel_emu.live.trace import ReplayLink
 from channel_emu.model.instants import NEVER_NS
 from channel_emu.model.link import Link
 from freshfield.clock import Clock

@@ -24,14 +24,15 @@ from grpc_reflection.v1alpha import reflection
 from channel_emu.live.camera_lane import HardLimit, Lane, Measures
 from channel_emu.live.event_queue import Agenda
 from channel_emu.live.histogram import Histogram
+from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.status import StatusFile, snapshot
-from channel_emu.live.trace import ReplayLink, Trace, TraceWriter
 from channel_emu.live.upstream import Upstream
 from channel_emu.live.wire import WireError, header_of
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
 from channel_emu.model.counter_rng import stream_key
 from channel_emu.model.link import Link
+from channel_emu.model.trace import Trace, TraceWriter
 from freshfield.clock import Clock, WallClock
 from freshfield.frame import valid_id
 from freshfield.ledger import Ledger

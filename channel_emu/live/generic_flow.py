@@ -13,9 +13,10 @@ import grpc.aio
 
 from channel_emu.live.event_queue import Agenda
 from channel_emu.live.histogram import Histogram
-from channel_emu.live.trace import ReplayLink, TraceWriter
+from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model.ages import RunningAge
 from channel_emu.model.link import Event, Kind, Link, Transit
+from channel_emu.model.trace import TraceWriter
 
 # Messages of one direction of a call that are held once the first can be written: beyond it the sender waits.
 # Behind a first one that is still in the link any number come in, for the link decides about each at once;

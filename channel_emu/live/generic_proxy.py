@@ -25,10 +25,11 @@ from channel_emu.live.camera_lane import HardLimit
 from channel_emu.live.event_queue import Agenda
 from channel_emu.live.generic_flow import ENDED, Flow, Line, Message, Tally
 from channel_emu.live.histogram import Histogram
-from channel_emu.live.trace import ReplayLink, Trace, TraceWriter
+from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import Kind, Link
+from channel_emu.model.trace import Trace, TraceWriter
 from freshfield.clock import Clock, WallClock
 from freshfield.transport import CLIENT_OPTIONS, Transport
 

@@ -15,7 +15,7 @@ from channel_emu import cli_syntax
 from channel_emu.cli import main
 from freshfield import ledger
 from freshfield.transport import Transport
-from tests.channel_emu.live.test_trace import record
+from tests.channel_emu.model.test_trace import record
 from tests.integration.peer import Peer
 from tests.ports import free_port
 

@@ -14,8 +14,9 @@ from pathlib import Path
 import grpc
 import pytest
 
-from channel_emu.live import trace
+from channel_emu.model import trace
 from channel_emu.testing import EmulatedLink, channel, put_behind
+from channel_emu.virtual.replay import compare
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
 
@@ -254,7 +255,7 @@ def test_a_trace_is_replayed_with_the_same_decisions(channel, greeter, client, t
     first.settle()
     first.close()
     found = trace.read(tmp_path / "1.jsonl")
-    assert trace.compare(found) == {"frames": 80, "equal": 80, "different": []}
+    assert compare(found) == {"frames": 80, "equal": 80, "different": []}
     second = channel("ideal", to=greeter.address, replay=tmp_path / "1.jsonl", trace=tmp_path / "2.jsonl")
     client(second).stream_unary(COLLECT)(paced(80, 0.008))
     report = second.settle()

@@ -11,11 +11,12 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live import trace
 from channel_emu.live.camera_lane import HardLimit
 from channel_emu.live.frame_proxy import Proxy, ProxyOptions
 from channel_emu.live.upstream import CREDITS
+from channel_emu.model import trace
 from channel_emu.model.config import channel_from_mapping
+from channel_emu.virtual.replay import compare
 from edge_server.report.frame_accounting import close_books
 from freshfield.frame import to_request
 from freshfield.transport import Transport
@@ -73,7 +74,7 @@ def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict)
 
     run(live())
     found = trace.read(tmp_path / "t.jsonl")
-    assert trace.compare(found) == {"frames": 320, "equal": 320, "different": []}
+    assert compare(found) == {"frames": 320, "equal": 320, "different": []}
     account = books_of(tmp_path)
     outcomes = [r.outcome for r in found.records]
     assert account.sent == 320

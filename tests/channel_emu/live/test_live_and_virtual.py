@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from channel_emu.live import trace
-from channel_emu.live.trace import Record
-from channel_emu.model import ages
+from channel_emu.model import ages, trace
 from channel_emu.model.link import Kind, Transit
+from channel_emu.model.trace import Record
 from channel_emu.virtual.simulate import replay_offers
 from tests.channel_emu.live.emulator import CAMERAS, rig
 from tests.channel_emu.live.test_frame_proxy import FAST, run

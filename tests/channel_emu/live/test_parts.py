@@ -131,7 +131,7 @@ def test_priority_says_what_it_reached_and_never_fails() -> None:
 def test_the_emulator_needs_neither_torch_nor_the_other_packages() -> None:
     code = """
 import sys
-import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.virtual.simulate, channel_emu.live.trace
+import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.virtual.simulate, channel_emu.live.benchmark
 wrong = [m for m in sys.modules if m.split('.')[0] in ('torch', 'numba', 'camera_node', 'edge_server')]
 print(','.join(wrong))
 """
