@@ -44,22 +44,22 @@ from typing import Any, TypeVar
 
 import pytest
 
-from channel_emu.live.generic_proxy import GenericOptions, GenericProxy, Report, show
+from channel_emu.live.priority import SWITCH_INTERVAL_S
+from channel_emu.live.proxy import Proxy, ProxyOptions
+from channel_emu.live.report import Report, show
 from channel_emu.model import trace as traces
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from freshfield.transport import Transport
 
 T = TypeVar("T")
 _PATIENCE_S = 30.0
-# The proxy's thread takes the interpreter's lock back from the test's threads after this long at most.
-_SWITCH_S = 0.0005
 
 
 class EmulatedLink:
     """A running proxy in front of one service, on an event loop of its own thread. address: where clients
     connect."""
 
-    def __init__(self, config: ChannelConfig, seed: int, options: GenericOptions) -> None:
+    def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions) -> None:
         self.config = config
         self.seed = seed
         self.options = options
@@ -113,8 +113,8 @@ class EmulatedLink:
             return repr(preset)
         return json.dumps(self.config.to_mapping())
 
-    async def _start(self) -> GenericProxy:
-        proxy = GenericProxy(self.config, self.seed, self.options)
+    async def _start(self) -> Proxy:
+        proxy = Proxy(self.config, self.seed, self.options)
         await proxy.start()
         return proxy
 
@@ -159,7 +159,7 @@ def put_behind(
     section: Any = {"preset": channel} if isinstance(channel, str) else channel
     config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
     replayed = traces.read(replay) if replay is not None else None
-    options = GenericOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
+    options = ProxyOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
     return EmulatedLink(config, seed, options)
 
 
@@ -176,7 +176,7 @@ def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
         return links[-1]
 
     before = sys.getswitchinterval()
-    sys.setswitchinterval(min(before, _SWITCH_S))
+    sys.setswitchinterval(min(before, SWITCH_INTERVAL_S))
     try:
         yield make
     finally:

@@ -30,13 +30,13 @@ import grpc.aio
 import numpy as np
 
 from channel_emu.live.priority import raise_priority
+from channel_emu.live.upstream import PUSH
 from channel_emu.live.wire import header_of
 from channel_emu.model import trace
 from freshfield.clock import WallClock
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 
-_PUSH = "/freshfield.v1.FrameStreamService/Push"
 # Every frame is let out (no server limit), so that "nothing lost" can be read off the counts.
 _CHANNEL = {"service": {"law": "exponential", "mean_ms": 60.0}, "discipline": "parallel"}
 _DRAIN_S = 10.0
@@ -239,7 +239,7 @@ async def _camera(
     totals: dict[str, Any],
 ) -> None:
     """One camera: a frame each period, one unanswered at most; periods it still waited in are skipped."""
-    call = channel.stream_stream(_PUSH)()
+    call = channel.stream_stream(PUSH)()
     clock = WallClock()
     frame = 0
     while frame < seconds * rate_hz:

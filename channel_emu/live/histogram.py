@@ -1,4 +1,4 @@
-"""A histogram of durations in fixed memory, for percentiles of a run of any length."""
+"""A histogram of durations in fixed memory, for percentiles over a run of any length."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Histogram:
         if value < _FLOOR_MS:
             self._bins[0] += 1
         else:
-            place = int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
-            self._bins[min(place, len(self._bins) - 1)] += 1
+            index = int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
+            self._bins[min(index, len(self._bins) - 1)] += 1
 
     @property
     def mean_ms(self) -> float | None:
@@ -42,12 +42,17 @@ class Histogram:
         if not self.count:
             return None
         rank = max(1, math.ceil(percent / 100 * self.count))
-        place = int(np.searchsorted(np.cumsum(self._bins), rank))
-        return min(_FLOOR_MS * 10 ** (place / _PER_DECADE), self.max_ms)
+        index = int(np.searchsorted(np.cumsum(self._bins), rank))
+        return min(_FLOOR_MS * 10 ** (index / _PER_DECADE), self.max_ms)
+
+    def summary(self) -> dict[str, float | None]:
+        """Mean, percentiles and maximum in ms; None if empty."""
+        found = {f"p{p}": self.percentile_ms(p) for p in (50, 95, 99)}
+        return {"mean": self.mean_ms, **found, "max": self.max_ms if self.count else None}
 
     def linear(self, count: int = 50) -> tuple[list[float], list[float]]:
-        """Edges (count + 1,) in ms from 0 to the 99.5th percentile, and counts (count,): the logarithmic bins
-        spread over equal ones, for drawing."""
+        """The histogram in equal bins, for drawing: edges (count + 1,) in ms, from 0 to the 99.5th percentile,
+        and counts (count,)."""
         top = self.percentile_ms(99.5)
         if not top:
             return [], []

@@ -12,8 +12,8 @@ from channel_emu.model import ages, trace
 from channel_emu.model.link import Kind, Transit
 from channel_emu.model.trace import Record
 from channel_emu.virtual.simulate import replay_offers
-from tests.channel_emu.live.emulator import CAMERAS, rig
-from tests.channel_emu.live.test_frame_proxy import FAST, run
+from tests.channel_emu.live.emulator import CAMERAS, emulate
+from tests.channel_emu.live.test_frame_stream import FAST, run
 
 CHAPTER_5 = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 8.0}}
 PARALLEL = {"service": {"law": "exponential", "mean_ms": 12.0}, "discipline": "parallel"}
@@ -23,7 +23,7 @@ TYPICAL_MS = 10.0
 
 
 async def record(out: Path, section: dict, period_s: float, frames: int, **options) -> None:
-    async with rig(out, section, trace=out / "t.jsonl", **options) as r:
+    async with emulate(out, section, trace=out / "t.jsonl", **options) as r:
         await asyncio.gather(*(c.stream(frames, period_s) for c in r.cameras.values()))
         await r.settled()
 

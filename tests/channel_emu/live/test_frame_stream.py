@@ -11,8 +11,9 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live.camera_lane import HardLimit
-from channel_emu.live.frame_proxy import Proxy, ProxyOptions
+from channel_emu.live.frame_stream import FrameStream
+from channel_emu.live.live_link import HardLimit
+from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.upstream import CREDITS
 from channel_emu.model import trace
 from channel_emu.model.config import channel_from_mapping
@@ -22,7 +23,7 @@ from freshfield.frame import to_request
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
-from tests.channel_emu.live.emulator import CAMERAS, frame_of, rig
+from tests.channel_emu.live.emulator import CAMERAS, emulate, frame_of
 from tests.integration.peer import Peer, silence
 
 # The thesis's channel six times faster, so that a test takes seconds.
@@ -68,7 +69,7 @@ def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict)
     """The emulator's trace, its offers decided again in virtual time: every start, due and outcome alike."""
 
     async def live() -> None:
-        async with rig(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
+        async with emulate(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
             await asyncio.gather(*(c.stream(80, 0.004) for c in r.cameras.values()))
             await r.settled()
 
@@ -97,12 +98,12 @@ def test_a_recorded_trace_is_repeated_live(tmp_path: Path) -> None:
     recorded, repeated = tmp_path / "1", tmp_path / "2"
 
     async def live() -> None:
-        async with rig(recorded, FAST, trace=recorded / "t.jsonl") as r:
+        async with emulate(recorded, FAST, trace=recorded / "t.jsonl") as r:
             await asyncio.gather(*(c.stream(50, 0.004) for c in r.cameras.values()))
             await r.settled()
         replay = trace.read(recorded / "t.jsonl")
         # Another channel and seed: what happens is the recording's all the same.
-        async with rig(repeated, QUICK, seed=99, replay=replay, trace=repeated / "t.jsonl") as r:
+        async with emulate(repeated, QUICK, seed=99, replay=replay, trace=repeated / "t.jsonl") as r:
             await asyncio.gather(*(c.stream(50, 0.009) for c in r.cameras.values()))
             await r.settled()
 
@@ -119,7 +120,7 @@ def test_every_fault_closes_the_books(tmp_path: Path) -> None:
     faults = {"loss": chance, "duplication": chance, "corruption": chance}
 
     async def live() -> None:
-        async with rig(tmp_path, {**QUICK, "faults": faults}) as r:
+        async with emulate(tmp_path, {**QUICK, "faults": faults}) as r:
             await asyncio.gather(*(c.stream(60, 0.005) for c in r.cameras.values()))
             await r.settled()
 
@@ -137,7 +138,7 @@ def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> 
     section = {"service": service, "faults": {"reset": {"at_ms": [1500.0]}}}
 
     async def live() -> None:
-        async with rig(tmp_path, section, cameras=("cam00",)) as r:
+        async with emulate(tmp_path, section, cameras=("cam00",)) as r:
             camera = r.cameras["cam00"]
             with pytest.raises((grpc.aio.AioRpcError, asyncio.InvalidStateError)):
                 for _ in range(100):
@@ -145,11 +146,11 @@ def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> 
                     await asyncio.sleep(0.1)
             # INTERNAL is what gRPC's client makes of a write that crosses the reset on the wire.
             assert await camera.code() in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL)
-            assert r.proxy.lanes["cam00"].link.resets == 1
+            assert r.stream.flows["cam00"].link.model.resets == 1
             await camera.connect()
             assert (await camera.push()).outcome == pb.OUTCOME_ACCEPTED
             await r.settled()
-            assert r.proxy.lanes["cam00"].link.counts["broken"] == 1
+            assert r.stream.flows["cam00"].link.model.counts["broken"] == 1
 
     run(live())
 
@@ -158,7 +159,7 @@ def test_held_out_frames_pass_beside_the_channel(tmp_path: Path) -> None:
     section = {"service": {"law": "deterministic", "mean_ms": 1e9}}
 
     async def live() -> None:
-        async with rig(tmp_path, section, held_out=("cam03",)) as r:
+        async with emulate(tmp_path, section, held_out=("cam03",)) as r:
             await r.cameras["cam03"].stream(20, 0.002)
             await r.cameras["cam00"].stream(5, 0.002)
             async with asyncio.timeout(10):
@@ -177,7 +178,7 @@ def test_held_out_frames_pass_beside_the_channel(tmp_path: Path) -> None:
 
 def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, QUICK) as r:
+        async with emulate(tmp_path, QUICK) as r:
             cameras = r.cameras.values()
             await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))
             await r.edge.stop()
@@ -186,8 +187,8 @@ def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
             await r.connected()
             await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))
             await r.settled()
-            assert sum(lane.broken for lane in r.proxy.lanes.values()) > 20
-            assert all(lane.upstream.connections == 2 for lane in r.proxy.lanes.values() if lane.upstream)
+            assert sum(flow.broken for flow in r.stream.flows.values()) > 20
+            assert all(flow.upstream.connections == 2 for flow in r.stream.flows.values())
             assert all(r.edge.ingest.delivered[c] > 0 for c in CAMERAS)
 
     run(live())
@@ -198,22 +199,22 @@ def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
 def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -> None:
     async def live() -> None:
         edge = await Peer(respond=silence).start()
-        options = ProxyOptions("127.0.0.1:0", edge.address, tmp_path, Transport())
-        proxy = Proxy(channel_from_mapping({}), ["cam00"], 0, options)
+        options = ProxyOptions("127.0.0.1:0", edge.address, Transport())
+        stream = FrameStream(["cam00"], tmp_path)
+        proxy = Proxy(channel_from_mapping({}), 0, options, stream)
         await proxy.start()
-        lane = proxy.lanes["cam00"]
-        assert lane.upstream is not None
-        while not lane.upstream.connected:
+        flow = stream.flows["cam00"]
+        while not flow.upstream.connected:
             await asyncio.sleep(0.01)
         for n in range(200):
             request = to_request(frame_of("cam00", "s", n, n))
-            lane.take(request.SerializeToString(), request.header)
+            flow.take(request.SerializeToString(), request.header)
             await asyncio.sleep(0)
         await edge.until(CREDITS)
-        assert lane.upstream.pending == CREDITS + 1
-        assert lane.broken == 200 - CREDITS - 1
+        assert flow.upstream.pending == CREDITS + 1
+        assert flow.broken == 200 - CREDITS - 1
         await proxy.stop()
-        assert lane.broken == 200
+        assert flow.broken == 200
         await edge.stop()
 
     run(live())
@@ -221,7 +222,7 @@ def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -
 
 def test_clock_health_and_reflection_pass_a_slow_channel(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, {"service": {"law": "deterministic", "mean_ms": 1e6}}) as r:
+        async with emulate(tmp_path, {"service": {"law": "deterministic", "mean_ms": 1e6}}) as r:
             channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
             clock = clock_pb2_grpc.ClockServiceStub(channel)
             reply = await clock.Exchange(clock_pb2.ExchangeRequest(client_sent_ns=7), timeout=5)
@@ -241,7 +242,7 @@ def test_clock_health_and_reflection_pass_a_slow_channel(tmp_path: Path) -> None
 
 def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, {}) as r:
+        async with emulate(tmp_path, {}) as r:
             channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
 
             async def send(raw: bytes) -> pb.PushResponse | None:
@@ -264,7 +265,7 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
                 assert await send(raw) is None
             # And the cameras never noticed.
             await r.cameras["cam01"].stream(3, 0)
-            assert r.proxy.rejected == {"unknown_camera": 1, "bad_id": 1}
+            assert r.stream.rejected == {"unknown_camera": 1, "bad_id": 1}
             await channel.close()
 
     run(live())
@@ -274,11 +275,12 @@ def test_the_hard_limit_ends_the_emulator(tmp_path: Path) -> None:
     async def live() -> None:
         edge = await Peer().start()
         config = channel_from_mapping({**QUICK, "hard_limit_ms": 1e-6})
-        options = ProxyOptions("127.0.0.1:0", edge.address, tmp_path, Transport())
-        proxy = Proxy(config, ["cam00"], 0, options)
+        options = ProxyOptions("127.0.0.1:0", edge.address, Transport())
+        stream = FrameStream(["cam00"], tmp_path)
+        proxy = Proxy(config, 0, options, stream)
         running = asyncio.create_task(proxy.run(asyncio.Event()))
-        lane = proxy.lanes["cam00"]
-        while lane.upstream is None or not lane.upstream.connected:
+        flow = stream.flows["cam00"]
+        while not flow.upstream.connected:
             await asyncio.sleep(0.01)
         header = pb.FrameHeader(camera_id="cam00", session_id="s", role=pb.ROLE_TRAIN)
         channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
@@ -294,7 +296,7 @@ def test_the_hard_limit_ends_the_emulator(tmp_path: Path) -> None:
 
 def test_the_token_is_demanded_and_passed_on(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, {}, transport=Transport(token="open sesame")) as r:
+        async with emulate(tmp_path, {}, transport=Transport(token="open sesame")) as r:
             await r.cameras["cam00"].stream(5, 0.002)
             await r.settled()
             assert r.edge.ingest.delivered["cam00"] == 5
