@@ -47,21 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_run(commands)
-    _add_simulate(commands)
-    _add_replay(commands)
-    _add_proxy(commands)
-    _add_fit(commands)
-    _add_bench(commands)
-    _add_accuracy(commands)
+    for add in (_add_run, _add_simulate, _add_replay, _add_proxy, _add_fit, _add_bench, _add_accuracy):
+        add(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     try:
         return args.go(args)
-    except ValueError as error:  # a scenario, a spelling, a transport option, a trace: all say what to change
-        print(f"channel-emu: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:  # a path that cannot be written, an address that is taken
+    # ValueError: a scenario, a spelling, a transport option, a trace. OSError: a path, an address.
+    except (ValueError, OSError) as error:
         print(f"channel-emu: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -75,7 +68,6 @@ def _add_run(commands: Any) -> None:
         "Writes OUT/channel.json twice a second and a ledger of every frame; ends cleanly on Ctrl-C.",
     )  # fmt: skip
     sub.add_argument("scenario", help="a scenario file, or the name of a shipped one")
-    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
     sub.add_argument("--to", default="127.0.0.1:7000", metavar="HOST:PORT", help="the edge (%(default)s)")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="for channel.json and the ledger")
     sub.add_argument("--seed", type=int, help="instead of the scenario's")
@@ -96,6 +88,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
     """The options of both live commands, as ``_serve`` reads them. what: passes the link."""
+    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
     sub.add_argument("--trace", type=Path, metavar="FILE", help=f"record what happens to every {what}")
     sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
     sub.add_argument("--hard-limit-ms", type=float, metavar="MS", help=f"stop if a {what} leaves this late")
@@ -154,7 +147,7 @@ def _add_simulate(commands: Any) -> None:
 
 
 def _add_channel_options(sub: argparse.ArgumentParser) -> None:
-    """A channel as ``_config_of`` reads it."""
+    """The options that describe a channel, as ``_config_of`` reads them."""
     source = sub.add_mutually_exclusive_group()
     source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
     source.add_argument("--scenario", help="take the channel section of a scenario")
@@ -257,7 +250,6 @@ def _add_proxy(commands: Any) -> None:
         "UNAVAILABLE, a dropped stream message is left out. Prints what happened on Ctrl-C. In tests, use "
         "the pytest fixture of channel_emu.testing.",
     )  # fmt: skip
-    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
     sub.add_argument("--to", required=True, metavar="HOST:PORT", help="the service")
     _add_channel_options(sub)
     sub.add_argument("--seed", type=int, default=0, metavar="K", help="default: %(default)s")

@@ -51,8 +51,8 @@ class Histogram:
         return {"mean": self.mean_ms, **found, "max": self.max_ms if self.count else None}
 
     def linear(self, count: int = 50) -> tuple[list[float], list[float]]:
-        """The histogram in equal bins, for drawing: edges (count + 1,) in ms, from 0 to the 99.5th percentile,
-        and counts (count,)."""
+        """The histogram in equal bins, for drawing: edges (count + 1,) in ms up to the 99.5th percentile, and
+        counts (count,)."""
         top = self.percentile_ms(99.5)
         if not top:
             return [], []

@@ -32,7 +32,7 @@ class HardLimit(RuntimeError):
 
 
 class Receiver(Protocol):
-    """Passes messages on when the link has decided: one direction of a call, or a camera's flow to the edge."""
+    """Passes messages on when the link has decided: one direction of a call, or a camera's frames."""
 
     def settle(self, message: Message, kind: Kind) -> None:
         """DELIVERED: pass the message on. DUPLICATED: pass it on once more. Any other kind: it is dropped."""

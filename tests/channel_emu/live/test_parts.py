@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import channel_emu
 from channel_emu.live import timer
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.histogram import Histogram
@@ -127,6 +130,14 @@ def test_priority_says_what_it_reached_and_never_fails() -> None:
     code = "from channel_emu.live.priority import raise_priority; print(raise_priority())"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() in ("realtime", "short-slice", "nice", "normal")
+
+
+@pytest.mark.parametrize("package", ["model", "live", "virtual", "estimate"])
+def test_the_packages_import_the_model_and_not_each_other(package: str) -> None:
+    folder = Path(channel_emu.__file__).parent / package
+    text = "\n".join(file.read_text() for file in folder.rglob("*.py"))
+    found = re.findall(r"^\s*(?:from|import) channel_emu\.(\w+)", text, re.MULTILINE)
+    assert set(found) <= {"model", package}
 
 
 def test_the_emulator_needs_neither_torch_nor_the_other_packages() -> None:
