@@ -109,11 +109,6 @@ class FrameStream:
                             self._proxy.options.to)  # fmt: skip
         await asyncio.to_thread(self._status.write, self._snapshot())
 
-    def cancel_calls(self) -> None:
-        for flow in self.flows.values():
-            for call in flow.link.calls:
-                call.task.cancel()
-
     def close(self) -> None:
         """Close ledger and status, each even if the other fails."""
         try:

@@ -93,9 +93,6 @@ class Hook(Protocol):
     async def refresh(self) -> None:
         """Called twice a second."""
 
-    def cancel_calls(self) -> None:
-        """The proxy stops: end the open calls at once."""
-
     def close(self) -> None:
         """After the last message: close what the hook writes. Raises OSError where that fails."""
 
@@ -178,8 +175,9 @@ class Proxy(grpc.GenericRpcHandler):
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
-            if self._hook is not None:
-                self._hook.cancel_calls()
+            # A camera's stream has no end of its own that the grace period could wait for.
+            for call in {call for link in self.links.values() if self._hook for call in link.calls}:
+                call.task.cancel()
             await self._server.stop(_STOP_GRACE_S)
             await self.service_channel.close()
 
