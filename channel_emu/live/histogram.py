@@ -12,26 +12,29 @@ _FLOOR_MS = 1e-4
 
 
 class Histogram:
-    """Durations in ms: logarithmic bins, exact count, mean, minimum and maximum."""
+    """Durations in ms: logarithmic bins, exact count, mean and maximum. total: counts them as well."""
 
-    def __init__(self) -> None:
+    def __init__(self, total: Histogram | None = None) -> None:
         self._bins = [0] * (_PER_DECADE * _DECADES + 2)
+        self._total = total
         self.count = 0
         self.sum_ms = 0.0
         self.max_ms = 0.0
 
     def add(self, value_ms: float) -> None:
         """Count one duration; negative ones count as zero."""
-        value = max(value_ms, 0.0)
+        value = value_ms if value_ms > 0.0 else 0.0
+        index = 0 if value < _FLOOR_MS else int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
+        self._count(value, index if index < len(self._bins) else -1)
+
+    def _count(self, value: float, index: int) -> None:
         self.count += 1
         self.sum_ms += value
         if value > self.max_ms:
             self.max_ms = value
-        if value < _FLOOR_MS:
-            self._bins[0] += 1
-        else:
-            index = int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
-            self._bins[min(index, len(self._bins) - 1)] += 1
+        self._bins[index] += 1
+        if self._total is not None:
+            self._total._count(value, index)
 
     @property
     def mean_ms(self) -> float | None:

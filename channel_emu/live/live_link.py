@@ -60,13 +60,13 @@ class DelayStats:
     """Histograms of one link, or of all links together.
 
     drawn: the delay that the link drew. latency: from receiving a message to handing it on. error: how long
-    after it was due a message was handed on.
+    after it was due a message was handed on. total: counts what this one counts.
     """
 
-    def __init__(self) -> None:
-        self.drawn = Histogram()
-        self.latency = Histogram()
-        self.error = Histogram()
+    def __init__(self, total: DelayStats | None = None) -> None:
+        self.drawn = Histogram(total and total.drawn)
+        self.latency = Histogram(total and total.latency)
+        self.error = Histogram(total and total.error)
 
 
 class ServedCall:
@@ -95,7 +95,7 @@ class ServedCall:
 class LiveLink:
     """``offer`` messages; the event queue calls ``advance`` when something is due.
 
-    name: decides the link's draws, together with the channel's seed. stats: where its messages are counted.
+    name: decides the link's draws, together with the channel's seed. stats: its messages are counted there.
     failed: told of a HardLimit. damage: how the bytes of a message are flipped.
     """
 
@@ -104,7 +104,7 @@ class LiveLink:
         name: str,
         model: Link | ReplayLink,
         events: EventQueue,
-        stats: tuple[DelayStats, ...],
+        stats: DelayStats,
         failed: Callable[[BaseException], None],
         damage: Callable[[bytes, Flips], bytes],
         trace: TraceWriter | None = None,
@@ -154,9 +154,8 @@ class LiveLink:
         self.last_ns = at_ns
         self.forwarded += 1
         error_ms = (at_ns - transit.ended_ns) / 1e6
-        for stats in self.stats:
-            stats.latency.add((at_ns - transit.offered_ns) / 1e6)
-            stats.error.add(error_ms)
+        self.stats.latency.add((at_ns - transit.offered_ns) / 1e6)
+        self.stats.error.add(error_ms)
         self.age.add(at_ns, transit.offered_ns)
         self.record(message, at_ns)
         if self._hard_limit_ms is not None and error_ms > self._hard_limit_ms:
@@ -188,8 +187,7 @@ class LiveLink:
             message.transit = event.transit
             kind = event.kind
             if kind is Kind.STARTED:
-                for stats in self.stats:
-                    stats.drawn.add((event.transit.drawn_ns or 0) / 1e6)
+                self.stats.drawn.add((event.transit.drawn_ns or 0) / 1e6)
                 continue
             if kind is Kind.DELIVERED and event.transit.flips:
                 message.raw = self._damage(message.raw, event.transit.flips)

@@ -210,7 +210,7 @@ class Proxy(grpc.GenericRpcHandler):
 
     def report(self) -> Report:
         """Everything so far."""
-        found = {name: figures_of([link], link.stats[0]) for name, link in self.links.items()}
+        found = {name: figures_of([link], link.stats) for name, link in self.links.items()}
         total = asdict(figures_of(list(self.links.values()), self.stats))
         return Report(**total, seed=self.channel.seed, direction=self.options.direction,
                       seconds=self.events.now_ns() / 1e9, by_method=found)  # fmt: skip
@@ -233,7 +233,7 @@ class Proxy(grpc.GenericRpcHandler):
         elif self.options.replay is not None:
             log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
         link = self.links[name] = LiveLink(
-            name, model, self.events, (DelayStats(), self.stats), self.fail, damage or _damage_any_byte,
+            name, model, self.events, DelayStats(self.stats), self.fail, damage or _damage_any_byte,
             self._trace, self.channel.config.hard_limit_ms,
         )  # fmt: skip
         # A fault may act before the first message.

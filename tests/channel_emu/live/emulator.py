@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import itertools
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
+from channel_emu.live.camera_flow import CameraFlow
 from channel_emu.live.frame_stream import FrameStream
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.model.config import channel_from_mapping
@@ -39,6 +40,29 @@ def frame_of(camera: str, session: str, sequence: int, at_ns: int, held_out: boo
     """A real frame: encoded, posed, with a lens."""
     pose = Pose((1, 0, 0, 0), (0, 0, 0))
     return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out)
+
+
+def run(coroutine: Coroutine[Any, Any, None]) -> None:
+    async def limited() -> None:
+        async with asyncio.timeout(60):
+            await coroutine
+
+    asyncio.run(limited())
+
+
+def make(
+    out: Path, address: str, section: dict, cameras: tuple[str, ...] = ("cam00",), **options
+) -> tuple[Proxy, list[CameraFlow]]:
+    """A proxy for the frame stream, not started, and its cameras' flows."""
+    stream = FrameStream(cameras, out)
+    chosen = ProxyOptions("127.0.0.1:0", address, Transport(), **options)
+    return Proxy(channel_from_mapping(section), 0, chosen, stream), list(stream.flows.values())
+
+
+def offer(flow: CameraFlow, sequence: int) -> None:
+    """A frame comes in."""
+    request = to_request(frame_of(flow.camera, "s", sequence, sequence))
+    flow.take(request.SerializeToString(), request.header)
 
 
 class Edge:

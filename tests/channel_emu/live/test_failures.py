@@ -15,15 +15,11 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from channel_emu.live import frame_stream
-from channel_emu.live.camera_flow import CameraFlow
-from channel_emu.live.frame_stream import FrameStream
-from channel_emu.live.proxy import EmulatorFailed, Proxy, ProxyOptions
+from channel_emu.live.proxy import EmulatorFailed, Proxy
 from channel_emu.model.chain import ChainError
-from channel_emu.model.config import channel_from_mapping
-from freshfield.frame import to_request
 from freshfield.ledger import Ledger, read_all
 from freshfield.transport import Transport
-from tests.channel_emu.live.emulator import Camera, frame_of
+from tests.channel_emu.live.emulator import Camera, make, offer, run
 from tests.integration.peer import Peer
 from tests.ports import free_port
 
@@ -31,27 +27,6 @@ SLOW = {"service": {"law": "deterministic", "mean_ms": 1e9}}
 SHORT = {"service": {"law": "deterministic", "mean_ms": 300.0}}
 FULL = Path("/dev/full")
 SERVICE = "freshfield.v1.FrameStreamService"
-
-
-def run(coroutine) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(60):
-            await coroutine
-
-    asyncio.run(limited())
-
-
-def make(
-    out: Path, address: str, section: dict, cameras: tuple[str, ...] = ("cam00",), **options
-) -> tuple[Proxy, list[CameraFlow]]:
-    stream = FrameStream(cameras, out)
-    chosen = ProxyOptions("127.0.0.1:0", address, Transport(), **options)
-    return Proxy(channel_from_mapping(section), 0, chosen, stream), list(stream.flows.values())
-
-
-def offer(flow: CameraFlow, sequence: int) -> None:
-    request = to_request(frame_of(flow.camera, "s", sequence, sequence))
-    flow.take(request.SerializeToString(), request.header)
 
 
 def fill_the_disk(proxy: Proxy) -> None:

@@ -11,19 +11,15 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live.frame_stream import FrameStream
 from channel_emu.live.live_link import HardLimit
-from channel_emu.live.proxy import Proxy, ProxyOptions
-from channel_emu.live.upstream import CREDITS
+from channel_emu.live.upstream import CREDITS, PUSH
 from channel_emu.model import trace
-from channel_emu.model.config import channel_from_mapping
 from channel_emu.virtual.replay import compare
 from edge_server.report.frame_accounting import close_books
-from freshfield.frame import to_request
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
-from tests.channel_emu.live.emulator import CAMERAS, emulate, frame_of
+from tests.channel_emu.live.emulator import CAMERAS, emulate, make, offer, run
 from tests.integration.peer import Peer, silence
 
 # The thesis's channel six times faster, so that a test takes seconds.
@@ -34,14 +30,6 @@ FAST = {
     "service": {"mean_ms": [5.0, 10.0]},
 }
 QUICK = {"service": {"law": "exponential", "mean_ms": 4.0}}
-
-
-def run(coroutine) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(60):
-            await coroutine
-
-    asyncio.run(limited())
 
 
 def frame_account(out: Path):
@@ -179,16 +167,12 @@ def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
 def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -> None:
     async def live() -> None:
         edge = await Peer(respond=silence).start()
-        options = ProxyOptions("127.0.0.1:0", edge.address, Transport())
-        stream = FrameStream(["cam00"], tmp_path)
-        proxy = Proxy(channel_from_mapping({}), 0, options, stream)
+        proxy, (flow,) = make(tmp_path, edge.address, {})
         await proxy.start()
-        flow = stream.flows["cam00"]
         while not flow.upstream.connected:
             await asyncio.sleep(0.01)
         for n in range(200):
-            request = to_request(frame_of("cam00", "s", n, n))
-            flow.take(request.SerializeToString(), request.header)
+            offer(flow, n)
             await asyncio.sleep(0)
         await edge.until(CREDITS)
         assert flow.upstream.pending == CREDITS + 1
@@ -226,7 +210,7 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
             channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
 
             async def send(raw: bytes) -> pb.PushResponse | None:
-                call = channel.stream_stream("/freshfield.v1.FrameStreamService/Push")()
+                call = channel.stream_stream(PUSH)()
                 await call.write(raw)
                 try:
                     return pb.PushResponse.FromString(await call.read())
@@ -254,21 +238,13 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
 def test_the_hard_limit_ends_the_emulator(tmp_path: Path) -> None:
     async def live() -> None:
         edge = await Peer().start()
-        config = channel_from_mapping({**QUICK, "hard_limit_ms": 1e-6})
-        options = ProxyOptions("127.0.0.1:0", edge.address, Transport())
-        stream = FrameStream(["cam00"], tmp_path)
-        proxy = Proxy(config, 0, options, stream)
+        proxy, (flow,) = make(tmp_path, edge.address, {**QUICK, "hard_limit_ms": 1e-6})
         running = asyncio.create_task(proxy.run(asyncio.Event()))
-        flow = stream.flows["cam00"]
         while not flow.upstream.connected:
             await asyncio.sleep(0.01)
-        header = pb.FrameHeader(camera_id="cam00", session_id="s", role=pb.ROLE_TRAIN)
-        channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
-        call = channel.stream_stream("/freshfield.v1.FrameStreamService/Push")()
-        await call.write(pb.PushRequest(header=header).SerializeToString())
+        offer(flow, 0)
         with pytest.raises(HardLimit, match=r"frame 0 of cam00 left .* ms after it was due"):
             await running
-        await channel.close()
         await edge.stop()
 
     run(live())
@@ -281,7 +257,7 @@ def test_the_token_is_demanded_and_passed_on(tmp_path: Path) -> None:
             await r.settled()
             assert r.edge.ingest.delivered["cam00"] == 5
             stranger = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
-            call = stranger.stream_stream("/freshfield.v1.FrameStreamService/Push")()
+            call = stranger.stream_stream(PUSH)()
             with pytest.raises(grpc.aio.AioRpcError) as refused:
                 await call.write(b"")
                 await call.read()

@@ -12,8 +12,8 @@ from channel_emu.model import ages, trace
 from channel_emu.model.link import Kind, Transit
 from channel_emu.model.trace import Record
 from channel_emu.virtual.simulate import replay_offers
-from tests.channel_emu.live.emulator import CAMERAS, emulate
-from tests.channel_emu.live.test_frame_stream import FAST, frame_account, run
+from tests.channel_emu.live.emulator import CAMERAS, emulate, run
+from tests.channel_emu.live.test_frame_stream import FAST, frame_account
 
 CHAPTER_5 = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 8.0}}
 PARALLEL = {"service": {"law": "exponential", "mean_ms": 12.0}, "discipline": "parallel"}
