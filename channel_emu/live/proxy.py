@@ -40,7 +40,7 @@ log = logging.getLogger("channel-emu")
 
 DIRECTIONS = ("up", "down", "both")
 _NOT_PASSED_ON = ("user-agent", "content-type", "te")
-_MOST_LINKS = 1000
+_MOST_METHODS = 1000
 _STOP_GRACE_S = 0.5
 _REFRESH_EVERY_S = 0.5
 # How much of the chain's path before the present is kept; no event is later than this.
@@ -225,8 +225,6 @@ class Proxy(grpc.GenericRpcHandler):
         """The link of this name, made when first asked for. damage: see ``LiveLink``; None flips any byte."""
         if name in self.links:
             return self.links[name]
-        if len(self.links) >= _MOST_LINKS:
-            raise RuntimeError(f"more than {_MOST_LINKS} methods were called")
         model: Link | ReplayLink = self.channel.link(name)
         if name in self._replayed:
             model = ReplayLink(name, self._replayed[name])
@@ -290,7 +288,10 @@ class Proxy(grpc.GenericRpcHandler):
     def _link_of(self, direction: str, method: str) -> LiveLink | None:
         if self.options.direction not in (direction, "both"):
             return None
-        return self.link(direction if self.options.shared else f"{direction} {method}")
+        name = direction if self.options.shared else f"{direction} {method}"
+        if name not in self.links and len(self.links) >= _MOST_METHODS:
+            raise RuntimeError(f"more than {_MOST_METHODS} methods were called")
+        return self.link(name)
 
     def _dropped(self, what: str, direction: str, method: str) -> str:
         return (
