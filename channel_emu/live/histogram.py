@@ -25,16 +25,16 @@ class Histogram:
         """Count one duration; negative ones count as zero."""
         value = value_ms if value_ms > 0.0 else 0.0
         index = 0 if value < _FLOOR_MS else int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
-        self._count(value, index if index < len(self._bins) else -1)
-
-    def _count(self, value: float, index: int) -> None:
-        self.count += 1
-        self.sum_ms += value
-        if value > self.max_ms:
-            self.max_ms = value
-        self._bins[index] += 1
-        if self._total is not None:
-            self._total._count(value, index)
+        if index >= len(self._bins):
+            index = -1
+        histogram: Histogram | None = self
+        while histogram is not None:
+            histogram.count += 1
+            histogram.sum_ms += value
+            if value > histogram.max_ms:
+                histogram.max_ms = value
+            histogram._bins[index] += 1
+            histogram = histogram._total
 
     @property
     def mean_ms(self) -> float | None:
