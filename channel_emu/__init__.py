@@ -1,5 +1,6 @@
-"""Emulates a bad network between cameras and the edge: chain -> traffic -> link -> (faults).
+"""Emulates a bad network between cameras and the edge: chain -> traffic -> link -> faults.
 
-``link.Link`` decides what happens to each frame and knows no clock. ``proxy`` drives links by the wall
-clock, ``simulate`` by virtual time; with the same offers and seed they decide alike.
+``model.link.Link`` decides what happens to each frame and knows no clock. ``live`` runs links on the wall
+clock, ``virtual`` in virtual time; with the same offers and seed they decide alike. ``estimate`` fits a
+channel to a recording. All three import ``model`` and none imports another.
 """

@@ -11,7 +11,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from channel_emu import cli_syntax
 from channel_emu.estimate.recording import ROW_DISCIPLINES
@@ -20,6 +20,9 @@ from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.presets import PRESETS
 from channel_emu.model.queue_server import ORDERS
 from freshfield import scenario, transport
+
+if TYPE_CHECKING:
+    from channel_emu.live.proxy import Hook, Report
 
 DESCRIPTION = """\
 Emulates a bad network between cameras and the edge, seeded and per frame.
@@ -44,21 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="channel-emu", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_run(commands)
-    _add_simulate(commands)
-    _add_replay(commands)
-    _add_proxy(commands)
-    _add_fit(commands)
-    _add_bench(commands)
-    _add_accuracy(commands)
+    for add in (_add_run, _add_simulate, _add_replay, _add_proxy, _add_fit, _add_bench, _add_accuracy):
+        add(commands)
     args = parser.parse_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     try:
         return args.go(args)
-    except ValueError as error:  # a scenario, a spelling, a transport option, a trace: all say what to change
-        print(f"channel-emu: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:  # a path that cannot be written, an address that is taken
+    # ValueError: a scenario, a spelling, a transport option, a trace. OSError: a path, an address.
+    except (ValueError, OSError) as error:
         print(f"channel-emu: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -72,52 +68,62 @@ def _add_run(commands: Any) -> None:
         "Writes OUT/channel.json twice a second and a ledger of every frame; ends cleanly on Ctrl-C.",
     )  # fmt: skip
     sub.add_argument("scenario", help="a scenario file, or the name of a shipped one")
-    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
     sub.add_argument("--to", default="127.0.0.1:7000", metavar="HOST:PORT", help="the edge (%(default)s)")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="for channel.json and the ledger")
     sub.add_argument("--seed", type=int, help="instead of the scenario's")
-    sub.add_argument("--trace", type=Path, metavar="FILE", help="record what happens to every frame")
-    sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
-    sub.add_argument("--hard-limit-ms", type=float, metavar="MS", help="stop if a frame leaves this late")
-    sub.add_argument("--no-priority", action="store_true", help="do not ask to run before other processes")
-    transport.add_arguments(sub)
+    _add_live_options(sub, "frame")
     sub.set_defaults(go=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
-    from channel_emu.live import trace
-    from channel_emu.live.camera_lane import HardLimit
-    from channel_emu.live.frame_proxy import EmulatorFailed, Proxy, ProxyOptions
+    from channel_emu.live.frame_stream import FrameStream
     from channel_emu.live.priority import raise_priority
 
     plan = scenario.load(args.scenario, args.seed)
     config = channel_from_mapping(plan.channel, f"{plan.path}: channel")
+    priority = "normal" if args.no_priority else raise_priority()
+    status, _ = _serve(args, config, plan.seed, hook=FrameStream(plan.cameras, args.out, priority))
+    return status
+
+
+def _add_live_options(sub: argparse.ArgumentParser, what: str) -> None:
+    """The options of both live commands, as ``_serve`` reads them. what: passes the link."""
+    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
+    sub.add_argument("--trace", type=Path, metavar="FILE", help=f"record what happens to every {what}")
+    sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
+    sub.add_argument("--hard-limit-ms", type=float, metavar="MS", help=f"stop if a {what} leaves this late")
+    sub.add_argument("--no-priority", action="store_true", help="do not ask to run before other processes")
+    transport.add_arguments(sub)
+
+
+def _serve(
+    args: argparse.Namespace, config: ChannelConfig, seed: int, hook: Hook | None = None, **options: Any
+) -> tuple[int, Report | None]:
+    """Run a proxy until told to stop: the exit status, and the report if nothing broke."""
+    from channel_emu.live.live_link import HardLimit
+    from channel_emu.live.priority import SWITCH_INTERVAL_S
+    from channel_emu.live.proxy import EmulatorFailed, Proxy, ProxyOptions
+    from channel_emu.model import trace
+
     if args.hard_limit_ms is not None:
         config = dataclasses.replace(config, hard_limit_ms=args.hard_limit_ms)
-    options = ProxyOptions(
-        listen=args.listen, to=args.to, out=args.out, transport=transport.from_arguments(args),
-        trace=args.trace, replay=trace.read(args.replay) if args.replay else None,
-        priority="normal" if args.no_priority else raise_priority(),
+    chosen = ProxyOptions(
+        args.listen, args.to, transport.from_arguments(args), trace=args.trace,
+        replay=trace.read(args.replay) if args.replay else None, **options,
     )  # fmt: skip
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
 
-    # The event loop takes the interpreter's lock back from a helper thread after this long at most.
-    sys.setswitchinterval(0.0005)
-
-    async def live() -> None:
+    async def live() -> Report:
         stop = asyncio.Event()
         for name in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(name, stop.set)
-        await Proxy(config, plan.cameras, plan.seed, options).run(stop)
+        return await Proxy(config, seed, chosen, hook).run(stop)
 
     try:
-        asyncio.run(live())
-    except HardLimit as error:
+        return 0, asyncio.run(live())
+    except (HardLimit, EmulatorFailed) as error:
         print(f"channel-emu: {error}", file=sys.stderr)
-        return _HARD_LIMIT_STATUS
-    except EmulatorFailed as error:
-        print(f"channel-emu: {error}", file=sys.stderr)
-        return 1
-    return 0
+        return _HARD_LIMIT_STATUS if isinstance(error, HardLimit) else 1, None
 
 
 def _add_simulate(commands: Any) -> None:
@@ -141,7 +147,7 @@ def _add_simulate(commands: Any) -> None:
 
 
 def _add_channel_options(sub: argparse.ArgumentParser) -> None:
-    """A channel as ``_config_of`` reads it."""
+    """The options that describe a channel, as ``_config_of`` reads them."""
     source = sub.add_mutually_exclusive_group()
     source.add_argument("--preset", choices=list(PRESETS), default="ideal", help="default: %(default)s")
     source.add_argument("--scenario", help="take the channel section of a scenario")
@@ -224,9 +230,10 @@ def _add_replay(commands: Any) -> None:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from channel_emu.live.trace import compare, read
+    from channel_emu.model import trace
+    from channel_emu.virtual.replay import compare
 
-    result = compare(read(args.trace))
+    result = compare(trace.read(args.trace))
     if args.json:
         print(json.dumps(result))
     else:
@@ -243,53 +250,28 @@ def _add_proxy(commands: Any) -> None:
         "UNAVAILABLE, a dropped stream message is left out. Prints what happened on Ctrl-C. In tests, use "
         "the pytest fixture of channel_emu.testing.",
     )  # fmt: skip
-    sub.add_argument("--listen", default="127.0.0.1:7001", metavar="HOST:PORT", help="default: %(default)s")
     sub.add_argument("--to", required=True, metavar="HOST:PORT", help="the service")
     _add_channel_options(sub)
     sub.add_argument("--seed", type=int, default=0, metavar="K", help="default: %(default)s")
     sub.add_argument("--direction", choices=["up", "down", "both"], default="up", help="messages that pass "
                      "the link: to the service, its answers, or both (%(default)s)")  # fmt: skip
     sub.add_argument("--shared", action="store_true", help="one link for all methods, not one for each")
-    sub.add_argument("--trace", type=Path, metavar="FILE", help="record what happens to every message")
-    sub.add_argument("--replay", type=Path, metavar="FILE", help="repeat a recorded trace's decisions")
-    sub.add_argument("--hard-limit-ms", type=float, metavar="MS", help="stop if a message leaves this late")
-    sub.add_argument("--no-priority", action="store_true", help="do not ask to run before other processes")
+    _add_live_options(sub, "message")
     sub.add_argument("--json", action="store_true")
-    transport.add_arguments(sub)
     sub.set_defaults(go=_proxy)
 
 
 def _proxy(args: argparse.Namespace) -> int:
-    from channel_emu.live import trace
-    from channel_emu.live.camera_lane import HardLimit
-    from channel_emu.live.generic_proxy import GenericOptions, GenericProxy, Report, show
     from channel_emu.live.priority import raise_priority
+    from channel_emu.live.report import show
 
     config = _config_of(args)
-    if args.hard_limit_ms is not None:
-        config = dataclasses.replace(config, hard_limit_ms=args.hard_limit_ms)
-    options = GenericOptions(
-        args.listen, args.to, transport.from_arguments(args), args.direction, args.shared, args.trace,
-        trace.read(args.replay) if args.replay else None,
-    )  # fmt: skip
     if not args.no_priority:
         raise_priority()
-    sys.setswitchinterval(0.0005)
-
-    async def live() -> Report:
-        stop = asyncio.Event()
-        for name in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(name, stop.set)
-        proxy = GenericProxy(config, args.seed, options)
-        return await proxy.run(stop)
-
-    try:
-        report = asyncio.run(live())
-    except HardLimit as error:
-        print(f"channel-emu: {error}", file=sys.stderr)
-        return _HARD_LIMIT_STATUS
-    print(json.dumps(report.plain()) if args.json else show(report))
-    return 0
+    status, report = _serve(args, config, args.seed, direction=args.direction, shared=args.shared)
+    if report is not None:
+        print(json.dumps(report.plain()) if args.json else show(report))
+    return status
 
 
 def _add_fit(commands: Any) -> None:

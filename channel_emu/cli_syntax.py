@@ -133,7 +133,7 @@ def delays_ms(path: Path) -> list[float]:
     except (OSError, UnicodeDecodeError) as error:
         raise SpellingError(f"{path}: cannot be read: {error}") from None
     if text.startswith("{"):
-        from channel_emu.live.trace import read
+        from channel_emu.model.trace import read
 
         return [r.drawn_ns / 1e6 for r in read(path).records if r.drawn_ns is not None]
     try:

@@ -6,7 +6,7 @@ your tests::
     pytest_plugins = ["channel_emu.testing"]
 
 (or, in the test's module, ``from channel_emu.testing import channel``). A test then puts any gRPC service
-behind a seeded link, talks to ``link.address`` instead of the service, and asserts on what became of it::
+behind a seeded link, talks to ``link.address`` instead of the service, and asserts on the report::
 
     def test_positions_stay_fresh(channel):
         server = grpc.server(ThreadPoolExecutor())          # your own service, as it is
@@ -44,22 +44,22 @@ from typing import Any, TypeVar
 
 import pytest
 
-from channel_emu.live import trace as traces
-from channel_emu.live.generic_proxy import GenericOptions, GenericProxy, Report, show
+from channel_emu.live.priority import SWITCH_INTERVAL_S
+from channel_emu.live.proxy import Proxy, ProxyOptions
+from channel_emu.live.report import Report, show
+from channel_emu.model import trace as traces
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from freshfield.transport import Transport
 
 T = TypeVar("T")
 _PATIENCE_S = 30.0
-# The proxy's thread takes the interpreter's lock back from the test's threads after this long at most.
-_SWITCH_S = 0.0005
 
 
 class EmulatedLink:
-    """A running proxy in front of one service, on an event loop of its own thread. address: where clients
-    connect."""
+    """A running proxy in front of one service, with an event loop in a thread of its own. address: where
+    clients connect."""
 
-    def __init__(self, config: ChannelConfig, seed: int, options: GenericOptions) -> None:
+    def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions) -> None:
         self.config = config
         self.seed = seed
         self.options = options
@@ -68,7 +68,7 @@ class EmulatedLink:
         self._thread.start()
         self._last: Report | None = None
         try:
-            self._proxy = self._do(self._start())
+            self._proxy = self._await(self._start())
         except BaseException:
             self._end()
             raise
@@ -76,45 +76,45 @@ class EmulatedLink:
         self.address = f"{host}:{self._proxy.port}"
 
     def report(self) -> Report:
-        """Ages, losses and delays so far, in all and by method. Raises HardLimit where the channel sets a
-        limit and it was exceeded; after ``close`` the last report."""
-        return self._last or self._do(self._report(checked=True))
+        """Ages, losses and delays so far, in total and by method; after ``close`` the last report. Raises
+        HardLimit if the channel sets a limit and it was exceeded, EmulatorFailed if the proxy broke."""
+        return self._last or self._await(self._report(checked=True))
 
     def settle(self, timeout_s: float = 10.0) -> Report:
-        """Wait until nothing is inside any more, then report. Raises TimeoutError."""
+        """Wait until no message is inside the link, then report. Raises TimeoutError."""
         try:
-            self._do(asyncio.wait_for(self._proxy.settled(), timeout_s), timeout_s + _PATIENCE_S)
+            self._await(asyncio.wait_for(self._proxy.settled(), timeout_s), timeout_s + _PATIENCE_S)
         except TimeoutError:
             inside = self.report().in_flight
             raise TimeoutError(f"{inside} messages are still inside the link after {timeout_s:g} s") from None
         return self.report()
 
     def close(self) -> None:
-        """End the proxy; open calls are cut. Once is enough."""
+        """Stop the proxy; open calls end. A second call does nothing."""
         if self._last is None:
             try:
-                self._last = self._do(self._report(checked=False))
-                self._do(self._proxy.stop())
+                self._last = self._await(self._report(checked=False))
+                self._await(self._proxy.stop())
             finally:
                 self._end()
 
-    def told(self) -> str:
-        """The link in words: what to put in again to see the same, and what it did."""
-        report = self._last or self._do(self._report(checked=False))
+    def describe(self) -> str:
+        """The call that makes the same link again, and what this one did."""
+        report = self._last or self._await(self._report(checked=False))
         head = (
-            f"channel({self._spelled()}, to={self.options.to!r}, seed={self.seed}, "
+            f"channel({self._channel_argument()}, to={self.options.to!r}, seed={self.seed}, "
             f"direction={self.options.direction!r})"
         )
         return f"{head}\n{show(report)}"
 
-    def _spelled(self) -> str:
+    def _channel_argument(self) -> str:
         preset = self.config.preset
         if preset is not None and channel_from_mapping({"preset": preset}) == self.config:
             return repr(preset)
         return json.dumps(self.config.to_mapping())
 
-    async def _start(self) -> GenericProxy:
-        proxy = GenericProxy(self.config, self.seed, self.options)
+    async def _start(self) -> Proxy:
+        proxy = Proxy(self.config, self.seed, self.options)
         await proxy.start()
         return proxy
 
@@ -123,7 +123,7 @@ class EmulatedLink:
             self._proxy.check()
         return self._proxy.report()
 
-    def _do(self, work: Coroutine[Any, Any, T], patience_s: float = _PATIENCE_S) -> T:
+    def _await(self, work: Coroutine[Any, Any, T], patience_s: float = _PATIENCE_S) -> T:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(patience_s)
 
     def _end(self) -> None:
@@ -147,19 +147,21 @@ def put_behind(
     replay: Path | None = None,
     transport: Transport | None = None,
 ) -> EmulatedLink:
-    """A link in front of the service at ``to``; ``close`` it. What the fixture calls.
+    """A link in front of the service at ``to``; ``close`` it after use. The fixture calls this.
 
-    channel: a preset's name, a ``channel:`` section, or a configuration. direction: the messages that pass
-    the link: up (to the service), down (its answers) or both. shared: one link for all methods of a
-    direction, instead of one each. trace: record to this file. replay: repeat the decisions of a recorded
-    file. transport: TLS of both sides.
+    channel: a preset's name, a ``channel:`` section, or a configuration.
+    to, listen: HOST:PORT of the service and of the link; port 0 takes any free one.
+    direction: the messages that pass the link: up (to the service), down (its answers) or both.
+    shared: one link for all methods of a direction, instead of one each.
+    trace: record to this file. replay: repeat the decisions of a recorded file.
+    transport: TLS and token of both sides.
 
     Raises ScenarioError, TraceError, TransportError (all ValueErrors), one line that says what to change.
     """
     section: Any = {"preset": channel} if isinstance(channel, str) else channel
     config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
     replayed = traces.read(replay) if replay is not None else None
-    options = GenericOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
+    options = ProxyOptions(listen, to, transport or Transport(), direction, shared, trace, replayed)
     return EmulatedLink(config, seed, options)
 
 
@@ -176,7 +178,7 @@ def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
         return links[-1]
 
     before = sys.getswitchinterval()
-    sys.setswitchinterval(min(before, _SWITCH_S))
+    sys.setswitchinterval(min(before, SWITCH_INTERVAL_S))
     try:
         yield make
     finally:
@@ -186,5 +188,5 @@ def channel(request: pytest.FixtureRequest) -> Iterator[ChannelFactory]:
                 ending.callback(link.close)
         if links:
             # Shown by pytest where the test failed.
-            told = "\n".join(link.told() for link in links)
-            request.node.add_report_section("teardown", "emulated channel", told)
+            text = "\n".join(link.describe() for link in links)
+            request.node.add_report_section("teardown", "emulated channel", text)

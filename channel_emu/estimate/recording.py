@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from channel_emu.estimate.hmm import Timeline
-from channel_emu.live import trace
+from channel_emu.model import trace
 from channel_emu.model.instants import NEVER_NS
 from channel_emu.model.link import Kind
 

@@ -1,1 +1,1 @@
-"""The emulator on the wall clock: gRPC proxies, timers, traces."""
+"""The emulator on the wall clock: a gRPC proxy, and our frame stream as its hook."""

@@ -1,10 +1,10 @@
 """Measures the live emulator from outside: cameras, emulator and sink are separate processes on loopback.
 
-Two errors are reported. ``delay_error_ms`` is the emulator's own: from the instant a frame was due to the
-instant it was handed to gRPC. ``arrival_error_ms`` is what a receiver sees: to the instant the sink's handler
-had the frame, which adds gRPC at both ends and the sink's own scheduling. ``floor_ms`` is how late this
-machine wakes a process that does nothing but sleep, at the emulator's priority, in the same seconds: no
-emulator on it can be better. ``stolen`` is the share of processor time that a hypervisor kept to itself.
+Two errors are reported, both from the instant a frame was due. ``delay_error_ms``, the emulator's own, ends
+when the frame is handed to gRPC. ``arrival_error_ms``, what a receiver sees, ends when the sink's handler has
+the frame: it adds gRPC at both ends and the sink's scheduling. ``floor_ms`` is how late this machine wakes a
+process that only sleeps, at the emulator's priority, during the same seconds; no emulator on it can do
+better. ``stolen`` is the share of processor time that a hypervisor kept to itself.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from channel_emu.live import trace
 from channel_emu.live.priority import raise_priority
+from channel_emu.live.upstream import PUSH
 from channel_emu.live.wire import header_of
+from channel_emu.model import trace
 from freshfield.clock import WallClock
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 
-_PUSH = "/freshfield.v1.FrameStreamService/Push"
 # Every frame is let out (no server limit), so that "nothing lost" can be read off the counts.
 _CHANNEL = {"service": {"law": "exponential", "mean_ms": 60.0}, "discipline": "parallel"}
 _DRAIN_S = 10.0
@@ -48,7 +48,7 @@ def bench(
 ) -> dict[str, Any]:
     """Drive ``cameras`` streams at ``rate_hz`` for ``seconds`` through a real emulator to a real sink.
 
-    load: processes that compute on the same cores meanwhile. Returns plain values, see the module.
+    load: processes that compute on the same cores meanwhile. Returns plain values; see the module.
     """
     if not (1 <= cameras <= 1000 and rate_hz > 0 and seconds > 0 and 0 <= frame_bytes <= 8_000_000):
         raise ValueError("bench: expected 1 to 1000 cameras, rate and seconds above 0, at most 8 MB a frame")
@@ -238,8 +238,8 @@ async def _camera(
     payload: bytes,
     totals: dict[str, Any],
 ) -> None:
-    """One camera: a frame each period, one unanswered at most; periods it still waited in are skipped."""
-    call = channel.stream_stream(_PUSH)()
+    """One camera: a frame each period, at most one unanswered. It skips periods in which it still waits."""
+    call = channel.stream_stream(PUSH)()
     clock = WallClock()
     frame = 0
     while frame < seconds * rate_hz:
@@ -260,8 +260,8 @@ async def _camera(
 
 
 def _probe(pipe: Connection, priority: bool, seconds: float) -> None:
-    """How late, in ms, a process that does nothing else is at each instant of a 2 ms grid. A pause of the
-    machine counts for every instant in it, as it does for messages."""
+    """Send how late, in ms, a process that only sleeps is at each instant of a 2 ms grid. A pause of the
+    machine counts for every instant within it, as it does for messages."""
     if priority:
         raise_priority()
     late = []
@@ -291,7 +291,7 @@ def _drain(pipe: Connection, sent: int) -> int:
 
 
 def _arrival_errors(out: Path) -> np.ndarray:
-    """Lateness in ms of each frame at the sink, by the emulator's trace of when it was due."""
+    """Lateness in ms of each frame at the sink; the emulator's trace says when it was due."""
     (ledger,) = out.glob("ledger-emulator-*.tsv")
     origin_ns = int(ledger.stem.rsplit("-", 1)[1])
     due = {(int(r.camera[3:]), r.sequence): r.due_ns for r in trace.read(out / "trace.jsonl").records}
@@ -309,7 +309,7 @@ def _percentiles(values: np.ndarray) -> dict[str, float | None]:
 
 
 def _usage(pid: int) -> tuple[float, float] | None:
-    """CPU seconds and resident MB of a process, where /proc tells."""
+    """CPU seconds and resident MB of a process, or None without /proc."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
         cpu_s = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -318,7 +318,7 @@ def _usage(pid: int) -> tuple[float, float] | None:
 
 
 def _stolen() -> list[int] | None:
-    """(stolen, all) processor time since boot, in ticks, where /proc tells."""
+    """(stolen, all) processor time since boot, in ticks, or None without /proc."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
         return [ticks[7], sum(ticks)]

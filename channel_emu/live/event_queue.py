@@ -1,4 +1,4 @@
-"""When each link's next event is due, on the wall clock: one exact timer for any number of links."""
+"""When each link's next event is due on the wall clock: one exact timer for any number of links."""
 
 from __future__ import annotations
 
@@ -7,46 +7,45 @@ from collections.abc import Callable
 from typing import Protocol
 
 from channel_emu.live.timer import LoopTimer
-from channel_emu.live.trace import ReplayLink
 from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import Link
 from freshfield.clock import Clock
 
-# Entries beside four for each link before the outdated ones are cleared away.
+# Beyond four entries a link and these, outdated entries are removed.
 _SLACK = 16
 
 
-class Timed(Protocol):
-    """Who has a link on the agenda. armed_ns: the agenda's own, -1 to begin with."""
+class Scheduled(Protocol):
+    """What the queue holds. scheduled_ns belongs to the queue and is -1 to begin with."""
+
+    scheduled_ns: int
 
     @property
-    def link(self) -> Link | ReplayLink: ...
-
-    armed_ns: int
+    def next_event_ns(self) -> int: ...
 
     def advance(self, now_ns: int) -> None:
         """Do what is due up to the channel's instant ``now_ns``."""
 
 
-class Agenda:
-    """Calls ``advance`` on whoever's link has an event due. Must be made with an event loop running.
+class EventQueue:
+    """Calls ``advance`` on each link that has an event due. Must be made with an event loop running.
 
-    origin_ns: the clock's reading at the channel's instant zero. failed: told of what ``advance`` raises; in
-    the timer's callback an exception would only be logged, and every later message be stuck. shared: the
-    links compete for one server, so that what happens to one changes what is next for all.
+    origin_ns: the clock's reading at the channel's instant zero.
+    failed: told of what ``advance`` raises. An exception in the timer's callback would only be logged, and no
+        later message would leave.
+    shared: the links compete for one server, so an event of one may change the next event of all.
     """
 
     def __init__(
         self, clock: Clock, origin_ns: int, failed: Callable[[BaseException], None], shared: bool = False
     ) -> None:
-        self.due: list[tuple[int, int, Timed]] = []
-        """Heap of (instant, order, who); outdated where who is no longer armed for the instant."""
+        self.entries: list[tuple[int, int, Scheduled]] = []
+        """Heap of (instant, order, link); outdated where the link is no longer scheduled for the instant."""
         self._clock = clock
         self._origin_ns = origin_ns
         self._failed = failed
-        self._everybody: dict[int, Timed] | None = {} if shared else None
+        self._sharing: dict[int, Scheduled] | None = {} if shared else None
         self._timer = LoopTimer(self._fire)
-        self._armed_ns = NEVER_NS
+        self._timer_ns = NEVER_NS
         self._order = 0
         self._most = _SLACK
 
@@ -54,42 +53,43 @@ class Agenda:
         """The channel's present instant."""
         return self._clock.now_ns() - self._origin_ns
 
-    def arm(self, who: Timed) -> None:
-        """Note the next event of who's link; an earlier entry of it is passed over when it comes up."""
-        if self._everybody is not None:
-            self._everybody.setdefault(id(who), who)
-        next_ns = who.link.next_event_ns
-        if next_ns == who.armed_ns:
+    def schedule(self, link: Scheduled) -> None:
+        """Note the link's next event. Its earlier entry, if any, is ignored when it comes up."""
+        if self._sharing is not None:
+            self._sharing.setdefault(id(link), link)
+        next_ns = link.next_event_ns
+        if next_ns == link.scheduled_ns:
             return
-        who.armed_ns = next_ns
+        link.scheduled_ns = next_ns
         if next_ns >= NEVER_NS:
             return
         self._order += 1
-        heapq.heappush(self.due, (next_ns, self._order, who))
-        if len(self.due) > self._most:
-            self._clear()
-        if next_ns < self._armed_ns:
-            self._armed_ns = next_ns
+        heapq.heappush(self.entries, (next_ns, self._order, link))
+        if len(self.entries) > self._most:
+            self._remove_outdated()
+        if next_ns < self._timer_ns:
+            self._timer_ns = next_ns
             self._timer.arm(next_ns - self.now_ns())
 
-    def arm_touched(self, who: Timed) -> None:
-        """Something happened to who's link: note its next event, and those of links that share its server."""
-        self.arm(who)
-        for other in tuple((self._everybody or {}).values()):
-            self.arm(other)
+    def reschedule(self, link: Scheduled) -> None:
+        """After something happened to the link: note its next event, and those of links that share its
+        server."""
+        self.schedule(link)
+        for other in tuple((self._sharing or {}).values()):
+            self.schedule(other)
 
     def close(self) -> None:
         self._timer.close()
 
-    def _clear(self) -> None:
-        """Where frames preempt each other, outdated entries would stay until their instants far ahead."""
-        found: dict[int, tuple[int, int, Timed]] = {}
-        for at_ns, order, who in self.due:
-            if at_ns == who.armed_ns:
-                found.setdefault(id(who), (at_ns, order, who))
-        self.due = list(found.values())
-        heapq.heapify(self.due)
-        self._most = 4 * len(self.due) + _SLACK
+    def _remove_outdated(self) -> None:
+        """Where messages preempt each other, outdated entries would stay until instants far ahead."""
+        current: dict[int, tuple[int, int, Scheduled]] = {}
+        for entry in self.entries:
+            if entry[0] == entry[2].scheduled_ns:
+                current.setdefault(id(entry[2]), entry)
+        self.entries = list(current.values())
+        heapq.heapify(self.entries)
+        self._most = 4 * len(self.entries) + _SLACK
 
     def _fire(self) -> None:
         try:
@@ -99,12 +99,12 @@ class Agenda:
 
     def _advance_due(self) -> None:
         now_ns = self.now_ns()
-        while self.due and self.due[0][0] <= now_ns:
-            at_ns, _, who = heapq.heappop(self.due)
-            if who.armed_ns == at_ns:
-                who.armed_ns = -1
-                who.advance(now_ns)
-                self.arm_touched(who)
-        self._armed_ns = self.due[0][0] if self.due else NEVER_NS
-        if self.due:
-            self._timer.arm(self._armed_ns - self.now_ns())
+        while self.entries and self.entries[0][0] <= now_ns:
+            at_ns, _, link = heapq.heappop(self.entries)
+            if link.scheduled_ns == at_ns:
+                link.scheduled_ns = -1
+                link.advance(now_ns)
+                self.reschedule(link)
+        self._timer_ns = self.entries[0][0] if self.entries else NEVER_NS
+        if self.entries:
+            self._timer.arm(self._timer_ns - self.now_ns())

@@ -1,4 +1,4 @@
-"""A histogram of durations in fixed memory, for percentiles of a run of any length."""
+"""A histogram of durations in fixed memory, for percentiles over a run of any length."""
 
 from __future__ import annotations
 
@@ -12,26 +12,29 @@ _FLOOR_MS = 1e-4
 
 
 class Histogram:
-    """Durations in ms: logarithmic bins, exact count, mean, minimum and maximum."""
+    """Durations in ms: logarithmic bins, exact count, mean and maximum. total: counts them as well."""
 
-    def __init__(self) -> None:
+    def __init__(self, total: Histogram | None = None) -> None:
         self._bins = [0] * (_PER_DECADE * _DECADES + 2)
+        self._total = total
         self.count = 0
         self.sum_ms = 0.0
         self.max_ms = 0.0
 
     def add(self, value_ms: float) -> None:
         """Count one duration; negative ones count as zero."""
-        value = max(value_ms, 0.0)
-        self.count += 1
-        self.sum_ms += value
-        if value > self.max_ms:
-            self.max_ms = value
-        if value < _FLOOR_MS:
-            self._bins[0] += 1
-        else:
-            place = int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
-            self._bins[min(place, len(self._bins) - 1)] += 1
+        value = value_ms if value_ms > 0.0 else 0.0
+        index = 0 if value < _FLOOR_MS else int(math.log10(value / _FLOOR_MS) * _PER_DECADE) + 1
+        if index >= len(self._bins):
+            index = -1
+        histogram: Histogram | None = self
+        while histogram is not None:
+            histogram.count += 1
+            histogram.sum_ms += value
+            if value > histogram.max_ms:
+                histogram.max_ms = value
+            histogram._bins[index] += 1
+            histogram = histogram._total
 
     @property
     def mean_ms(self) -> float | None:
@@ -42,12 +45,17 @@ class Histogram:
         if not self.count:
             return None
         rank = max(1, math.ceil(percent / 100 * self.count))
-        place = int(np.searchsorted(np.cumsum(self._bins), rank))
-        return min(_FLOOR_MS * 10 ** (place / _PER_DECADE), self.max_ms)
+        index = int(np.searchsorted(np.cumsum(self._bins), rank))
+        return min(_FLOOR_MS * 10 ** (index / _PER_DECADE), self.max_ms)
+
+    def summary(self) -> dict[str, float | None]:
+        """Mean, percentiles and maximum in ms; None if empty."""
+        found = {f"p{p}": self.percentile_ms(p) for p in (50, 95, 99)}
+        return {"mean": self.mean_ms, **found, "max": self.max_ms if self.count else None}
 
     def linear(self, count: int = 50) -> tuple[list[float], list[float]]:
-        """Edges (count + 1,) in ms from 0 to the 99.5th percentile, and counts (count,): the logarithmic bins
-        spread over equal ones, for drawing."""
+        """The histogram in equal bins, for drawing: edges (count + 1,) in ms up to the 99.5th percentile, and
+        counts (count,)."""
         top = self.percentile_ms(99.5)
         if not top:
             return [], []

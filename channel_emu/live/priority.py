@@ -1,4 +1,4 @@
-"""Asks the system to run the emulator when it is due: a network does not wait for a neighbour's training.
+"""Asks the system to run the emulator when a message is due, even while other processes compute.
 
 Measured on two cores with two processes computing on each, lateness of a timer at 50 / 90 / 99 %: untouched
 0.19 / 2.8 / 9.9 ms; niceness -15 no better (schedulers that group by session or container compare niceness
@@ -13,6 +13,9 @@ import os
 import platform
 
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+SWITCH_INTERVAL_S = 0.0005
+"""The event loop takes the interpreter's lock back from another thread after this long at most
+(``sys.setswitchinterval``)."""
 # A thread that asks for short slices is let in sooner when it wakes (Linux 6.12 and later).
 _SLICE_NS = 100_000
 
@@ -31,10 +34,10 @@ class _Attributes(ctypes.Structure):
 
 
 def raise_priority() -> str:
-    """Best of what the system permits: ``realtime``, ``short-slice``, ``nice`` or ``normal``.
+    """Take the best that the system permits: ``realtime``, ``short-slice``, ``nice`` or ``normal``.
 
-    Threads started later inherit it: call it before gRPC starts its own, for a thread that was put aside
-    while it held the interpreter's lock would hold up the others. Real time needs CAP_SYS_NICE; the kernel
+    Threads started later inherit it. Call it before gRPC starts its own: a thread that is preempted while it
+    holds the interpreter's lock delays the others. Real time needs CAP_SYS_NICE; the kernel
     still keeps 5 % of each core from it.
     """
     if hasattr(os, "sched_setscheduler"):

@@ -1,4 +1,4 @@
-"""What the emulator says about itself, twice a second: ``OUT/channel.json``, replaced atomically."""
+"""The emulator's status, written twice a second to ``OUT/channel.json`` and replaced atomically."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from channel_emu.live.camera_lane import Lane, Measures
+from channel_emu.live.camera_flow import CameraFlow
 from channel_emu.live.histogram import Histogram
+from channel_emu.live.live_link import DelayStats
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import Kind
 from freshfield.files import write_json
@@ -19,51 +20,49 @@ _SERIES_MOST = 600
 
 
 class StatusFile:
-    """Readers see the old file or the new one, never half of one."""
+    """Readers see the old file or the new one, never a part of one."""
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
 
     def write(self, state: dict[str, Any]) -> None:
-        """A full disk costs a status, not the emulator."""
+        """On a full disk the status is not written; the emulator goes on."""
         with contextlib.suppress(OSError):
             write_json(self.path, state)
 
 
 def snapshot(
     channel: Channel,
-    lanes: Sequence[Lane],
-    measures: Measures,
+    flows: Sequence[CameraFlow],
+    stats: DelayStats,
     rejected: dict[str, int],
     now_ns: int,
     priority: str,
     final: bool,
 ) -> dict[str, Any]:
-    """Everything worth knowing now, as plain values.
+    """The status as plain values.
 
-    ``state`` and ``series`` are those of the shared chain; with a chain for each camera they are in
-    ``by_camera``. ``counts`` are over all cameras; ``broken`` counts frames that the edge was not there for.
+    ``state`` and ``series`` are those of the shared chain; with a chain for each camera, ``by_camera`` has
+    its state. ``counts`` are over all cameras; ``broken`` counts frames that a reset or an absent edge broke.
     """
     now = max(now_ns, 0)
     names = channel.config.state_names
     totals: Counter[str] = Counter()
     by_camera: dict[str, Any] = {}
-    for lane in lanes:
-        counts = _counts(lane)
+    edge_rejected: Counter[str] = Counter()
+    for flow in flows:
+        counts = _counts(flow)
         totals.update(counts)
+        edge_rejected.update(flow.upstream.rejected)
         entry: dict[str, Any] = {
             **counts,
-            "connected": lane.upstream is not None and lane.upstream.connected,
-            "streams": len(lane.streams),
+            "connected": flow.upstream.connected,
+            "streams": len(flow.link.calls),
         }
-        if channel.chain is None and lane.link.chain is not None:
-            entry["state"] = names[lane.link.chain.state(now)]
-        by_camera[lane.camera] = entry
-    edge_rejected: Counter[str] = Counter()
-    for lane in lanes:
-        if lane.upstream is not None:
-            edge_rejected.update(lane.upstream.rejected)
+        if channel.chain is None and flow.link.model.chain is not None:
+            entry["state"] = names[flow.link.model.chain.state(now)]
+        by_camera[flow.camera] = entry
     chain = channel.chain
     return {
         "running": not final,
@@ -74,10 +73,10 @@ def snapshot(
         "uptime_s": round(now / 1e9, 3),
         "states": names,
         "state": None if chain is None else names[chain.state(now)],
-        "state_share": _shares(channel, lanes, now),
+        "state_share": _shares(channel, flows, now),
         "series": _series(channel, now),
-        "drawn_delay_ms": _figures(measures.drawn_delay, shape=True),
-        "delay_error_ms": _figures(measures.delay_error, shape=final),
+        "drawn_delay_ms": _figures(stats.drawn, shape=True),
+        "delay_error_ms": _figures(stats.error, shape=final),
         "counts": dict(totals),
         "rejected": dict(rejected),
         "edge_rejected": dict(edge_rejected),
@@ -85,25 +84,25 @@ def snapshot(
     }
 
 
-def _counts(lane: Lane) -> dict[str, int]:
-    link = lane.link
+def _counts(flow: CameraFlow) -> dict[str, int]:
+    link = flow.link.model
     return {
-        "received": lane.received,
-        "held_out": lane.held_out,
-        "forwarded": lane.forwarded,
+        "received": link.offered + flow.held_out,
+        "held_out": flow.held_out,
+        "forwarded": flow.forwarded,
         **{str(kind): link.counts[kind] for kind in Kind if kind is not Kind.STARTED},
         # Both a stream reset by the channel and an edge that was away break frames.
-        "broken": link.counts[Kind.BROKEN] + lane.broken,
-        "in_flight": link.in_flight + (lane.upstream.pending if lane.upstream is not None else 0),
+        "broken": link.counts[Kind.BROKEN] + flow.broken,
+        "in_flight": link.in_flight + flow.upstream.pending,
         "clock_backwards": link.clock_backwards,
     }
 
 
-def _shares(channel: Channel, lanes: Sequence[Lane], now_ns: int) -> dict[str, float]:
-    chains = [channel.chain] if channel.chain else [lane.link.chain for lane in lanes if lane.link.chain]
-    if not chains:
-        return {}
+def _shares(channel: Channel, flows: Sequence[CameraFlow], now_ns: int) -> dict[str, float]:
+    chains = [channel.chain] if channel.chain else [flow.link.model.chain for flow in flows]
     shares = [chain.occupancy(now_ns) for chain in chains if chain is not None]
+    if not shares:
+        return {}
     return {
         name: round(sum(s[i] for s in shares) / len(shares), 6)
         for i, name in enumerate(channel.config.state_names)
@@ -120,16 +119,9 @@ def _series(channel: Channel, now_ns: int) -> list[tuple[float, str]]:
 
 
 def _figures(histogram: Histogram, shape: bool) -> dict[str, Any]:
-    def rounded(value: float | None) -> float | None:
-        return None if value is None else round(value, 4)
-
     figures: dict[str, Any] = {
         "count": histogram.count,
-        "mean": rounded(histogram.mean_ms),
-        "p50": rounded(histogram.percentile_ms(50)),
-        "p95": rounded(histogram.percentile_ms(95)),
-        "p99": rounded(histogram.percentile_ms(99)),
-        "max": rounded(histogram.max_ms if histogram.count else None),
+        **{name: None if value is None else round(value, 4) for name, value in histogram.summary().items()},
     }
     if shape:
         edges_ms, counts = histogram.linear()

@@ -1,8 +1,8 @@
 """Wakes the event loop at an exact instant.
 
-asyncio's own timers are rounded up to the selector's millisecond (p99 2 ms late on an idle machine). A Linux
+asyncio rounds its own timers up to the selector's millisecond (p99 2 ms late on an idle machine). A Linux
 timerfd is a file that becomes readable when the kernel's high-resolution timer fires: the loop wakes on it as
-on a socket, with no second thread to hand over from. Elsewhere asyncio's timers have to do.
+on a socket, without a second thread. On other systems asyncio's timers are used.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The stream from the emulator to the edge for one camera: several credits, no queue, reconnects for ever."""
+"""One camera's stream from the emulator to the edge: several credits, no queue, reconnects forever."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import contextlib
 import logging
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import grpc
@@ -15,6 +14,7 @@ import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError
 
+from channel_emu.live.live_link import STREAM_ENDED, Message
 from freshfield.transport import backoff_s
 from freshfield.v1 import frames_pb2 as pb
 
@@ -26,25 +26,14 @@ PUSH = "/freshfield.v1.FrameStreamService/Push"
 CREDITS = 8
 FIRST_BACKOFF_S = 0.1
 MAX_BACKOFF_S = 2.0
-# How gRPC says that a stream is over.
-_ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
-
-
-@dataclass(slots=True)
-class Outgoing:
-    """A frame that the link has let out. ``tag`` is the sender's own."""
-
-    raw: bytes
-    sequence: int
-    tag: Any
 
 
 class Upstream:
-    """Sends frames as they are given. One that cannot go, because the edge is away or has answered none of
-    the last CREDITS and a newer one came, is ``broken``.
+    """Sends frames as they are given. A frame is ``broken`` if the edge is away, or if CREDITS frames are
+    unanswered and a newer frame took its place.
 
-    forwarded, broken: called once for each frame, on the event loop; a forwarded frame whose stream ends
-    before its answer is broken after all (what the edge wrote decides whether it arrived).
+    forwarded, broken: called once for each frame, on the event loop. A forwarded frame whose stream ends
+    before its answer is broken as well (the edge's ledger decides whether it arrived).
     """
 
     def __init__(
@@ -52,15 +41,15 @@ class Upstream:
         camera: str,
         channel: grpc.aio.Channel,
         metadata: tuple[tuple[str, str], ...],
-        forwarded: Callable[[Outgoing], None],
-        broken: Callable[[Outgoing], None],
+        forwarded: Callable[[Message], None],
+        broken: Callable[[Message], None],
         jitter: np.random.Generator,
     ) -> None:
         self.camera = camera
         self.connected = False
         self.connections = 0
         self.opened = asyncio.Event()
-        """Set once the first stream stands."""
+        """Set when the first stream is open."""
         self.rejected: Counter[str] = Counter()
         """The edge's refusals, by reason."""
         self._channel = channel
@@ -68,14 +57,14 @@ class Upstream:
         self._forwarded = forwarded
         self._broken = broken
         self._jitter = jitter
-        self._outbox: deque[Outgoing] = deque()
-        self._unanswered: deque[Outgoing] = deque()
-        self._held: Outgoing | None = None
+        self._outbox: deque[Message] = deque()
+        self._unanswered: deque[Message] = deque()
+        self._held: Message | None = None
         self._wake = asyncio.Event()
         self._trouble = ""
 
-    def send(self, frame: Outgoing) -> None:
-        """Hand over a frame that is due now. Never blocks, never raises."""
+    def send(self, frame: Message) -> None:
+        """Send a frame that is due now. Never blocks."""
         if not self.connected:
             self._broken(frame)
         elif len(self._outbox) + len(self._unanswered) >= CREDITS:
@@ -99,7 +88,7 @@ class Upstream:
             try:
                 await self._channel.channel_ready()
                 answered = await self._session()
-            except _ENDED as error:
+            except STREAM_ENDED as error:
                 self._say(error)
             finally:
                 self._end()
@@ -117,12 +106,12 @@ class Upstream:
         try:
             done, _ = await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
-                # The stream itself may stand: asking how it ended would take for ever.
+                # The stream itself may still be open: asking how it ended would take forever.
                 error = task.exception()
                 if isinstance(error, DecodeError):
                     self._say("the edge sent bytes that are no answer")
                     return False
-                if error is not None and not isinstance(error, _ENDED):
+                if error is not None and not isinstance(error, STREAM_ENDED):
                     raise error
             code, details = await call.code(), await call.details()
             self._say(f"{code.name}: {details}" if details else code.name)
@@ -132,7 +121,7 @@ class Upstream:
             call.cancel()
             for task in (reader, writer):
                 task.cancel()
-                with contextlib.suppress(asyncio.CancelledError, DecodeError, *_ENDED):
+                with contextlib.suppress(asyncio.CancelledError, DecodeError, *STREAM_ENDED):
                     await task
 
     async def _write(self, call: grpc.aio.StreamStreamCall) -> None:
@@ -165,7 +154,7 @@ class Upstream:
                     self._outbox.append(self._held)
                     self._held = None
                     self._wake.set()
-        except _ENDED:
+        except STREAM_ENDED:
             return answered
 
     def _end(self) -> None:

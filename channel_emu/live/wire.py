@@ -1,8 +1,8 @@
-"""Reads a PushRequest's header without touching its payload, and damages a payload where a fault says so."""
+"""Reads a PushRequest's header without touching its payload, and flips bytes of the payload for a fault."""
 
 from __future__ import annotations
 
-from channel_emu.model.link import Transit
+from channel_emu.live.live_link import Flips
 from freshfield.v1 import frames_pb2 as pb
 
 _HEADER = 1 << 3 | 2  # field 1, length-delimited
@@ -10,11 +10,11 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
 class WireError(ValueError):
-    """Bytes that are no PushRequest."""
+    """Bytes that are not a PushRequest."""
 
 
 def header_of(raw: bytes) -> pb.FrameHeader:
-    """The header of a serialised PushRequest; the payload is skipped over, not copied. Raises WireError."""
+    """The header of a serialized PushRequest; the payload is skipped, not copied. Raises WireError."""
     view = memoryview(raw)
     header: memoryview | None = None
     at = 0
@@ -42,15 +42,12 @@ def header_of(raw: bytes) -> pb.FrameHeader:
         raise WireError(f"not a PushRequest: {error}") from None
 
 
-def damaged(raw: bytes, transit: Transit) -> bytes:
-    """The message as it leaves the link: unchanged unless a fault flipped bytes of its payload. The checksum
-    stays the sender's, which is how the edge will notice."""
-    if not transit.flips:
-        return raw
-    from channel_emu.model.faults.corruption import damage
+def damage_payload(raw: bytes, flips: Flips) -> bytes:
+    """The message with bytes of its payload flipped. The checksum stays the sender's: so the edge notices."""
+    from channel_emu.model.faults.corruption import damage  # only where a scenario lists it
 
     request = pb.PushRequest.FromString(raw)
-    request.payload = damage(request.payload, transit.flips)
+    request.payload = damage(request.payload, flips)
     return request.SerializeToString()
 
 

@@ -1,5 +1,4 @@
-"""The ``channel`` fixture as a user has it: their own service, its server and clients as they are, a link
-between them."""
+"""The ``channel`` fixture as a user has it: a link between the server and the clients of their service."""
 
 from __future__ import annotations
 
@@ -14,8 +13,9 @@ from pathlib import Path
 import grpc
 import pytest
 
-from channel_emu.live import trace
+from channel_emu.model import trace
 from channel_emu.testing import EmulatedLink, channel, put_behind
+from channel_emu.virtual.replay import compare
 
 assert channel  # the fixture; where a conftest.py lists the plugin, no import is needed
 
@@ -26,7 +26,7 @@ WAIT = {"service": {"law": "deterministic", "mean_ms": 40.0}}
 
 
 class Greeter:
-    """A service of all four kinds of call, by hand: bytes in, bytes out."""
+    """A service with all four kinds of call, without protobuf: bytes in, bytes out."""
 
     def __init__(self) -> None:
         self.collected: list[bytes] = []
@@ -110,7 +110,7 @@ def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client, tm
     report = link.settle()
     assert report.offered == 100 and int(answer) == len(greeter.collected) == report.delivered
     link.close()
-    # A machine that is busy with other things paces them unevenly: what passes is told by when they came.
+    # A busy machine paces them unevenly: when each one came says which pass.
     offered_ms = [r.offered_ns / 1e6 for r in trace.read(tmp_path / "1.jsonl").records]
     free_ms, passed = float("-inf"), 0
     for at_ms in sorted(offered_ms):
@@ -118,7 +118,7 @@ def test_a_streams_ages_and_losses_are_the_channels(channel, greeter, client, tm
             free_ms, passed = at_ms + 15, passed + 1
     assert report.delivered == passed < 100 and report.dropped == report.outcomes["dropped_busy"]
     gap_ms = max(b - a for a, b in itertools.pairwise(sorted(offered_ms)))
-    # It hands messages on late, too, and says so.
+    # It also hands messages on late, by an error that it reports.
     late_ms = report.error_ms["max"]
     assert 20 < report.mean_age_ms < 25 + gap_ms / 2 + late_ms
     assert report.mean_age_ms < report.peak_age_ms < 30 + gap_ms + late_ms
@@ -254,7 +254,7 @@ def test_a_trace_is_replayed_with_the_same_decisions(channel, greeter, client, t
     first.settle()
     first.close()
     found = trace.read(tmp_path / "1.jsonl")
-    assert trace.compare(found) == {"frames": 80, "equal": 80, "different": []}
+    assert compare(found) == {"frames": 80, "equal": 80, "different": []}
     second = channel("ideal", to=greeter.address, replay=tmp_path / "1.jsonl", trace=tmp_path / "2.jsonl")
     client(second).stream_unary(COLLECT)(paced(80, 0.008))
     report = second.settle()

@@ -1,5 +1,4 @@
-"""Our own services behind the fixture that users get (``channel_emu.testing``): as they are, over a seeded
-link that knows nothing of them."""
+"""Our own services, unchanged, behind the fixture that users get (``channel_emu.testing``)."""
 
 from __future__ import annotations
 
@@ -38,8 +37,8 @@ async def edge_at(out: Path) -> AsyncIterator[Edge]:
 
 
 def test_the_edges_frame_stream_over_a_lossy_link(channel, tmp_path: Path) -> None:
-    """Frames at 100 a second over exponential delays of 15 ms: what the link let out is what the edge
-    buffered, in order, and the edge's own age is the link's."""
+    """Frames at 100 a second over exponential delays of 15 ms: the edge buffers what the link released, in
+    order, and its age is the link's."""
     section = {"service": {"law": "exponential", "mean_ms": 15.0}, "discipline": "drop-new"}
     clock = WallClock()
     born: dict[int, int] = {}
@@ -63,11 +62,11 @@ def test_the_edges_frame_stream_over_a_lossy_link(channel, tmp_path: Path) -> No
             assert len(answered) == edge.ingest.delivered["cam00"] == report.delivered
             assert not edge.ingest.rejected and answered == sorted(answered)
             assert report.dropped == report.outcomes["dropped_busy"]
-            (books,) = ledger.read_all(tmp_path)
-            arrived = [(e.t_ns, born[e.sequence]) for e in books.events if e.event == "delivered"]
+            (file,) = ledger.read_all(tmp_path)
+            arrived = [(e.t_ns, born[e.sequence]) for e in file.events if e.event == "delivered"]
             at_ns, born_ns = (np.array(column, np.int64) for column in zip(*arrived))
             saw = ages.sawtooth(at_ns, born_ns, int(at_ns[-1]))
-            # All that lies between the two are the hops to the link and from it.
+            # Between the two lie only the hops to the link and from it.
             hops_ms = float((at_ns - born_ns).mean()) / 1e6 - report.latency_ms["mean"]
             assert 0 < hops_ms < 100
             expected = report.mean_age_ms + hops_ms
@@ -78,8 +77,8 @@ def test_the_edges_frame_stream_over_a_lossy_link(channel, tmp_path: Path) -> No
 
 @pytest.mark.parametrize(("direction", "sign"), [("up", 1), ("down", -1), ("both", 0)])
 def test_the_clock_exchange_over_an_unequal_link(channel, tmp_path: Path, direction: str, sign: int) -> None:
-    """NTP takes both ways for equal: a delay on one way only is an error of half of it, and the bound that
-    the estimate comes with holds it."""
+    """NTP assumes that both ways take equally long: a delay of one way only gives an error of half of it,
+    which lies within the estimate's bound."""
     section = {"service": {"law": "deterministic", "mean_ms": DELAY_MS}}
     estimator, clock = OffsetEstimator(), WallClock()
     trips_ms: list[float] = []
@@ -110,7 +109,7 @@ def test_the_clock_exchange_over_an_unequal_link(channel, tmp_path: Path, direct
 
 
 def test_watching_decisions_leaves_out_what_the_link_drops(channel, tmp_path: Path) -> None:
-    """Two thirds of a stream of answers lost: those that come are whole and in order."""
+    """Two thirds of a stream of answers are lost: those that arrive are whole and in order."""
 
     async def answers(request: bytes, context: grpc.aio.ServicerContext) -> None:
         for n in itertools.count():

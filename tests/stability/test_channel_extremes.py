@@ -1,4 +1,4 @@
-"""The channel where numbers are extreme: it stays exact or says why it will not."""
+"""The channel with extreme numbers: it stays exact, or refuses and says why."""
 
 from __future__ import annotations
 

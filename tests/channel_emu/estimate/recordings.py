@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from channel_emu.live.trace import TraceWriter
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
+from channel_emu.model.trace import TraceWriter
 from channel_emu.virtual.simulate import OUTCOMES, simulate
 
 

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import itertools
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,9 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from channel_emu.live.frame_proxy import Proxy, ProxyOptions
+from channel_emu.live.camera_flow import CameraFlow
+from channel_emu.live.frame_stream import FrameStream
+from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.model.config import channel_from_mapping
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.grpc_services import ClockService
@@ -38,6 +40,29 @@ def frame_of(camera: str, session: str, sequence: int, at_ns: int, held_out: boo
     """A real frame: encoded, posed, with a lens."""
     pose = Pose((1, 0, 0, 0), (0, 0, 0))
     return Frame(camera, session, sequence, at_ns, pose, _LENS, "jpeg", _IMAGE, held_out)
+
+
+def run(coroutine: Coroutine[Any, Any, None]) -> None:
+    async def limited() -> None:
+        async with asyncio.timeout(60):
+            await coroutine
+
+    asyncio.run(limited())
+
+
+def make(
+    out: Path, address: str, section: dict, cameras: tuple[str, ...] = ("cam00",), **options
+) -> tuple[Proxy, list[CameraFlow]]:
+    """A proxy for the frame stream, not started, and its cameras' flows."""
+    stream = FrameStream(cameras, out)
+    chosen = ProxyOptions("127.0.0.1:0", address, Transport(), **options)
+    return Proxy(channel_from_mapping(section), 0, chosen, stream), list(stream.flows.values())
+
+
+def offer(flow: CameraFlow, sequence: int) -> None:
+    """A frame comes in."""
+    request = to_request(frame_of(flow.camera, "s", sequence, sequence))
+    flow.take(request.SerializeToString(), request.header)
 
 
 class Edge:
@@ -130,30 +155,26 @@ class Camera:
         self._ledger.write(self._clock.now_ns(), self.name, self.session, sequence, event, detail)
 
 
-class Rig:
+class Emulation:
     """Edge, emulator and cameras in one folder."""
 
-    def __init__(self, edge: Edge, proxy: Proxy, cameras: dict[str, Camera]) -> None:
-        self.edge, self.proxy, self.cameras = edge, proxy, cameras
+    def __init__(self, edge: Edge, proxy: Proxy, stream: FrameStream, cameras: dict[str, Camera]) -> None:
+        self.edge, self.proxy, self.stream, self.cameras = edge, proxy, stream, cameras
 
     async def connected(self) -> None:
-        """Until every upstream stream stands."""
+        """Wait until every stream to the edge is open."""
         async with asyncio.timeout(30):
-            while not all(lane.upstream and lane.upstream.connected for lane in self.proxy.lanes.values()):
+            while not all(flow.upstream.connected for flow in self.stream.flows.values()):
                 await asyncio.sleep(0.01)
 
     async def settled(self) -> None:
-        """Until nothing is inside the emulator any more."""
+        """Wait until nothing is inside the emulator any more."""
         async with asyncio.timeout(30):
-            while any(
-                lane.link.in_flight or (lane.upstream and lane.upstream.pending)
-                for lane in self.proxy.lanes.values()
-            ):
-                await asyncio.sleep(0.01)
+            await self.proxy.settled()
 
 
 @contextlib.asynccontextmanager
-async def rig(
+async def emulate(
     out: Path,
     section: dict,
     *,
@@ -162,16 +183,17 @@ async def rig(
     seed: int = 5,
     transport: Transport | None = None,
     **options: Any,
-) -> AsyncIterator[Rig]:
+) -> AsyncIterator[Emulation]:
     transport = transport or Transport()
     edge = Edge(out, cameras, held_out, transport)
     await edge.start()
-    chosen = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{edge.port}", out, transport, **options)
-    proxy = Proxy(channel_from_mapping(section), cameras, seed, chosen)
+    chosen = ProxyOptions("127.0.0.1:0", f"127.0.0.1:{edge.port}", transport, **options)
+    stream = FrameStream(cameras, out)
+    proxy = Proxy(channel_from_mapping(section), seed, chosen, stream)
     await proxy.start()
     ledger = Ledger(out, "node", "all", WallClock().now_ns())
     nodes = {c: Camera(c, proxy.port, transport, c in held_out, ledger) for c in cameras}
-    made = Rig(edge, proxy, nodes)
+    made = Emulation(edge, proxy, stream, nodes)
     await made.connected()
     try:
         yield made

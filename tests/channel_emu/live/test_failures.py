@@ -14,14 +14,12 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live import frame_proxy as proxy_module
-from channel_emu.live.frame_proxy import EmulatorFailed, Proxy, ProxyOptions
+from channel_emu.live import frame_stream
+from channel_emu.live.proxy import EmulatorFailed, Proxy
 from channel_emu.model.chain import ChainError
-from channel_emu.model.config import channel_from_mapping
-from freshfield.frame import to_request
 from freshfield.ledger import Ledger, read_all
 from freshfield.transport import Transport
-from tests.channel_emu.live.emulator import Camera, frame_of
+from tests.channel_emu.live.emulator import Camera, make, offer, run
 from tests.integration.peer import Peer
 from tests.ports import free_port
 
@@ -29,26 +27,6 @@ SLOW = {"service": {"law": "deterministic", "mean_ms": 1e9}}
 SHORT = {"service": {"law": "deterministic", "mean_ms": 300.0}}
 FULL = Path("/dev/full")
 SERVICE = "freshfield.v1.FrameStreamService"
-
-
-def run(coroutine) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(60):
-            await coroutine
-
-    asyncio.run(limited())
-
-
-def make(out: Path, address: str, section: dict, cameras: tuple[str, ...] = ("cam00",), **options) -> Proxy:
-    chosen = ProxyOptions("127.0.0.1:0", address, out, Transport(), **options)
-    return Proxy(channel_from_mapping(section), cameras, 0, chosen)
-
-
-def offer(proxy: Proxy, sequence: int, camera: str = "cam00") -> None:
-    request = to_request(frame_of(camera, "s", sequence, sequence))
-    lane = proxy.lanes[camera]
-    lane.take(request.SerializeToString(), request.header)
-    proxy._agenda.arm(lane)
 
 
 def fill_the_disk(proxy: Proxy) -> None:
@@ -64,18 +42,16 @@ def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edge_is_there: bool
 ) -> None:
     """A frame comes due whose fate cannot be recorded: broken at once, or forwarded by the stream's task."""
-    monkeypatch.setattr(proxy_module, "_FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
+    monkeypatch.setattr(frame_stream, "_FIRST_WAIT_S", 5.0 if edge_is_there else 0.1)
 
     async def live() -> None:
         edge = await Peer().start() if edge_is_there else None
         address = edge.address if edge else f"127.0.0.1:{free_port()}"
-        proxy = make(tmp_path, address, SHORT, trace=tmp_path / "t.jsonl")
+        proxy, (flow,) = make(tmp_path, address, SHORT, trace=tmp_path / "t.jsonl")
         running = asyncio.create_task(proxy.run(asyncio.Event()))
-        upstream = None
-        while upstream is None or upstream.opened.is_set() is not edge_is_there:
+        while not proxy.port or flow.upstream.opened.is_set() is not edge_is_there:
             await asyncio.sleep(0.01)
-            upstream = proxy.lanes["cam00"].upstream
-        offer(proxy, 0)
+        offer(flow, 0)
         fill_the_disk(proxy)
         with pytest.raises(EmulatorFailed, match=r"No space left on device.*is there room"):
             async with asyncio.timeout(15):
@@ -91,15 +67,15 @@ def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(
 
 def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A background task and the timer's callback, each with an error that is no OSError."""
-    monkeypatch.setattr(proxy_module, "_FIRST_WAIT_S", 0.1)
+    monkeypatch.setattr(frame_stream, "_FIRST_WAIT_S", 0.1)
 
     async def live(break_it) -> None:
-        proxy = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
-        break_it(proxy)
+        proxy, (flow,) = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
+        break_it(proxy, flow)
         running = asyncio.create_task(proxy.run(asyncio.Event()))
         await asyncio.sleep(0.3)
         if not running.done():
-            offer(proxy, 0)
+            offer(flow, 0)
         with pytest.raises(EmulatorFailed, match="ChainError: no such state"):
             async with asyncio.timeout(15):
                 await running
@@ -107,8 +83,8 @@ def test_a_part_that_breaks_ends_the_emulator(tmp_path: Path, monkeypatch: pytes
     def raising(*_: object) -> None:
         raise ChainError("no such state")
 
-    run(live(lambda proxy: setattr(proxy.channel, "forget", raising)))
-    run(live(lambda proxy: setattr(proxy.lanes["cam00"], "advance", raising)))
+    run(live(lambda proxy, _: setattr(proxy.channel, "forget", raising)))
+    run(live(lambda _, flow: setattr(flow.link, "advance", raising)))
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
@@ -154,39 +130,37 @@ def test_an_answer_that_is_none_ends_the_stream_and_not_the_emulator(tmp_path: P
         server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handler),))
         address = f"127.0.0.1:{Transport().bind(server, '127.0.0.1:0')}"
         await server.start()
-        proxy = make(tmp_path, address, {})
+        proxy, (flow,) = make(tmp_path, address, {})
         await proxy.start()
-        lane = proxy.lanes["cam00"]
-        assert lane.upstream is not None
-        offer(proxy, 0)
+        offer(flow, 0)
         async with asyncio.timeout(10):
-            while lane.upstream.connections < 2:
+            while flow.upstream.connections < 2:
                 await asyncio.sleep(0.01)
-        assert lane.broken == 1 and not proxy._failure.done()
+        assert flow.broken == 1 and not proxy._failure.done()
         await proxy.stop()
         await server.stop(None)
 
     run(live())
 
 
-def test_the_agenda_stays_bounded_however_often_frames_preempt_each_other(tmp_path: Path) -> None:
+def test_the_event_queue_stays_bounded_however_often_frames_preempt_each_other(tmp_path: Path) -> None:
     async def live() -> None:
         cameras = ("cam00", "cam01")
-        proxy = make(tmp_path, "127.0.0.1:1", {**SLOW, "discipline": "lcfs-preempt"}, cameras)
-        offer(proxy, 0, "cam01")
+        section = {**SLOW, "discipline": "lcfs-preempt"}
+        proxy, (flow, other) = make(tmp_path, "127.0.0.1:1", section, cameras)
+        offer(other, 0)
         most = 0
         for n in range(10_001):
-            offer(proxy, n)
-            most = max(most, len(proxy._agenda.due))
+            offer(flow, n)
+            most = max(most, len(proxy.events.entries))
             if n % 100 == 0:
                 await asyncio.sleep(0)
-        assert proxy.lanes["cam00"].link.counts["superseded"] == 10_000
+        assert flow.link.model.counts["superseded"] == 10_000
         assert most <= 4 * len(cameras) + 16
-        # What is still to come is on it, that of the camera which was left alone too.
-        for lane in proxy.lanes.values():
-            assert (lane.link.next_event_ns, lane) in [
-                (at_ns, found) for at_ns, _, found in proxy._agenda.due
-            ]
+        # The next event of each is in it, also that of the camera which was left alone.
+        scheduled = [(at_ns, link) for at_ns, _, link in proxy.events.entries]
+        for link in (flow.link, other.link):
+            assert (link.next_event_ns, link) in scheduled
         await proxy.stop()
 
     run(live())
@@ -195,11 +169,11 @@ def test_the_agenda_stays_bounded_however_often_frames_preempt_each_other(tmp_pa
 def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -> None:
     async def live() -> None:
         edge = await Peer().start()
-        proxy = make(tmp_path, edge.address, {}, ("cam00", "cam01", "cam02"))
+        proxy, flows = make(tmp_path, edge.address, {}, ("cam00", "cam01", "cam02"))
         await proxy.start()
-        assert all(lane.upstream and lane.upstream.connected for lane in proxy.lanes.values())
-        offer(proxy, 0)
-        assert proxy.lanes["cam00"].broken == 0
+        assert all(flow.upstream.connected for flow in flows)
+        offer(flows[0], 0)
+        assert flows[0].broken == 0
         await proxy.stop()
         await edge.stop()
 
@@ -209,10 +183,10 @@ def test_cameras_are_let_in_once_the_streams_to_the_edge_stand(tmp_path: Path) -
 def test_without_an_edge_they_are_let_in_a_moment_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(proxy_module, "_FIRST_WAIT_S", 0.2)
+    monkeypatch.setattr(frame_stream, "_FIRST_WAIT_S", 0.2)
 
     async def live() -> None:
-        proxy = make(tmp_path, f"127.0.0.1:{free_port()}", {})
+        proxy, _ = make(tmp_path, f"127.0.0.1:{free_port()}", {})
         await proxy.start()
         channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
         check = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=5)

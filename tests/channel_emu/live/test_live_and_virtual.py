@@ -1,4 +1,4 @@
-"""One channel, two clocks: what the wall clock adds to virtual time is the delay error, and nothing else."""
+"""The wall clock adds the delay error to virtual time, and nothing else."""
 
 from __future__ import annotations
 
@@ -8,23 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from channel_emu.live import trace
-from channel_emu.live.trace import Record
-from channel_emu.model import ages
+from channel_emu.model import ages, trace
 from channel_emu.model.link import Kind, Transit
+from channel_emu.model.trace import Record
 from channel_emu.virtual.simulate import replay_offers
-from tests.channel_emu.live.emulator import CAMERAS, rig
-from tests.channel_emu.live.test_frame_proxy import FAST, run
+from tests.channel_emu.live.emulator import CAMERAS, emulate, run
+from tests.channel_emu.live.test_frame_stream import FAST, frame_account
 
 CHAPTER_5 = {"preset": "ch5", "service": {"law": "exponential", "mean_ms": 8.0}}
 PARALLEL = {"service": {"law": "exponential", "mean_ms": 12.0}, "discipline": "parallel"}
-# Cameras, emulator and edge share one event loop here: what a machine that is busy with other things may take
-# to come round to a frame, half of the time.
+# Median delay error that a busy machine may have: cameras, emulator and edge share one event loop here.
 TYPICAL_MS = 10.0
 
 
 async def record(out: Path, section: dict, period_s: float, frames: int, **options) -> None:
-    async with rig(out, section, trace=out / "t.jsonl", **options) as r:
+    async with emulate(out, section, trace=out / "t.jsonl", **options) as r:
         await asyncio.gather(*(c.stream(frames, period_s) for c in r.cameras.values()))
         await r.settled()
 
@@ -46,7 +44,7 @@ def test_ages_live_are_those_of_virtual_time_and_the_delay_error(tmp_path: Path,
     virtual = replay_offers(found.config, found.seed, found.offers(), end_ns)
     for camera, records in found.by_camera().items():
         assert [r.outcome for r in records] == [t.outcome for t in virtual[camera]]
-        # What the link lets out while the edge is stalled is broken, and has no actual instant.
+        # A frame that leaves the link while the edge is stalled is broken and has no actual instant.
         came = [r for r in records if r.actual_ns is not None]
         due = [virtual[camera][r.number] for r in came]
         assert len(came) > 15
@@ -67,6 +65,7 @@ def test_a_trace_replayed_twice_is_decided_and_delivered_alike(tmp_path: Path) -
     recorded = trace.read(tmp_path / "0" / "t.jsonl")
     run(record(first, CHAPTER_5, 0.006, 60, seed=11, replay=recorded))
     run(record(second, PARALLEL, 0.009, 60, seed=12, replay=recorded))
+    frame_account(first)
     replays = [trace.read(out / "t.jsonl").by_camera() for out in (first, second)]
     apart_ms, errors_ms = [], []
     for camera in CAMERAS:

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import subprocess
 import sys
 import time
+from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import channel_emu
 from channel_emu.live import timer
+from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.histogram import Histogram
+from channel_emu.live.live_link import Message, ServedCall
 from channel_emu.live.timer import LoopTimer
-from channel_emu.live.wire import WireError, damaged, header_of
+from channel_emu.live.wire import WireError, damage_payload, header_of
 from channel_emu.model import ages
-from channel_emu.model.link import Transit
+from channel_emu.model.link import Kind
 from freshfield.frame import FrameRejected, from_request, to_request
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import frame_of
@@ -110,10 +116,8 @@ def test_two_headers_are_refused() -> None:
 
 def test_damage_changes_the_payload_and_nothing_else() -> None:
     raw = to_request(frame_of("cam00", "s", 1, 5)).SerializeToString()
-    untouched = Transit(0, None, len(raw), 0)
-    assert damaged(raw, untouched) is raw
-    hit = Transit(0, None, len(raw), 0, flips=((0.5, 1), (0.9, 255)))
-    before, after = pb.PushRequest.FromString(raw), pb.PushRequest.FromString(damaged(raw, hit))
+    damaged = damage_payload(raw, ((0.5, 1), (0.9, 255)))
+    before, after = pb.PushRequest.FromString(raw), pb.PushRequest.FromString(damaged)
     assert after.header == before.header and after.crc32c == before.crc32c
     assert sum(a != b for a, b in zip(before.payload, after.payload)) == 2
     with pytest.raises(FrameRejected, match="damaged") as refused:
@@ -128,10 +132,19 @@ def test_priority_says_what_it_reached_and_never_fails() -> None:
     assert found.stdout.strip() in ("realtime", "short-slice", "nice", "normal")
 
 
+@pytest.mark.parametrize("package", ["model", "live", "virtual", "estimate"])
+def test_the_packages_import_the_model_and_not_each_other(package: str) -> None:
+    folder = Path(channel_emu.__file__).parent / package
+    text = "\n".join(file.read_text() for file in folder.rglob("*.py"))
+    found = re.findall(r"^\s*(?:from|import) channel_emu\.(\w+)", text, re.MULTILINE)
+    assert set(found) <= {"model", package}
+
+
 def test_the_emulator_needs_neither_torch_nor_the_other_packages() -> None:
     code = """
 import sys
-import channel_emu.cli, channel_emu.live.frame_proxy, channel_emu.virtual.simulate, channel_emu.live.trace
+import channel_emu.cli, channel_emu.live.frame_stream, channel_emu.live.benchmark
+import channel_emu.virtual.simulate
 wrong = [m for m in sys.modules if m.split('.')[0] in ('torch', 'numba', 'camera_node', 'edge_server')]
 print(','.join(wrong))
 """
@@ -159,10 +172,11 @@ def test_running_ages_are_those_of_the_whole_sawtooth(steps: list[tuple[int, int
 
 
 def test_dropped_messages_hold_no_bytes() -> None:
-    from channel_emu.live.generic_flow import Flow, Message
+    async def live() -> None:
+        flow = CallFlow(0, ServedCall(mock.Mock()), None, lambda: 0)
+        dropped, kept = Message(b"x" * 100, "call0", 0, flow), Message(b"y", "call0", 1, flow)
+        flow.settle(dropped, Kind.LOST)
+        flow.settle(kept, Kind.DELIVERED)
+        assert dropped.raw == b"" and kept.raw == b"y"
 
-    flow = Flow(0, None, lambda: None)
-    dropped, kept = Message(b"x" * 100, flow, 0), Message(b"y", flow, 1)
-    flow.settle(dropped, False)
-    flow.settle(kept, True)
-    assert dropped.raw == b"" and kept.raw == b"y"
+    asyncio.run(live())

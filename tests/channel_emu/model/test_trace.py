@@ -5,11 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from channel_emu.live import trace
-from channel_emu.live.trace import ReplayLink, TraceError, TraceWriter
+from channel_emu.live.replay_link import ReplayLink
+from channel_emu.model import trace
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.model.link import Event, Kind
+from channel_emu.model.trace import TraceError, TraceWriter
+from channel_emu.virtual.replay import compare
 
 MS = 10**6
 CHANCE = {"probability": 0.15}
@@ -48,9 +50,9 @@ def test_a_recorded_trace_is_decided_again_exactly(tmp_path: Path, preset: str) 
     assert sum(r.outcome == "delivered" for r in found.by_camera()["a"]) == sum(
         e.kind is Kind.DELIVERED for e in told["a"]
     )
-    assert trace.compare(found) == {"frames": 800, "equal": 800, "different": []}
+    assert compare(found) == {"frames": 800, "equal": 800, "different": []}
     # It would notice: another seed decides otherwise.
-    assert trace.compare(dataclasses.replace(found, seed=4))["equal"] < 700
+    assert compare(dataclasses.replace(found, seed=4))["equal"] < 700
 
 
 @pytest.mark.parametrize("preset", ["ch5", "ch6"])

@@ -11,17 +11,15 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from channel_emu.live import trace
-from channel_emu.live.camera_lane import HardLimit
-from channel_emu.live.frame_proxy import Proxy, ProxyOptions
-from channel_emu.live.upstream import CREDITS
-from channel_emu.model.config import channel_from_mapping
+from channel_emu.live.live_link import HardLimit
+from channel_emu.live.upstream import CREDITS, PUSH
+from channel_emu.model import trace
+from channel_emu.virtual.replay import compare
 from edge_server.report.frame_accounting import close_books
-from freshfield.frame import to_request
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
-from tests.channel_emu.live.emulator import CAMERAS, frame_of, rig
+from tests.channel_emu.live.emulator import CAMERAS, emulate, make, offer, run
 from tests.integration.peer import Peer, silence
 
 # The thesis's channel six times faster, so that a test takes seconds.
@@ -34,18 +32,11 @@ FAST = {
 QUICK = {"service": {"law": "exponential", "mean_ms": 4.0}}
 
 
-def run(coroutine) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(60):
-            await coroutine
-
-    asyncio.run(limited())
-
-
-def books_of(out: Path):
-    books = close_books(out)
-    assert not books.contradictions and books.total.closes
-    return books.total
+def frame_account(out: Path):
+    """The account of every frame, over the ledgers of all processes; it must close."""
+    account = close_books(out)
+    assert not account.contradictions and account.total.closes
+    return account.total
 
 
 SHARED = {"service": {"law": "exponential", "mean_ms": 1.5}, "queue_limit": 6}
@@ -67,14 +58,14 @@ def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict)
     """The emulator's trace, its offers decided again in virtual time: every start, due and outcome alike."""
 
     async def live() -> None:
-        async with rig(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
+        async with emulate(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
             await asyncio.gather(*(c.stream(80, 0.004) for c in r.cameras.values()))
             await r.settled()
 
     run(live())
     found = trace.read(tmp_path / "t.jsonl")
-    assert trace.compare(found) == {"frames": 320, "equal": 320, "different": []}
-    account = books_of(tmp_path)
+    assert compare(found) == {"frames": 320, "equal": 320, "different": []}
+    account = frame_account(tmp_path)
     outcomes = [r.outcome for r in found.records]
     assert account.sent == 320
     assert account.delivered == outcomes.count("delivered") > 30
@@ -92,38 +83,17 @@ def test_live_decisions_are_those_of_virtual_time(tmp_path: Path, section: dict)
         assert len(status["series"]) > 3
 
 
-def test_a_recorded_trace_is_repeated_live(tmp_path: Path) -> None:
-    recorded, repeated = tmp_path / "1", tmp_path / "2"
-
-    async def live() -> None:
-        async with rig(recorded, FAST, trace=recorded / "t.jsonl") as r:
-            await asyncio.gather(*(c.stream(50, 0.004) for c in r.cameras.values()))
-            await r.settled()
-        replay = trace.read(recorded / "t.jsonl")
-        # Another channel and seed: what happens is the recording's all the same.
-        async with rig(repeated, QUICK, seed=99, replay=replay, trace=repeated / "t.jsonl") as r:
-            await asyncio.gather(*(c.stream(50, 0.009) for c in r.cameras.values()))
-            await r.settled()
-
-    run(live())
-    first, second = (trace.read(d / "t.jsonl").by_camera() for d in (recorded, repeated))
-    for camera in CAMERAS:
-        assert [r.outcome for r in first[camera]] == [r.outcome for r in second[camera]]
-        assert [r.drawn_ns for r in first[camera]] == [r.drawn_ns for r in second[camera]]
-    books_of(repeated)
-
-
-def test_every_fault_closes_the_books(tmp_path: Path) -> None:
+def test_the_account_closes_with_every_fault(tmp_path: Path) -> None:
     chance = {"probability": 0.2}
     faults = {"loss": chance, "duplication": chance, "corruption": chance}
 
     async def live() -> None:
-        async with rig(tmp_path, {**QUICK, "faults": faults}) as r:
+        async with emulate(tmp_path, {**QUICK, "faults": faults}) as r:
             await asyncio.gather(*(c.stream(60, 0.005) for c in r.cameras.values()))
             await r.settled()
 
     run(live())
-    account = books_of(tmp_path)
+    account = frame_account(tmp_path)
     assert min(account.lost, account.duplicated, account.delivered) > 10
     # The edge refuses damaged frames by their checksum, and second copies by their sequence number.
     assert set(account.rejected) == {"crc_mismatch", "replayed_sequence"}
@@ -136,7 +106,7 @@ def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> 
     section = {"service": service, "faults": {"reset": {"at_ms": [1500.0]}}}
 
     async def live() -> None:
-        async with rig(tmp_path, section, cameras=("cam00",)) as r:
+        async with emulate(tmp_path, section, cameras=("cam00",)) as r:
             camera = r.cameras["cam00"]
             with pytest.raises((grpc.aio.AioRpcError, asyncio.InvalidStateError)):
                 for _ in range(100):
@@ -144,11 +114,11 @@ def test_a_reset_breaks_the_stream_and_the_camera_comes_back(tmp_path: Path) -> 
                     await asyncio.sleep(0.1)
             # INTERNAL is what gRPC's client makes of a write that crosses the reset on the wire.
             assert await camera.code() in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL)
-            assert r.proxy.lanes["cam00"].link.resets == 1
+            assert r.stream.flows["cam00"].link.model.resets == 1
             await camera.connect()
             assert (await camera.push()).outcome == pb.OUTCOME_ACCEPTED
             await r.settled()
-            assert r.proxy.lanes["cam00"].link.counts["broken"] == 1
+            assert r.stream.flows["cam00"].link.model.counts["broken"] == 1
 
     run(live())
 
@@ -157,7 +127,7 @@ def test_held_out_frames_pass_beside_the_channel(tmp_path: Path) -> None:
     section = {"service": {"law": "deterministic", "mean_ms": 1e9}}
 
     async def live() -> None:
-        async with rig(tmp_path, section, held_out=("cam03",)) as r:
+        async with emulate(tmp_path, section, held_out=("cam03",)) as r:
             await r.cameras["cam03"].stream(20, 0.002)
             await r.cameras["cam00"].stream(5, 0.002)
             async with asyncio.timeout(10):
@@ -171,12 +141,12 @@ def test_held_out_frames_pass_beside_the_channel(tmp_path: Path) -> None:
     status = json.loads((tmp_path / "channel.json").read_text())
     assert status["delay_error_ms"]["count"] == 0 and status["counts"]["held_out"] == 20
     assert status["drawn_delay_ms"]["count"] == 1
-    assert books_of(tmp_path).in_flight == 1
+    assert frame_account(tmp_path).in_flight == 1
 
 
 def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, QUICK) as r:
+        async with emulate(tmp_path, QUICK) as r:
             cameras = r.cameras.values()
             await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))
             await r.edge.stop()
@@ -185,34 +155,30 @@ def test_the_edge_may_die_and_come_back(tmp_path: Path) -> None:
             await r.connected()
             await asyncio.gather(*(c.stream(20, 0.005) for c in cameras))
             await r.settled()
-            assert sum(lane.broken for lane in r.proxy.lanes.values()) > 20
-            assert all(lane.upstream.connections == 2 for lane in r.proxy.lanes.values() if lane.upstream)
+            assert sum(flow.broken for flow in r.stream.flows.values()) > 20
+            assert all(flow.upstream.connections == 2 for flow in r.stream.flows.values())
             assert all(r.edge.ingest.delivered[c] > 0 for c in CAMERAS)
 
     run(live())
-    account = books_of(tmp_path)
+    account = frame_account(tmp_path)
     assert account.sent == 240 and account.in_flight == 0 and account.broken > 20
 
 
 def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -> None:
     async def live() -> None:
         edge = await Peer(respond=silence).start()
-        options = ProxyOptions("127.0.0.1:0", edge.address, tmp_path, Transport())
-        proxy = Proxy(channel_from_mapping({}), ["cam00"], 0, options)
+        proxy, (flow,) = make(tmp_path, edge.address, {})
         await proxy.start()
-        lane = proxy.lanes["cam00"]
-        assert lane.upstream is not None
-        while not lane.upstream.connected:
+        while not flow.upstream.connected:
             await asyncio.sleep(0.01)
         for n in range(200):
-            request = to_request(frame_of("cam00", "s", n, n))
-            lane.take(request.SerializeToString(), request.header)
+            offer(flow, n)
             await asyncio.sleep(0)
         await edge.until(CREDITS)
-        assert lane.upstream.pending == CREDITS + 1
-        assert lane.broken == 200 - CREDITS - 1
+        assert flow.upstream.pending == CREDITS + 1
+        assert flow.broken == 200 - CREDITS - 1
         await proxy.stop()
-        assert lane.broken == 200
+        assert flow.broken == 200
         await edge.stop()
 
     run(live())
@@ -220,7 +186,7 @@ def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path: Path) -
 
 def test_clock_health_and_reflection_pass_a_slow_channel(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, {"service": {"law": "deterministic", "mean_ms": 1e6}}) as r:
+        async with emulate(tmp_path, {"service": {"law": "deterministic", "mean_ms": 1e6}}) as r:
             channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
             clock = clock_pb2_grpc.ClockServiceStub(channel)
             reply = await clock.Exchange(clock_pb2.ExchangeRequest(client_sent_ns=7), timeout=5)
@@ -240,11 +206,11 @@ def test_clock_health_and_reflection_pass_a_slow_channel(tmp_path: Path) -> None
 
 def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, {}) as r:
+        async with emulate(tmp_path, {}) as r:
             channel = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
 
             async def send(raw: bytes) -> pb.PushResponse | None:
-                call = channel.stream_stream("/freshfield.v1.FrameStreamService/Push")()
+                call = channel.stream_stream(PUSH)()
                 await call.write(raw)
                 try:
                     return pb.PushResponse.FromString(await call.read())
@@ -263,7 +229,7 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
                 assert await send(raw) is None
             # And the cameras never noticed.
             await r.cameras["cam01"].stream(3, 0)
-            assert r.proxy.rejected == {"unknown_camera": 1, "bad_id": 1}
+            assert r.stream.rejected == {"unknown_camera": 1, "bad_id": 1}
             await channel.close()
 
     run(live())
@@ -272,20 +238,13 @@ def test_strangers_and_nonsense_are_refused_and_counted(tmp_path: Path) -> None:
 def test_the_hard_limit_ends_the_emulator(tmp_path: Path) -> None:
     async def live() -> None:
         edge = await Peer().start()
-        config = channel_from_mapping({**QUICK, "hard_limit_ms": 1e-6})
-        options = ProxyOptions("127.0.0.1:0", edge.address, tmp_path, Transport())
-        proxy = Proxy(config, ["cam00"], 0, options)
+        proxy, (flow,) = make(tmp_path, edge.address, {**QUICK, "hard_limit_ms": 1e-6})
         running = asyncio.create_task(proxy.run(asyncio.Event()))
-        lane = proxy.lanes["cam00"]
-        while lane.upstream is None or not lane.upstream.connected:
+        while not flow.upstream.connected:
             await asyncio.sleep(0.01)
-        header = pb.FrameHeader(camera_id="cam00", session_id="s", role=pb.ROLE_TRAIN)
-        channel = Transport().aio_channel(f"127.0.0.1:{proxy.port}")
-        call = channel.stream_stream("/freshfield.v1.FrameStreamService/Push")()
-        await call.write(pb.PushRequest(header=header).SerializeToString())
+        offer(flow, 0)
         with pytest.raises(HardLimit, match=r"frame 0 of cam00 left .* ms after it was due"):
             await running
-        await channel.close()
         await edge.stop()
 
     run(live())
@@ -293,20 +252,16 @@ def test_the_hard_limit_ends_the_emulator(tmp_path: Path) -> None:
 
 def test_the_token_is_demanded_and_passed_on(tmp_path: Path) -> None:
     async def live() -> None:
-        async with rig(tmp_path, {}, transport=Transport(token="open sesame")) as r:
+        async with emulate(tmp_path, {}, transport=Transport(token="open sesame")) as r:
             await r.cameras["cam00"].stream(5, 0.002)
             await r.settled()
             assert r.edge.ingest.delivered["cam00"] == 5
             stranger = Transport().aio_channel(f"127.0.0.1:{r.proxy.port}")
-            call = stranger.stream_stream("/freshfield.v1.FrameStreamService/Push")()
+            call = stranger.stream_stream(PUSH)()
             with pytest.raises(grpc.aio.AioRpcError) as refused:
                 await call.write(b"")
                 await call.read()
-                raise await_error(call)
             assert refused.value.code() == grpc.StatusCode.UNAUTHENTICATED
             await stranger.close()
-
-    def await_error(call) -> Exception:
-        return AssertionError("the stream was not refused")
 
     run(live())

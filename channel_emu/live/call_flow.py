@@ -1,0 +1,135 @@
+"""One direction of one gRPC call on its way through a link, whatever its messages mean."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import grpc.aio
+
+from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message, ServedCall
+from channel_emu.model.link import Kind
+
+# Messages that are read ahead of the one being written, at most; then the sender waits. Behind a message that
+# is still in the link any number are read, because the link decides about each at once. Those it drops are
+# held without their bytes.
+_MOST_READY = 64
+
+Read = Callable[[], Awaitable[Any]]
+Write = Callable[[bytes], Awaitable[None]]
+
+
+class CallFlow:
+    """Reads one side's messages, passes them through a link and writes them to the other side.
+
+    Nothing overtakes on one stream: a message that is due before its predecessor waits for it.
+
+    number: the call's. call: what a reset of the link ends. link: None passes messages straight on. now_ns:
+    the channel's clock.
+    """
+
+    def __init__(
+        self, number: int, call: ServedCall, link: LiveLink | None, now_ns: Callable[[], int]
+    ) -> None:
+        self._number = number
+        self._call = call
+        self._link = link
+        self._now_ns = now_ns
+        self._closed = False
+        self._messages: deque[Message] = deque()
+        self._read = 0
+        self._dropped = 0
+        self._ended = False
+        self._wake = asyncio.Event()
+        self._room = asyncio.Event()
+        self._room.set()
+        if link is not None:
+            link.calls.add(call)
+
+    @property
+    def lost_its_only_message(self) -> bool:
+        """The sender sent one message and no more, and the link dropped it."""
+        return self._ended and self._read == 1 and self._dropped == 1
+
+    async def carry(self, read: Read, write: Write) -> None:
+        """Run until the sender is done and every message has been written or dropped."""
+        reader = asyncio.create_task(self._fill(read))
+        try:
+            while not (self._ended and not self._messages):
+                if self._messages and self._messages[0].delivered is not None:
+                    await self._pass(self._messages.popleft(), write)
+                    continue
+                if reader.done():
+                    reader.result()
+                self._wake.clear()
+                await self._wake.wait()
+        finally:
+            self.close()
+            reader.cancel()
+
+    def settle(self, message: Message, kind: Kind) -> None:
+        if kind is Kind.DUPLICATED:
+            return  # ``_pass`` writes the second copy
+        message.delivered = kind is Kind.DELIVERED
+        if not message.delivered:
+            message.raw = b""
+        elif self._closed:
+            self._cancel(message)
+        self._wake.set()
+
+    def describe(self, message: Message) -> str:
+        name = "" if self._link is None else self._link.name
+        return f"message {message.sequence} of call {self._number} on {name!r}"
+
+    def close(self) -> None:
+        """The call is over: what the link still delivers is counted as cancelled."""
+        self._closed = True
+        if self._link is not None:
+            self._link.calls.discard(self._call)
+            for message in self._messages:
+                if message.delivered:
+                    self._cancel(message)
+        self._messages.clear()
+
+    def _cancel(self, message: Message) -> None:
+        assert self._link is not None
+        self._link.cancelled += 1
+        self._link.record(message)
+
+    async def _fill(self, read: Read) -> None:
+        try:
+            while True:
+                try:
+                    raw = await read()
+                except STREAM_ENDED:  # the call's status says how it ended
+                    break
+                if raw is grpc.aio.EOF:
+                    break
+                message = Message(raw, f"call{self._number}", self._read, self)
+                self._read += 1
+                self._messages.append(message)
+                if self._link is None:
+                    self.settle(message, Kind.DELIVERED)
+                else:
+                    self._link.offer(message, self._now_ns())
+                if len(self._messages) >= _MOST_READY and self._messages[0].delivered is not None:
+                    self._room.clear()
+                    await self._room.wait()
+            self._ended = True
+        finally:
+            self._wake.set()
+
+    async def _pass(self, message: Message, write: Write) -> None:
+        if not message.delivered:
+            self._dropped += 1
+        else:
+            if self._link is not None:
+                self._link.hand_on(message, self._now_ns())
+            await write(message.raw)
+            # A unary method takes one message: the only message of a call is not written twice.
+            if message.duplicated and self._read > 1:
+                await write(message.raw)
+        if len(self._messages) < _MOST_READY:
+            self._room.set()

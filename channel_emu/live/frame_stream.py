@@ -1,0 +1,186 @@
+"""Our frame stream as a hook of the proxy: cameras stream to the emulator, the emulator streams to the edge.
+
+Frames are opaque bytes: only their headers are read. A node is answered with its link's decision. What the
+edge answers stays here and is counted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import grpc
+import grpc.aio
+import numpy as np
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from channel_emu.live.camera_flow import CameraFlow
+from channel_emu.live.live_link import ServedCall
+from channel_emu.live.proxy import Proxy
+from channel_emu.live.status import StatusFile, snapshot
+from channel_emu.live.upstream import PUSH
+from channel_emu.live.wire import WireError, damage_payload, header_of
+from channel_emu.model.counter_rng import stream_key
+from freshfield.frame import valid_id
+from freshfield.ledger import Ledger
+from freshfield.limits import MAX_STREAMS_PER_CAMERA
+from freshfield.transport import CLIENT_OPTIONS
+from freshfield.v1 import clock_pb2, frames_pb2
+
+log = logging.getLogger("channel-emu")
+
+SERVICE = frames_pb2.DESCRIPTOR.services_by_name["FrameStreamService"].full_name
+CLOCK_SERVICE = clock_pb2.DESCRIPTOR.services_by_name["ClockService"].full_name
+_EXCHANGE = f"/{CLOCK_SERVICE}/Exchange"
+_EXCHANGE_TIMEOUT_S = 5.0
+# After this long without the edge, warn once.
+_WARN_AFTER_NS = 3 * 10**9
+# Cameras are let in when the streams to the edge are open, or after this long without them.
+_FIRST_WAIT_S = 2.0
+
+
+class FrameStream:
+    """Give it to ``Proxy``.
+
+    cameras: of the scenario; others are refused.
+    out: folder of ``channel.json`` and the ledger.
+    priority: what ``priority.raise_priority`` reached, for the status.
+    """
+
+    client_options = CLIENT_OPTIONS
+
+    def __init__(self, cameras: Sequence[str], out: Path, priority: str = "normal") -> None:
+        self.cameras = tuple(cameras)
+        self.flows: dict[str, CameraFlow] = {}
+        self.rejected: dict[str, int] = {}
+        """Frames refused here, by reason."""
+        self._out = out
+        self._priority = priority
+        self._streams = 0
+
+    def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
+        self._proxy = proxy
+        self._ledger = Ledger(self._out, "emulator", "channel", proxy.origin_ns)
+        self._status = StatusFile(self._out / "channel.json")
+        self._exchange = proxy.service_channel.unary_unary(_EXCHANGE)
+        self._warn_at_ns = proxy.origin_ns + _WARN_AFTER_NS
+        for camera in self.cameras:
+            jitter = np.random.default_rng(stream_key(proxy.channel.seed, camera, "channel.backoff"))
+            self.flows[camera] = CameraFlow(
+                proxy.link(camera, damage_payload), proxy.clock, proxy.origin_ns, self._ledger,
+                proxy.service_channel, proxy.options.transport.metadata(), jitter,
+            )  # fmt: skip
+        return {
+            PUSH: grpc.stream_stream_rpc_method_handler(self._push),
+            _EXCHANGE: grpc.unary_unary_rpc_method_handler(self._pass_exchange),
+        }
+
+    async def start(self, server: grpc.aio.Server) -> None:
+        """Look for the edge; return when it is found or a moment has passed."""
+        checks = health.aio.HealthServicer()
+        health_pb2_grpc.add_HealthServicer_to_server(checks, server)
+        names = (SERVICE, CLOCK_SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME)
+        reflection.enable_server_reflection(names, server)
+        for name in ("", SERVICE, CLOCK_SERVICE):
+            await checks.set(name, health_pb2.HealthCheckResponse.SERVING)
+        for flow in self.flows.values():
+            self._proxy.spawn(flow.upstream.run())
+        # Frames that come before the streams to the edge would be broken, and not by the channel.
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_FIRST_WAIT_S):
+                for flow in self.flows.values():
+                    await flow.upstream.opened.wait()
+        # The collector's long pauses come from old objects, and nearly all of those are made by now.
+        gc.collect()
+        gc.freeze()
+
+    async def refresh(self) -> None:
+        """Write the status; warn once if the edge is not there."""
+        if self._warn_at_ns and self._proxy.clock.now_ns() > self._warn_at_ns:
+            self._warn_at_ns = 0
+            if not any(flow.upstream.connected for flow in self.flows.values()):
+                log.warning("no answer from the edge at %s yet; frames are broken until it is there",
+                            self._proxy.options.to)  # fmt: skip
+        await asyncio.to_thread(self._status.write, self._snapshot())
+
+    def close(self) -> None:
+        """Close ledger and status, each even if the other fails."""
+        try:
+            self._ledger.close(self._proxy.clock.now_ns())
+        finally:
+            self._status.write(self._snapshot(final=True))
+
+    @property
+    def pending(self) -> int:
+        return sum(flow.upstream.pending for flow in self.flows.values())
+
+    async def _push(self, _: Any, context: grpc.aio.ServicerContext) -> None:
+        """One stream of a node. Every message is answered once, as soon as the link has decided."""
+        if self._streams >= MAX_STREAMS_PER_CAMERA * len(self.flows):
+            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, "too many streams are open")
+        flow: CameraFlow | None = None
+        self._streams += 1
+        async with ServedCall(context) as call:
+            try:
+                # Nodes wait for this before they send.
+                await context.send_initial_metadata(())
+                while (raw := await context.read()) is not grpc.aio.EOF:
+                    response, flow = self._take(raw, flow, call)
+                    await context.write(response.SerializeToString())
+            except WireError as error:
+                await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
+            finally:
+                self._streams -= 1
+                if flow is not None:
+                    flow.link.calls.discard(call)
+
+    def _take(
+        self, raw: bytes, flow: CameraFlow | None, call: ServedCall
+    ) -> tuple[frames_pb2.PushResponse, CameraFlow | None]:
+        """One frame, after one of ``flow`` on the same stream: the answer, and the frame's own flow."""
+        header = header_of(raw)
+        if flow is None or flow.camera != header.camera_id:
+            if flow is not None:
+                flow.link.calls.discard(call)
+            flow = self.flows.get(header.camera_id)
+        if flow is None:
+            return self._reject(header, "unknown_camera", "this camera is not part of the scenario"), None
+        flow.link.calls.add(call)
+        if not valid_id(header.session_id):
+            detail = "session ids are 1 to 64 letters, digits, '.', '_', '-'"
+            return self._reject(header, "bad_id", detail), flow
+        try:
+            return flow.take(raw, header), flow
+        except Exception as error:
+            self._proxy.fail(error)
+            raise
+
+    def _reject(self, header: frames_pb2.FrameHeader, reason: str, detail: str) -> frames_pb2.PushResponse:
+        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+        ids = [i if valid_id(i) else "?" for i in (header.camera_id, header.session_id)]
+        self._ledger.write(self._proxy.clock.now_ns(), ids[0], ids[1], header.sequence, "rejected", reason)
+        return frames_pb2.PushResponse(
+            sequence=header.sequence, outcome=frames_pb2.OUTCOME_REJECTED, reason=reason, detail=detail
+        )
+
+    async def _pass_exchange(self, request: bytes, context: grpc.aio.ServicerContext) -> bytes:
+        """The clock exchange is part of the instrument, not of the emulated network: it passes undelayed."""
+        try:
+            return await self._exchange(
+                request, timeout=_EXCHANGE_TIMEOUT_S, metadata=self._proxy.options.transport.metadata()
+            )
+        except grpc.aio.AioRpcError as error:
+            await context.abort(error.code(), f"edge: {error.details()}")
+            raise AssertionError("abort raises") from None
+
+    def _snapshot(self, final: bool = False) -> dict[str, Any]:
+        return snapshot(
+            self._proxy.channel, list(self.flows.values()), self._proxy.stats, self.rejected,
+            self._proxy.events.now_ns(), self._priority, final,
+        )  # fmt: skip

@@ -1,0 +1,355 @@
+"""A gRPC proxy that passes every message through a seeded link, on one event loop woken by an exact timer.
+
+Without a hook it serves any service and parses nothing. Each method has a link of its own in each delayed
+direction, or one link carries all. On the wire all four kinds of call are streams, so one handler serves
+them. Metadata, deadline, status, trailers and cancellation are passed on undelayed, the status after the
+messages that came before it. A dropped message of a stream is left out. Where the only message of a direction
+is dropped there would be nothing to pass on, so the call ends UNAVAILABLE: that is what a dropped unary
+request or answer looks like (and a stream that consists of one message: on the wire they are the same).
+
+With a hook, the hook answers the methods it names, and no others are served. ``frame_stream`` is the hook for
+our frame stream. Links, event queue, delay figures, trace, replay, hard limit and shutdown are the same.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import grpc
+import grpc.aio
+
+from channel_emu.live.call_flow import CallFlow
+from channel_emu.live.event_queue import EventQueue
+from channel_emu.live.live_link import STREAM_ENDED, DelayStats, Flips, HardLimit, LiveLink, ServedCall
+from channel_emu.live.replay_link import ReplayLink
+from channel_emu.live.report import Report, figures_of
+from channel_emu.model.channel import Channel
+from channel_emu.model.config import ChannelConfig
+from channel_emu.model.link import Kind, Link
+from channel_emu.model.trace import Trace, TraceWriter
+from freshfield.clock import Clock, WallClock
+from freshfield.transport import CLIENT_OPTIONS, Transport
+
+log = logging.getLogger("channel-emu")
+
+DIRECTIONS = ("up", "down", "both")
+_NOT_PASSED_ON = ("user-agent", "content-type", "te")
+_MOST_METHODS = 1000
+_STOP_GRACE_S = 0.5
+_REFRESH_EVERY_S = 0.5
+# How much of the chain's path before the present is kept; no event is later than this.
+_KEEP_PATH_NS = 60 * 10**9
+# The service at the other end has not agreed to the project's keepalive pings, and would hang up.
+_CLIENT_OPTIONS = [
+    (key, value) for key, value in CLIENT_OPTIONS if "keepalive" not in key and "ping" not in key
+]
+
+
+class EmulatorFailed(RuntimeError):
+    """The emulator cannot go on: its trace or ledger cannot be written, or a part of it broke."""
+
+
+@dataclass(frozen=True)
+class ProxyOptions:
+    """How a proxy runs.
+
+    listen, to: HOST:PORT; port 0 takes any free one.
+    direction: the messages that are delayed: up (to the service), down (its answers) or both.
+    shared: one link for all methods of a direction.
+    trace: record to this file. replay: repeat these decisions instead of making new ones.
+    """
+
+    listen: str
+    to: str
+    transport: Transport = field(default_factory=Transport)
+    direction: str = "up"
+    shared: bool = False
+    trace: Path | None = None
+    replay: Trace | None = None
+
+    def __post_init__(self) -> None:
+        if self.direction not in DIRECTIONS:
+            raise ValueError(f"direction: expected one of {', '.join(DIRECTIONS)}, got {self.direction!r}")
+
+
+class Hook(Protocol):
+    """Answers a service's methods itself, with the proxy's links."""
+
+    client_options: list[tuple[str, Any]]
+    """Of the gRPC channel to the service."""
+
+    def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
+        """Called once, by the proxy's constructor: the handlers by method path."""
+
+    async def start(self, server: grpc.aio.Server) -> None:
+        """Before the server takes calls."""
+
+    async def refresh(self) -> None:
+        """Called twice a second."""
+
+    def close(self) -> None:
+        """After the last message: close what the hook writes. Raises OSError where that fails."""
+
+    @property
+    def pending(self) -> int:
+        """Messages that left their link and are not done with."""
+
+
+class Proxy(grpc.GenericRpcHandler):
+    """``start``, then ``stop``; or ``run`` until told. Must be made with an event loop running."""
+
+    def __init__(
+        self,
+        config: ChannelConfig,
+        seed: int,
+        options: ProxyOptions,
+        hook: Hook | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self.options = options
+        self.clock = clock or WallClock()
+        self.origin_ns = self.clock.now_ns()
+        """The clock's reading at the channel's instant zero."""
+        self.channel = Channel(config, seed)
+        self.stats = DelayStats()
+        """Of all links together."""
+        self.links: dict[str, LiveLink] = {}
+        self.port = 0
+        self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.events = EventQueue(self.clock, self.origin_ns, self.fail, shared=config.server.shared)
+        self._trace = TraceWriter(options.trace, config, seed) if options.trace else None
+        self._replayed = options.replay.by_camera() if options.replay else {}
+        self._calls = 0
+        self._tasks: list[asyncio.Task[None]] = []
+        self._server = options.transport.aio_server()
+        self.service_channel = options.transport.aio_channel(
+            options.to, _CLIENT_OPTIONS if hook is None else hook.client_options
+        )
+        self._hook = hook
+        self._hooked = {} if hook is None else hook.attach(self)
+
+    async def start(self) -> int:
+        """Listen; the port. Raises TransportError if the address cannot be had."""
+        self._server.add_generic_rpc_handlers((self,))
+        self.port = self.options.transport.bind(self._server, self.options.listen)
+        self.spawn(self._refresh())
+        if self._hook is not None:
+            await self._hook.start(self._server)
+        await self._server.start()
+        return self.port
+
+    async def run(self, stop: asyncio.Event) -> Report:
+        """From start to ``stop``; the report. Raises HardLimit where the channel sets one, EmulatorFailed."""
+        await self.start()
+        log.info("listening on port %d, sending to %s", self.port, self.options.to)
+        stopping = asyncio.ensure_future(stop.wait())
+        either: set[asyncio.Future[Any]] = {stopping, self._failure}
+        try:
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            stopping.cancel()
+            try:
+                await self.stop()
+            except OSError as error:
+                self.fail(error)
+        self.check()
+        return self.report()
+
+    async def stop(self) -> None:
+        """End what is open and close every file, each even if another fails. What is inside the links stays
+        ``in_flight``. Raises OSError if a file cannot be closed. Once is enough."""
+        with contextlib.ExitStack() as closing:  # closes the last one named first
+            if self._hook is not None:
+                closing.callback(self._hook.close)
+            if self._trace is not None:
+                closing.callback(self._trace.close)
+            for link in self.links.values():
+                closing.callback(link.close)
+            closing.callback(self.events.close)
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            # A camera's stream has no end of its own that the grace period could wait for.
+            for call in {call for link in self.links.values() if self._hook for call in link.calls}:
+                call.task.cancel()
+            await self._server.stop(_STOP_GRACE_S)
+            await self.service_channel.close()
+
+    def fail(self, error: BaseException) -> None:
+        """End ``run`` with this error; the first one counts."""
+        if self._failure.done():
+            return
+        if not isinstance(error, HardLimit | OSError):
+            log.error("a part of the emulator broke", exc_info=error)
+        self._failure.set_exception(error)
+        # Whoever runs the proxy asks; where nobody does, asyncio need not complain at exit.
+        self._failure.exception()
+
+    def check(self) -> None:
+        """Raise HardLimit or EmulatorFailed if anything broke."""
+        failure = self._failure.exception() if self._failure.done() else None
+        if failure is None:
+            return
+        if isinstance(failure, HardLimit):
+            raise failure
+        kind = "" if isinstance(failure, OSError) else f"{type(failure).__name__}: "
+        hint = "; is there room on the disk?" if isinstance(failure, OSError) else ""
+        raise EmulatorFailed(f"stopped, it could not go on: {kind}{failure}{hint}") from failure
+
+    async def settled(self) -> None:
+        """Wait until no message is inside a link, nor on its way out of one."""
+        while any(link.model.in_flight for link in self.links.values()) or self._pending():
+            self.check()
+            await asyncio.sleep(0.002)
+
+    def report(self) -> Report:
+        """Everything so far."""
+        found = {name: figures_of([link], link.stats) for name, link in self.links.items()}
+        total = asdict(figures_of(list(self.links.values()), self.stats))
+        return Report(**total, seed=self.channel.seed, direction=self.options.direction,
+                      seconds=self.events.now_ns() / 1e9, by_method=found)  # fmt: skip
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run in the background until the proxy stops; what it raises ends the proxy."""
+        task = asyncio.create_task(work)
+        task.add_done_callback(self._ended)
+        self._tasks.append(task)
+
+    def link(self, name: str, damage: Callable[[bytes, Flips], bytes] | None = None) -> LiveLink:
+        """The link of this name, made when first asked for. damage: see ``LiveLink``; None flips any byte."""
+        if name in self.links:
+            return self.links[name]
+        model: Link | ReplayLink = self.channel.link(name)
+        if name in self._replayed:
+            model = ReplayLink(name, self._replayed[name])
+        elif self.options.replay is not None:
+            log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
+        link = self.links[name] = LiveLink(
+            name, model, self.events, DelayStats(self.stats), self.fail, damage or _damage_any_byte,
+            self._trace, self.channel.config.hard_limit_ms,
+        )  # fmt: skip
+        # A fault may act before the first message.
+        self.events.schedule(link)
+        return link
+
+    def service(self, details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler | None:
+        """gRPC asks: who handles this method?"""
+        if self._hook is not None:
+            return self._hooked.get(details.method)
+
+        async def carry(_: Any, context: grpc.aio.ServicerContext) -> None:
+            async with ServedCall(context) as call:
+                await self._carry(details.method, context, call)
+
+        return grpc.stream_stream_rpc_method_handler(carry)
+
+    async def _carry(self, method: str, context: grpc.aio.ServicerContext, served: ServedCall) -> None:
+        """One call, of any kind."""
+        self._calls += 1
+        up = CallFlow(self._calls, served, self._link_of("up", method), self.events.now_ns)
+        down = CallFlow(self._calls, served, self._link_of("down", method), self.events.now_ns)
+        metadata = _passed_on(context.invocation_metadata())
+        call = self.service_channel.stream_stream(method)(metadata=metadata, timeout=context.time_remaining())
+        parts = [
+            asyncio.create_task(_carry_up(up, context, call)),
+            asyncio.create_task(_carry_down(down, context, call)),
+        ]
+        try:
+            done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
+            if parts[1] not in done:
+                parts[0].result()  # what broke here ends the call
+                if up.lost_its_only_message:
+                    await context.abort(grpc.StatusCode.UNAVAILABLE, self._dropped("request", "up", method))
+            await parts[1]
+            code, trailers = await call.code(), _passed_on(await call.trailing_metadata())
+            if code is grpc.StatusCode.OK and down.lost_its_only_message:
+                await context.abort(
+                    grpc.StatusCode.UNAVAILABLE, self._dropped("answer", "down", method), trailers
+                )
+            if code is not grpc.StatusCode.OK:
+                await context.abort(code, await call.details() or "", trailers)
+            context.set_trailing_metadata(trailers)
+        finally:
+            up.close()
+            down.close()
+            call.cancel()
+            for part in parts:
+                part.cancel()
+            for outcome in await asyncio.gather(*parts, return_exceptions=True):
+                if isinstance(outcome, Exception) and not isinstance(outcome, STREAM_ENDED):
+                    self.fail(outcome)
+
+    def _link_of(self, direction: str, method: str) -> LiveLink | None:
+        if self.options.direction not in (direction, "both"):
+            return None
+        name = direction if self.options.shared else f"{direction} {method}"
+        if name not in self.links and len(self.links) >= _MOST_METHODS:
+            raise RuntimeError(f"more than {_MOST_METHODS} methods were called")
+        return self.link(name)
+
+    def _dropped(self, what: str, direction: str, method: str) -> str:
+        return (
+            f"the emulated network dropped the {what} ({direction} {method}, seed {self.channel.seed}, "
+            f"discipline {self.channel.config.discipline})"
+        )
+
+    def _pending(self) -> int:
+        """Messages that the links let out and that are neither handed on nor cancelled."""
+        if self._hook is not None:
+            return self._hook.pending
+        return sum(
+            link.model.counts[Kind.DELIVERED] - link.forwarded - link.cancelled
+            for link in self.links.values()
+        )
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self.fail(error)
+
+    async def _refresh(self) -> None:
+        while True:
+            if self._hook is not None:
+                await self._hook.refresh()
+            before_ns = self.events.now_ns() - _KEEP_PATH_NS
+            self.channel.forget(before_ns)
+            for link in self.links.values():
+                if link.model.chain is not None:
+                    link.model.chain.forget(before_ns)
+            await asyncio.sleep(_REFRESH_EVERY_S)
+
+
+async def _carry_up(
+    flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall
+) -> None:
+    with contextlib.suppress(*STREAM_ENDED):  # the service ended the call: its status says how
+        await flow.carry(context.read, call.write)
+        if not flow.lost_its_only_message:
+            await call.done_writing()
+
+
+async def _carry_down(
+    flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall
+) -> None:
+    await context.send_initial_metadata(_passed_on(await call.initial_metadata()))
+    await flow.carry(call.read, context.write)
+
+
+def _passed_on(metadata: Any) -> tuple[tuple[str, str | bytes], ...]:
+    """Metadata without what each hop says for itself."""
+    return tuple(
+        (key, value)
+        for key, value in metadata or ()
+        if key not in _NOT_PASSED_ON and not (key.startswith("grpc-") and not key.endswith("-bin"))
+    )
+
+
+def _damage_any_byte(raw: bytes, flips: Flips) -> bytes:
+    from channel_emu.model.faults.corruption import damage  # only where a scenario lists it
+
+    return damage(raw, flips)

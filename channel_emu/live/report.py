@@ -1,0 +1,94 @@
+"""What became of the messages that passed the links: counts, ages and delays, for a program or a person."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from channel_emu.live.live_link import DelayStats, LiveLink
+from channel_emu.model.link import Kind
+
+DROPPED = (Kind.DROPPED_BUSY, Kind.SUPERSEDED, Kind.SKIPPED, Kind.LOST, Kind.BROKEN)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one link, or of all links together: offered = delivered + dropped + in_flight.
+
+    outcomes: by ``link.Kind``, with ``forwarded`` (handed on) and ``cancelled`` (delivered after the call was
+        over).
+    mean_age_ms, peak_age_ms: age of the newest message handed on, counted from when the proxy received it,
+        between the first one handed on and the last that came in or went out; the mean over links, None where
+        there is none.
+    delay_ms: what the link drew. latency_ms: from receiving a message to handing it on.
+    error_ms: how long after the link's decision a message was handed on.
+    """
+
+    offered: int
+    delivered: int
+    dropped: int
+    in_flight: int
+    outcomes: dict[str, int]
+    mean_age_ms: float | None
+    peak_age_ms: float | None
+    delay_ms: dict[str, float | None]
+    latency_ms: dict[str, float | None]
+    error_ms: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Report(Figures):
+    """All links together; ``by_method`` has each link's figures under ``up /pkg.Service/Method``."""
+
+    seed: int
+    direction: str
+    seconds: float
+    by_method: dict[str, Figures] = field(default_factory=dict)
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON takes it."""
+        return asdict(self)
+
+
+def figures_of(links: Sequence[LiveLink], stats: DelayStats) -> Figures:
+    """The figures of links whose delays are in ``stats``."""
+    outcomes: Counter[str] = Counter()
+    for link in links:
+        outcomes.update({str(kind): count for kind, count in link.model.counts.items()})
+        outcomes.update(forwarded=link.forwarded, cancelled=link.cancelled)
+    return Figures(
+        offered=sum(link.model.offered for link in links),
+        delivered=outcomes[Kind.DELIVERED],
+        dropped=sum(outcomes[kind] for kind in DROPPED),
+        in_flight=sum(link.model.in_flight for link in links),
+        outcomes={name: count for name, count in outcomes.items() if count},
+        mean_age_ms=_mean([link.age.mean_age_ms(link.last_ns) for link in links]),
+        peak_age_ms=_mean([link.age.peak_age_ms() for link in links]),
+        delay_ms=stats.drawn.summary(),
+        latency_ms=stats.latency.summary(),
+        error_ms=stats.error.summary(),
+    )
+
+
+def show(report: Report) -> str:
+    """The report for a person: every link's figures in two lines."""
+    lines = []
+    for name, figures in report.by_method.items():
+        outcomes = ", ".join(f"{count} {kind}" for kind, count in figures.outcomes.items())
+        lines.append(f"  {name}: {figures.offered} offered; {outcomes or 'none settled'}")
+        lines.append(
+            f"    mean age {_ms(figures.mean_age_ms)}, peak age {_ms(figures.peak_age_ms)}, "
+            f"delay mean {_ms(figures.delay_ms['mean'])}, error p99 {_ms(figures.error_ms['p99'])}"
+        )
+    return "\n".join(lines) or "  no call was made"
+
+
+def _ms(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} ms"
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None

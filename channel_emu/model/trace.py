@@ -1,0 +1,136 @@
+"""The trace file: what the link did to every message, one JSON line each.
+
+First line: ``{"freshfield_trace": 1, "seed": ..., "channel": {...}}``. Then one line when a message's outcome
+is known::
+
+    {"camera": "cam03", "session": "f3a1", "sequence": 17, "number": 16, "bytes": 20481, "offered_ns": ...,
+     "outcome": "delivered", "state": 0, "started_ns": ..., "drawn_ns": ..., "due_ns": ..., "ended_ns": ...,
+     "actual_ns": ..., "duplicated": false, "flips": []}
+
+Instants are nanoseconds since the emulator started. ``due_ns`` is when the link releases the message,
+``actual_ns`` when it was handed to gRPC. ``outcome`` is null for a message that was still inside the link
+when the recording ended. For services other than the frame stream, ``camera`` is the link's name
+(``up /pkg.Service/Method``), ``session`` the call and ``sequence`` the message's place in it.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+from channel_emu.model.config import ChannelConfig, channel_from_mapping
+from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.link import Kind, Transit
+
+VERSION = 1
+_INSTANTS = ("offered_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
+
+
+class TraceError(ValueError):
+    """A file that is not a trace, or a trace that cannot be replayed. The message says where."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One offered message: a line of the file."""
+
+    camera: str
+    session: str
+    sequence: int
+    number: int
+    bytes: int
+    offered_ns: int
+    outcome: str | None
+    state: int
+    started_ns: int | None
+    drawn_ns: int | None
+    due_ns: int | None
+    ended_ns: int | None
+    actual_ns: int | None = None
+    duplicated: bool = False
+    flips: tuple[tuple[float, int], ...] = ()
+
+
+@dataclass(frozen=True)
+class Trace:
+    seed: int
+    config: ChannelConfig
+    records: list[Record]
+
+    def by_camera(self) -> dict[str, list[Record]]:
+        """Each camera's records by offer number."""
+        found: dict[str, list[Record]] = {}
+        for record in sorted(self.records, key=lambda r: r.number):
+            found.setdefault(record.camera, []).append(record)
+        return found
+
+    def offers(self) -> dict[str, list[tuple[int, int]]]:
+        """(instant in ns, bytes) of every offer, by camera."""
+        return {name: [(r.offered_ns, r.bytes) for r in found] for name, found in self.by_camera().items()}
+
+
+class TraceWriter:
+    """Appends records to a file. If the process is killed, only the last few lines are lost."""
+
+    def __init__(self, path: Path, config: ChannelConfig, seed: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file: TextIO = path.open("w", buffering=1 << 16)
+        self._line({"freshfield_trace": VERSION, "seed": seed, "channel": config.to_mapping()})
+
+    def write(
+        self,
+        camera: str,
+        session: str,
+        sequence: int,
+        transit: Transit,
+        actual_ns: int | None = None,
+        duplicated: bool = False,
+    ) -> None:
+        self._line({
+            "camera": camera, "session": session, "sequence": sequence, "number": transit.number,
+            "bytes": transit.size_bytes, "offered_ns": transit.offered_ns,
+            "outcome": None if transit.outcome is None else str(transit.outcome), "state": transit.state,
+            "started_ns": transit.started_ns, "drawn_ns": transit.drawn_ns, "due_ns": transit.due_ns,
+            "ended_ns": transit.ended_ns, "actual_ns": actual_ns, "duplicated": duplicated,
+            "flips": transit.flips,
+        })  # fmt: skip
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _line(self, values: dict[str, Any]) -> None:
+        self._file.write(json.dumps(values, separators=(",", ":")) + "\n")
+
+
+def read(path: Path) -> Trace:
+    """Read a trace. An incomplete last line is left out. Raises TraceError."""
+    try:
+        lines = path.read_text().split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TraceError(f"{path}: cannot be read: {error}") from None
+    try:
+        head = json.loads(lines[0])
+        if head["freshfield_trace"] != VERSION:
+            raise TraceError(f"{path}: trace version {head['freshfield_trace']}, expected {VERSION}")
+        config = channel_from_mapping(head["channel"], f"{path}: channel")
+        seed = int(head["seed"])
+    except (json.JSONDecodeError, KeyError, TypeError):
+        raise TraceError(f"{path}: not a freshfield trace: the first line has no trace header") from None
+    records = []
+    for number, line in enumerate(lines[1:-1], start=2):
+        try:
+            values = json.loads(line)
+            values["flips"] = tuple((float(place), int(mask)) for place, mask in values["flips"])
+            record = Record(**values)
+        except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+            raise TraceError(f"{path}: line {number} is not a trace record") from None
+        for key in _INSTANTS:
+            instant = getattr(record, key)
+            if instant is not None and (type(instant) is not int or not 0 <= instant <= NEVER_NS):
+                raise TraceError(f"{path}: line {number}: {key}: expected nanoseconds, got {instant!r}")
+        if record.outcome is not None and record.outcome not in list(Kind):
+            raise TraceError(f"{path}: line {number}: outcome: unknown, got {record.outcome!r}")
+        records.append(record)
+    return Trace(seed, config, records)
