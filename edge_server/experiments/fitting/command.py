@@ -20,9 +20,8 @@ from camera_node.sources.datasets.formats import FORMATS
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
 from camera_node.synthetic.source import WORLD_FPS
-from edge_server.experiments.common.machine_load import Usage
 from edge_server.experiments.fitting.evaluate import Scored, evaluate, fit_in_slices, marks_s
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
 from edge_server.fidelity.baselines import Baseline, baseline
 from edge_server.fidelity.images import Colour, to_unit
@@ -32,6 +31,7 @@ from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import field_names, option_help
 from edge_server.live.scoring_thread import to_bytes
 from freshfield.files import write_json
+from freshfield.machine_load import LoadMeter, outside_cores
 
 DESCRIPTION = """\
 Fit a recorded data set as fast as this machine can, and measure fidelity on views it never saw.
@@ -62,7 +62,7 @@ class FitError(ValueError):
 
 
 @dataclass(frozen=True)
-class Job:
+class FitRequest:
     """One fit as asked for. options: of the field, as in a scenario."""
 
     data: Path
@@ -122,12 +122,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
-    job = Job(args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background,
-              args.seed, args.format)  # fmt: skip
-    out = args.out or Path("runs") / f"fit-{_called(args.data)}"
+    request = FitRequest(
+        args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background, args.seed,
+        args.format,
+    )  # fmt: skip
+    out = args.out or Path("runs") / f"fit-{_data_name(args.data)}"
     try:
-        job.options.update(parse_options(args.option))
-        run(job, out, args.lpips, args.resume)
+        request.options.update(parse_options(args.option))
+        run(request, out, args.lpips, args.resume)
     except (DatasetError, FitError) as error:
         print(f"edge-server fit: {error}", file=sys.stderr)
         return 2
@@ -148,24 +150,26 @@ def parse_options(words: Sequence[str]) -> dict[str, Any]:
     return options
 
 
-def run(job: Job, out: Path, lpips_folder: Path | None = None, resume: bool = False) -> dict[str, Any]:
+def run(
+    request: FitRequest, out: Path, lpips_folder: Path | None = None, resume: bool = False
+) -> dict[str, Any]:
     """Fit, measure and leave everything in ``out``; returns the contents of report.json.
 
     Raises DatasetError or FitError for input that cannot be used.
     """
     from edge_server.fields.registry import make_field  # numba loads only once the options are read
 
-    if not 0.0 < job.seconds <= 1e6:
-        raise FitError(f"--seconds {job.seconds:g}: expected more than 0")
-    data = _open(job)
+    if not 0.0 < request.seconds <= 1e6:
+        raise FitError(f"--seconds {request.seconds:g}: expected more than 0")
+    data = _open(request)
     transparent = any(v.image.shape[2] == 4 for v in data.training)
-    options = {"background": job.background, **job.options} if transparent else job.options
+    options = {"background": request.background, **request.options} if transparent else request.options
     try:
-        model = make_field(job.field, options, seed=job.seed)
+        model = make_field(request.field, options, seed=request.seed)
     except (ValueError, TypeError) as error:
-        raise FitError(f"--field {job.field}: {error}") from None
+        raise FitError(f"--field {request.field}: {error}") from None
     out.mkdir(parents=True, exist_ok=True)
-    run_ = _Run(job, options, data, model, out, lpips_folder)
+    run_ = _Run(request, options, data, model, out, lpips_folder)
     if resume:
         run_.load()
     print(run_.headline(), flush=True)
@@ -177,35 +181,41 @@ def _is_scene(data: Path) -> bool:
     return str(data) in SCENES and not data.exists()
 
 
-def _called(data: Path) -> str:
-    """What a scene or data set is called in names of folders and reports."""
+def _data_name(data: Path) -> str:
+    """The name of a scene or data set in folders and reports."""
     return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
 
 
-def _open(job: Job) -> Recorded:
-    if not _is_scene(job.data):
-        return load_recorded(job.data, job.holdout, job.scale, job.frame, job.format)
-    t_s = job.frame / WORLD_FPS
-    still = synthetic(str(job.data), size=max(8, round(_SCENE_SIZE / job.scale)), t_s=t_s)
-    return Recorded(job.data, still.training, still.held_out, f"at {t_s:g} s")
+def _open(request: FitRequest) -> Recorded:
+    if not _is_scene(request.data):
+        return load_recorded(request.data, request.holdout, request.scale, request.frame, request.format)
+    t_s = request.frame / WORLD_FPS
+    still = synthetic_still(str(request.data), size=max(8, round(_SCENE_SIZE / request.scale)), t_s=t_s)
+    return Recorded(request.data, still.training, still.held_out, f"at {t_s:g} s")
 
 
 class _Run:
-    """One fit in progress: the files of ``out`` and the lines on the terminal."""
+    """A fit in progress: its files in ``out`` and its lines on the terminal."""
 
     def __init__(
-        self, job: Job, options: dict[str, Any], data: Recorded, model: Field, out: Path, lpips: Path | None
+        self,
+        request: FitRequest,
+        options: dict[str, Any],
+        data: Recorded,
+        model: Field,
+        out: Path,
+        lpips: Path | None,
     ) -> None:
-        self.job, self.options, self.data, self.model, self.out = job, options, data, model, out
+        self.request, self.options, self.data, self.model, self.out = request, options, data, model, out
         metric, self.lpips_missing = open_lpips(lpips)
-        self.background = BACKGROUNDS[job.background]
+        self.background = BACKGROUNDS[request.background]
         self.scorer = Scorer(metric, background=self.background)
         self.views = data.held_out or data.training[:_SCORED_OF_TRAINING]
         self.rendered: NDArray[np.float32] | None = None
         self.rows: list[dict[str, Any]] = []
         self.processes: list[dict[str, Any]] = []
         self.spent_s, self.spent_steps = 0.0, 0
-        self.usage = Usage("fit")
+        self.load_meter = LoadMeter("fit")
 
     def headline(self) -> str:
         d, image = self.data, self.data.training[0].image
@@ -216,7 +226,7 @@ class _Run:
         return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
 
     def load(self) -> None:
-        """Take up what ``save`` left. Raises FitError where that is not possible."""
+        """Load what ``finish`` left. FitError where there is nothing to go on from."""
         try:
             state, about = checkpoint.load(self.out / "field")
             self.model.load_state(state)
@@ -227,13 +237,13 @@ class _Run:
             ]
         except (OSError, ValueError, KeyError) as error:
             raise FitError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
-        if self.spent_s >= self.job.seconds - 0.05:
+        if self.spent_s >= self.request.seconds - 0.05:
             raise FitError(
                 f"--resume: {self.out} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
             )
 
     def go(self) -> dict[str, Any]:
-        marks = marks_s(self.job.seconds)
+        marks = marks_s(self.request.seconds)
         try:
             done = fit_in_slices(
                 self.model,
@@ -251,7 +261,7 @@ class _Run:
         return self.finish()
 
     def _score(self) -> Score:
-        self.processes.append(self.usage.row(0.0))
+        self.processes.append(self.load_meter.row(0.0))
         score, self.rendered = evaluate(self.model, self.views, self.scorer)
         return score
 
@@ -260,8 +270,8 @@ class _Run:
         self.spent_s = at.seconds
         self.spent_steps = at.steps if at.steps is not None else self.spent_steps
         self.processes[-1]["t_s"] = round(at.seconds, 3)
-        outside = self.usage.outside(self.processes[-1])
-        self.usage.row(0.0)  # what evaluation used is nobody's load
+        outside = outside_cores(self.processes[-1])
+        self.load_meter.row(0.0)  # evaluation counts for nobody
         self.rows.append(
             {
                 "number": len(self.rows),
@@ -279,17 +289,17 @@ class _Run:
                 "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else "selected",
             }
         )
-        print(progress(at, outside), flush=True)
+        print(progress_line(at, outside), flush=True)
 
     def finish(self) -> dict[str, Any]:
-        """Write checkpoint, pictures and report."""
+        """Write checkpoint, images and report; returns report.json."""
         from edge_server.report import build_report  # draws with matplotlib
 
         about = {
-            "field": self.job.field,
+            "field": self.request.field,
             "options": self.options,
             "scenario": self._name(),
-            "seed": self.job.seed,
+            "seed": self.request.seed,
             "seconds": self.spent_s,
             "steps": self.spent_steps,
         }
@@ -310,8 +320,8 @@ class _Run:
         return {
             "kind": "fit",
             "scenario": self._name(),
-            "seed": self.job.seed,
-            "field": self.job.field,
+            "seed": self.request.seed,
+            "field": self.request.field,
             "options": self.options,
             "data": {
                 "file": self.data.file.name,
@@ -333,10 +343,10 @@ class _Run:
         return baseline(self.data.training, view.image, view.camera_to_world, self.background)
 
     def _name(self) -> str:
-        return f"fit {_called(self.job.data)}"
+        return f"fit {_data_name(self.request.data)}"
 
 
-def progress(at: Scored, outside: float | None) -> str:
+def progress_line(at: Scored, outside: float | None) -> str:
     """One line for people: time, steps, scores and how many cores others kept busy."""
     score = at.score
     words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]

@@ -27,13 +27,15 @@ _NOISE_FRAMES = 8
 
 
 @dataclass(frozen=True)
-class Film:
+class MultiviewSequence:
     """Frames 0, 1, 2, ... of a moving scene, without end: it repeats.
 
-    cameras: name -> (intrinsics, camera-to-world), in the order of training. held_out: of them, those that
-    are scored and not trained on. key: frame -> what names its pictures; equal keys, equal pictures.
-    image: (camera, key) -> picture. before: (camera, frame) -> what the camera saw ``LAGS_MS`` earlier.
-    bounds: by held-out camera, how much a pixel differs where it moves.
+    cameras: name -> (intrinsics, camera-to-world), in the order of training.
+    held_out: those of them that are scored and not trained on.
+    key: frame -> identity of its images; equal keys, equal images.
+    image: (camera, key) -> image.
+    before: (camera, frame) -> what the camera saw ``LAGS_MS`` earlier.
+    bounds: held-out camera -> by how much a pixel differs at least where it moves.
     """
 
     name: str
@@ -83,9 +85,9 @@ class Film:
         return View(camera, self._known[at], pose, lens, round(frame * self.period_ms * 1e6))
 
 
-def synthetic_film(
+def synthetic_sequence(
     name: str = "room", cameras: int = 19, size: int = 128, fps: float = 15.0, **params: Any
-) -> Film:
+) -> MultiviewSequence:
     """A scene of ours, its first camera held out. params: of the scene (``speed_m_per_s``). Raises
     camera_node's SceneError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size, **params})
@@ -93,13 +95,13 @@ def synthetic_film(
     known: dict[tuple[str, int], list[Image]] = {}
 
     def before(camera: str, frame: int) -> list[Image]:
-        # An analytic scene tells of any instant, also of those before the first and between two frames.
+        # An analytic scene is known at any instant, before the first frame and between two frames too.
         at = (camera, frame % loop)
         if at not in known:
             known[at] = [scene.render(camera, frame % loop / fps - lag / 1e3) for lag in LAGS_MS]
         return known[at]
 
-    return Film(
+    return MultiviewSequence(
         name=name,
         period_ms=1e3 / fps,
         cameras=scene.cameras,
@@ -111,7 +113,7 @@ def synthetic_film(
     )
 
 
-def recorded_film(path: Path, holdout: str, scale: float = 1.0) -> Film:
+def recorded_sequence(path: Path, holdout: str, scale: float = 1.0) -> MultiviewSequence:
     """A recording of several cameras, played back and forth. holdout: as in ``load_recorded``. Raises
     DatasetError, also for a data set in which nothing moves."""
     file, dataset = open_dataset(path, scale)
@@ -122,7 +124,7 @@ def recorded_film(path: Path, holdout: str, scale: float = 1.0) -> Film:
     if count < 2:
         raise DatasetError(f"{file}: one instant only: nothing moves in it")
     cameras = {c: (r[0].intrinsics, r[0].camera_to_world) for c, r in records.items()}
-    # Pictures are not needed to tell who is held out.
+    # The split needs no images.
     blank = np.zeros((1, 1, 3), np.uint8)
     _, held_out = split([View(c, blank, pose, lens) for c, (lens, pose) in cameras.items()], holdout)
     if not held_out:
@@ -147,7 +149,7 @@ def recorded_film(path: Path, holdout: str, scale: float = 1.0) -> Film:
         return known[camera, at]
 
     names = tuple(view.camera for view in held_out)
-    return Film(
+    return MultiviewSequence(
         name=file.resolve().parent.name,
         period_ms=period_ms,
         cameras=cameras,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export.run_source import open_source, poses_of
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import field_names, make_field
@@ -25,7 +25,7 @@ def saved(folder, name: str, steps: int = 30):
     """A checkpoint of a field that has learnt ``tile`` a little, as a run leaves it."""
     options = OPTIONS.get(name, SMALL)
     field = make_field(name, options, seed=3)
-    field.fit(synthetic("tile", cameras=9, size=32).training, Budget(steps=steps))
+    field.fit(synthetic_still("tile", cameras=9, size=32).training, Budget(steps=steps))
     checkpoint.save(folder / "field.npz", field.state(), {"field": name, "options": {}, "seed": 3})
     return field
 
