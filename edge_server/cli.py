@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from freshfield import transport
 from freshfield.scenario import ScenarioError, load
@@ -94,7 +94,16 @@ _PLACES = {
 def _offline(name: str, words: list[str]) -> int:
     import importlib
 
-    return importlib.import_module(f"edge_server.{_PLACES[name]}").main(words)
+    main = importlib.import_module(f"edge_server.{_PLACES[name]}").main
+    return main(words, _compare_with_scene) if name == "export" else main(words)
+
+
+def _compare_with_scene(*args: Any) -> Any:
+    """``export --measure``, which composes edge and synthetic world and is imported only when it is
+    called."""
+    import importlib
+
+    return importlib.import_module("edge_server.experiments.scenes.mesh_truth").compare_with_scene(*args)
 
 
 def _add_run(commands: argparse._SubParsersAction) -> None:

@@ -23,7 +23,7 @@ from edge_server.experiments.bench.run import BenchError, BenchRun
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.result_store import settings_digest
 from edge_server.experiments.common.tables import markdown_table
-from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, exact_depth, scan, truth_of
+from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, exact_depth, scan, surface_truth
 from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
 from edge_server.surface import SurfaceError
@@ -90,7 +90,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     if run.fields:
         names = tuple(n for n, (representation, _) in CASES.items() if representation in run.fields)
     close = scan(workload.size)
-    truth = truth_of(close)
+    truth = surface_truth(close)
     store.results["scan"] = {
         "views": len(close.views), "size": workload.size, "distance_m": DISTANCE_M,
         "truth_points": len(truth.points), "seen_by_two": float((truth.cameras >= SEEN_BY).mean()),

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from camera_node.capture import Camera
-from edge_server.experiments.virtual.from_scenario import deploy, training_cameras
-from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, Truth
+from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth
 from edge_server.fidelity.scorer import PerceptualMetric, Score, Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.live.state import Publication
@@ -94,10 +94,10 @@ class WarmStart:
         self.field.load_state(self._warm)
         update_s = compute.charge_ns(steps) / 1e9
         # 16 scores give the mean of a run as well as hundreds of them.
-        terms = Terms(steps, compute=compute, score_every_ms=1e3 * seconds / 16)
+        terms = RunSettings(steps, compute=compute, score_every_ms=1e3 * seconds / 16)
         settled_s = _SETTLED_SHARE * seconds
         viewer = ViewerScores(settled_s)
-        deployment = deploy(
+        deployment = build_deployment(
             self.scenario, terms, field=self.field, scorer=Scorer(lpips), cameras=self.cameras,
             on_published=lambda p: viewer.published(p, self.field),
         )  # fmt: skip

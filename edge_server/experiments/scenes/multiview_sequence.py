@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,13 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.scene import HELD_OUT
 from edge_server.experiments.scenes.recorded import split
-from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
+from edge_server.experiments.virtual.truth import NOISE_FRAMES, noise_bound
+from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, frames_at_lags
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Renderer, View
 from freshfield.geometry import Pinhole
 
 Image = NDArray[np.uint8]
-
-_NOISE_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -157,17 +155,10 @@ def recorded_sequence(path: Path, holdout: str, scale: float = 1.0) -> Multiview
         key=key,
         image=read,
         before=before,
-        bounds={c: _noise_bound([read(c, k) for k in range(min(count, _NOISE_FRAMES))]) for c in names},
+        bounds={c: noise_bound(read(c, k) for k in range(min(count, NOISE_FRAMES))) for c in names},
     )
 
 
 def _fps(times_s: Sequence[float | None]) -> float:
     known = [t for t in times_s if t is not None]
     return float(1.0 / np.median(np.diff(known)))
-
-
-def _noise_bound(images: Sequence[Image]) -> float:
-    estimate = NoiseEstimate()
-    for a, b in pairwise(images):
-        estimate.add(a, b)
-    return estimate.bound

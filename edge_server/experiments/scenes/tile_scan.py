@@ -71,7 +71,7 @@ def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
     return renderer.distance()
 
 
-def truth_of(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
+def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
     """The surface that the scan's cameras see, see ``surface.metrics``."""
     placed = place_still(scan.scene.world.statics)
     points, normals = [], []

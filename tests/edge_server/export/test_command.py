@@ -78,7 +78,7 @@ def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
 
 def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    from edge_server.experiments.scenes.mesh_truth import measured
+    from edge_server.experiments.scenes.mesh_truth import distances
     from edge_server.experiments.scenes.tile_scan import exact_depth, scan
     from edge_server.surface.depth import depth_map
     from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
@@ -88,7 +88,7 @@ def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
         depth_map(exact_depth(near.scene, v).astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
         for v in near.views
     ]
-    found = measured(mesh_of_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
+    found = distances(mesh_of_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
     assert found["chamfer_mm"] < 3.0 and found["complete"] > 0.7
 
 
