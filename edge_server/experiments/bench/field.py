@@ -20,13 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.bench.run import BenchRun, open_recording, result_settings
+from edge_server.experiments.bench.run import BenchRun, mean_baselines, open_recording, result_settings
 from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
 from edge_server.experiments.common.result_store import ResultStore, settings_digest
 from edge_server.experiments.common.tables import grouped, markdown_table, number
 from edge_server.experiments.fitting.evaluate import evaluate
 from edge_server.experiments.scenes.multiview_still import MultiviewStill, smallest_angle_deg, synthetic_still
-from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field
@@ -85,7 +84,9 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 def _describe(store: ResultStore, scene: str, still: MultiviewStill) -> None:
-    store.get(scene, "baseline", compute=partial(_baseline, still))
+    store.get(
+        scene, "baseline", compute=partial(mean_baselines, still.training, still.held_out, still.background)
+    )
     store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
 
 
@@ -201,15 +202,6 @@ def _rates(field: str, still: MultiviewStill, repeats: int) -> dict[str, Any]:
 
 def _render_ms(field: Field, pose: Any, lens: Pinhole, repeats: int = 11) -> float:
     return 1e3 * median_s(repeats, lambda: field.render(pose, lens))
-
-
-def _baseline(still: MultiviewStill) -> dict[str, float | None]:
-    """Means over the held-out cameras."""
-    found = [baseline(still.training, v.image, v.camera_to_world, still.background) for v in still.held_out]
-    return {
-        name: statistics.fmean(getattr(b, name) for b in found)
-        for name in ("mean_colour_db", "nearest_view_db")
-    }
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:

@@ -22,7 +22,14 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.bench.run import RECORDINGS, BenchError, BenchRun, data_file, result_settings
+from edge_server.experiments.bench.run import (
+    RECORDINGS,
+    BenchError,
+    BenchRun,
+    data_file,
+    mean_baselines,
+    result_settings,
+)
 from edge_server.experiments.common.progress import Progress
 from edge_server.experiments.common.result_store import Interrupted
 from edge_server.experiments.common.tables import markdown_table
@@ -32,7 +39,6 @@ from edge_server.experiments.scenes.multiview_sequence import (
     recorded_sequence,
     synthetic_sequence,
 )
-from edge_server.fidelity.baselines import baseline
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
@@ -103,7 +109,7 @@ def measure(run: BenchRun) -> dict[str, Any]:
     todo = [(s, n) for s in sequences for n in names if store.find(s, n, settings=settings[n]) is None]
     progress = Progress(workload.seconds_or_steps() * len(todo))
     for scene, sequence in sequences.items():
-        store.get(scene, "baseline", compute=partial(_baseline, sequence))
+        store.get(scene, "baseline", compute=partial(_baselines, sequence))
         store.results[scene] |= {"scene": sequence.describe(), "frame_ms": sequence.period_ms}
         for name in names:
             follow = partial(_follow, name, sequence, workload, progress)
@@ -245,12 +251,9 @@ def _row(score: Score) -> dict[str, Any]:
     return {"psnr_db": score.psnr_db, "psnr_moving_db": score.psnr_moving_db}
 
 
-def _baseline(sequence: MultiviewSequence) -> dict[str, Any]:
-    """Of the first frame; means over the held-out cameras."""
-    training = sequence.training(0)
-    found = [baseline(training, v.image, v.camera_to_world) for v in sequence.truth(0)]
-    names = ("mean_colour_db", "nearest_view_db")
-    return {name: statistics.fmean(getattr(b, name) for b in found) for name in names}
+def _baselines(sequence: MultiviewSequence) -> dict[str, Any]:
+    """Of the first frame."""
+    return mean_baselines(sequence.training(0), sequence.truth(0))
 
 
 def _runs(figures: Mapping[str, Any]) -> Iterable[tuple[str, str, str, dict[str, Any], dict[str, Any]]]:

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A Markdown table.
@@ -36,3 +38,9 @@ def number(value: float | None, digits: int = 2, sign: str = "") -> str:
 def grouped(value: float | None, digits: int = 2) -> str:
     """As ``number``, but from 1000 on whole and with commas between thousands."""
     return f"{value:,.0f}" if value is not None and abs(value) >= 1000 else number(value, digits)
+
+
+def mean_or_none(values: Iterable[float | None]) -> float | None:
+    """The mean of the values that are known; None where none is."""
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None

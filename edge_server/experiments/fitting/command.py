@@ -79,39 +79,33 @@ class FitRequest:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="edge-server fit", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
-    parser.add_argument("--format", choices=list(FORMATS), help="of the data set [what its files say]")
-    parser.add_argument(
-        "--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]"
-    )
-    parser.add_argument("--list-options", action="store_true", help="say what the field's options mean")
-    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
-    parser.add_argument(
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server fit", description=DESCRIPTION, formatter_class=raw)
+    add = parser.add_argument
+    add("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
+    add("--format", choices=list(FORMATS), help="of the data set [what its files say]")
+    add("--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]")
+    add("--list-options", action="store_true", help="say what the field's options mean")
+    add("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
+    add(
         "--holdout", default="8", metavar="K|NAME,...",
         help="every K-th view, or these images or cameras; split: what the data set keeps for testing; "
         "0: none [%(default)s]",
     )  # fmt: skip
-    parser.add_argument(
-        "--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]"
-    )
-    parser.add_argument(
-        "--frame", type=int, default=0, metavar="N", help="instant of a moving set [%(default)s]"
-    )
-    parser.add_argument(
+    add("--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]")
+    add("--frame", type=int, default=0, metavar="N", help="instant of a moving set [%(default)s]")
+    add(
         "--background", choices=sorted(BACKGROUNDS), default="white",
         help="what transparent images are laid on [%(default)s]",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
-    parser.add_argument(
+    add("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
+    add(
         "--option", action="append", default=[], metavar="KEY=VALUE",
         help="setting of the field, e.g. levels=12; again for more",
     )  # fmt: skip
-    parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
-    parser.add_argument("--resume", action="store_true", help="go on from OUT until --seconds in all")
+    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    add("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
+    add("--resume", action="store_true", help="go on from OUT until --seconds in all")
     args = parser.parse_args(argv)
     if args.list_options:
         try:
@@ -198,14 +192,9 @@ class _Run:
     """A fit in progress: its files in ``out`` and its lines on the terminal."""
 
     def __init__(
-        self,
-        request: FitRequest,
-        options: dict[str, Any],
-        data: Recorded,
-        model: Field,
-        out: Path,
+        self, request: FitRequest, options: dict[str, Any], data: Recorded, model: Field, out: Path,
         lpips: Path | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.request, self.options, self.data, self.model, self.out = request, options, data, model, out
         metric, self.lpips_missing = open_lpips(lpips)
         self.background = BACKGROUNDS[request.background]
@@ -231,10 +220,8 @@ class _Run:
             state, about = checkpoint.load(self.out / "field")
             self.model.load_state(state)
             self.spent_s, self.spent_steps = float(about["seconds"]), int(about["steps"])
-            self.rows = [json.loads(line) for line in (self.out / "series.jsonl").read_text().splitlines()]
-            self.processes = [
-                json.loads(line) for line in (self.out / "processes.jsonl").read_text().splitlines()
-            ]
+            self.rows = _read_lines(self.out / "series.jsonl")
+            self.processes = _read_lines(self.out / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise FitError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
         if self.spent_s >= self.request.seconds - 0.05:
@@ -355,6 +342,10 @@ def progress_line(at: Scored, outside: float | None) -> str:
     words += [f"LPIPS {score.lpips:.3f}"] if score.lpips is not None else []
     words += [f"(others used {outside:.1f} cores)"] if outside is not None else []
     return "  ".join(words)
+
+
+def _read_lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def _write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -267,10 +268,8 @@ class Frontier:
         points = []
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
-                "figure": 1, "scene": self.still.describe(), "field": effort.field,
-                "options": effort.options, "divided": effort.divided,
-                "defaults": settings_digest(effort.field, effort.options), "seconds": planned_s,
-                "seed": seed, "lpips": self.lpips is not None,
+                "figure": 1, "scene": self.still.describe(), **_settings(effort), "divided": effort.divided,
+                "seconds": planned_s, "seed": seed, "lpips": self.lpips is not None,
             }  # fmt: skip
             measure = partial(effort_sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
             point, new = self.file.get(settings, measure)
@@ -293,8 +292,7 @@ class Frontier:
         moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
         for effort in self._live:
             settings: Row = {
-                "figure": "charged", **asdict(moving), "speed_m_per_s": speed, "field": effort.field,
-                "options": effort.options, "defaults": settings_digest(effort.field, effort.options),
+                "figure": "charged", **asdict(moving), "speed_m_per_s": speed, **_settings(effort),
                 "warm_steps": sweep.warm_steps,
             }  # fmt: skip
             measure = partial(_measured_compute, moving, speed, effort, sweep.warm_steps)
@@ -308,63 +306,48 @@ class Frontier:
         return found
 
     def _updates(self, charged: dict[str, Compute]) -> list[Row]:
-        rows: list[Row] = []
-        total = len(charged) * len(self.sweep.speeds) * len(self._seeds) * len(self.sweep.update_s)
-        for effort in self._live:
+        """Figure 2: every update time of every effort, speed and seed, as means over the seeds."""
+        sweep, rows = self.sweep, []
+        runs = list(product(self._live, sweep.speeds, self._seeds))
+        for effort, speed, seed in runs:
+            # Made for the first new point only: a resumed sweep makes only what it still needs.
+            start = cache(partial(_warm_start, sweep, effort, speed, seed))
             compute = charged[effort.label]
-            for speed in self.sweep.speeds:
-                for seed in self._seeds:
-                    rows += self._moving(effort, compute, speed, seed, len(rows), total)
+            for update_s in sweep.update_s:
+                seconds, steps = max(sweep.run_s, 6.0 * update_s), update_time.steps_for(update_s, compute)
+                settings: Row = {
+                    "figure": 2, **asdict(sweep.moving), "speed_m_per_s": speed, **_settings(effort),
+                    "warm_steps": sweep.warm_steps, "steps": steps, "seed": seed, "seconds": seconds,
+                    "compute": asdict(compute), "lpips": self.lpips is not None,
+                }  # fmt: skip
+                point, new = self.file.get(
+                    settings, partial(_moving_run, start, steps, compute, seconds, self.lpips)
+                )
+                rows.append({
+                    **point, "field": effort.field, "effort": effort.name, "options": effort.options,
+                    "speed_m_per_s": speed, "planned_update_s": update_s, "seed": seed,
+                })  # fmt: skip
+                print(
+                    f"[{len(rows)}/{len(runs) * len(sweep.update_s)}] {effort.label:16} {speed:g} m/s, "
+                    f"update {point['update_s']:5.2f} s  "
+                    f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
+                    flush=True,
+                )
         return update_time.mean_over_seeds(rows)
 
-    def _moving(
-        self, effort: effort_sweep.Effort, compute: Compute, speed: float, seed: int, done: int, total: int
-    ) -> list[Row]:
-        """Every update time of one effort, speed and seed."""
-        # Made for the first new point only: a resumed sweep makes only what it still needs.
-        start = cache(partial(self._warm_start, speed, effort, seed))
-        rows: list[Row] = []
-        for update_s in self.sweep.update_s:
-            settings, measure = self._update_point(start, speed, effort, seed, update_s, compute)
-            point, new = self.file.get(settings, measure)
-            rows.append({
-                **point, "field": effort.field, "effort": effort.name, "options": effort.options,
-                "speed_m_per_s": speed, "planned_update_s": update_s, "seed": seed,
-            })  # fmt: skip
-            print(
-                f"[{done + len(rows)}/{total}] {effort.label:16} {speed:g} m/s, "
-                f"update {point['update_s']:5.2f} s  "
-                f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
-                flush=True,
-            )
-        return rows
 
-    def _warm_start(self, speed: float, effort: effort_sweep.Effort, seed: int) -> update_time.WarmStart:
-        sweep = self.sweep
-        return update_time.WarmStart(
-            sweep.moving, speed, effort.field, effort.options, seed, sweep.warm_steps
-        )
+def _settings(effort: effort_sweep.Effort) -> Row:
+    """What of an effort decides a result."""
+    digest = settings_digest(effort.field, effort.options)
+    return {"field": effort.field, "options": effort.options, "defaults": digest}
 
-    def _update_point(
-        self,
-        start: Callable[[], update_time.WarmStart],
-        speed: float,
-        effort: effort_sweep.Effort,
-        seed: int,
-        update_s: float,
-        compute: Compute,
-    ) -> tuple[Row, Callable[[], Row]]:
-        """The settings of one point of figure 2, and how to measure it."""
-        sweep = self.sweep
-        seconds = max(sweep.run_s, 6.0 * update_s)
-        steps = update_time.steps_for(update_s, compute)
-        settings: Row = {
-            "figure": 2, **asdict(sweep.moving), "speed_m_per_s": speed, "field": effort.field,
-            "options": effort.options, "defaults": settings_digest(effort.field, effort.options),
-            "warm_steps": sweep.warm_steps, "steps": steps, "seed": seed, "seconds": seconds,
-            "compute": asdict(compute), "lpips": self.lpips is not None,
-        }  # fmt: skip
-        return settings, lambda: start().run(steps, compute, seconds, self.lpips)
+
+def _warm_start(sweep: Sweep, effort: effort_sweep.Effort, speed: float, seed: int) -> update_time.WarmStart:
+    return update_time.WarmStart(sweep.moving, speed, effort.field, effort.options, seed, sweep.warm_steps)
+
+
+def _moving_run(start: Callable[[], update_time.WarmStart], *how: Any) -> Row:
+    return start().run(*how)
 
 
 def _measured_compute(

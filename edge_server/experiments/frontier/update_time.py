@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.capture import Camera
+from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth
 from edge_server.fidelity.scorer import PerceptualMetric, Score, Scorer
@@ -110,8 +111,8 @@ class WarmStart:
             "update_s": update_s,
             "updates": len(publications),
             "scored": len(scored),
-            "aaoi_ms": _mean([p.aaoi_ms for p in publications]),
-            **{name: _mean([getattr(p, name) for p in scored]) for name in METRICS},
+            "aaoi_ms": mean_or_none([p.aaoi_ms for p in publications]),
+            **{name: mean_or_none([getattr(p, name) for p in scored]) for name in METRICS},
             **viewer.means(),
             "frames": deployment.frames(),
         }
@@ -164,7 +165,7 @@ class ViewerScores:
                 self._scores += [score] if score is not None else []
 
     def means(self) -> dict[str, float | None]:
-        return {name: _mean([getattr(s, name[5:]) for s in self._scores]) for name in SEEN}
+        return {name: mean_or_none([getattr(s, name[5:]) for s in self._scores]) for name in SEEN}
 
 
 def steps_for(update_s: float, compute: Compute) -> int:
@@ -192,7 +193,7 @@ def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "planned_update_s": planned_s, "seeds": len(group),
         }  # fmt: skip
         for name in ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, *SEEN):
-            row[name] = _mean([r[name] for r in group])
+            row[name] = mean_or_none([r[name] for r in group])
         for name in METRICS[:2]:
             known = [r[name] for r in group if r[name] is not None]
             many = len(known) > 1
@@ -206,8 +207,3 @@ def _view(camera: Camera, at_ns: int = 0) -> View:
     k = shot.intrinsics
     image = payload.decode(shot.payload, camera.codec, k.width, k.height)
     return View(camera.name, image, shot.pose.matrix(), k, at_ns)
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None

@@ -17,6 +17,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_config
+from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
@@ -111,9 +112,9 @@ def summary(
         "compute": dataclasses.asdict(settings.compute),
         "updates": len(publications),
         "frames": deployment.frames(),
-        "last_fifth": {name: _mean([getattr(p, name) for p in late]) for name in _METRICS},
-        "views": _mean([float(len(p.selected)) for p in publications]),
-        "update_ms": _mean([p.update_ms for p in publications]),
+        "last_fifth": {name: mean_or_none([getattr(p, name) for p in late]) for name in _METRICS},
+        "views": mean_or_none([float(len(p.selected)) for p in publications]),
+        "update_ms": mean_or_none([p.update_ms for p in publications]),
         "treated_ms_per_view": deployment.updates.treatment_cost.ms_per_view,
         "digest": digest(deployment),
         "versions": versions(),
@@ -148,10 +149,12 @@ def show(found: dict[str, Any]) -> str:
         f"{found['scenario']}, seed {found['seed']}, {found['seconds']:g} s of virtual time, "
         f"{found['policy']}{value}",
         f"  updates     {found['updates']} of {found['steps']} steps, {cost_text}",
-        f"  views       {_n(found['views'], 1)} an update",
+        f"  views       {number(found['views'], 1)} an update",
         "  last fifth  "
         + ", ".join(
-            f"{k} {_n(v, 3)}" for k, v in found["last_fifth"].items() if k != "perceptual" or v is not None
+            f"{k} {number(v, 3)}"
+            for k, v in found["last_fifth"].items()
+            if k != "perceptual" or v is not None
         ),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]}",
@@ -169,7 +172,7 @@ def _run(deployment: VirtualDeployment, seconds: float, quiet: bool) -> None:
             spent = time.monotonic() - began
             left = spent / done_s * (seconds - done_s)
             found = deployment.publications
-            psnr = f", PSNR {_n(found[-1].psnr_db, 2)}" if found else ""
+            psnr = f", PSNR {number(found[-1].psnr_db, 2)}" if found else ""
             print(f"  {done_s:g} of {seconds:g} s: {len(found)} updates{psnr}; {left:.0f} s left", flush=True)
 
 
@@ -213,31 +216,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--steps", type=int, metavar="N", help="of an update [edge.steps of the scenario, else 100]")
     add("--first-steps", type=int, default=0, metavar="N", help="of the first update [as the others]")
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
-    add(
-        "--epoch-ms",
-        type=float,
-        default=250.0,
-        metavar="MS",
-        help="between two decisions [%(default)g]",
-    )
+    add("--epoch-ms", type=float, default=250.0, metavar="MS", help="between two decisions [%(default)g]")
     add("--score-every-ms", type=float, default=250.0, metavar="MS", help="[%(default)g]")
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add(
-        "--lpips",
-        type=Path,
-        metavar="DIR",
-        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]",
-    )
+    add("--lpips", type=Path, metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
     add("--out", type=Path, metavar="DIR",
         help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
     add("--json", action="store_true", help="everything, as one JSON object")
     return parser
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None
-
-
-def _n(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

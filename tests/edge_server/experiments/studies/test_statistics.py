@@ -67,7 +67,8 @@ def test_a_flat_curve_is_not_given_an_optimum():
 
 
 def test_a_best_point_is_measured_on_seeds_that_did_not_choose_it():
-    """Even seeds have their best at 1, odd ones at 2: what one half prefers is the worse one for the other."""
+    """Even seeds have their best at 1, odd ones at 2: what one half prefers is the worse one for the
+    other."""
     curve = {1.0: {s: 10.0 * (s % 2 == 0) for s in range(8)}, 2.0: {s: 10.0 * (s % 2) for s in range(8)}}
     assert at_its_best(curve) == dict.fromkeys(range(8), 0.0)  # chosen by themselves all would have 10
     assert at_its_best(curve, lower_is_better=True) == dict.fromkeys(range(8), 10.0)
