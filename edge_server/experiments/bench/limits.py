@@ -1,12 +1,12 @@
 """How far the fields' kernels are from what this machine allows: its limits, then each kernel against them.
 
-The limits are measured, not looked up: random reads and writes of one vertex (two float32, as the hash
-tables hold them) in tables of several sizes, arithmetic on what is in registers, divisions, and copies within
-a core's own cache; multiply-adds of BLAS, on one large and one narrow matrix, are a peer, not a limit: on a
-processor that it was not tuned for it does half of what is possible. A kernel's floor is the time that all
-cores together need at the least for whatever of its reads, writes and arithmetic takes longest, the others
-going on beside it, as they do in these processors; what it takes beyond that goes into addresses, drawing,
-marching, branches and waiting. Of ``ngp`` and ``splat``: the default and the fastest.
+The limits are measured, not looked up: random reads and writes of one vertex (two float32, as in the hash
+tables) in tables of several sizes, arithmetic in registers, divisions, and copies within a core's own cache.
+Multiply-adds of BLAS, on one large and one narrow matrix, are a peer and no limit: on a processor that BLAS
+was not tuned for they reach half of what is possible. A kernel's floor is the time that all cores together
+need at least for the slowest of its reads, writes and arithmetic; these processors do the others meanwhile.
+The rest of a kernel's time goes into addresses, sampling, marching, branches and waiting. Measured for
+``ngp`` and ``splat``: the default and the fastest.
 """
 
 from __future__ import annotations
@@ -104,11 +104,12 @@ def measure(run: BenchRun) -> dict[str, Any]:
 
 
 class Limits:
-    """The machine's limits, measured again after each fit that is held against them: a shared machine gets
-    slower and faster within a minute, and a kernel is not faster than its limits because they were measured
-    in a slow one.
+    """The machine's limits, measured again after each fit that is compared with them: a shared machine
+    changes its speed within a minute, and a kernel must not seem faster than limits that were measured in a
+    slow one.
 
-    highest: of each limit, over all measurements."""
+    highest: of each limit, over all measurements.
+    """
 
     def __init__(self, repeats: int) -> None:
         self.pool = Pool(nice=0)
@@ -117,7 +118,7 @@ class Limits:
         self.highest = self._last
 
     def around(self) -> dict[str, float]:
-        """Of what was done since the measurement before: the higher of that and of a new one."""
+        """The limits for the time since the last measurement: the higher ones of that and of a new one."""
         before, self._last = self._last, machine_limits(self.pool, self._repeats)
         self.highest = _higher(self.highest, self._last)
         return _higher(before, self._last)
