@@ -103,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             where = f"; what was measured is in {args.json}: --resume goes on" if args.json else ""
             print(f"\nstopped{where}", flush=True)
             return 130
-        print(_as_text(part, module, figures[part]), flush=True)
+        print(_table(module, figures[part]), flush=True)
         _write(args.json, figures)
     return status
 
@@ -220,12 +220,7 @@ def _write(path: Path | None, figures: dict[str, Any]) -> None:
             picture = path.with_name(f"{part}.png")
             module.draw(figures[part], picture)
             text += [f"![{part}]({picture.name})"] if picture.is_file() else []
-        tabled = hasattr(module, "table")
-        text.append(
-            module.table(figures[part])
-            if tabled
-            else markdown_table(("figure", "value"), flat(figures[part]))
-        )
+        text.append(_table(module, figures[part]))
     write_text(path.with_suffix(".md"), "\n\n".join(text) + "\n")
 
 
@@ -239,11 +234,12 @@ def _conditions(figures: dict[str, Any]) -> str:
     )
 
 
-def _as_text(part: str, module: ModuleType, figures: dict[str, Any]) -> str:
+def _table(module: ModuleType, figures: dict[str, Any]) -> str:
+    """The part's own tables, or every figure by its name."""
     if hasattr(module, "table"):
         text: str = module.table(figures)
         return text
-    return "\n".join(f"  {name:42} {value}" for name, value in flat(figures))
+    return markdown_table(("figure", "value"), flat(figures))
 
 
 def flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -60,8 +60,8 @@ def copies(counter, worker, memory):
 
 
 # (lanes of a vector, multiply-adds, additions) of each probe: chains of operations, each of which waits for
-# its predecessor. They are enough to keep all units of a core busy and fit into its registers. Some cores have
-# units of their own for additions; those with 16 lanes have 32 registers instead of 16.
+# its predecessor. They are enough to keep all units of a core busy and fit into its registers. Some cores
+# have units of their own for additions; those with 16 lanes have 32 registers instead of 16.
 CHAINS = ((8, 12, 0), (8, 7, 7), (16, 12, 0), (16, 12, 12))
 CHAINED = 200_000  # operations of each chain in one task
 
