@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from freshfield import transport
 from freshfield.scenario import ScenarioError, load
@@ -50,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     try:
         if words and words[0] in _COMMANDS:
-            return importlib.import_module(f"edge_server.{_COMMANDS[words[0]][0]}").main(words[1:])
+            command = importlib.import_module(f"edge_server.{_COMMANDS[words[0]][0]}").main
+            return command(words[1:], _compare_with_scene) if words[0] == "export" else command(words[1:])
         args = parser.parse_args(words)
         return args.run(args)
     except (ScenarioError, TransportError, OSError) as error:  # OSError: of a file or folder
@@ -104,6 +105,11 @@ _COMMANDS = {
         "fetch LPIPS weights with the public package and convert them to our weights folder",
     ),
 }
+
+
+def _compare_with_scene(*args: Any) -> Any:
+    """``export --measure``: it needs the synthetic world, so experiments do it, imported only when called."""
+    return importlib.import_module("edge_server.experiments.scenes.mesh_truth").compare_with_scene(*args)
 
 
 def _add_run(commands: argparse._SubParsersAction) -> None:

@@ -34,6 +34,7 @@ from channel_emu.live.upstream import PUSH
 from channel_emu.live.wire import header_of
 from channel_emu.model import trace
 from freshfield.clock import WallClock
+from freshfield.machine_load import cpu_s, machine_ticks, rss_mb
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 
@@ -73,7 +74,7 @@ def bench(
         source = spawn.Process(
             target=_source, args=(source_end, address, cameras, rate_hz, frame_bytes, seconds), daemon=True
         )
-        stolen = _stolen()
+        ticks = machine_ticks()
         source.start()
         probe.start()
         stack.callback(source.kill)
@@ -82,8 +83,8 @@ def bench(
             raise RuntimeError("bench: the cameras did not finish; is the emulator still running?")
         sent = source_pipe.recv()
         arrived = _drain(here, sent["sent"])
-        stolen = None if stolen is None else [b - a for a, b in zip(stolen, _stolen() or stolen)]
-        used = _usage(emulator.pid)
+        spent = [b - a for a, b in zip(ticks or (), machine_ticks() or ())]
+        used_s, resident_mb = cpu_s(emulator.pid), rss_mb(emulator.pid)
         emulator.send_signal(signal.SIGTERM)
         emulator.wait(10)
         here.send("stop")
@@ -109,9 +110,9 @@ def bench(
         "arrival_error_ms": _percentiles(late),
         "answer_ms": _percentiles(np.array(sent["answer_ms"])),
         "floor_ms": _percentiles(np.array(floor)),
-        "stolen": round(stolen[0] / stolen[1], 4) if stolen and stolen[1] else None,
-        "emulator_cpu": None if used is None else round(used[0] / sent["seconds"], 3),
-        "emulator_rss_mb": None if used is None else round(used[1], 1),
+        "stolen": round(spent[-1] / sum(spent), 4) if sum(spent) else None,
+        "emulator_cpu": None if used_s is None else round(used_s / sent["seconds"], 3),
+        "emulator_rss_mb": resident_mb,
     }
 
 
@@ -306,23 +307,6 @@ def _percentiles(values: np.ndarray) -> dict[str, float | None]:
         return dict.fromkeys(("p50", "p95", "p99", "max"))
     found = np.percentile(values, [50, 95, 99, 100])
     return {name: round(float(v), 4) for name, v in zip(("p50", "p95", "p99", "max"), found)}
-
-
-def _usage(pid: int) -> tuple[float, float] | None:
-    """CPU seconds and resident MB of a process, or None without /proc."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-        cpu_s = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-        return cpu_s, int(fields[21]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-    return None
-
-
-def _stolen() -> list[int] | None:
-    """(stolen, all) processor time since boot, in ticks, or None without /proc."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
-        return [ticks[7], sum(ticks)]
-    return None
 
 
 def _free_port() -> int:

@@ -64,9 +64,9 @@ class DelayStats:
     """
 
     def __init__(self, total: DelayStats | None = None) -> None:
-        self.drawn = Histogram(total and total.drawn)
-        self.latency = Histogram(total and total.latency)
-        self.error = Histogram(total and total.error)
+        self.drawn: Histogram = Histogram(total.drawn if total else None)
+        self.latency: Histogram = Histogram(total.latency if total else None)
+        self.error: Histogram = Histogram(total.error if total else None)
 
 
 class ServedCall:

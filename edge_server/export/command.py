@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from edge_server.export import ExportError, file_names
 from edge_server.surface import SurfaceError
@@ -34,15 +35,20 @@ from depth as the cameras see it, fused on a grid; what no camera saw stays open
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns its exit status."""
+# (mesh, scenario, views) -> distances to the true surface, None where it is not known, and a line for people.
+Comparison = Callable[[Any, str, Any], tuple[dict[str, Any] | None, str]]
+
+
+def main(argv: Sequence[str] | None = None, compare: Comparison | None = None) -> int:
+    """The command; returns its exit status. compare: what --measure does. It needs the synthetic world, which
+    the edge does not import, so the ``edge-server`` command hands it in."""
     parser = _parser()
     args = parser.parse_args(argv)
     wanted = ("mesh", "splats", "points", "colmap", "transforms", "trajectory")
     if all(getattr(args, name) is None for name in wanted):
         parser.error(f"say what to write: {', '.join(f'--{name}' for name in wanted)}")
     try:
-        Export(args).run()
+        Export(args, compare).run()
     except (ExportError, SurfaceError) as error:
         print(f"edge-server export: {error}", file=sys.stderr)
         return 2
@@ -90,8 +96,8 @@ def _parser() -> argparse.ArgumentParser:
 class Export:
     """One call of the command. What several outputs need is made once, and only if one needs it."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
-        self.args = args
+    def __init__(self, args: argparse.Namespace, compare: Comparison | None = None) -> None:
+        self.args, self._compare = args, compare
         self._said = ("", 0.0)
         self._began = time.perf_counter()
         self._stages: dict[str, tuple[float, float]] = {}  # when each began and when it was last heard of
@@ -139,6 +145,8 @@ class Export:
             raise ExportError("--binary is for --colmap DIR")
         if args.mesh is None and (args.measure is not None or args.json is not None):
             raise ExportError("--measure and --json are for --mesh FILE")
+        if args.measure is not None and self._compare is None:
+            raise ExportError("--measure: run it as edge-server export")
         self._settings()
 
     def _settings(self):
@@ -177,7 +185,10 @@ class Export:
         spent_s = time.perf_counter() - begin
         closed = ", watertight" if mesh.watertight else ""
         print(f"{path}: {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices{closed}", flush=True)
-        found = None if self.args.measure is None else self._measured(mesh)
+        found = None
+        if self.args.measure is not None and self._compare is not None:
+            found, words = self._compare(mesh, self.args.measure, self.source.views)
+            print(f"  {words}", flush=True)
         if self.args.json is None:
             return
         about = {
@@ -191,14 +202,6 @@ class Export:
             "measured": found,
         }
         write_json(self.args.json, about, indent=1)
-
-    def _measured(self, mesh):
-        from edge_server.experiments.scenes.mesh_truth import in_words, measured
-
-        found = measured(mesh, self.args.measure, self.source.views)
-        unknown = "not measured: the true surface is known of synthetic scenes that stand still"
-        print(f"  {in_words(found) if found else unknown}", flush=True)
-        return found
 
     def _points(self, path: Path) -> None:
         from edge_server.export.ply import write_points

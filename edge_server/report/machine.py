@@ -1,4 +1,4 @@
-"""What a run was measured on: versions, the machine, and how busy others kept it meanwhile.
+"""What a run was measured on: versions and the machine. ``freshfield.machine_load`` has how busy it was.
 
 A figure in milliseconds means little without these. Everything comes from /proc and installed metadata;
 where the system does not tell, the value is None.
@@ -9,8 +9,6 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-import statistics
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,43 +38,6 @@ def machine(proc: Path = _PROC) -> dict[str, Any]:
         "system": platform.system(),
         "kernel": platform.release(),
     }
-
-
-def outside_load(processes: Sequence[dict[str, Any]], proc: Path = _PROC) -> dict[str, Any]:
-    """How many cores others kept busy.
-
-    processes: rows of processes.jsonl. Returns {cores, ours, method}. Where rows say what the whole machine
-    used (``machine: {cpu}``), ``cores`` is the median of that minus our own processes'. Else it is the
-    load average of the last minute, as of now, minus what ours used then: rougher, because the load
-    average counts our waiting threads too. None where neither is known.
-    """
-    ours, others = [], []
-    for row in processes:
-        own = sum(v["cpu"] for k, v in row.items() if k != "machine" and _has_cpu(v))
-        ours.append(own)
-        if _has_cpu(row.get("machine")):
-            others.append(max(0.0, row["machine"]["cpu"] - own))
-    used = round(statistics.median(ours), 2) if ours else None
-    if others:
-        return {"cores": round(statistics.median(others), 2), "ours": used, "method": "machine minus ours"}
-    load = load_average(proc)
-    if load is None or used is None:
-        return {"cores": None, "ours": used, "method": None}
-    last_s = processes[-1]["t_s"]
-    recent = statistics.fmean(o for o, row in zip(ours, processes) if row["t_s"] > last_s - 60.0)
-    return {"cores": round(max(0.0, load - recent), 2), "ours": used, "method": "load average minus ours"}
-
-
-def load_average(proc: Path = _PROC) -> float | None:
-    """Load average of the last minute."""
-    try:
-        return float((proc / "loadavg").read_text().split()[0])
-    except (OSError, ValueError, IndexError):
-        return None
-
-
-def _has_cpu(value: Any) -> bool:
-    return isinstance(value, dict) and isinstance(value.get("cpu"), int | float)
 
 
 def _field(path: Path, name: str) -> str | None:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from edge_server.report.frame_accounting import close_books
-from edge_server.report.machine import machine, outside_load, versions
+from edge_server.report.machine import machine, versions
 from edge_server.report.run_files import Records, Row, read_records
 from freshfield.files import write_json, write_text
+from freshfield.machine_load import outside_load
 
 METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual")
 SERIES = ("t_s", *METRICS, "aaoi_ms", "selected", "update_ms", "truth_gap_ms")

@@ -8,13 +8,13 @@ import json
 import sys
 import tempfile
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from edge_server.experiments.common.machine_load import BenchError
-from edge_server.experiments.common.result_store import Kept
+from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.common.result_store import ResultStore
+from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.fitting.command import FitError, parse_options
 from edge_server.fields.registry import field_names, make_field
 from edge_server.report.machine import machine, versions
@@ -53,12 +53,12 @@ with .md (a table a part) and PART.png beside it. After Ctrl-C, --resume goes on
 PARTS = ("field", "track", "drift", "options", "limits", "ingest", "fidelity", "decide")
 # Not part of "all": they need an extra, or recorded data and patience.
 MORE = ("embed", "foreground", "peer", "surface")
-# Parts that write each figure as it comes, and can skip what is known.
-_KEEPING = ("field", "track", "drift", "options", "surface")
+# Parts that store each figure as it comes, and skip what is known.
+_RESUMABLE = ("field", "track", "drift", "options", "surface")
 _FOLLOWING = ("track", "drift")
 # Flags that mean something to some parts only.
 _ONLY_OF = {
-    "field": _KEEPING, "resume": (*PARTS, *MORE), "only": ("options",), "scene": _FOLLOWING,
+    "field": _RESUMABLE, "resume": (*PARTS, *MORE), "only": ("options",), "scene": _FOLLOWING,
     "updates": _FOLLOWING, "update_s": _FOLLOWING, "steps": _FOLLOWING, "samples": _FOLLOWING,
     "option": _FOLLOWING, "model": ("embed", "foreground"),
 }  # fmt: skip
@@ -100,10 +100,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             continue
         except KeyboardInterrupt:
             _write(args.json, figures)
-            kept = f"; what was measured is in {args.json}: --resume goes on" if args.json else ""
-            print(f"\nstopped{kept}", flush=True)
+            where = f"; what was measured is in {args.json}: --resume goes on" if args.json else ""
+            print(f"\nstopped{where}", flush=True)
             return 130
-        print(_as_text(part, module, figures[part]), flush=True)
+        print(_table(module, figures[part]), flush=True)
         _write(args.json, figures)
     return status
 
@@ -182,24 +182,18 @@ def _known(path: Path, quick: bool) -> dict[str, Any]:
 
 def _measure(part: str, module: ModuleType, args: argparse.Namespace, figures: dict[str, Any]) -> None:
     """One part, into ``figures``."""
-    more: dict[str, Any] = {}
-    if part in _KEEPING:
-        save = partial(_write_json, args.json, figures)
-        more = {"fields": args.field, "kept": Kept(figures.setdefault(part, {}), save)}
+    store = ResultStore()
+    if part in _RESUMABLE:
+        store = ResultStore(figures.setdefault(part, {}), lambda *_: _write_json(args.json, figures))
     elif args.resume and part in figures:
         print("  known already", flush=True)
         return
-    if part in _FOLLOWING:
-        more |= {
-            "scenes": args.scene, "updates": args.updates, "update_s": args.update_s, "steps": args.steps,
-            "samples": args.samples, "options": args.option or None,
-        }  # fmt: skip
-    elif part == "options":
-        more["only"] = args.only
-    elif part in ("embed", "foreground"):
-        more["model"] = args.model
     with tempfile.TemporaryDirectory(prefix="freshfield-bench-") as folder:
-        figures[part] = module.measure(args.quick, Path(folder), args.lpips, **more)
+        run = BenchRun(
+            args.quick, Path(folder), args.lpips, tuple(args.field), store, tuple(args.scene), args.updates,
+            args.update_s, args.steps, args.samples, args.option or None, tuple(args.only), args.model,
+        )  # fmt: skip
+        figures[part] = module.measure(run)
 
 
 def _write_json(path: Path | None, figures: dict[str, Any]) -> None:
@@ -226,11 +220,7 @@ def _write(path: Path | None, figures: dict[str, Any]) -> None:
             picture = path.with_name(f"{part}.png")
             module.draw(figures[part], picture)
             text += [f"![{part}]({picture.name})"] if picture.is_file() else []
-        if hasattr(module, "table"):
-            text.append(module.table(figures[part]))
-        else:
-            rows = "\n".join(f"| {name} | {value} |" for name, value in flat(figures[part]))
-            text.append(f"| figure | value |\n|---|---|\n{rows}")
+        text.append(_table(module, figures[part]))
     write_text(path.with_suffix(".md"), "\n\n".join(text) + "\n")
 
 
@@ -244,11 +234,12 @@ def _conditions(figures: dict[str, Any]) -> str:
     )
 
 
-def _as_text(part: str, module: ModuleType, figures: dict[str, Any]) -> str:
+def _table(module: ModuleType, figures: dict[str, Any]) -> str:
+    """The part's own tables, or every figure by its name."""
     if hasattr(module, "table"):
         text: str = module.table(figures)
         return text
-    return "\n".join(f"  {name:42} {value}" for name, value in flat(figures))
+    return markdown_table(("figure", "value"), flat(figures))
 
 
 def flat(figures: dict[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -1,6 +1,6 @@
-"""How long a learnt decision takes, from the newest frames to the action, and what of it is the network.
+"""How long a learned decision takes, from the newest frames to the action, and the network's share of it.
 
-FrameEmbeddings are not computed here (``bench embed`` measures them): a decision is given them.
+Embeddings are given: ``bench embed`` measures what they cost.
 """
 
 from __future__ import annotations
@@ -8,13 +8,12 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.experiments.common.machine_load import Usage
+from edge_server.experiments.bench.run import BenchRun
 from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler import STATE_PARTS, Epoch
 from edge_server.scheduler.learned import networks
@@ -25,6 +24,7 @@ from edge_server.scheduler.learned.observation import observe
 from edge_server.scheduler.learned.state import State, StateLayout
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose, look_at
+from freshfield.machine_load import LoadMeter
 
 CAMERAS = (18, 200)
 DIM = 64
@@ -32,21 +32,22 @@ OMEGAS_MS = tuple(float(omega) for omega in range(0, 301, 20))
 _LENS = Pinhole.from_fov(64, 64, 60.0)
 
 
-def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
-    """Milliseconds, median and 99th percentile, by what is decided and by how many cameras there are."""
-    del folder, lpips
-    repeats = 200 if quick else 2000
-    usage = Usage("bench")
+def measure(run: BenchRun) -> dict[str, Any]:
+    """Milliseconds, median and 99th percentile, by the kind of action and the number of cameras."""
+    repeats = 200 if run.quick else 2000
+    load = LoadMeter()
     found = {
-        f"{action}, {n} cameras": _of(action, n, repeats) for n in CAMERAS for action in ("select", "wait")
+        f"{action}, {n} cameras": _decision(action, n, repeats)
+        for n in CAMERAS
+        for action in ("select", "wait")
     }
-    return {"embedding_dim": DIM, **found, "outside_cores": usage.outside(usage.row(0.0))}
+    return {"embedding_dim": DIM, **found, "outside_cores": load.outside_cores()}
 
 
-def _of(action: Any, n: int, repeats: int) -> dict[str, float]:
+def _decision(action: Any, n: int, repeats: int) -> dict[str, float]:
     spec = Spec(action, StateLayout(dim=DIM), () if action == "select" else OMEGAS_MS)
     policy = BanditPolicy(Actor(spec, networks.init_actor(spec, np.random.default_rng(0))), "bandit", _rng())
-    newest, embeddings = _rig(n), _Known(n)
+    newest, embeddings = _newest_frames(n), _StoredEmbeddings(n)
     names = tuple(newest)
     generated = {c: item.generated_ns for c, item in newest.items()}
     at = [0]
@@ -61,13 +62,13 @@ def _of(action: Any, n: int, repeats: int) -> dict[str, float]:
         policy.select(epoch, plan)
 
     whole, features = state(), spec.layout.batch([state()])
-    told = {
+    tasks = {
         "decision": decide,
         "state": lambda: spec.layout.features(state(spec.layout.parts)),
         "network": lambda: policy.actor.logits(features),
         "action": lambda: policy.actor.act([whole]),
     }
-    return {name: value for part, task in told.items() for name, value in _ms(part, task, repeats).items()}
+    return {name: value for part, task in tasks.items() for name, value in _ms(part, task, repeats).items()}
 
 
 def _ms(part: str, task: Callable[[], Any], repeats: int) -> dict[str, float]:
@@ -92,8 +93,8 @@ def _rng() -> np.random.Generator:
     return np.random.default_rng(1)
 
 
-def _rig(n: int) -> dict[str, BufferedFrame]:
-    """The newest frames of ``n`` cameras in a circle; nobody decodes them."""
+def _newest_frames(n: int) -> dict[str, BufferedFrame]:
+    """The newest frames of ``n`` cameras in a circle; no decision decodes them."""
     found = {}
     for i in range(n):
         angle = 2.0 * np.pi * i / n
@@ -103,8 +104,8 @@ def _rig(n: int) -> dict[str, BufferedFrame]:
     return found
 
 
-class _Known:
-    """FrameEmbeddings that are there already."""
+class _StoredEmbeddings:
+    """Embeddings that need no computing."""
 
     def __init__(self, n: int) -> None:
         self._rows = _rng().standard_normal((n, DIM)).astype(np.float32)

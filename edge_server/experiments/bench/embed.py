@@ -5,42 +5,47 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import MODELS, EmbeddingConfig, EmbeddingError, SizeError, make_embedder
-from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.bench.run import BenchError, BenchRun
+from edge_server.experiments.common.tables import markdown_table
+from freshfield.machine_load import LoadMeter
 
 SIZES = (128, 320)
 BATCHES = (1, 18)  # one camera, and a whole rig
 # Of a camera whose frames are not of the model's size.
 CAMERA = (480, 640)
 DIM = 32
-_LEFT_OUT = 3  # rounds at first: memory is laid out in them
+_WARM_UP = 3  # rounds that do not count: memory is allocated in them
+# Figures of a row of the table and their decimals.
+_COLUMNS = (("embed_ms", 3), ("runtime_ms", 3), ("ratio", 2), ("cpu_ratio", 2), ("camera_ms", 3),
+            ("camera_ratio", 2), ("camera_cpu_ratio", 2))  # fmt: skip
 
 
-def measure(
-    quick: bool, folder: Path, lpips: Path | None = None, model: Path | None = None, threads: int = 1
-) -> dict[str, Any]:
-    """Median milliseconds a frame by model, size and batch: ``embed_ms`` of frames of the model's size,
-    ``runtime_ms`` of ONNX Runtime on ready-made input in the same parts, run by run in turn, ``camera_ms``
-    from frames of 640 x 480, which are fitted into the model's size first; ``ratio`` and ``camera_ratio``,
-    the medians over rounds of the first and of the last over the second, and ``cpu_ratio`` and
-    ``camera_cpu_ratio`` of their processor time, which others' load does not touch. Raises BenchError where
-    there is no model to measure."""
-    del folder, lpips
-    repeats = 20 if quick else 100
-    files = [model] if model is not None else sorted(MODELS.glob("detector_*.onnx"))
+def measure(run: BenchRun, threads: int = 1) -> dict[str, Any]:
+    """Median milliseconds a frame by model, size and batch.
+
+    ``embed_ms``: of frames of the model's size. ``runtime_ms``: of ONNX Runtime on ready-made input in the
+    same parts, run by run in turn. ``camera_ms``: of frames of 640 x 480, which are fitted into the model's
+    size first. ``ratio`` and ``camera_ratio``: medians over rounds of the first and of the last over the
+    second; ``cpu_ratio`` and ``camera_cpu_ratio``: of their processor time, which the load of others does not
+    touch.
+
+    Raises BenchError where there is no model to measure.
+    """
+    repeats = 20 if run.quick else 100
+    files = [run.model] if run.model is not None else sorted(MODELS.glob("detector_*.onnx"))
     found: dict[str, Any] = {"threads": threads, "repeats": repeats}
     for path in files:
         of_model = {}
         for size in SIZES:
             try:
                 config = EmbeddingConfig(str(path), DIM, size, None, "cpu", threads)
-                rows = {str(n): _of_batch(config, n, repeats) for n in BATCHES}
+                rows = {str(n): _by_batch(config, n, repeats) for n in BATCHES}
             except SizeError:
                 continue  # exported for one size, and measured at that one
             except EmbeddingError as error:
@@ -52,7 +57,7 @@ def measure(
     return found
 
 
-def _of_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
+def _by_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
     embedder = make_embedder(config)
     backbone = embedder.backbone
     rng = np.random.default_rng(0)
@@ -68,7 +73,7 @@ def _of_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
         for part in parts:
             embedder.run(part)
 
-    usage = Usage("bench")
+    load = LoadMeter()
     spent = _in_turn(
         {"embed": lambda: embedder.embed(frames), "runtime": alone, "camera": lambda: embedder.embed(larger)},
         repeats,
@@ -79,24 +84,21 @@ def _of_batch(config: EmbeddingConfig, n: int, repeats: int) -> dict[str, Any]:
         rounds = list(zip(spent[name], spent["runtime"]))
         ratios[f"{prefix}ratio"] = statistics.median(a[0] / b[0] for a, b in rounds)
         ratios[f"{prefix}cpu_ratio"] = statistics.median(a[1] / b[1] for a, b in rounds)
-    return {
-        **ms,
-        **ratios,
-        "outside_cores": usage.outside(usage.row(0.0)),
-    }
+    return {**ms, **ratios, "outside_cores": load.outside_cores()}
 
 
 def _in_turn(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, list[tuple[float, float]]]:
-    """(milliseconds, processor milliseconds) of each run; in turn, so that whatever else happens meets all
-    alike, and each round in another order, because a busy system likes to stop whoever has just run long."""
+    """(milliseconds, processor milliseconds) of each run. All take turns, so that the load of others meets
+    them alike, and the order changes every round, because a busy system tends to stop what has just run
+    long."""
     spent: dict[str, list[tuple[float, float]]] = {name: [] for name in work}
     names = list(work)
-    for k in range(repeats + _LEFT_OUT):
+    for k in range(repeats + _WARM_UP):
         for i in range(len(names)):
             name = names[(i + k) % len(names)]
             began, cpu = time.perf_counter(), time.process_time()
             work[name]()
-            if k >= _LEFT_OUT:
+            if k >= _WARM_UP:
                 row = (time.perf_counter() - began, time.process_time() - cpu)
                 spent[name].append((row[0] * 1e3, row[1] * 1e3))
     return spent
@@ -107,21 +109,16 @@ def _pictures(rng: np.random.Generator, n: int, height: int, width: int) -> list
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Rows of a model, size and batch."""
-    lines = [
-        f"ms a frame, medians of {figures['repeats']} runs in turn, {figures['threads']} thread(s)",
-        "",
-        "| model | size | batch | embed | ONNX Runtime | ratio | CPU ratio | of 640 x 480 | its ratio | "
-        "its CPU ratio | outside cores |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, sizes in figures.items():
-        for size, batches in sizes.items() if isinstance(sizes, dict) else ():
-            for n, row in batches.items():
-                lines.append(
-                    f"| {name} | {size} | {n} | {row['embed_ms']:.3f} | {row['runtime_ms']:.3f} | "
-                    f"{row['ratio']:.2f} | {row['cpu_ratio']:.2f} | {row['camera_ms']:.3f} | "
-                    f"{row['camera_ratio']:.2f} | {row['camera_cpu_ratio']:.2f} | "
-                    f"{row['outside_cores']} |"
-                )
-    return "\n".join(lines)
+    """A row for each model, size and batch."""
+    rows = [
+        (
+            name, size, n, *(f"{row[key]:.{digits}f}" for key, digits in _COLUMNS), row["outside_cores"],
+        )
+        for name, sizes in figures.items() if isinstance(sizes, dict)
+        for size, batches in sizes.items()
+        for n, row in batches.items()
+    ]  # fmt: skip
+    head = ("model", "size", "batch", "embed", "ONNX Runtime", "ratio", "CPU ratio", "of 640 x 480",
+            "its ratio", "its CPU ratio", "outside cores")  # fmt: skip
+    about = f"ms a frame, medians of {figures['repeats']} runs in turn, {figures['threads']} thread(s)"
+    return f"{about}\n\n{markdown_table(head, rows)}"

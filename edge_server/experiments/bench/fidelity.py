@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.machine_load import Usage
+from edge_server.experiments.bench.run import BenchRun
+from edge_server.experiments.common.machine_speed import median_s
 from edge_server.fidelity.lpips import Lpips
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.moving_pixels import moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fidelity.ssim import ssim
+from freshfield.machine_load import LoadMeter
 
 SIZES = (128, 256)
 
 
-def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
+def measure(run: BenchRun) -> dict[str, Any]:
     """Median milliseconds of each metric by image size."""
-    del folder
-    metric, missing = open_lpips(lpips)
-    found = {str(size): _of_size(size, metric, 5 if quick else 25) for size in SIZES}
+    metric, missing = open_lpips(run.lpips)
+    found = {str(size): _by_metric(size, metric, 5 if run.quick else 25) for size in SIZES}
     return {"lpips_missing": missing, **found}
 
 
-def _of_size(size: int, metric: Lpips | None, repeats: int) -> dict[str, Any]:
+def _by_metric(size: int, metric: Lpips | None, repeats: int) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     truth = rng.integers(0, 256, (size, size, 3), dtype=np.uint8)
     earlier = [rng.integers(0, 256, truth.shape, dtype=np.uint8) for _ in range(4)]
@@ -43,16 +41,6 @@ def _of_size(size: int, metric: Lpips | None, repeats: int) -> dict[str, Any]:
     }
     if metric is not None:
         work["lpips_ms"] = lambda: metric(shown, truth)
-    usage = Usage("bench")
-    found: dict[str, Any] = {name: _median_ms(task, repeats) for name, task in work.items()}
-    return {**found, "outside_cores": usage.outside(usage.row(0.0))}
-
-
-def _median_ms(task: Callable[[], Any], repeats: int) -> float:
-    task()  # libraries load and allocate at the first call
-    spent = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        task()
-        spent.append((time.perf_counter() - began) * 1e3)
-    return statistics.median(spent)
+    load = LoadMeter()
+    found: dict[str, Any] = {name: 1e3 * median_s(repeats, task) for name, task in work.items()}
+    return {**found, "outside_cores": load.outside_cores()}

@@ -1,8 +1,8 @@
 """How fast each representation is: seconds to a quality from scratch, rates, renderings, compilation, memory.
 
-Every point is a field of its own, fitted from scratch for a planned time, since a fit plans its learning
-rate by its time; the score is of cameras that were held out. Beside every scene stands what no field is
-needed for: the mean colour of the training images, and the training image nearest to each held-out camera.
+Every point is a new field, fitted from scratch for a planned time, because a fit schedules its learning rate
+over its time. Scores are of held-out cameras. Beside every scene stand two baselines that need no field: the
+mean color of the training images, and the training image nearest to each held-out camera.
 """
 
 from __future__ import annotations
@@ -14,32 +14,41 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.machine_load import Usage, peak_rss_mb
-from edge_server.experiments.common.machine_speed import Speed, told
-from edge_server.experiments.common.result_store import Kept, settled
+from edge_server.experiments.bench.run import BenchRun, mean_baselines, open_recording, result_settings
+from edge_server.experiments.common.machine_speed import MachineSpeed, median_s, speed_text
+from edge_server.experiments.common.result_store import ResultStore, settings_digest
+from edge_server.experiments.common.tables import grouped, markdown_table, number
 from edge_server.experiments.fitting.evaluate import evaluate
-from edge_server.experiments.scenes.multiview_still import Still, open_still, smallest_angle_deg, synthetic
-from edge_server.fidelity.baselines import baseline
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, smallest_angle_deg, synthetic_still
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
 from freshfield.geometry import Pinhole
+from freshfield.machine_load import LoadMeter, peak_rss_mb
 
 GROWN = 500  # steps after which every representation has its full size
 VIEWS, SIZE = 18, 128
 TARGETS_DB = (22, 25, 28, 30)
 
 
+# Recordings, and by what their images are divided.
+_SCALES = {"kitchen": 1.0, "lego": 1.0, "fox": 2.0}
+
+
 @dataclass(frozen=True)
-class Effort:
-    """planned_s: fitting times, each from scratch, on the synthetic scenes and on the recorded ones."""
+class Workload:
+    """How much is measured.
+
+    planned_s: fitting times on the synthetic scenes, each from scratch.
+    recorded_s: those on the recorded scenes.
+    """
 
     seeds: int
     planned_s: tuple[float, ...]
@@ -47,84 +56,58 @@ class Effort:
     rate_repeats: int
 
 
-FULL = Effort(5, (0.25, 0.3, 0.5, 0.8, 1.0, 1.5, 2.5, 3.0, 4.0, 8.0, 15.0), (2.0, 5.0, 15.0, 60.0), 9)
-QUICK = Effort(1, (0.5, 1.0, 2.5, 8.0), (2.0, 5.0), 3)
-
-# Under the data folder: file or folder, what is held out, by what its images are divided.
-_RECORDED = {
-    "kitchen": ("blender_kitchen/transforms.json", "cam00", 1.0),
-    "lego": ("lego_synthetic", "8", 1.0),
-    "fox": ("fox/transforms_2.json", "8", 2.0),
-}
+FULL = Workload(5, (0.25, 0.3, 0.5, 0.8, 1.0, 1.5, 2.5, 3.0, 4.0, 8.0, 15.0), (2.0, 5.0, 15.0, 60.0), 9)
+QUICK = Workload(1, (0.5, 1.0, 2.5, 8.0), (2.0, 5.0), 3)
 
 
-def measure(
-    quick: bool,
-    folder: Path,
-    lpips: Path | None = None,
-    fields: Sequence[str] = (),
-    kept: Kept | None = None,
-) -> dict[str, Any]:
-    """All figures of ``fields`` (default: all there are); ``folder`` takes a fresh kernel cache.
-
-    {start: {field: jit, memory}, SCENE: {scene, angle_deg, baseline, FIELD: {series, seconds_to_db, rates}}};
-    recorded scenes where FRESHFIELD_DATA names their folder.
-    """
-    effort, names, kept = QUICK if quick else FULL, tuple(fields) or field_names(), kept or Kept()
-    scorer_lpips, missing = open_lpips(lpips)
-    kept.put("lpips_missing", missing)
+def measure(run: BenchRun) -> dict[str, Any]:
+    """{start: {FIELD: jit, memory}, SCENE: {scene, angle_deg, baseline, FIELD: {series, seconds_to_db,
+    ...}}}; recorded scenes where FRESHFIELD_DATA names their folder."""
+    workload, names, store = QUICK if run.quick else FULL, run.fields or field_names(), run.store
+    lpips, missing = open_lpips(run.lpips)
+    store.results["lpips_missing"] = missing
     for name in names:
-        start = partial(_start_up, name, quick, folder / name)
-        kept.get("start", name, measure=start, settings={"cold": not quick, "defaults": settled(name)})
-    for scene in ("tile", "room"):
-        still = synthetic(scene, cameras=VIEWS + 1, size=SIZE)
-        _describe(kept, scene, still)
+        start = partial(_start_up, name, run.quick, run.folder / name)
+        settings = {"cold": not run.quick, "defaults": settings_digest(name)}
+        store.get("start", name, compute=start, settings=settings)
+    stills = {scene: synthetic_still(scene, cameras=VIEWS + 1, size=SIZE) for scene in ("tile", "room")}
+    for scene, still in (*stills.items(), *_recorded_stills()):
+        _describe(store, scene, still)
         for name in names:
-            ours = partial(_of_ours, name, still, effort, scorer_lpips)
-            kept.get(scene, name, measure=ours, settings=_as_json(effort, name, scorer_lpips))
-    for scene, still in _recorded_scenes():
-        _describe(kept, scene, still)
-        for name in names:
-            curve = partial(_curve, name, still, effort.recorded_s, 1, scorer_lpips)
-            kept.get(scene, name, measure=curve, settings=_as_json(effort, name, scorer_lpips))
-    return kept.figures
+            if scene in stills:
+                work = partial(_curve_and_rates, name, still, workload, lpips)
+            else:
+                work = partial(_curve, name, still, workload.recorded_s, 1, lpips)
+            settings = result_settings(workload, name, lpips=lpips is not None)
+            store.get(scene, name, compute=work, settings=settings)
+    return store.results
 
 
-def _as_json(effort: Effort, name: str, lpips: Any) -> dict[str, Any]:
-    """The settings that a row is kept with."""
-    values = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(effort).items()}
-    return {**values, "lpips": lpips is not None, "defaults": settled(name)}
+def _describe(store: ResultStore, scene: str, still: MultiviewStill) -> None:
+    store.get(
+        scene, "baseline", compute=partial(mean_baselines, still.training, still.held_out, still.background)
+    )
+    store.results[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
 
 
-def _describe(kept: Kept, scene: str, still: Still) -> None:
-    kept.get(scene, "baseline", measure=partial(_baseline, still))
-    kept.figures[scene] |= {"scene": still.describe(), "angle_deg": smallest_angle_deg(still)}
+def _curve_and_rates(name: str, still: MultiviewStill, workload: Workload, lpips: Any) -> dict[str, Any]:
+    curve = _curve(name, still, workload.planned_s, workload.seeds, lpips)
+    return {**curve, **_rates(name, still, workload.rate_repeats)}
 
 
-def _of_ours(name: str, still: Still, effort: Effort, lpips: Any) -> dict[str, Any]:
-    return {
-        **_curve(name, still, effort.planned_s, effort.seeds, lpips),
-        **_rates(name, still, effort.rate_repeats),
-    }
-
-
-def _recorded_scenes() -> Iterable[tuple[str, Still]]:
-    data = os.environ.get("FRESHFIELD_DATA")
-    if not data:
-        print("  FRESHFIELD_DATA is not set: recorded scenes are left out", flush=True)
-        return
-    for scene, (path, holdout, scale) in _RECORDED.items():
+def _recorded_stills() -> Iterable[tuple[str, MultiviewStill]]:
+    for scene, scale in _SCALES.items():
         try:
-            yield scene, open_still(str(Path(data) / path), holdout=holdout, scale=scale)
+            yield scene, open_recording(scene, scale)
         except DatasetError as error:
             print(f"  {scene} left out: {error}", flush=True)
 
 
 def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
     """Compile times and memory, each in a process of its own, cold with an empty kernel cache."""
-    speed = Speed()
-    speed.look()
-    usage = Usage("bench")
+    speed = MachineSpeed()
+    speed.sample()
+    load = LoadMeter()
     figures: dict[str, Any] = {}
     if not quick:
         cold = _child(field, folder)
@@ -135,9 +118,9 @@ def _start_up(field: str, quick: bool, folder: Path) -> dict[str, Any]:
         cached = _child(field, None)
     figures["jit_cached_s"], figures["jit_cached_cpu_s"] = cached["jit_s"], cached["jit_cpu_s"]
     figures["peak_rss_mb"] = cached["peak_rss_mb"]
-    figures["machine_cores_busy"] = usage.row(0.0).get("machine", {}).get("cpu")
-    speed.look()
-    figures["machine"] = speed.row()
+    figures["machine_cores_busy"] = load.row(0.0).get("machine", {}).get("cpu")
+    speed.sample()
+    figures["machine"] = speed.medians()
     speed.close()
     return figures
 
@@ -150,13 +133,15 @@ def _child(field: str, cache: Path | None) -> dict[str, float]:
     return found
 
 
-def _curve(field: str, still: Still, planned_s: Sequence[float], seeds: int, lpips: Any) -> dict[str, Any]:
+def _curve(
+    field: str, still: MultiviewStill, planned_s: Sequence[float], seeds: int, lpips: Any
+) -> dict[str, Any]:
     """Fidelity against seconds from scratch: medians over seeds, and the first planned time whose median
     reaches each quality (None: none did)."""
     make_field(field).warm_up()
-    usage, speed, series = Usage("bench"), Speed(), []
+    load, speed, series = LoadMeter(), MachineSpeed(), []
     for seconds in planned_s:
-        speed.look()
+        speed.sample()
         points = [_point(field, still, seconds, seed, lpips) for seed in range(seeds)]
         row: dict[str, Any] = {"seconds": seconds}
         for name in ("fitted_s", "steps", "psnr_db", "ssim", "lpips"):
@@ -171,20 +156,20 @@ def _curve(field: str, still: Still, planned_s: Sequence[float], seeds: int, lpi
         "series": {f"{row['seconds']:g}_s": row for row in series},
         "seconds_to_db": _seconds_to_db(series),
         "best_db": max(row["psnr_db"] for row in series),
-        "outside_cores": usage.outside(usage.row(0.0)),
-        "machine": speed.row(),
+        "outside_cores": load.outside_cores(),
+        "machine": speed.medians(),
     }
 
 
 def _seconds_to_db(series: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
-    """The seconds fitted, which may be a little more than planned, of the first point of each quality."""
+    """Seconds fitted until each quality; they may be a little more than planned."""
     return {
         f"{target}_db": next((r["fitted_s"] for r in series if r["psnr_db"] >= target), None)
         for target in TARGETS_DB
     }
 
 
-def _point(field: str, still: Still, seconds: float, seed: int, lpips: Any) -> dict[str, Any]:
+def _point(field: str, still: MultiviewStill, seconds: float, seed: int, lpips: Any) -> dict[str, Any]:
     model = make_field(field, seed=seed)
     report = model.fit(still.training, Budget(seconds=seconds))
     score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
@@ -194,15 +179,15 @@ def _point(field: str, still: Still, seconds: float, seed: int, lpips: Any) -> d
     }  # fmt: skip
 
 
-def _rates(field: str, still: Still, repeats: int) -> dict[str, Any]:
+def _rates(field: str, still: MultiviewStill, repeats: int) -> dict[str, Any]:
     """Rates of a field that has settled, and milliseconds of a rendering."""
     model = make_field(field)
     model.fit(still.training, Budget(seconds=3.0))
-    usage, speed, reports = Usage("bench"), Speed(), []
+    load, speed, reports = LoadMeter(), MachineSpeed(), []
     for _ in range(repeats):
-        speed.look()
+        speed.sample()
         reports.append(model.fit(still.training, Budget(seconds=1.0)))
-    outside = usage.outside(usage.row(0.0))
+    outside = load.outside_cores()
     speed.close()
     pose, lens = still.held_out[0].camera_to_world, still.held_out[0].intrinsics
     return {
@@ -210,27 +195,13 @@ def _rates(field: str, still: Still, repeats: int) -> dict[str, Any]:
         "rays_per_s": statistics.median(r.rays / r.seconds for r in reports),
         "samples_per_s": statistics.median(r.samples / r.seconds for r in reports),
         "rates_outside_cores": outside,
-        "rates_machine": speed.row(),
+        "rates_machine": speed.medians(),
         **{f"render_{w}_ms": _render_ms(model, pose, lens.scaled(w / lens.width)) for w in (128, 256)},
     }
 
 
 def _render_ms(field: Field, pose: Any, lens: Pinhole, repeats: int = 11) -> float:
-    spent = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        field.render(pose, lens)
-        spent.append((time.perf_counter() - began) * 1e3)
-    return statistics.median(spent)
-
-
-def _baseline(still: Still) -> dict[str, float | None]:
-    """Means over the held-out cameras."""
-    found = [baseline(still.training, v.image, v.camera_to_world, still.background) for v in still.held_out]
-    return {
-        name: statistics.fmean(getattr(b, name) for b in found)
-        for name in ("mean_colour_db", "nearest_view_db")
-    }
+    return 1e3 * median_s(repeats, lambda: field.render(pose, lens))
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:
@@ -264,49 +235,44 @@ def table(figures: dict[str, Any]) -> str:
         for name, rows in part.items()
         if isinstance(rows, dict) and "series" in rows
     ]
-    least = [
+    bases = [
         (
             part["scene"], f"{part['angle_deg']:.1f}",
-            *(_n(part["baseline"][key], 1) for key in ("mean_colour_db", "nearest_view_db")),
+            *(number(part["baseline"][key], 1) for key in ("mean_colour_db", "nearest_view_db")),
         )
         for part in scenes.values()
     ]  # fmt: skip
     curves = [
         (
-            scene, name, str(rows["seeds"]),
+            scene, name, rows["seeds"],
             ", ".join(f"{r['seconds']:g}: {r['psnr_db']:.1f}" for r in rows["series"].values()),
-            ", ".join(_n(rows["seconds_to_db"][f"{db}_db"]) for db in TARGETS_DB), _n(rows["outside_cores"]),
-            told(rows.get("machine")),
+            ", ".join(grouped(rows["seconds_to_db"][f"{db}_db"]) for db in TARGETS_DB),
+            grouped(rows["outside_cores"]), speed_text(rows.get("machine")),
         )
         for scene, name, rows in found
     ]  # fmt: skip
-    of_rates = ("steps_per_s", "rays_per_s", "samples_per_s", "render_128_ms", "render_256_ms")
+    of_rates = ("steps_per_s", "rays_per_s", "samples_per_s", "render_128_ms", "render_256_ms",
+                "rates_outside_cores")  # fmt: skip
     rates = [
-        (
-            scene,
-            name,
-            *(_n(rows[key]) for key in of_rates),
-            _n(rows["rates_outside_cores"]),
-            told(rows.get("rates_machine")),
-        )
+        (scene, name, *(grouped(rows[key]) for key in of_rates), speed_text(rows.get("rates_machine")))
         for scene, name, rows in found
         if "steps_per_s" in rows
     ]
-    compiled = ("jit_cold_s", "jit_cold_cpu_s", "jit_cached_s", "jit_cached_cpu_s")
-    keys = (*compiled, "peak_rss_mb", "machine_cores_busy")
+    of_start = ("jit_cold_s", "jit_cold_cpu_s", "jit_cached_s", "jit_cached_cpu_s", "peak_rss_mb",
+                "machine_cores_busy")  # fmt: skip
     starts = [
-        (name, *(_n(row.get(key)) for key in keys), told(row.get("machine")))
+        (name, *(grouped(row.get(key)) for key in of_start), speed_text(row.get("machine")))
         for name, row in figures.get("start", {}).items()
     ]
     targets = ", ".join(str(db) for db in TARGETS_DB)
-    busy = "outside cores|the machine"
-    tables = {
-        "scene|held-out camera from any other, degrees|mean colour dB|nearest view dB": least,
-        f"scene|representation|seeds|seconds: PSNR dB|seconds to {targets} dB|{busy}": curves,
-        f"scene|representation|steps/s|rays/s|samples/s|128 x 128 in ms|256 x 256 in ms|{busy}": rates,
+    load = "outside cores|the machine"
+    tables: dict[str, list[tuple[Any, ...]]] = {
+        "scene|held-out camera from any other, degrees|mean colour dB|nearest view dB": bases,
+        f"scene|representation|seeds|seconds: PSNR dB|seconds to {targets} dB|{load}": curves,
+        f"scene|representation|steps/s|rays/s|samples/s|128 x 128 in ms|256 x 256 in ms|{load}": rates,
         "representation|JIT cold s|of CPU s|JIT cached s|of CPU s|peak MB|cores busy|the machine": starts,
     }
-    texts = [_markdown(head.split("|"), rows) for head, rows in tables.items() if rows]
+    texts = [markdown_table(head.split("|"), rows) for head, rows in tables.items() if rows]
     if any(name == "splat" for _, name, *_ in rates):
         texts.append(
             "Rays of `splat` are pixels, its samples pairs of a Gaussian and a tile of 8 x 8 pixels."
@@ -315,30 +281,19 @@ def table(figures: dict[str, Any]) -> str:
         texts.append(
             "The machine: how fast it was just before each time or rate was measured, all cores together: "
             "billions of multiply-adds in registers and millions of random reads from 4 MB a second "
-            "(medians). On one that is shared both may halve, for an hour or for a second, which no load of "
-            "its own tells."
+            "(medians). On a shared machine both may halve, for an hour or for a second, which no load of "
+            "its own shows."
         )
     return "\n\n".join(texts)
 
 
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-
-
-def _n(value: float | None, digits: int = 2) -> str:
-    if value is None:
-        return "-"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.{digits}f}"
-
-
 def _main(field: str) -> None:
-    """In a process of its own: the time until kernels are ready, and what fitting takes of memory."""
+    """In a process of its own: print the time until kernels are ready, and the memory that fitting takes."""
     model = make_field(field)
     began, cpu = time.perf_counter(), time.process_time()
     model.warm_up()
     jit_s, jit_cpu_s = time.perf_counter() - began, time.process_time() - cpu
-    still = synthetic("room", cameras=VIEWS + 1, size=SIZE)
+    still = synthetic_still("room", cameras=VIEWS + 1, size=SIZE)
     model.fit(still.training, Budget(steps=GROWN))
     model.render(still.held_out[0].camera_to_world, still.held_out[0].intrinsics)
     print(json.dumps({"jit_s": jit_s, "jit_cpu_s": jit_cpu_s, "peak_rss_mb": peak_rss_mb()}))

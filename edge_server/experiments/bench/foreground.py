@@ -1,14 +1,14 @@
 """What cutting the background out costs and gains, on pictures whose alpha is the truth (lego).
 
-The pictures have no background of their own, so they are laid over two: white, and a cluttered one that is a
-function of the direction alone, hence the same place seen from every camera and infinitely far. On the
-second a field is fitted as well, for the same steps: to whole pictures, to cut ones, and to the true alpha.
+The pictures have no background of their own, so they are composited over two: white, and a cluttered one.
+The clutter depends on the viewing direction alone, so that all cameras see the same place, infinitely far.
+Over the clutter a field is fitted as well, for the same steps: to whole pictures, to cut ones, and to the
+true alpha.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.bench.run import RECORDINGS, BenchError, BenchRun, data_file
+from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.fidelity.psnr import psnr
 from edge_server.fields import Budget, View
@@ -27,8 +28,8 @@ from edge_server.fields.registry import make_field
 from edge_server.foreground import BOX, DEFAULT, GRABCUT, ForegroundConfig, ForegroundError, Four
 from edge_server.foreground.foreground import Foreground, make_foreground
 from freshfield.geometry import world_rays
+from freshfield.machine_load import LoadMeter
 
-SCENE = "lego_synthetic"
 # Half a percent of each side: what a detector that was trained for the object is good for.
 BOX_MARGIN = 0.005
 SIDES, ITERATIONS = (80, 160, 320), (1, 3, 5)
@@ -40,35 +41,30 @@ _CLUTTER_SEED = 17
 Mask = NDArray[np.bool_]
 
 
-def measure(
-    quick: bool, folder: Path, lpips: Path | None = None, model: Path | None = None
-) -> dict[str, Any]:
-    """``masks``: IoU and milliseconds of each way to cut, by background; ``detectors``: what they find of the
-    object; ``field``: PSNR on the object's pixels of held-out views after the same steps.
+def measure(run: BenchRun) -> dict[str, Any]:
+    """``masks``: IoU and milliseconds of each way to cut, by background. ``detectors``: what they find of the
+    object. ``field``: PSNR on the object's pixels of held-out views after the same steps.
 
-    Raises BenchError."""
-    del folder, lpips
-    data = os.environ.get("FRESHFIELD_DATA")
-    if not data:
-        raise BenchError(f"set FRESHFIELD_DATA to the folder that holds {SCENE}")
+    Raises BenchError.
+    """
     # Full size for masks, half for the field.
-    large, small = _views(Path(data), 1.0), _views(Path(data), 2.0)
-    some = large[:: 25 if quick else 10]
-    usage = Usage("bench")
+    large, small = _views(1.0), _views(2.0)
+    some = large[:: 25 if run.quick else 10]
+    load = LoadMeter()
     figures: dict[str, Any] = {"views": len(some), "size": [*some[0].image.shape[:2]], "masks": {}}
-    for ground, lay in (("white", _white), ("clutter", _clutter)):
-        figures["masks"][ground] = _masks(some, lay)
+    for ground, compose in _BACKGROUNDS.items():
+        figures["masks"][ground] = _masks(some, compose)
         print(f"  masks on {ground}: measured", flush=True)
-    models = [DEFAULT] if model is None else [DEFAULT, str(model)]
+    models = [DEFAULT] if run.model is None else [DEFAULT, str(run.model)]
     figures["detectors"] = {Path(m).name: _detections(some, m) for m in models}
-    figures["field"] = _fields(small, steps=100 if quick else 500, seeds=1 if quick else 2)
-    figures["outside_cores"] = usage.outside(usage.row(0.0))
+    figures["field"] = _fields(small, steps=100 if run.quick else 500, seeds=1 if run.quick else 2)
+    figures["outside_cores"] = load.outside_cores()
     return figures
 
 
-def _views(data: Path, scale: float) -> tuple[View, ...]:
+def _views(scale: float) -> tuple[View, ...]:
     try:
-        return load_recorded(data / SCENE, holdout="0", scale=scale).training
+        return load_recorded(data_file(RECORDINGS["lego"][0]), holdout="0", scale=scale).training
     except DatasetError as error:
         raise BenchError(str(error)) from None
 
@@ -79,23 +75,26 @@ def true_mask(view: View) -> Mask:
 
 
 def _white(view: View) -> NDArray[np.uint8]:
-    return _laid(view, np.full((*view.image.shape[:2], 3), 255.0))
+    return _composed(view, np.full((*view.image.shape[:2], 3), 255.0))
 
 
 def _clutter(view: View) -> NDArray[np.uint8]:
-    """Waves of all directions and some edges, in every colour, as strong as the object's own."""
+    """Waves of all directions and some edges, in every color, with as much contrast as the object."""
     _, rays = world_rays(view.intrinsics, view.camera_to_world)
     rng = np.random.default_rng(_CLUTTER_SEED)
     waves = rng.normal(0.0, 9.0, (_WAVES, 3))
     shades = np.sin(rays @ waves.T + rng.uniform(0.0, 2 * np.pi, _WAVES))
     edges = np.sign(shades[..., : _WAVES // 3])
     mixed = np.concatenate([shades, edges], axis=-1) @ rng.normal(0.0, 1.0, (_WAVES + _WAVES // 3, 3))
-    return _laid(view, 127.5 + 100.0 * np.tanh(mixed / 6.0))
+    return _composed(view, 127.5 + 100.0 * np.tanh(mixed / 6.0))
 
 
-def _laid(view: View, ground: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _composed(view: View, ground: NDArray[np.float64]) -> NDArray[np.uint8]:
     alpha = view.image[..., 3:] / 255.0
     return np.rint(view.image[..., :3] * alpha + ground * (1.0 - alpha)).astype(np.uint8)
+
+
+_BACKGROUNDS: dict[str, Callable[[View], NDArray[np.uint8]]] = {"white": _white, "clutter": _clutter}
 
 
 def true_box(view: View, margin: float = BOX_MARGIN) -> Four:
@@ -107,10 +106,10 @@ def true_box(view: View, margin: float = BOX_MARGIN) -> Four:
     return left, top, min((columns[-1] + 1) / w + margin, 1.0), min((rows[-1] + 1) / h + margin, 1.0)
 
 
-def _masks(views: Sequence[View], lay: Callable[[View], NDArray[np.uint8]]) -> dict[str, Any]:
+def _masks(views: Sequence[View], compose: Callable[[View], NDArray[np.uint8]]) -> dict[str, Any]:
     """By way to cut: mean and worst IoU with the truth, and median milliseconds a picture."""
     boxes = {view.camera: true_box(view) for view in views}
-    pictures = [(view.camera, lay(view), true_mask(view)) for view in views]
+    pictures = [(view.camera, compose(view), true_mask(view)) for view in views]
     ways = {BOX: ForegroundConfig(boxes=boxes, segment=BOX)}
     for side in SIDES:
         for iterations in ITERATIONS:
@@ -125,7 +124,7 @@ def _masks(views: Sequence[View], lay: Callable[[View], NDArray[np.uint8]]) -> d
             begun = time.perf_counter()
             rgba, _ = cut.apply(camera, picture)
             spent_ms.append(1e3 * (time.perf_counter() - begun))
-            ious.append(_iou(_kept(rgba), truth))
+            ious.append(_iou(_foreground_mask(rgba), truth))
         found[name] = {
             "iou": statistics.fmean(ious),
             "worst": min(ious),
@@ -135,8 +134,8 @@ def _masks(views: Sequence[View], lay: Callable[[View], NDArray[np.uint8]]) -> d
     return found
 
 
-def _kept(image: NDArray[np.uint8]) -> Mask:
-    """What an image still shows; all of one that was passed through whole."""
+def _foreground_mask(image: NDArray[np.uint8]) -> Mask:
+    """The pixels that an image still shows: all of them where it was passed through whole."""
     return image[..., 3] > 0 if image.shape[2] == 4 else np.ones(image.shape[:2], np.bool_)
 
 
@@ -154,10 +153,10 @@ def _detections(views: Sequence[View], model: str) -> dict[str, Any]:
     except (ForegroundError, ModuleNotFoundError) as error:
         return {"missing": str(error)}
     found: dict[str, Any] = {}
-    for ground, lay in (("white", _white), ("clutter", _clutter)):
+    for ground, compose in _BACKGROUNDS.items():
         ious, kinds, spent_ms = [], [], []
         for view in views:
-            picture = lay(view)
+            picture = compose(view)
             begun = time.perf_counter()
             detected = detector.detect(picture, 0.25)
             spent_ms.append(1e3 * (time.perf_counter() - begun))
@@ -215,7 +214,9 @@ def _fields(views: Sequence[View], steps: int, seeds: int) -> dict[str, Any]:
         found["rows"][name] = {
             "object_db": statistics.fmean(dbs),
             "spread_db": max(dbs) - min(dbs),
-            "iou": statistics.fmean(_iou(_kept(v.image), true_mask(o)) for v, o in zip(fitted, training)),
+            "iou": statistics.fmean(
+                _iou(_foreground_mask(v.image), true_mask(o)) for v, o in zip(fitted, training)
+            ),
             "fit_s": statistics.median(spent_s),
         }
         print(f"  field on {name}: {found['rows'][name]['object_db']:.2f} dB on the object", flush=True)
@@ -237,42 +238,44 @@ def _with_alpha(seen: View, view: View) -> View:
 def table(figures: dict[str, Any]) -> str:
     """Three tables: masks, detectors, field."""
     h, w = figures["size"]
-    lines = [
+    about = (
         f"lego at {w} x {h}, {figures['views']} views, box known to {100 * BOX_MARGIN:g} % of a side; "
-        f"one thread; outside cores: {figures['outside_cores']}",
-        "",
-        "| segmentation | IoU on white (worst) | ms | IoU on clutter (worst) | ms |",
-        "|---|---|---|---|---|",
-    ]
-    white, clutter = figures["masks"]["white"], figures["masks"]["clutter"]
-    for name in white:
-        cells = [
-            f"{m[name]['iou']:.3f} ({m[name]['worst']:.3f}) | {m[name]['ms']:.1f}" for m in (white, clutter)
-        ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    lines += ["", "| detector | on | detected | box IoU | taken for | ms |", "|---|---|---|---|---|---|"]
-    for name, grounds in figures["detectors"].items():
-        if "missing" in grounds:
-            lines.append(f"| {name} | - | {grounds['missing']} | - | - | - |")
+        f"one thread; outside cores: {figures['outside_cores']}"
+    )
+    grounds = [figures["masks"][ground] for ground in _BACKGROUNDS]
+    masks = [
+        (name, *(c for m in grounds for c in (f"{m[name]['iou']:.3f} ({m[name]['worst']:.3f})",
+                                              f"{m[name]['ms']:.1f}")))
+        for name in grounds[0]
+    ]  # fmt: skip
+    detectors: list[tuple[Any, ...]] = []
+    for name, by_ground in figures["detectors"].items():
+        if "missing" in by_ground:
+            detectors.append((name, "-", by_ground["missing"], "-", "-", "-"))
             continue
-        for ground, row in grounds.items():
-            iou = "-" if row["iou"] is None else f"{row['iou']:.2f}"
+        for ground, row in by_ground.items():
             kinds = ", ".join(f"{kind} {n}" for kind, n in row["kinds"].items()) or "-"
             share = f"{row['detected']} of {row['of']}"
-            lines.append(f"| {name} | {ground} | {share} | {iou} | {kinds} | {row['ms']:.1f} |")
+            detectors.append((name, ground, share, number(row["iou"]), kinds, f"{row['ms']:.1f}"))
     field = figures["field"]
-    lines += [
-        "",
-        f"{FIELD}, {field['steps']} steps on 200 x 200 over clutter, {field['seeds']} seeds; PSNR on the "
-        "object's pixels of 13 held-out views",
-        "",
-        "| fitted to | mask IoU | dB | spread | against whole | fit s |",
-        "|---|---|---|---|---|---|",
-    ]
     base = field["rows"]["whole"]["object_db"]
-    for name, row in field["rows"].items():
-        lines.append(
-            f"| {name} | {row['iou']:.3f} | {row['object_db']:.2f} | {row['spread_db']:.2f} | "
-            f"{row['object_db'] - base:+.2f} | {row['fit_s']:.1f} |"
+    fits = [
+        (
+            name, f"{row['iou']:.3f}", f"{row['object_db']:.2f}", f"{row['spread_db']:.2f}",
+            f"{row['object_db'] - base:+.2f}", f"{row['fit_s']:.1f}",
         )
-    return "\n".join(lines)
+        for name, row in field["rows"].items()
+    ]  # fmt: skip
+    of_fits = (
+        f"{FIELD}, {field['steps']} steps on 200 x 200 over clutter, {field['seeds']} seeds; PSNR on the "
+        "object's pixels of 13 held-out views"
+    )
+    return "\n\n".join((
+        about,
+        markdown_table(
+            ("segmentation", "IoU on white (worst)", "ms", "IoU on clutter (worst)", "ms"), masks
+        ),
+        markdown_table(("detector", "on", "detected", "box IoU", "taken for", "ms"), detectors),
+        of_fits,
+        markdown_table(("fitted to", "mask IoU", "dB", "spread", "against whole", "fit s"), fits),
+    ))  # fmt: skip

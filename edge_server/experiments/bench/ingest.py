@@ -20,11 +20,12 @@ import numpy as np
 import yaml
 
 from camera_node.synthetic import Scene, make_scene
-from edge_server.experiments.common.machine_load import BenchError, Usage, cpu_s, rss_mb
+from edge_server.experiments.bench.run import BenchError, BenchRun
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.frame import Frame, to_request
 from freshfield.geometry import Pose
+from freshfield.machine_load import LoadMeter, cpu_s, rss_mb
 from freshfield.transport import Transport
 from freshfield.v1 import frames_pb2 as pb
 from freshfield.v1 import frames_pb2_grpc
@@ -36,16 +37,15 @@ _IMAGES = 8  # different frames of a camera, shown in turn
 _START_S = 180.0  # compiling every kernel on a busy machine
 
 
-def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
-    """Answers and memory at each frame rate, the field training all the time."""
-    del lpips
-    seconds = 8.0 if quick else 60.0
+def measure(run: BenchRun) -> dict[str, Any]:
+    """Answers and memory at each frame rate, while the field trains all the time."""
+    seconds = 8.0 if run.quick else 60.0
     scene = make_scene("room", {"count": CAMERAS, "width": SIZE, "height": SIZE})
     frames = _frames(scene)
-    return {f"{fps}_fps": run(folder / str(fps), scene, frames, fps, seconds) for fps in RATES}
+    return {f"{fps}_fps": _at_rate(run.folder / str(fps), scene, frames, fps, seconds) for fps in RATES}
 
 
-def run(
+def _at_rate(
     out: Path, scene: Scene, frames: dict[str, list[bytes]], fps: float, seconds: float
 ) -> dict[str, Any]:
     """One server, one rate. Raises BenchError."""
@@ -56,8 +56,11 @@ def run(
 
 @dataclass
 class _Tally:
-    """answer_ms: of accepted frames since counting began; missed: ticks at which the last frame had no
-    answer yet (one frame unacknowledged, as a node keeps it)."""
+    """Counts over all cameras.
+
+    answer_ms: of accepted frames since counting began.
+    missed: ticks at which the last frame had no answer yet (one frame unacknowledged, as a node keeps it).
+    """
 
     counting: bool = False
     answer_ms: list[float] = field(default_factory=list)
@@ -74,12 +77,12 @@ async def _drive(
     fps: float,
     seconds: float,
 ) -> dict[str, Any]:
-    tally, usage = _Tally(), Usage("client")
+    tally, load = _Tally(), LoadMeter("client")
     channel = Transport().aio_channel(address)
     cameras = [asyncio.ensure_future(_camera(channel, scene, c, frames[c], fps, tally)) for c in frames]
     try:
         await _until_training(process, out, cameras)
-        usage.row(0.0)
+        load.row(0.0)
         begun, edge_begun = time.perf_counter(), cpu_s(process.pid)
         updates = _updates(out)
         tally.counting = True
@@ -88,7 +91,7 @@ async def _drive(
             memory.append((t_s, rss_mb(process.pid)))
             await asyncio.sleep(0.5)
         tally.counting = False
-        row, edge_ended = usage.row(0.0), cpu_s(process.pid)
+        outside, edge_ended = load.outside_cores(), cpu_s(process.pid)
         updates = _updates(out) - updates
     finally:
         for task in cameras:
@@ -96,7 +99,6 @@ async def _drive(
         await asyncio.gather(*cameras, return_exceptions=True)
         await channel.close()
     edge = None if edge_begun is None or edge_ended is None else (edge_ended - edge_begun) / t_s
-    outside = usage.outside(row)
     p50, p99 = np.percentile(tally.answer_ms, [50, 99])
     return {
         "frames": len(tally.answer_ms),
@@ -116,7 +118,7 @@ async def _drive(
 async def _camera(
     channel: Any, scene: Scene, camera: str, images: list[bytes], fps: float, tally: _Tally
 ) -> None:
-    """Push a frame a tick over one stream; a tick finds the last one unanswered: missed."""
+    """Push a frame a tick over one stream; a tick at which the last one is unanswered is missed."""
     lens, matrix = scene.cameras[camera]
     pose, clock, session = Pose.from_matrix(matrix), WallClock(), f"bench-{os.getpid()}"
     outgoing: asyncio.Queue[pb.PushRequest] = asyncio.Queue()

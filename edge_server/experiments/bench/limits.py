@@ -1,12 +1,12 @@
 """How far the fields' kernels are from what this machine allows: its limits, then each kernel against them.
 
-The limits are measured, not looked up: random reads and writes of one vertex (two float32, as the hash
-tables hold them) in tables of several sizes, arithmetic on what is in registers, divisions, and copies within
-a core's own cache; multiply-adds of BLAS, on one large and one narrow matrix, are a peer, not a limit: on a
-processor that it was not tuned for it does half of what is possible. A kernel's floor is the time that all
-cores together need at the least for whatever of its reads, writes and arithmetic takes longest, the others
-going on beside it, as they do in these processors; what it takes beyond that goes into addresses, drawing,
-marching, branches and waiting. Of ``ngp`` and ``splat``: the default and the fastest.
+The limits are measured, not looked up: random reads and writes of one vertex (two float32, as in the hash
+tables) in tables of several sizes, arithmetic in registers, divisions, and copies within a core's own cache.
+Multiply-adds of BLAS, on one large and one narrow matrix, are a peer and no limit: on a processor that BLAS
+was not tuned for they reach half of what is possible. A kernel's floor is the time that all cores together
+need at least for the slowest of its reads, writes and arithmetic; these processors do the others meanwhile.
+The rest of a kernel's time goes into addresses, sampling, marching, branches and waiting. Measured for
+``ngp`` and ``splat``: the default and the fastest.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.common.machine_load import Usage
+from edge_server.experiments.bench.run import BenchRun
 from edge_server.experiments.common.machine_probe import (
     CHAINS,
     PER_TASK,
@@ -32,7 +31,8 @@ from edge_server.experiments.common.machine_probe import (
     random_adds,
 )
 from edge_server.experiments.common.machine_speed import in_chains, median_s, reads
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.common.tables import markdown_table
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, FitReport, View
 from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.thread_pool import Pool
@@ -43,6 +43,7 @@ from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.composite import SAVED, STRIP, STRIPS, SUMS
 from edge_server.fields.splat.kernels.project import BASE, HALF_HEIGHT, MEAN_Y, TILE
 from edge_server.fields.splat.settings import SplatSettings
+from freshfield.machine_load import LoadMeter
 
 TABLES_MB = (1, 4, 64)
 CORNERS = 8  # of a cell, each read once a level and sample, and written once by its gradient
@@ -62,11 +63,11 @@ LIMITS = {
 # Operations of the Gaussians' kernels, counted in their sources: additions, multiplications, comparisons and
 # conversions, a multiplication with the addition that follows it as one. Of a pixel and a Gaussian in one of
 # its strips, forward (a power of 2 is 12 of them) and back (folding the sums of lanes is 11):
-LAYING, LIFTING = 33, 31
+COMPOSITING, COMPOSITING_BACK = 33, 31
 # Of a Gaussian: projected; its pairs' sums led back through the projection, and a step of Adam.
 PROJECTING, UPDATING = 300, 680
 # Of a Gaussian that is sorted: counted and moved, twice. Of a pair: counted, owned, listed.
-SORTING, DEALING = 4, 3
+SORTING, BINNING = 4, 3
 
 
 class TimedPool(Pool):
@@ -83,32 +84,32 @@ class TimedPool(Pool):
         self.seconds[kernel.__name__] += time.perf_counter() - began
 
 
-def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
+def measure(run: BenchRun) -> dict[str, Any]:
     """The machine's limits and, for ``ngp`` and ``splat`` on ``tile`` and ``room``, each kernel's share of a
     step, its milliseconds a step and the share of them that its floor explains."""
-    del folder, lpips
     pool = TimedPool()
-    usage = Usage("bench")
-    limits = Limits(repeats=5 if quick else 15)
+    load = LoadMeter()
+    limits = Limits(repeats=5 if run.quick else 15)
     figures: dict[str, Any] = {}
-    steps = 60 if quick else 300
+    steps = 60 if run.quick else 300
     for name in ("tile", "room"):
-        views = synthetic(name, cameras=19, size=128).training
+        views = synthetic_still(name, cameras=19, size=128).training
         figures[f"ngp on {name}"] = _of_ngp(views, pool, limits, steps)
         figures[f"splat on {name}"] = _of_splat(views, pool, limits, steps)
     figures["machine"] = limits.highest
     limits.pool.close()
     pool.close()
-    figures["outside_cores"] = usage.outside(usage.row(0.0))
+    figures["outside_cores"] = load.outside_cores()
     return figures
 
 
 class Limits:
-    """The machine's limits, measured again after each fit that is held against them: a shared machine gets
-    slower and faster within a minute, and a kernel is not faster than its limits because they were measured
-    in a slow one.
+    """The machine's limits, measured again after each fit that is compared with them: a shared machine
+    changes its speed within a minute, and a kernel must not seem faster than limits that were measured in a
+    slow one.
 
-    highest: of each limit, over all measurements."""
+    highest: of each limit, over all measurements.
+    """
 
     def __init__(self, repeats: int) -> None:
         self.pool = Pool(nice=0)
@@ -117,7 +118,7 @@ class Limits:
         self.highest = self._last
 
     def around(self) -> dict[str, float]:
-        """Of what was done since the measurement before: the higher of that and of a new one."""
+        """The limits for the time since the last measurement: the higher ones of that and of a new one."""
         before, self._last = self._last, machine_limits(self.pool, self._repeats)
         self.highest = _higher(self.highest, self._last)
         return _higher(before, self._last)
@@ -267,12 +268,12 @@ def _floors_of_splat(
     parameters = BASE
     return {
         "train_tiles": {
-            "arithmetic": strips * STRIP * (LAYING + LIFTING) / operations,
+            "arithmetic": strips * STRIP * (COMPOSITING + COMPOSITING_BACK) / operations,
             "divisions": strips * STRIP / divisions_ms,
             "copies": strips * SAVED * 4 / copied,  # written once, read once
         },
         "project": {"arithmetic": gaussians * PROJECTING / operations},
-        "bin_tiles": {"moves": (seen * SORTING + pairs * DEALING) / added},
+        "bin_tiles": {"moves": (seen * SORTING + pairs * BINNING) / added},
         "adam_step": {
             "arithmetic": (seen * UPDATING + pairs * SUMS) / operations,
             "divisions": seen * 2 * parameters / divisions_ms,  # roots take as long
@@ -283,33 +284,30 @@ def _floors_of_splat(
 
 def table(figures: dict[str, Any]) -> str:
     """Markdown: the machine's limits, then a row a kernel."""
-    rows = ["| limit of this machine, all cores | |", "|---|---|"]
-    for name, value in figures["machine"].items():
-        rows.append(
-            f"| {LIMITS[name]} | {value:,.0f} |" if value >= 100 else f"| {LIMITS[name]} | {value:.1f} |"
-        )
-    rows += [
-        "",
-        "| field, scene | kernel | ms a step | of the step | explained by limits | by which, ms |",
-        "|---|---|---|---|---|---|",
+    limits = [(LIMITS[k], f"{v:,.0f}" if v >= 100 else f"{v:.1f}") for k, v in figures["machine"].items()]
+    head = ("field, scene", "kernel", "ms a step", "of the step", "explained by limits", "by which, ms")
+    rows = [
+        row
+        for about, found in figures.items()
+        if isinstance(found, dict) and "kernels" in found
+        for row in _rows(about, found)
     ]
-    for about, found in figures.items():
-        if isinstance(found, dict) and "kernels" in found:
-            rows += _rows(about, found)
-    return "\n".join(rows)
+    tables = markdown_table(("limit of this machine, all cores", ""), limits), markdown_table(head, rows)
+    return "\n\n".join(tables)
 
 
-def _rows(about: str, found: dict[str, Any]) -> list[str]:
+def _rows(about: str, found: dict[str, Any]) -> list[tuple[str, ...]]:
     rows = []
     for name, kernel in found["kernels"].items():
         if kernel["share"] >= LEAST_SHARE:
             parts = kernel.get("floor_parts_ms", {})
-            told = ", ".join(f"{part.replace('_', '-')} {ms:.2f}" for part, ms in parts.items())
+            floor = ", ".join(f"{part.replace('_', '-')} {ms:.2f}" for part, ms in parts.items())
             explained = f"{kernel['floor_share']:.0%}" if parts else "-"
-            took = f"{kernel['ms_a_step']:.2f} | {kernel['share']:.0%}"
-            rows.append(f"| {about} | {name} | {took} | {explained} | {told} |")
+            rows.append(
+                (about, name, f"{kernel['ms_a_step']:.2f}", f"{kernel['share']:.0%}", explained, floor)
+            )
     outside = found["outside_kernels_share"]
     return [
         *rows,
-        f"| {about} | outside kernels | {found['ms_a_step'] * outside:.2f} | {outside:.0%} | - | |",
+        (about, "outside kernels", f"{found['ms_a_step'] * outside:.2f}", f"{outside:.0%}", "-", ""),
     ]

@@ -1,22 +1,25 @@
 """The optional parts of the representations, and the scenes that call for them or do not.
 
-``CHOICES`` is what ``bench options`` goes through: another option is another line.
+``bench options`` goes through ``OPTIONS``: another option is another line.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.scenes.multiview_sequence import Film, recorded_film, synthetic_film
-from edge_server.experiments.scenes.multiview_still import Still, open_still, synthetic
+from edge_server.experiments.bench.run import RECORDINGS, data_file, open_recording
+from edge_server.experiments.scenes.multiview_sequence import (
+    MultiviewSequence,
+    recorded_sequence,
+    synthetic_sequence,
+)
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, synthetic_still
 from edge_server.fields import View
 from freshfield.geometry import so3_exp
 
@@ -28,8 +31,8 @@ LATE_FRAMES = 4  # of 1/15 s: views up to 267 ms old
 
 
 @dataclass(frozen=True)
-class Choice:
-    """One optional part. off, on: settings of a field. scenes: of ``SCENES``."""
+class Option:
+    """One optional part of a representation. off, on: settings of a field. scenes: of ``SCENES``."""
 
     name: str
     off: Mapping[str, Any]
@@ -38,38 +41,38 @@ class Choice:
 
 
 # Another option is another line here.
-CHOICES: tuple[Choice, ...] = (
-    Choice("view-dependent colour", {"harmonics": 1}, {"harmonics": 4}, ("tile", "room", "lego", "kitchen")),
-    Choice("exposure", {"exposure": False}, {"exposure": True}, ("room, gains", "room")),
-    Choice("contraction", {"contracted": False}, {"contracted": True}, ("room", "tile")),
-    Choice(
+OPTIONS: tuple[Option, ...] = (
+    Option("view-dependent colour", {"harmonics": 1}, {"harmonics": 4}, ("tile", "room", "lego", "kitchen")),
+    Option("exposure", {"exposure": False}, {"exposure": True}, ("room, gains", "room")),
+    Option("contraction", {"contracted": False}, {"contracted": True}, ("room", "tile")),
+    Option(
         "pose refinement",
         {"refine_m": 0.0, "refine_deg": 0.0},
         {"refine_m": 0.03, "refine_deg": 3.0},
         ("room, poses", "room"),
     ),
-    Choice("random background", {"background": "auto"}, {"background": "random"}, ("tile", "lego")),
-    Choice("distortion loss", {"distortion": 0.0}, {"distortion": 0.01}, ("tile", "room")),
-    Choice("no density seen by few", {"min_views": 0}, {"min_views": 2}, ("tile", "room")),
-    Choice("near fade", {"near_fade": 0.0}, {"near_fade": 0.3}, ("tile", "room")),
-    Choice(
+    Option("random background", {"background": "auto"}, {"background": "random"}, ("tile", "lego")),
+    Option("distortion loss", {"distortion": 0.0}, {"distortion": 0.01}, ("tile", "room")),
+    Option("no density seen by few", {"min_views": 0}, {"min_views": 2}, ("tile", "room")),
+    Option("near fade", {"near_fade": 0.0}, {"near_fade": 0.3}, ("tile", "room")),
+    Option(
         "changed pixels first", {"changed_share": 0.0}, {"changed_share": 0.25},
         ("room, moving", "kitchen, moving"),
     ),
-    Choice(
+    Option(
         "depth guide", {"depth_guide": 0.0}, {"depth_guide": 0.1},
         ("tile", "tile, six", "lego", "kitchen, six", "room"),
     ),
-    Choice("smoothness", {"smooth": 0.0}, {"smooth": 3e-3}, ("tile", "room")),
-    Choice("diffusion", {"diffuse": 0.0}, {"diffuse": 1.0}, ("tile", "room", "kitchen", "lego")),
-    Choice("appearance", {"appearance": 0}, {"appearance": 8}, ("room, gains", "room")),
-    Choice("outlines", {"outline": 0.0}, {"outline": 0.25}, ("tile", "room")),
-    Choice("weighed by age", {"age_tau_ms": 0.0}, {"age_tau_ms": 100.0}, ("room, late", "room, moving")),
-    Choice(
+    Option("smoothness", {"smooth": 0.0}, {"smooth": 3e-3}, ("tile", "room")),
+    Option("diffusion", {"diffuse": 0.0}, {"diffuse": 1.0}, ("tile", "room", "kitchen", "lego")),
+    Option("appearance", {"appearance": 0}, {"appearance": 8}, ("room, gains", "room")),
+    Option("outlines", {"outline": 0.0}, {"outline": 0.25}, ("tile", "room")),
+    Option("weighed by age", {"age_tau_ms": 0.0}, {"age_tau_ms": 100.0}, ("room, late", "room, moving")),
+    Option(
         "stale pixels masked", {"mask_stale_ms": 0.0}, {"mask_stale_ms": 50.0}, ("room, late", "room, moving")
     ),
-    Choice("movement followed", {"follow": 0}, {"follow": 8}, ("room, late", "room, moving")),
-    Choice(
+    Option("movement followed", {"follow": 0}, {"follow": 8}, ("room, late", "room, moving")),
+    Option(
         "wrong views refused", {"refuse_beyond": 0.0}, {"refuse_beyond": 2.5},
         ("room, moving", "kitchen, moving"),
     ),
@@ -78,20 +81,22 @@ CHOICES: tuple[Choice, ...] = (
 
 @dataclass(frozen=True)
 class Scene:
-    """What a field is fitted to and scored on. still: views, from scratch. film: else, updates after motion;
-    late: its views are up to so many frames old. Scores of a film are means over the updates."""
+    """What a field is fitted to and scored on: a still from scratch, or a sequence, updates after motion.
 
-    still: Still | None = None
-    film: Film | None = None
+    late: views of a sequence are up to so many frames old. Scores of a sequence are means over the updates.
+    """
+
+    still: MultiviewStill | None = None
+    sequence: MultiviewSequence | None = None
     late: int = 0
 
 
-def _ours(name: str) -> Scene:
-    return Scene(synthetic(name, cameras=VIEWS + 1, size=SIZE))
+def _synthetic(name: str) -> Scene:
+    return Scene(synthetic_still(name, cameras=VIEWS + 1, size=SIZE))
 
 
-def _recorded(path: str, holdout: str, scale: float) -> Scene:
-    return Scene(open_still(str(_data() / path), holdout=holdout, scale=scale))
+def _recorded(name: str, scale: float) -> Scene:
+    return Scene(open_recording(name, scale))
 
 
 def _few(make: Callable[[], Scene]) -> Scene:
@@ -103,45 +108,35 @@ def _few(make: Callable[[], Scene]) -> Scene:
     return replace(scene, still=replace(scene.still, training=tuple(some)))
 
 
-def _data() -> Path:
-    if not (data := os.environ.get("FRESHFIELD_DATA")):
-        raise DatasetError("set FRESHFIELD_DATA to the folder that holds it")
-    return Path(data)
-
-
 def _gains() -> Scene:
-    still = synthetic("room", cameras=VIEWS + 1, size=SIZE)
+    still = synthetic_still("room", cameras=VIEWS + 1, size=SIZE)
     return Scene(replace(still, name="room, gains", training=with_gains(still.training, GAIN_SPREAD)))
 
 
 def _poses() -> Scene:
-    still = synthetic("room", cameras=VIEWS + 1, size=SIZE)
+    still = synthetic_still("room", cameras=VIEWS + 1, size=SIZE)
     return Scene(replace(still, name="room, poses", training=displaced(still.training, POSE_M, POSE_DEG)))
 
 
 def _moving(late: int = 0) -> Scene:
-    return Scene(film=synthetic_film("room", VIEWS + 1, SIZE, 15.0, speed_m_per_s=1.0), late=late)
-
-
-def _kitchen() -> Scene:
-    return _recorded("blender_kitchen/transforms.json", "cam00", 1.0)
+    return Scene(sequence=synthetic_sequence("room", VIEWS + 1, SIZE, 15.0, speed_m_per_s=1.0), late=late)
 
 
 def _kitchen_moving() -> Scene:
-    return Scene(film=recorded_film(_data() / "blender_kitchen" / "transforms.json", "cam00"))
+    return Scene(sequence=recorded_sequence(data_file(RECORDINGS["kitchen"][0]), "cam00"))
 
 
 SCENES: dict[str, tuple[str, Callable[[], Scene]]] = {
-    "tile": ("18 views", partial(_ours, "tile")),
-    "room": ("18 views", partial(_ours, "room")),
+    "tile": ("18 views", partial(_synthetic, "tile")),
+    "room": ("18 views", partial(_synthetic, "room")),
     "room, gains": (f"each camera and channel with a gain of its own, e^N(0, {GAIN_SPREAD:g})", _gains),
     "room, poses": (f"each camera off by {100 * POSE_M:g} cm and {POSE_DEG:g} degree", _poses),
     "room, moving": ("a person at 1 m/s, 15 frames a second", _moving),
     "room, late": ("the same, views 0 to 267 ms old", partial(_moving, LATE_FRAMES)),
-    "lego": ("at 200 x 200, every 8th held out", partial(_recorded, "lego_synthetic", "8", 2.0)),
-    "kitchen": ("the first instant", _kitchen),
-    "tile, six": (f"{FEW} of them", partial(_few, partial(_ours, "tile"))),
-    "kitchen, six": (f"{FEW} of its 18 views", partial(_few, _kitchen)),
+    "lego": ("at 200 x 200, every 8th held out", partial(_recorded, "lego", 2.0)),
+    "kitchen": ("the first instant", partial(_recorded, "kitchen", 1.0)),
+    "tile, six": (f"{FEW} of them", partial(_few, partial(_synthetic, "tile"))),
+    "kitchen, six": (f"{FEW} of its 18 views", partial(_few, partial(_recorded, "kitchen", 1.0))),
     "kitchen, moving": ("30 frames a second", _kitchen_moving),
 }  # fmt: skip
 MOVING = ("room, moving", "room, late", "kitchen, moving")
@@ -156,8 +151,8 @@ def with_gains(views: Sequence[View], spread: float, seed: int = 3) -> tuple[Vie
 
 
 def displaced(views: Sequence[View], size_m: float, deg: float, seed: int = 5) -> tuple[View, ...]:
-    """The views, each pose off by ``size_m`` and ``deg`` on average, in any direction; the mean of all errors
-    is none, since no picture could tell it from a scene that stands elsewhere."""
+    """The views, each pose off by ``size_m`` and ``deg`` on average, in any direction. The errors have a mean
+    of zero, because no image could tell their mean from a scene that stands elsewhere."""
     both = np.random.default_rng(seed).normal(size=(2, len(views), 3))
     both -= both.mean(axis=1, keepdims=True)
     turns, shifts = both / np.linalg.norm(both, axis=2).mean(axis=1)[:, None, None]
@@ -171,14 +166,15 @@ def displaced(views: Sequence[View], size_m: float, deg: float, seed: int = 5) -
 
 
 def missing(scenes: Iterable[str]) -> set[str]:
-    """Those scenes that cannot be had; says why."""
+    """Those scenes whose recordings are not there; prints why."""
     out = set()
     for scene in sorted(scenes):
-        if scene == "lego" or scene.startswith("kitchen"):
-            folder = "lego_synthetic" if scene == "lego" else "blender_kitchen"
+        recording = scene.split(",")[0]
+        if recording in RECORDINGS:
             try:
-                if not (_data() / folder).is_dir():
-                    raise DatasetError(f"{_data()} has no folder {folder}")
+                folder = data_file(RECORDINGS[recording][0].split("/")[0])
+                if not folder.is_dir():
+                    raise DatasetError(f"{folder.parent} has no folder {folder.name}")
             except DatasetError as error:
                 print(f"  {scene} left out: {error}", flush=True)
                 out.add(scene)

@@ -8,27 +8,27 @@ cost nothing. A representation that does not have an option is left out of its r
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
-from edge_server.experiments.bench.option_ablation import CHOICES, MOVING, SCENES, Scene, missing
-from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.bench.option_ablation import MOVING, OPTIONS, SCENES, Scene, missing
+from edge_server.experiments.bench.run import BenchError, BenchRun, result_settings
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.common.result_store import Kept, settled
+from edge_server.experiments.common.tables import markdown_table
+from edge_server.experiments.common.tables import number as _db
 from edge_server.experiments.fitting.evaluate import evaluate
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
+from freshfield.machine_load import LoadMeter
 
 
 @dataclass(frozen=True)
-class Effort:
+class Workload:
     """Budgets from scratch and of an update, in steps and seconds. warm_steps: before the first update."""
 
     seeds: int
@@ -40,78 +40,64 @@ class Effort:
     warm_steps: int
 
     def budgets(self, moving: bool) -> dict[str, Budget]:
-        """Of a fit, or of an update; by name."""
+        """The budgets of a fit, or of an update, by name."""
         steps, seconds = (self.update_steps, self.update_s) if moving else (self.steps, self.seconds)
         return {f"{steps}_steps": Budget(steps=steps), **{f"{s:g}_s": Budget(seconds=s) for s in seconds}}
 
-    def work(self, moving: bool) -> float:
-        """Of one point, in seconds, roughly."""
+    def seconds_of(self, moving: bool) -> float:
+        """What one point takes, roughly."""
         once = sum(b.seconds or 0.01 * (b.steps or 0) for b in self.budgets(moving).values())
         return self.seeds * (once * (self.updates if moving else 1) + 0.01 * self.warm_steps * moving)
 
 
-FULL = Effort(3, 400, (4.0,), 8, 25, (0.25,), 800)
-QUICK = Effort(1, 150, (2.5,), 4, 25, (0.25,), 300)
+FULL = Workload(3, 400, (4.0,), 8, 25, (0.25,), 800)
+QUICK = Workload(1, 150, (2.5,), 4, 25, (0.25,), 300)
 
 
-def measure(
-    quick: bool,
-    folder: Path,
-    lpips: Path | None = None,
-    fields: Sequence[str] = (),
-    kept: Kept | None = None,
-    only: Sequence[str] = (),
-) -> dict[str, Any]:
-    """{points: {SCENE: {FIELD: {SETTINGS: figures}}}, rows: [...], left_out: {FIELD: {choice: why}}}.
+def measure(run: BenchRun) -> dict[str, Any]:
+    """{points: {SCENE: {FIELD: {SETTINGS: figures}}}, rows: [...], left_out: {FIELD: {option: why}}}.
 
-    Points that several rows share (everything at its default) are measured once. only: names of choices
-    [all]. BenchError: there is no such choice.
+    Points that several rows share (everything at its default) are measured once. BenchError: no option has
+    the name that was asked for.
     """
-    del folder, lpips
-    effort, kept = QUICK if quick else FULL, kept or Kept()
-    names = tuple(fields) or field_names()
-    if unknown := set(only) - {c.name for c in CHOICES}:
-        raise BenchError(f"no option is called {', '.join(unknown)}: {', '.join(c.name for c in CHOICES)}")
-    choices = [c for c in CHOICES if not only or c.name in only]
-    absent = missing({s for c in choices for s in c.scenes})
+    workload, names, store = QUICK if run.quick else FULL, run.fields or field_names(), run.store
+    if unknown := set(run.only) - {o.name for o in OPTIONS}:
+        raise BenchError(f"no option is called {', '.join(unknown)}: {', '.join(o.name for o in OPTIONS)}")
+    wanted = [o for o in OPTIONS if not run.only or o.name in run.only]
+    absent = missing({s for o in wanted for s in o.scenes})
     todo: list[tuple[str, str, str, Mapping[str, Any]]] = []  # name, scene, settings as text, as given
     for name in names:
         points: dict[tuple[str, str], Mapping[str, Any]] = {}
-        for choice in choices:
+        for option in wanted:
             try:
-                sides = [(label(name, options), options) for options in (choice.off, choice.on)]
+                sides = [(label(name, settings), settings) for settings in (option.off, option.on)]
             except ValueError as error:
                 why = str(error).split(";")[0]
-                print(f"  {name}: {choice.name} left out: {why}", flush=True)
-                kept.figures.setdefault("left_out", {}).setdefault(name, {})[choice.name] = why
+                print(f"  {name}: {option.name} left out: {why}", flush=True)
+                store.results.setdefault("left_out", {}).setdefault(name, {})[option.name] = why
                 continue
-            for scene in choice.scenes:
-                points |= {(scene, text): options for text, options in sides if scene not in absent}
+            for scene in option.scenes:
+                points |= {(scene, text): settings for text, settings in sides if scene not in absent}
+        settings = result_settings(workload, name)
         todo += [
             (name, scene, text, options)
             for (scene, text), options in points.items()
-            if not kept.has("points", scene, name, text, settings=_as_json(effort, name))
+            if store.find("points", scene, name, text, settings=settings) is None
         ]
-    progress = Progress(sum(effort.work(scene in MOVING) for _, scene, *_ in todo))
+    progress = Progress(sum(workload.seconds_of(scene in MOVING) for _, scene, *_ in todo))
     make = cache(lambda scene: SCENES[scene][1]())
-    kept.put("scenes", {s: SCENES[s][0] for c in CHOICES for s in c.scenes})
+    store.results["scenes"] = {s: SCENES[s][0] for o in OPTIONS for s in o.scenes}
     try:
         for name, scene, text, options in todo:
-            point = partial(_point, name, make, scene, options, effort)
-            settings = _as_json(effort, name)
-            found = kept.get("points", scene, name, text, settings=settings, measure=point)
-            progress.did(effort.work(scene in MOVING))
-            told = ", ".join(f"{run.replace('_', ' ')} {_db(db)} dB" for run, db in found["psnr_db"].items())
-            progress.say(f"{name} {scene}", text, told)
+            point = partial(_point, name, make, scene, options, workload)
+            settings = result_settings(workload, name)
+            found = store.get("points", scene, name, text, settings=settings, compute=point)
+            progress.advance(workload.seconds_of(scene in MOVING))
+            scores = ", ".join(f"{k.replace('_', ' ')} {_db(db)} dB" for k, db in found["psnr_db"].items())
+            progress.report(f"{name} {scene}", text, scores)
     finally:  # Ctrl-C, too
-        kept.put("rows", rows(kept.figures.get("points", {})))
-    return kept.figures
-
-
-def _as_json(effort: Effort, name: str) -> dict[str, Any]:
-    """The settings that a point is kept with; what differs from the defaults is in its name."""
-    values = {key: list(v) if isinstance(v, tuple) else v for key, v in dataclasses.asdict(effort).items()}
-    return {**values, "defaults": settled(name)}
+        store.results["rows"] = rows(store.results.get("points", {}))
+    return store.results
 
 
 def label(name: str, options: Mapping[str, Any]) -> str:
@@ -124,15 +110,15 @@ def label(name: str, options: Mapping[str, Any]) -> str:
 
 
 def _point(
-    name: str, make: Callable[[str], Scene], scene: str, options: Mapping[str, Any], effort: Effort
+    name: str, make: Callable[[str], Scene], scene: str, options: Mapping[str, Any], workload: Workload
 ) -> dict[str, Any]:
     """One representation with some settings on one scene: medians over seeds."""
     make_field(name, options).warm_up()
-    usage, where = Usage("bench"), make(scene)
-    fit = partial(_updates, where, effort) if where.film is not None else partial(_from_scratch, where)
+    load, where = LoadMeter(), make(scene)
+    fit = partial(_updates, where, workload) if where.sequence is not None else partial(_from_scratch, where)
     runs = {
-        budget_name: [fit(make_field(name, options, seed=seed), budget) for seed in range(effort.seeds)]
-        for budget_name, budget in effort.budgets(where.film is not None).items()
+        budget_name: [fit(make_field(name, options, seed=seed), budget) for seed in range(workload.seeds)]
+        for budget_name, budget in workload.budgets(where.sequence is not None).items()
     }
     same_steps = next(iter(runs.values()))
     figures: dict[str, Any] = {
@@ -142,7 +128,7 @@ def _point(
     figures["steps"] = {run: _median([p.steps for p in found]) for run, found in runs.items()}
     figures["ms_per_step"] = _median([1e3 * p.seconds / p.steps for p in same_steps])
     figures["cpu_ms_per_step"] = _median([1e3 * p.cpu_s / p.steps for p in same_steps])
-    return {**figures, "outside_cores": usage.outside(usage.row(0.0))}
+    return {**figures, "outside_cores": load.outside_cores()}
 
 
 @dataclass(frozen=True)
@@ -164,20 +150,20 @@ def _from_scratch(where: Scene, model: Field, budget: Budget) -> _Fitted:
     return _Fitted(score.psnr_db, score.psnr_moving_db, report.steps, report.seconds, cpu_s)
 
 
-def _updates(where: Scene, effort: Effort, model: Field, budget: Budget) -> _Fitted:
-    """Frame after frame of a film, from a field that has settled on the first."""
-    film, scorer = where.film, Scorer()
-    assert film is not None
-    model.fit(film.training(0, where.late), Budget(steps=effort.warm_steps))
+def _updates(where: Scene, workload: Workload, model: Field, budget: Budget) -> _Fitted:
+    """Frame after frame of a sequence, from a field that has settled on the first."""
+    sequence, scorer = where.sequence, Scorer()
+    assert sequence is not None
+    model.fit(sequence.training(0, where.late), Budget(steps=workload.warm_steps))
     scores: list[Score] = []
     steps, seconds, cpu_s = 0, 0.0, 0.0
-    for frame in range(1, effort.updates + 1):
-        views = film.training(frame, where.late)
+    for frame in range(1, workload.updates + 1):
+        views = sequence.training(frame, where.late)
         cpu = time.process_time()
         report = model.fit(views, budget)
         cpu_s += time.process_time() - cpu
         steps, seconds = steps + report.steps, seconds + report.seconds
-        scores.append(film.score(model, frame, scorer))
+        scores.append(sequence.score(model, frame, scorer))
     score = mean_score(scores)
     return _Fitted(score.psnr_db, score.psnr_moving_db, steps, seconds, cpu_s)
 
@@ -188,22 +174,22 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 
 def rows(points: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Off beside on, for every choice, scene and representation of which both are measured. points: as
+    """Off beside on, for every option, scene and representation of which both are measured. points: as
     ``measure`` keeps them."""
     names = dict.fromkeys(name for of_scene in points.values() for name in of_scene)
     out = []
-    for choice in CHOICES:
+    for option in OPTIONS:
         for name in names:
             try:
-                sides = [label(name, options) for options in (choice.off, choice.on)]
+                sides = [label(name, options) for options in (option.off, option.on)]
             except ValueError:
                 continue
-            for scene in choice.scenes:
+            for scene in option.scenes:
                 known = points.get(scene, {}).get(name, {})
                 # Of an earlier run with other budgets, one side may still stand there.
                 budgets = [known[side]["settings"] for side in sides if side in known]
                 if len(budgets) == 2 and budgets[0] == budgets[1]:
-                    row = {"option": choice.name, "scene": scene, "field": name}
+                    row = {"option": option.name, "scene": scene, "field": name}
                     row |= {"settings_off": sides[0], "settings_on": sides[1]}
                     out.append({**row, **_beside(known[sides[0]], known[sides[1]])})
     return out
@@ -236,7 +222,7 @@ def table(figures: dict[str, Any]) -> str:
         head = ["option", "on a scene", "representation", "off, on"]
         head += [f"dB {what} {run.replace('_', ' ')}: off, on, gain" for run in runs]
         head += ["ms a step: off, on", "of CPU ms", "outside cores"]
-        lines = [head, ["---"] * len(head)]
+        lines = []
         for r in found:
             cells = [r["option"], r["scene"], r["field"], f"{r['settings_off']}; {r['settings_on']}"]
             for run in runs:
@@ -245,16 +231,12 @@ def table(figures: dict[str, Any]) -> str:
             for key in ("ms_per_step", "cpu_ms_per_step", "outside_cores"):
                 cells.append(", ".join(_db(r[side][key]) for side in ("off", "on")))
             lines.append(cells)
-        texts.append("\n".join(f"| {' | '.join(cells)} |" for cells in lines))
+        texts.append(markdown_table(head, lines))
     for name, reasons in figures.get("left_out", {}).items():
-        texts.append("\n".join(f"{name}, {choice}: left out, {why}" for choice, why in reasons.items()))
+        texts.append("\n".join(f"{name}, {option}: left out, {why}" for option, why in reasons.items()))
     return "\n\n".join(texts)
 
 
 def _pair(row: Mapping[str, Any], key: str, run: str) -> str:
     off, on = (_db(row[side][key].get(run)) for side in ("off", "on"))
-    return f"{off}, {on}, **{_db(row[f'gain_{key}'].get(run), '+')}**"
-
-
-def _db(value: float | None, sign: str = "") -> str:
-    return "-" if value is None else f"{value:{sign}.2f}"
+    return f"{off}, {on}, **{_db(row[f'gain_{key}'].get(run), sign='+')}**"

@@ -9,22 +9,21 @@ as a peer: ``pip install nerfstudio`` in the same environment.
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.machine_load import BenchError, Usage
-from edge_server.experiments.scenes.multiview_still import Still, open_still
+from edge_server.experiments.bench.run import BenchError, BenchRun, open_recording
+from edge_server.experiments.scenes.multiview_still import MultiviewStill
 from edge_server.fidelity.psnr import psnr
 from edge_server.fields import Budget, View
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
+from freshfield.machine_load import LoadMeter
 
 TARGETS_DB = (20, 25)
 QUICK_S, FULL_S = 60.0, 900.0
@@ -32,25 +31,21 @@ QUICK_S, FULL_S = 60.0, 900.0
 _FIRST_SLICE_S, _FIRST_PEER_SLICE_S, _GROWTH = 0.25, 4.0, 1.3
 # What nerfacto is given a step: its default of 4096 rays would be a single step in half a minute.
 _RAYS = 1024
-# Recorded scenes: folder or file under the data folder, what is held out, by what images are divided.
-_SCENES = {"lego": ("lego_synthetic", "8", 4.0), "kitchen": ("blender_kitchen/transforms.json", "cam00", 1.0)}
+# Recordings, and by what their images are divided.
+SCALES = {"lego": 4.0, "kitchen": 1.0}
 
 # Trains for some seconds; renders a view to float32 (H, W, 3).
 Contestant = tuple[Callable[[float], float], Callable[[View], np.ndarray]]
 
 
-def measure(quick: bool, folder: Path, lpips: Path | None = None) -> dict[str, Any]:
+def measure(run: BenchRun) -> dict[str, Any]:
     """For every scene and contestant the seconds to each quality (None: not within ``limit_s``), and how
     many times longer a peer took than our field; a lower bound where it did not arrive."""
-    del folder, lpips
-    data = os.environ.get("FRESHFIELD_DATA")
-    if not data:
-        raise BenchError("set FRESHFIELD_DATA to the folder that holds lego_synthetic and blender_kitchen")
-    limit_s = QUICK_S if quick else FULL_S
+    limit_s = QUICK_S if run.quick else FULL_S
     figures: dict[str, Any] = {"limit_s": limit_s, "nerfacto_missing": nerfacto_missing()}
-    for name, (path, holdout, scale) in _SCENES.items():
+    for name, scale in SCALES.items():
         try:
-            still = open_still(str(Path(data) / path), holdout=holdout, scale=scale)
+            still = open_recording(name, scale)
         except DatasetError as error:
             raise BenchError(str(error)) from None
         figures[name] = {"scene": still.describe(), **_race(still, limit_s)}
@@ -66,8 +61,11 @@ def nerfacto_missing() -> str | None:
     return None
 
 
-def _race(still: Still, limit_s: float) -> dict[str, Any]:
-    contestants: dict[str, Callable[[Still], Contestant]] = {"ngp": _ngp, "plain_torch": _plain_torch}
+def _race(still: MultiviewStill, limit_s: float) -> dict[str, Any]:
+    contestants: dict[str, Callable[[MultiviewStill], Contestant]] = {
+        "ngp": _ngp,
+        "plain_torch": _plain_torch,
+    }
     if nerfacto_missing() is None:
         contestants["nerfacto"] = _nerfacto
     rows: dict[str, Any] = {}
@@ -93,7 +91,7 @@ def _seconds_to(
     limit_s: float,
     slice_s: float,
 ) -> dict[str, Any]:
-    usage = Usage("bench")
+    load = LoadMeter()
     reached: dict[int, float | None] = dict.fromkeys(TARGETS_DB)
     spent, best = 0.0, 0.0
     while spent < limit_s and best < TARGETS_DB[-1]:
@@ -107,23 +105,23 @@ def _seconds_to(
         **{f"{target}_db_s": seconds for target, seconds in reached.items()},
         "best_db": best,
         "within_s": spent,
-        "outside_cores": usage.outside(usage.row(0.0)),
+        "outside_cores": load.outside_cores(),
     }
 
 
-def _ngp(still: Still) -> Contestant:
+def _ngp(still: MultiviewStill) -> Contestant:
     field = NgpField(NgpSettings(device="cpu"))
     field.warm_up()
     return _of_field(field, still)
 
 
-def _plain_torch(still: Still) -> Contestant:
+def _plain_torch(still: MultiviewStill) -> Contestant:
     from edge_server.fields.ngp.torch_field import NgpTorchField
 
     return _of_field(NgpTorchField(NgpSettings(device="cpu"), device="cpu"), still)
 
 
-def _of_field(field: Any, still: Still) -> Contestant:
+def _of_field(field: Any, still: MultiviewStill) -> Contestant:
     def train(seconds: float) -> float:
         spent: float = field.fit(still.training, Budget(seconds=seconds)).seconds
         return spent
@@ -131,7 +129,7 @@ def _of_field(field: Any, still: Still) -> Contestant:
     return train, lambda view: field.render(view.camera_to_world, view.intrinsics).color
 
 
-def _nerfacto(still: Still) -> Contestant:
+def _nerfacto(still: MultiviewStill) -> Contestant:
     """nerfacto with its own defaults, but fewer rays a step, white ground and no refinement of exact poses.
 
     Poses go in with OpenGL's axes, centred and scaled as nerfstudio's own loader does it.

@@ -14,16 +14,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.bench.run import BenchError, BenchRun
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.common.result_store import Kept, settled
-from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, exact_depth, scan, truth_of
+from edge_server.experiments.common.result_store import settings_digest
+from edge_server.experiments.common.tables import markdown_table
+from edge_server.experiments.scenes.tile_scan import DISTANCE_M, Scan, exact_depth, scan, surface_truth
 from edge_server.fields import Budget
 from edge_server.fields.registry import make_field
 from edge_server.surface import SurfaceError
@@ -38,6 +38,7 @@ from edge_server.surface.metrics import (
     depth_error_mm,
 )
 from edge_server.surface.reconstruct import MeshSettings, maps_of, mesh_of_maps
+from freshfield.machine_load import LoadMeter
 
 # What is fitted, by name: representation and options.
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -59,9 +60,14 @@ TARGET = (
 
 
 @dataclass(frozen=True)
-class Effort:
-    """size: of the pictures. fit_s: seconds of fitting after which meshes are made. voxels_mm: of the
-    sharpened meshes; the others are made at the middle one. cases: of ``CASES``."""
+class Workload:
+    """How much is measured.
+
+    size: pixels a side of the pictures.
+    fit_s: seconds of fitting after which meshes are made.
+    voxels_mm: of the sharpened and carved meshes; the others are made at the middle one.
+    cases: of ``CASES``.
+    """
 
     size: int
     fit_s: tuple[float, ...]
@@ -69,74 +75,69 @@ class Effort:
     cases: tuple[str, ...]
 
 
-FULL = Effort(192, (5.0, 20.0, 60.0), (4.0, 2.0, 1.0), tuple(CASES))
-QUICK = Effort(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"))
+FULL = Workload(192, (5.0, 20.0, 60.0), (4.0, 2.0, 1.0), tuple(CASES))
+QUICK = Workload(96, (10.0,), (2.0, 4.0), ("splat", "splat, planar"))
 
 
-def measure(
-    quick: bool,
-    folder: Path,
-    lpips: Path | None = None,
-    fields: Sequence[str] = (),
-    kept: Kept | None = None,
-) -> dict[str, Any]:
+def measure(run: BenchRun) -> dict[str, Any]:
     """{scan: facts, exact: {meshes}, cases: {CASE: {fits: [...]}}}. BenchError: scikit-image is missing."""
-    del folder, lpips
     try:
-        import skimage  # noqa: F401 -- told before minutes of fitting, not after
+        import skimage  # noqa: F401 -- said before minutes of fitting, not after
     except ImportError:
         raise BenchError("marching cubes needs scikit-image: pip install 'freshfield[surface]'") from None
-    effort, kept = QUICK if quick else FULL, kept or Kept()
-    names = [n for n in (effort.cases if not fields else CASES) if not fields or CASES[n][0] in fields]
-    settings = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(effort).items()}
-    settings.pop("cases")
-    settings["depths"] = list(DEPTHS)  # figures of other stages are measured anew
-    close = scan(effort.size)
-    truth = truth_of(close)
-    kept.put("scan", {
-        "views": len(close.views), "size": effort.size, "distance_m": DISTANCE_M,
+    workload, store = QUICK if run.quick else FULL, run.store
+    names = workload.cases
+    if run.fields:
+        names = tuple(n for n, (representation, _) in CASES.items() if representation in run.fields)
+    close = scan(workload.size)
+    truth = surface_truth(close)
+    store.results["scan"] = {
+        "views": len(close.views), "size": workload.size, "distance_m": DISTANCE_M,
         "truth_points": len(truth.points), "seen_by_two": float((truth.cameras >= SEEN_BY).mean()),
-    })  # fmt: skip
+    }  # fmt: skip
     exact = [exact_depth(close.scene, view) for view in close.views]
-    kept.get("exact", measure=lambda: _of_exact(effort, close, exact, truth), settings=settings)
-    progress = Progress(len(names) * effort.fit_s[-1])
+    # Results of other stages are measured anew, those of other cases are not.
+    about = {"size": workload.size, "fit_s": workload.fit_s, "voxels_mm": workload.voxels_mm,
+             "depths": list(DEPTHS)}  # fmt: skip
+    store.get("exact", compute=lambda: _exact_meshes(workload, close, exact, truth), settings=about)
+    progress = Progress(len(names) * workload.fit_s[-1])
     for name in names:
-        case = partial(_of_case, name, effort, close, exact, truth, progress)
-        made_with = {**settings, "defaults": settled(*CASES[name])}
-        kept.get("cases", name, settings=made_with, measure=case)
-    return kept.figures
+        case = partial(_case, name, workload, close, exact, truth, progress)
+        settings = {**about, "defaults": settings_digest(*CASES[name])}
+        store.get("cases", name, settings=settings, compute=case)
+    return store.results
 
 
-def _of_exact(
-    effort: Effort, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth
+def _exact_meshes(
+    workload: Workload, close: Scan, exact: Sequence[NDArray[np.float64]], truth: Truth
 ) -> dict[str, Any]:
     maps = [
         depth_map(d.astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
         for d, v in zip(exact, close.views)
     ]
-    return {"meshes": [_mesh(maps, "tsdf", "exact", mm, truth) for mm in effort.voxels_mm]}
+    return {"meshes": [_mesh(maps, "tsdf", "exact", mm, truth) for mm in workload.voxels_mm]}
 
 
-def _of_case(
+def _case(
     name: str,
-    effort: Effort,
+    workload: Workload,
     close: Scan,
     exact: Sequence[NDArray[np.float64]],
     truth: Truth,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Fits of one case, each the last one gone on with."""
+    """Fits of one case, each continuing the one before."""
     representation, options = CASES[name]
     field = make_field(representation, {**close.options, **options})
     field.warm_up()
-    usage, fits, spent, steps = Usage("bench"), [], 0.0, 0
-    for until in effort.fit_s:
+    load, fits, spent, steps = LoadMeter(), [], 0.0, 0
+    for until in workload.fit_s:
         report = field.fit(close.views, Budget(seconds=until - spent))
         spent, steps = until, steps + report.steps
         fit: dict[str, Any] = {"fit_s": until, "steps": steps, "meshes": []}
         snapshot = field.snapshot()
-        middle = effort.voxels_mm[len(effort.voxels_mm) // 2]
-        every = [("tsdf", mm) for mm in effort.voxels_mm]
+        middle = workload.voxels_mm[len(workload.voxels_mm) // 2]
+        every = [("tsdf", mm) for mm in workload.voxels_mm]
         for depth, wanted in (
             ("of the field", [("tsdf", middle)]),
             ("sharpened", [*every, ("sdf", middle)]),
@@ -152,10 +153,10 @@ def _of_case(
             fit[depth] = {**_depth_error(maps, exact), **{f"{k}_s": v for k, v in seconds.items()}}
             fit["meshes"] += [_mesh(maps, method, depth, mm, truth) for method, mm in wanted]
         fits.append(fit)
-        progress.did(until - (fits[-2]["fit_s"] if len(fits) > 1 else 0.0))
+        progress.advance(until - (fits[-2]["fit_s"] if len(fits) > 1 else 0.0))
         best = min((m["chamfer_mm"] for m in fit["meshes"] if "chamfer_mm" in m), default=float("nan"))
-        progress.say(name, f"{until:g} s", f"{steps} steps, best chamfer {best:.2f} mm")
-    return {"fits": fits, "outside_cores": usage.outside(usage.row(0.0))}
+        progress.report(name, f"{until:g} s", f"{steps} steps, best chamfer {best:.2f} mm")
+    return {"fits": fits, "outside_cores": load.outside_cores()}
 
 
 def _depth_error(maps: Sequence[DepthMap], exact: Sequence[NDArray[np.float64]]) -> dict[str, float]:
@@ -167,7 +168,7 @@ def _depth_error(maps: Sequence[DepthMap], exact: Sequence[NDArray[np.float64]])
 
 
 def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, truth: Truth) -> dict[str, Any]:
-    """One mesh, measured. seconds: of all after the depth maps."""
+    """One mesh, measured. ``seconds`` are those of all stages after the depth maps."""
     row: dict[str, Any] = {"method": method, "depth": depth, "voxel_mm": voxel_mm}
     began = time.perf_counter()
     try:
@@ -181,39 +182,37 @@ def _mesh(maps: Sequence[DepthMap], method: str, depth: str, voxel_mm: float, tr
 def table(figures: dict[str, Any]) -> str:
     """Two Markdown tables: depth, and meshes."""
     facts = figures["scan"]
-    lines = [
+    about = (
         f"{facts['views']} pictures of {facts['size']} x {facts['size']} of `tile` from "
-        f"{facts['distance_m']:g} m. Target: {TARGET}.",
-        "",
-        "| field | fit s | steps | depth | covered | bias mm | median mm | p90 mm | seconds |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, case in figures.get("cases", {}).items():
-        for fit in case["fits"]:
-            for depth in DEPTHS:
-                d = fit[depth]
-                seconds = ", ".join(f"{k[:-2]} {v:.1f}" for k, v in d.items() if k.endswith("_s"))
-                lines.append(
-                    f"| {name} | {fit['fit_s']:g} | {fit['steps']} | {depth} | {100 * d['covered']:.0f} % | "
-                    f"{d['bias_mm']:+.2f} | {d['median_mm']:.2f} | {d['p90_mm']:.2f} | {seconds} |"
-                )
-    lines += [
-        "",
-        "| field | fit s | depth | method | voxel mm | chamfer mm | accuracy mm (median) | "
-        "completeness mm | within 3 mm: surface, mesh | triangles | seconds |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    rows = [("exact", "", m) for m in figures.get("exact", {}).get("meshes", [])]
-    for name, case in figures.get("cases", {}).items():
-        rows += [(name, f"{fit['fit_s']:g}", m) for fit in case["fits"] for m in fit["meshes"]]
-    for name, fit_s, m in rows:
-        head = f"| {name} | {fit_s} | {m['depth']} | {m['method']} | {m['voxel_mm']:g} |"
+        f"{facts['distance_m']:g} m. Target: {TARGET}."
+    )
+    fits = [(name, fit) for name, case in figures.get("cases", {}).items() for fit in case["fits"]]
+    depths = []
+    for name, fit in fits:
+        for depth in DEPTHS:
+            d = fit[depth]
+            seconds = ", ".join(f"{k[:-2]} {v:.1f}" for k, v in d.items() if k.endswith("_s"))
+            depths.append((
+                name, f"{fit['fit_s']:g}", fit["steps"], depth, f"{100 * d['covered']:.0f} %",
+                f"{d['bias_mm']:+.2f}", f"{d['median_mm']:.2f}", f"{d['p90_mm']:.2f}", seconds,
+            ))  # fmt: skip
+    made = [("exact", "", m) for m in figures.get("exact", {}).get("meshes", [])]
+    made += [(name, f"{fit['fit_s']:g}", m) for name, fit in fits for m in fit["meshes"]]
+    meshes = []
+    for name, fit_s, m in made:
+        cells = [name, fit_s, m["depth"], m["method"], f"{m['voxel_mm']:g}"]
         if "failed" in m:
-            lines.append(f"{head} {m['failed']} | | | | | |")
+            meshes.append([*cells, m["failed"], *[""] * 5])
             continue
-        lines.append(
-            f"{head} {m['chamfer_mm']:.2f} | {m['accuracy_mm']:.2f} ({m['accuracy_median_mm']:.2f}) | "
-            f"{m['completeness_mm']:.2f} | {100 * m['complete']:.1f} %, {100 * m['precise']:.1f} % | "
-            f"{m['triangles']} | {m['seconds']:.1f} |"
-        )
-    return "\n".join(lines)
+        meshes.append([
+            *cells, f"{m['chamfer_mm']:.2f}", f"{m['accuracy_mm']:.2f} ({m['accuracy_median_mm']:.2f})",
+            f"{m['completeness_mm']:.2f}", f"{100 * m['complete']:.1f} %, {100 * m['precise']:.1f} %",
+            m["triangles"], f"{m['seconds']:.1f}",
+        ])  # fmt: skip
+    of_depth = "field|fit s|steps|depth|covered|bias mm|median mm|p90 mm|seconds"
+    of_mesh = (
+        "field|fit s|depth|method|voxel mm|chamfer mm|accuracy mm (median)|completeness mm|"
+        "within 3 mm: surface, mesh|triangles|seconds"
+    )
+    tables = markdown_table(of_depth.split("|"), depths), markdown_table(of_mesh.split("|"), meshes)
+    return "\n\n".join((about, *tables))

@@ -1,9 +1,9 @@
 """Updates after motion: how far a field that follows a moving scene stays behind one fitted afresh.
 
-A field that has settled on the first frame is given all training views of the next one and a short update,
-then those of the frame after that, and so on; each update is scored on the held-out camera at that frame.
-At some of the frames a new field of the same representation is fitted for fifteen seconds (or times the
-steps of an update) to the same views: that is what the follower could know. Between those frames its score is
+A field that has settled on the first frame gets a short update with all training views of the next frame,
+then with those of the frame after that, and so on; each update is scored on the held-out camera at its frame.
+At some frames a new field of the same representation is fitted to the same views for fifteen seconds (or
+fifteen times the steps of an update): its score is what the follower could reach. Between those frames it is
 interpolated.
 
 Updates are of some seconds, or of a number of steps (``--steps``), which repeats bit for bit.
@@ -11,38 +11,54 @@ Updates are of some seconds, or of a number of steps (``--steps``), which repeat
 
 from __future__ import annotations
 
-import os
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.common.machine_load import BenchError, Usage
+from edge_server.experiments.bench.run import (
+    RECORDINGS,
+    BenchError,
+    BenchRun,
+    data_file,
+    mean_baselines,
+    result_settings,
+)
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.common.result_store import Interrupted, Kept, settled
-from edge_server.experiments.scenes.multiview_sequence import Film, recorded_film, synthetic_film
-from edge_server.fidelity.baselines import baseline
+from edge_server.experiments.common.result_store import Interrupted
+from edge_server.experiments.common.tables import markdown_table
+from edge_server.experiments.common.tables import number as _db
+from edge_server.experiments.scenes.multiview_sequence import (
+    MultiviewSequence,
+    recorded_sequence,
+    synthetic_sequence,
+)
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Budget, Field
 from edge_server.fields.registry import field_names, make_field
+from freshfield.machine_load import LoadMeter
 
 NEAR_DB = 0.5
 FRESH_TIMES = 15  # a fresh fit takes so many times an update of one second, or of ``--steps``
 _METRICS = {"whole": "psnr_db", "moving": "psnr_moving_db"}
-# Under FRESHFIELD_DATA: file, held out, by what images are divided.
-_RECORDED = {"kitchen": ("blender_kitchen/transforms.json", "cam00", 1.0)}
-SCENES = ("room", *_RECORDED)
+SCENES = ("room", "kitchen")
 
 
 @dataclass(frozen=True)
-class Plan:
-    """update_s: seconds of an update, each tried in a run of its own; steps: their number instead. samples:
-    frames at which a fresh field is fitted, the first one (where the follower comes from) among them."""
+class Workload:
+    """How much is measured.
+
+    update_s: seconds of an update, each tried in a run of its own.
+    steps: their number instead.
+    samples: frames at which a fresh field is fitted, among them the first one, where the follower starts.
+    options: settings of the field.
+    """
 
     updates: int = 100
     update_s: tuple[float, ...] = (1.0, 0.25)
@@ -52,7 +68,7 @@ class Plan:
     size: int = 128
     speed_m_per_s: float = 1.0
     fps: float = 15.0
-    options: Mapping[str, Any] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     def budgets(self) -> dict[str, Budget]:
         """The budget of an update in each run, by the run's name."""
@@ -70,121 +86,111 @@ class Plan:
         """The frames of the fresh fits, evenly spread from the first to the last."""
         return sorted({round(f) for f in np.linspace(0, self.updates, max(2, self.samples))})
 
-    def amount(self) -> float:
+    def seconds_or_steps(self) -> float:
         """Seconds, or steps, of all fits of one representation on one scene."""
         updates = sum(map(_amount, self.budgets().values())) * self.updates
         return updates + _amount(self.fresh()) * len(self.sampled())
 
 
-FULL = Plan()
-QUICK = Plan(updates=16, samples=3)
+FULL = Workload()
+QUICK = Workload(updates=16, samples=3)
 
 
-def measure(
-    quick: bool,
-    folder: Path,
-    lpips: Path | None = None,
-    fields: Sequence[str] = (),
-    kept: Kept | None = None,
-    scenes: Sequence[str] = (),
-    **changed: Any,
-) -> dict[str, Any]:
-    """{SCENE: {scene, baseline, FIELD: {fresh, RUN: {series, gaps, ...}}}} of ``fields`` (default: all).
+def measure(run: BenchRun) -> dict[str, Any]:
+    """{SCENE: {scene, baseline, FIELD: {fresh, RUN: {series, gaps, ...}}}} of the fields asked for.
 
-    scenes: of ``SCENES``; recorded ones need FRESHFIELD_DATA. changed: other values for the plan.
-    BenchError: a scene that was asked for cannot be had.
+    Recorded scenes need FRESHFIELD_DATA. BenchError: a scene that was asked for cannot be had.
     """
-    del folder, lpips
-    given = {name: value for name, value in changed.items() if value is not None}
-    plan, kept = replace(QUICK if quick else FULL, **given), kept or Kept()
-    names = tuple(fields) or field_names()
-    films = dict(_films(plan, scenes))
-    todo = [(s, n) for s in films for n in names if not kept.has(s, n, settings=_as_json(plan, n))]
-    progress = Progress(plan.amount() * len(todo))
-    for scene, film in films.items():
-        kept.get(scene, "baseline", measure=lambda film=film: _baseline(film))  # type: ignore[misc]
-        kept.figures[scene] |= {"scene": film.describe(), "frame_ms": film.period_ms}
+    asked = {name: getattr(run, name) for name in ("updates", "update_s", "steps", "samples", "options")}
+    given = {name: value for name, value in asked.items() if value is not None}
+    workload, names = replace(QUICK if run.quick else FULL, **given), run.fields or field_names()
+    store, settings = run.store, {n: result_settings(workload, n, workload.options) for n in names}
+    sequences = dict(_sequences(workload, run.scenes))
+    todo = [(s, n) for s in sequences for n in names if store.find(s, n, settings=settings[n]) is None]
+    progress = Progress(workload.seconds_or_steps() * len(todo))
+    for scene, sequence in sequences.items():
+        store.get(scene, "baseline", compute=partial(_baselines, sequence))
+        store.results[scene] |= {"scene": sequence.describe(), "frame_ms": sequence.period_ms}
         for name in names:
-            kept.get(
-                scene,
-                name,
-                settings=_as_json(plan, name),
-                measure=lambda name=name, film=film: _follow(name, film, plan, progress),  # type: ignore[misc]
-            )
-    return kept.figures
+            follow = partial(_follow, name, sequence, workload, progress)
+            store.get(scene, name, settings=settings[name], compute=follow)
+    return store.results
 
 
-def _films(plan: Plan, scenes: Sequence[str]) -> Iterable[tuple[str, Film]]:
-    data = os.environ.get("FRESHFIELD_DATA")
+def _sequences(workload: Workload, scenes: Sequence[str]) -> Iterable[tuple[str, MultiviewSequence]]:
     for scene in scenes or SCENES:
         if scene == "room":
-            film = synthetic_film(scene, plan.cameras, plan.size, plan.fps, speed_m_per_s=plan.speed_m_per_s)
-            yield scene, film
+            yield (
+                scene,
+                synthetic_sequence(
+                    scene, workload.cameras, workload.size, workload.fps, speed_m_per_s=workload.speed_m_per_s
+                ),
+            )
             continue
-        path, holdout, scale = _RECORDED[scene]
+        path, holdout = RECORDINGS[scene]
         try:
-            if not data:
-                raise DatasetError("set FRESHFIELD_DATA to the folder that holds it")
-            yield scene, replace(recorded_film(Path(data) / path, holdout, scale), name=scene)
+            yield scene, replace(recorded_sequence(data_file(path), holdout), name=scene)
         except DatasetError as error:
             if scenes:
                 raise BenchError(f"{scene}: {error}") from None
             print(f"  {scene} left out: {error}", flush=True)
 
 
-def _follow(name: str, film: Film, plan: Plan, progress: Progress) -> dict[str, Any]:
+def _follow(name: str, sequence: MultiviewSequence, workload: Workload, progress: Progress) -> dict[str, Any]:
     """One representation on one scene. Raises Interrupted with what there is by then."""
-    usage, scorer = Usage("bench"), Scorer()
+    load, scorer = LoadMeter(), Scorer()
     figures: dict[str, Any] = {"fresh": {}}
-    make_field(name, plan.options).warm_up()
+    make_field(name, workload.options).warm_up()
     start: Field | None = None
-    known: dict[int, dict[str, Any]] = {}  # of a film that repeats no frame is fitted twice
+    known: dict[int, dict[str, Any]] = {}  # of a sequence that repeats no frame is fitted twice
     try:
-        for frame in plan.sampled():
-            key = film.key(frame)
+        for frame in workload.sampled():
+            key = sequence.key(frame)
             if key not in known:
-                field = make_field(name, plan.options)
-                report = field.fit(film.training(frame), plan.fresh())
+                field = make_field(name, workload.options)
+                report = field.fit(sequence.training(frame), workload.fresh())
                 start = start or field  # the first frame comes first
-                score = _row(film.score(field, frame, scorer))
+                score = _row(sequence.score(field, frame, scorer))
                 known[key] = {"fitted_s": report.seconds, "steps": report.steps, **score}
             # Beside each: what is seen of this frame by a field that stayed with the first one.
             assert start is not None
-            stayed = _row(film.score(start, frame, scorer))
+            stayed = _row(sequence.score(start, frame, scorer))
             stale = {f"not_updated_{metric}": stayed[metric] for metric in _METRICS.values()}
             figures["fresh"][str(frame)] = {**known[key], **stale}
-            progress.did(_amount(plan.fresh()))
-            progress.say(f"{name} {film.name}", f"fresh at frame {frame}", _told(known[key]))
+            progress.advance(_amount(workload.fresh()))
+            progress.report(f"{name} {sequence.name}", f"fresh at frame {frame}", _score_text(known[key]))
         assert start is not None
         warm = start.state()
-        for run, budget in plan.budgets().items():
+        for run, budget in workload.budgets().items():
             start.load_state(warm)
             figures[run] = _run(
-                start, film, plan, budget, figures["fresh"], scorer, progress, f"{name} {run}"
+                start, sequence, workload, budget, figures["fresh"], scorer, progress, f"{name} {run}"
             )
     except Interrupted as stopped:
-        figures[run] = stopped.figures
-        raise Interrupted({**figures, "outside_cores": usage.outside(usage.row(0.0))}) from None
+        figures[run] = stopped.result
+        raise Interrupted({**figures, "outside_cores": load.outside_cores()}) from None
     except KeyboardInterrupt:
-        raise Interrupted({**figures, "outside_cores": usage.outside(usage.row(0.0))}) from None
-    return {**figures, "outside_cores": usage.outside(usage.row(0.0))}
+        raise Interrupted({**figures, "outside_cores": load.outside_cores()}) from None
+    return {**figures, "outside_cores": load.outside_cores()}
 
 
 def _run(
-    field: Field, film: Film, plan: Plan, budget: Budget, fresh: Mapping[str, Mapping[str, Any]],
-    scorer: Scorer, progress: Progress, label: str,
+    field: Field, sequence: MultiviewSequence, workload: Workload, budget: Budget,
+    fresh: Mapping[str, Mapping[str, Any]], scorer: Scorer, progress: Progress, label: str,
 ) -> dict[str, Any]:  # fmt: skip
     """Updates of one length, one frame after the other."""
     rows: list[dict[str, Any]] = []
     stopped = True
     with suppress(KeyboardInterrupt):
-        for frame in range(1, plan.updates + 1):
-            report = field.fit(film.training(frame), budget)
-            score = _row(film.score(field, frame, scorer))
+        for frame in range(1, workload.updates + 1):
+            report = field.fit(sequence.training(frame), budget)
+            score = _row(sequence.score(field, frame, scorer))
             rows.append({"frame": frame, "fitted_s": report.seconds, "steps": report.steps, **score})
-            progress.did(_amount(budget))
-            if frame % max(1, plan.updates // 10) == 0:
-                progress.say(f"{label} {film.name}", f"update {frame} of {plan.updates}", _told(score))
+            progress.advance(_amount(budget))
+            if frame % max(1, workload.updates // 10) == 0:
+                progress.report(
+                    f"{label} {sequence.name}", f"update {frame} of {workload.updates}", _score_text(score)
+                )
         stopped = False
     figures = summary(rows, fresh)
     if stopped:
@@ -233,7 +239,7 @@ def gaps(
     return dict(zip(names, map(float, values)))
 
 
-def _told(score: Mapping[str, Any]) -> str:
+def _score_text(score: Mapping[str, Any]) -> str:
     return f"PSNR {_db(score['psnr_db'])} dB, moving {_db(score['psnr_moving_db'])} dB"
 
 
@@ -245,18 +251,9 @@ def _row(score: Score) -> dict[str, Any]:
     return {"psnr_db": score.psnr_db, "psnr_moving_db": score.psnr_moving_db}
 
 
-def _as_json(plan: Plan, name: str) -> dict[str, Any]:
-    """The settings that a representation's row is kept with."""
-    values = {**asdict(plan), "update_s": list(plan.update_s), "options": dict(plan.options or {})}
-    return {**values, "defaults": settled(name, plan.options)}
-
-
-def _baseline(film: Film) -> dict[str, Any]:
-    """Of the first frame; means over the held-out cameras."""
-    training = film.training(0)
-    found = [baseline(training, v.image, v.camera_to_world) for v in film.truth(0)]
-    names = ("mean_colour_db", "nearest_view_db")
-    return {name: statistics.fmean(getattr(b, name) for b in found) for name in names}
+def _baselines(sequence: MultiviewSequence) -> dict[str, Any]:
+    """Of the first frame."""
+    return mean_baselines(sequence.training(0), sequence.truth(0))
 
 
 def _runs(figures: Mapping[str, Any]) -> Iterable[tuple[str, str, str, dict[str, Any], dict[str, Any]]]:
@@ -316,30 +313,29 @@ def _fresh(rows: Mapping[str, Any], key: str) -> tuple[list[int], list[float]]:
 
 def table(figures: dict[str, Any]) -> str:
     """Every run as a row of one Markdown table; whole image, and moving pixels in parentheses."""
-    lines = [
-        "| scene | representation | update | updates | PSNR dB (moving) | fresh fit dB | never updated dB "
-        f"| within {NEAR_DB} dB of fresh | median gap dB | gap of the first, last tenth dB "
-        "| mean colour, nearest view dB | outside cores |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for scene, name, run, found, rows in _runs(figures):
+    head = (
+        "scene|representation|update|updates|PSNR dB (moving)|fresh fit dB|never updated dB|"
+        f"within {NEAR_DB} dB of fresh|median gap dB|gap of the first, last tenth dB|"
+        "mean colour, nearest view dB|outside cores"
+    )
+    rows = []
+    for scene, name, run, found, of_field in _runs(figures):
         whole, moving = found["whole"], found["moving"]
-        # Of the first frame a field that is never updated knows as much as any: it tells nothing.
-        later = {**rows, "fresh": {f: row for f, row in rows["fresh"].items() if f != "0"}}
+        # A field that is never updated knows the first frame as well as any: that frame says nothing.
+        later = {"fresh": {f: row for f, row in of_field["fresh"].items() if f != "0"}}
         values = [_fresh(later, f"not_updated_{metric}")[1] for metric in _METRICS.values()]
         stayed = [statistics.fmean(v) if v else None for v in values]
         bases = figures[scene]["baseline"]
-        cells = [
-            scene, name, _length(run, found), str(found["updates"]), _both(whole, moving, "mean_db"),
+        rows.append((
+            scene, name, _length(run, found), found["updates"], _both(whole, moving, "mean_db"),
             _both(whole, moving, "fresh_mean_db"), f"{_db(stayed[0])} ({_db(stayed[1])})",
             f"{_percent(whole['share_near'])} ({_percent(moving['share_near'])})",
             _both(whole, moving, "median_db"),
             f"{_both(whole, moving, 'first_tenth_db')}, {_both(whole, moving, 'last_tenth_db')}",
             ", ".join(_db(bases[key]) for key in ("mean_colour_db", "nearest_view_db")),
-            _db(rows.get("outside_cores")),
-        ]  # fmt: skip
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            _db(of_field.get("outside_cores")),
+        ))  # fmt: skip
+    return markdown_table(head.split("|"), rows)
 
 
 def _length(run: str, found: Mapping[str, Any]) -> str:
@@ -349,10 +345,6 @@ def _length(run: str, found: Mapping[str, Any]) -> str:
 
 def _both(whole: Mapping[str, Any], moving: Mapping[str, Any], key: str) -> str:
     return f"{_db(whole[key])} ({_db(moving[key])})"
-
-
-def _db(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _percent(value: float | None) -> str:

@@ -1,5 +1,5 @@
-"""What a machine can do at most: random reads of, and additions to, vertices of two float32, divisions,
-copies within a core's own cache, and arithmetic on what is in registers."""
+"""Kernels that probe the limits of a machine: random reads of and additions to vertices (two float32),
+divisions, copies within a core's own cache, and arithmetic in registers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 
 TASKS, PER_TASK = 64, 1 << 16
-ROUNDS = 64  # of short loops in one task: drawing its number would be what is measured
+ROUNDS = 64  # of short loops in one task, so that fetching the task's number does not count
 
 
 @kernel
@@ -59,15 +59,15 @@ def copies(counter, worker, memory):
             mine[half + i] = mine[i] + np.float32(1.0)
 
 
-# Chains of operations, each of which waits for its predecessor: as many as keep all units of a core busy,
-# and no more than its registers hold. Lanes of a vector, multiply-adds, additions: some cores have units of
-# their own for additions, and those with 16 lanes have 32 registers instead of 16.
+# (lanes of a vector, multiply-adds, additions) of each probe: chains of operations, each of which waits for
+# its predecessor. They are enough to keep all units of a core busy and fit into its registers. Some cores
+# have units of their own for additions; those with 16 lanes have 32 registers instead of 16.
 CHAINS = ((8, 12, 0), (8, 7, 7), (16, 12, 0), (16, 12, 12))
 CHAINED = 200_000  # operations of each chain in one task
 
 
 def _chains(lanes: int, multiply_adds: int, additions: int) -> Any:
-    """A kernel that does nothing but arithmetic in registers; what comes out of it goes to out[worker]."""
+    """A kernel that does nothing but arithmetic in registers; its result goes to out[worker]."""
     vector = ir.VectorType(ir.FloatType(), lanes)
 
     def spread(builder: Any, number: Any) -> Any:
@@ -82,7 +82,7 @@ def _chains(lanes: int, multiply_adds: int, additions: int) -> Any:
             step = spread(builder, args[1])
             chains = [cgutils.alloca_once(builder, vector) for _ in range(multiply_adds + additions)]
             for k, chain in enumerate(chains):
-                # From 2 on: 1 times 1/2 and 1/2 more is 1 again, a chain that would be left out.
+                # From 2 on: 1 * 1/2 + 1/2 is 1 again, and the compiler would leave that chain out.
                 builder.store(spread(builder, ir.FloatType()(float(k + 2))), chain)
             with cgutils.for_range(builder, args[0]):
                 for k, chain in enumerate(chains):

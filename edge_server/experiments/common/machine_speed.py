@@ -1,7 +1,7 @@
 """How fast the machine is just now.
 
-On a shared one two cores may be one core's two threads for an hour, which doubles the time of arithmetic and
-shows in no load of its own; so what is measured stands beside how fast the machine was meanwhile.
+The speed of a shared machine changes: two cores may be the two threads of one core for an hour. That doubles
+the time of arithmetic and shows in no load, so measured times stand beside the machine's speed meanwhile.
 """
 
 from __future__ import annotations
@@ -31,39 +31,42 @@ REPEATS = 3
 Row = dict[str, float]
 
 
-class Speed:
-    """``look`` now and then while something is measured, some 50 ms each; ``row`` has the medians since the
-    row before: billions of float32 multiply-adds in registers a second and millions of random reads a second,
-    all cores together, as ``bench limits`` measures both."""
+class MachineSpeed:
+    """Speed of the machine while something else is measured.
+
+    ``sample`` now and then, some 50 ms each. ``medians`` are over the samples since its last call: billions
+    of float32 multiply-adds in registers a second, and millions of random reads a second, all cores together,
+    as ``bench limits`` measures both.
+    """
 
     def __init__(self) -> None:
         self._pool = Pool(nice=0)
-        self._seen: list[tuple[float, float]] = []
-        self.look()  # compiles
-        self._seen.clear()
+        self._samples: list[tuple[float, float]] = []
+        self.sample()  # compiles
+        self._samples.clear()
 
-    def look(self) -> None:
+    def sample(self) -> None:
         """Measure once."""
-        self._seen.append((multiply_adds(self._pool, REPEATS), reads(self._pool, MEGABYTES, REPEATS)))
+        self._samples.append((multiply_adds(self._pool, REPEATS), reads(self._pool, MEGABYTES, REPEATS)))
 
-    def row(self) -> Row:
-        """{} where nobody has looked."""
-        seen, self._seen = self._seen, []
+    def medians(self) -> Row:
+        """{} where nothing was sampled."""
+        samples, self._samples = self._samples, []
         names = ("multiply_adds_g_per_s", f"reads_{MEGABYTES}mb_m_per_s")
-        return {name: statistics.median(values) for name, values in zip(names, zip(*seen))}
+        return {name: statistics.median(values) for name, values in zip(names, zip(*samples))}
 
     def close(self) -> None:
         """Stop its threads."""
         self._pool.close()
 
 
-def told(row: Row | None) -> str:
-    """A row in a table's cell; "-" where none was measured."""
+def speed_text(row: Row | None) -> str:
+    """``MachineSpeed.medians`` as the cell of a table; "-" where nothing was measured."""
     return ", ".join(f"{value:,.0f}" for value in row.values()) if row else "-"
 
 
 def multiply_adds(pool: Pool, repeats: int) -> float:
-    """Billions of float32 multiply-adds a second: the most of the widths of vector that processors have."""
+    """Billions of float32 multiply-adds a second at the vector width that is fastest here."""
     return max(
         chains * in_chains(pool, k, repeats)
         for k, (_, chains, additions) in enumerate(CHAINS)
@@ -72,13 +75,13 @@ def multiply_adds(pool: Pool, repeats: int) -> float:
 
 
 def in_chains(pool: Pool, k: int, repeats: int) -> float:
-    """Billions of float32 operations a second in each of the chains of kernel ``arithmetic[k]``."""
+    """Billions of float32 operations a second in each chain of kernel ``arithmetic[k]``."""
     totals = np.zeros(pool.threads, np.float32)
     return TASKS * CHAINED * CHAINS[k][0] / median_s(repeats, partial(pool.run, arithmetic[k], totals)) / 1e9
 
 
 def reads(pool: Pool, megabytes: int, repeats: int) -> float:
-    """Millions of random reads a second of a vertex, two float32, from one table of so many MB."""
+    """Millions of random reads a second of one vertex (two float32) from a table of so many MB."""
     vertices = megabytes * 2**20 // (4 * FEATURES)
     table = np.zeros((vertices, FEATURES), np.float32)
     rows = np.random.default_rng(0).integers(0, vertices, PER_TASK).astype(np.uint32)
@@ -87,7 +90,7 @@ def reads(pool: Pool, megabytes: int, repeats: int) -> float:
 
 
 def median_s(repeats: int, work: Callable[[], Any]) -> float:
-    """Seconds that ``work`` takes, once it has been done."""
+    """Median seconds that ``work`` takes, after one call that does not count."""
     work()  # compiles, and warms the caches
     spent = []
     for _ in range(repeats):

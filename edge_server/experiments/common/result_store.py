@@ -1,70 +1,123 @@
-"""The figures of a bench as they come: each is written at once, and a bench that goes on skips it."""
+"""Results of a long computation, saved one by one as they come; a rerun computes only what is missing.
+
+One store for all: ``bench`` and ``frontier`` keep their results within the JSON file that they write anyway,
+trials and evaluations in a file of lines that only grows.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from edge_server.fields.registry import settings_of
+from freshfield.files import Lines
+
+Result = dict[str, Any]
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C in the midst of a measurement. figures: what it has by now."""
+    """Ctrl-C in the midst of a computation. result: what it has by now."""
 
-    def __init__(self, figures: dict[str, Any]) -> None:
+    def __init__(self, result: Result) -> None:
         super().__init__()
-        self.figures = figures
+        self.result = result
 
 
-def settled(name: str, options: Mapping[str, Any] | None = None) -> str:
-    """What options of a representation come to, as a digest: with another default, another thing was
-    measured, so figures are kept with it. ValueError as ``make_field``."""
+class ResultStore:
+    """Results by path, a name or several nested ones.
+
+    results: what is known, nested mappings with a result at the end of each path.
+    save: called with path and result as soon as there is a new one; it makes the result outlive the process.
+    """
+
+    def __init__(
+        self,
+        results: dict[str, Any] | None = None,
+        save: Callable[[tuple[str, ...], Result], None] | None = None,
+    ) -> None:
+        self.results: dict[str, Any] = {} if results is None else results
+        self._save = save
+        self._lines: Lines | None = None
+
+    @classmethod
+    def in_lines(cls, path: Path) -> ResultStore:
+        """Results by content key in a file of JSON lines, ``{"key": ..., **result}``. A torn line counts as
+        none, and of several lines with one key the last one counts. OSError where it cannot be opened."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        results = {}
+        for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
+            try:
+                found = json.loads(line)
+                results[str(found.pop("key"))] = found
+            except (ValueError, KeyError, TypeError, AttributeError):
+                continue
+        lines = Lines(path)
+        store = cls(results, lambda key, result: _append(lines, key, result))
+        store._lines = lines
+        return store
+
+    def close(self) -> None:
+        """Close the file of lines; a store of another kind has nothing to close."""
+        if self._lines is not None:
+            self._lines.close()
+
+    def find(self, *path: str, settings: Mapping[str, Any] | None = None) -> Result | None:
+        """The result at ``path`` if it is there, whole, and was computed with the same settings."""
+        found: Any = self.results
+        for name in path:
+            found = found.get(name) if isinstance(found, dict) else None
+        whole = isinstance(found, dict) and not found.get("interrupted")
+        return found if whole and found.get("settings") == _as_json(settings) else None
+
+    def put(self, *path: str, result: Result) -> Result:
+        """Keep and save a result."""
+        *folders, last = path
+        place = self.results
+        for name in folders:
+            place = place.setdefault(name, {})
+        place[last] = result
+        if self._save is not None:
+            self._save(path, result)
+        return result
+
+    def get(
+        self, *path: str, compute: Callable[[], Result], settings: Mapping[str, Any] | None = None
+    ) -> Result:
+        """The result at ``path``, computed where ``find`` does not find it.
+
+        compute: called for a missing result. What an ``Interrupted`` one has is kept and marked as such.
+        settings: JSON values; results of other settings count as missing.
+        """
+        known = self.find(*path, settings=settings)
+        if known is not None:
+            return known
+        about = {} if settings is None else {"settings": _as_json(settings)}
+        try:
+            return self.put(*path, result={**compute(), **about})
+        except Interrupted as stopped:
+            self.put(*path, result={**stopped.result, **about, "interrupted": True})
+            raise
+
+
+def content_key(parts: Any, length: int = 16) -> str:
+    """A key of everything that decides a result: JSON values, in any order of their names."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:length]
+
+
+def settings_digest(name: str, options: Mapping[str, Any] | None = None) -> str:
+    """A digest of the settings that options of a representation come to. It belongs into the settings of a
+    result: with another default, another thing was measured. ValueError as ``make_field``."""
     return hashlib.sha256(repr(settings_of(name, options)).encode()).hexdigest()[:16]
 
 
-def _nowhere() -> None:
-    pass
+def _as_json(settings: Mapping[str, Any] | None) -> Any:
+    """As they come back from a file: lists for tuples."""
+    return json.loads(json.dumps(settings))
 
 
-@dataclass
-class Kept:
-    """figures: of one part of a bench, nested, as JSON takes them. save: writes them, with all the others."""
-
-    figures: dict[str, Any] = field(default_factory=dict)
-    save: Callable[[], None] = _nowhere
-
-    def get(
-        self, *path: str, measure: Callable[[], dict[str, Any]], settings: dict[str, Any] | None = None
-    ) -> dict[str, Any]:
-        """The figures at ``path``: those that are there, if they are whole and of the same settings (JSON
-        values), else what ``measure`` returns. What an ``Interrupted`` one has is kept, marked so."""
-        *folders, last = path
-        place = self.figures
-        for name in folders:
-            place = place.setdefault(name, {})
-        if self.has(*path, settings=settings):
-            found: dict[str, Any] = place[last]
-            return found
-        more = {} if settings is None else {"settings": settings}
-        try:
-            place[last] = {**measure(), **more}
-        except Interrupted as stopped:
-            place[last] = {**stopped.figures, **more, "interrupted": True}
-            raise
-        finally:
-            self.save()
-        return place[last]
-
-    def has(self, *path: str, settings: dict[str, Any] | None = None) -> bool:
-        """Whether ``get`` would find the figures there."""
-        known: Any = self.figures
-        for name in path:
-            known = known.get(name) if isinstance(known, dict) else None
-        whole = isinstance(known, dict) and not known.get("interrupted")
-        return whole and known.get("settings") == settings
-
-    def put(self, name: str, value: Any) -> None:
-        """Something said of the whole part."""
-        self.figures[name] = value
+def _append(lines: Lines, path: tuple[str, ...], result: Result) -> None:
+    (key,) = path
+    lines.write(json.dumps({"key": key, **result}))

@@ -1,4 +1,4 @@
-"""What every worker process of a long computation does at its beginning."""
+"""How worker processes of a long computation begin, and how they end with their parent."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ import cv2
 from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE
 
 
-def begin(threads: int) -> None:
-    """As many threads as are its due; Ctrl-C is the parent's business, and without the parent, however it
-    ended, there is nobody to compute for."""
+def init_worker(threads: int) -> None:
+    """Initializer of a worker process: give it its share of threads, leave Ctrl-C to the parent, and end it
+    when the parent ends, however that happens.
+
+    threads: of our kernels and of OpenCV.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ[THREADS_VARIABLE] = str(threads)
     cv2.setNumThreads(threads)
@@ -26,4 +29,4 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
-    os._exit(1)  # at once: nobody waits for what is half done
+    os._exit(1)  # at once: nobody waits for half a result

@@ -20,9 +20,8 @@ from camera_node.sources.datasets.formats import FORMATS
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import SCENES
 from camera_node.synthetic.source import WORLD_FPS
-from edge_server.experiments.common.machine_load import Usage
 from edge_server.experiments.fitting.evaluate import Scored, evaluate, fit_in_slices, marks_s
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.experiments.scenes.recorded import Recorded, load_recorded
 from edge_server.fidelity.baselines import Baseline, baseline
 from edge_server.fidelity.images import Color, to_unit
@@ -32,6 +31,7 @@ from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import field_names, option_help
 from edge_server.live.scoring_thread import to_bytes
 from freshfield.files import write_json
+from freshfield.machine_load import LoadMeter, outside_cores
 
 DESCRIPTION = """\
 Fit a recorded data set as fast as this machine can, and measure fidelity on views it never saw.
@@ -62,7 +62,7 @@ class FitError(ValueError):
 
 
 @dataclass(frozen=True)
-class Job:
+class FitRequest:
     """One fit as asked for. options: of the field, as in a scenario."""
 
     data: Path
@@ -79,39 +79,33 @@ class Job:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
-    parser = argparse.ArgumentParser(
-        prog="edge-server fit", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
-    parser.add_argument("--format", choices=list(FORMATS), help="of the data set [what its files say]")
-    parser.add_argument(
-        "--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]"
-    )
-    parser.add_argument("--list-options", action="store_true", help="say what the field's options mean")
-    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
-    parser.add_argument(
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("edge-server fit", description=DESCRIPTION, formatter_class=raw)
+    add = parser.add_argument
+    add("data", type=Path, nargs="?", metavar="DATA", help="data set: folder or file")
+    add("--format", choices=list(FORMATS), help="of the data set [what its files say]")
+    add("--field", default="ngp", metavar="NAME", help=f"{', '.join(field_names())} [%(default)s]")
+    add("--list-options", action="store_true", help="say what the field's options mean")
+    add("--seconds", type=float, default=60.0, metavar="S", help="of fitting [%(default)g]")
+    add(
         "--holdout", default="8", metavar="K|NAME,...",
         help="every K-th view, or these images or cameras; split: what the data set keeps for testing; "
         "0: none [%(default)s]",
     )  # fmt: skip
-    parser.add_argument(
-        "--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]"
-    )
-    parser.add_argument(
-        "--frame", type=int, default=0, metavar="N", help="instant of a moving set [%(default)s]"
-    )
-    parser.add_argument(
+    add("--scale", type=float, default=1.0, metavar="K", help="divide the images by this [%(default)g]")
+    add("--frame", type=int, default=0, metavar="N", help="instant of a moving set [%(default)s]")
+    add(
         "--background", choices=sorted(BACKGROUNDS), default="white",
         help="what transparent images are laid on [%(default)s]",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
-    parser.add_argument(
+    add("--seed", type=int, default=0, metavar="N", help="[%(default)s]")
+    add(
         "--option", action="append", default=[], metavar="KEY=VALUE",
         help="setting of the field, e.g. levels=12; again for more",
     )  # fmt: skip
-    parser.add_argument("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
-    parser.add_argument("--resume", action="store_true", help="go on from OUT until --seconds in all")
+    add("--lpips", type=Path, metavar="DIR", help="LPIPS weights [$FRESHFIELD_LPIPS]")
+    add("--out", type=Path, metavar="DIR", help="[runs/fit-NAME]")
+    add("--resume", action="store_true", help="go on from OUT until --seconds in all")
     args = parser.parse_args(argv)
     if args.list_options:
         try:
@@ -122,12 +116,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
-    job = Job(args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background,
-              args.seed, args.format)  # fmt: skip
-    out = args.out or Path("runs") / f"fit-{_called(args.data)}"
+    request = FitRequest(
+        args.data, args.field, args.seconds, args.holdout, args.scale, args.frame, args.background, args.seed,
+        args.format,
+    )  # fmt: skip
+    out = args.out or Path("runs") / f"fit-{_data_name(args.data)}"
     try:
-        job.options.update(parse_options(args.option))
-        run(job, out, args.lpips, args.resume)
+        request.options.update(parse_options(args.option))
+        run(request, out, args.lpips, args.resume)
     except (DatasetError, FitError) as error:
         print(f"edge-server fit: {error}", file=sys.stderr)
         return 2
@@ -148,24 +144,26 @@ def parse_options(words: Sequence[str]) -> dict[str, Any]:
     return options
 
 
-def run(job: Job, out: Path, lpips_folder: Path | None = None, resume: bool = False) -> dict[str, Any]:
+def run(
+    request: FitRequest, out: Path, lpips_folder: Path | None = None, resume: bool = False
+) -> dict[str, Any]:
     """Fit, measure and leave everything in ``out``; returns the contents of report.json.
 
     Raises DatasetError or FitError for input that cannot be used.
     """
     from edge_server.fields.registry import make_field  # numba loads only once the options are read
 
-    if not 0.0 < job.seconds <= 1e6:
-        raise FitError(f"--seconds {job.seconds:g}: expected more than 0")
-    data = _open(job)
+    if not 0.0 < request.seconds <= 1e6:
+        raise FitError(f"--seconds {request.seconds:g}: expected more than 0")
+    data = _open(request)
     transparent = any(v.image.shape[2] == 4 for v in data.training)
-    options = {"background": job.background, **job.options} if transparent else job.options
+    options = {"background": request.background, **request.options} if transparent else request.options
     try:
-        model = make_field(job.field, options, seed=job.seed)
+        model = make_field(request.field, options, seed=request.seed)
     except (ValueError, TypeError) as error:
-        raise FitError(f"--field {job.field}: {error}") from None
+        raise FitError(f"--field {request.field}: {error}") from None
     out.mkdir(parents=True, exist_ok=True)
-    run_ = _Run(job, options, data, model, out, lpips_folder)
+    run_ = _Run(request, options, data, model, out, lpips_folder)
     if resume:
         run_.load()
     print(run_.headline(), flush=True)
@@ -177,35 +175,36 @@ def _is_scene(data: Path) -> bool:
     return str(data) in SCENES and not data.exists()
 
 
-def _called(data: Path) -> str:
-    """What a scene or data set is called in names of folders and reports."""
+def _data_name(data: Path) -> str:
+    """The name of a scene or data set in folders and reports."""
     return str(data) if _is_scene(data) else (data if data.is_dir() else data.parent).resolve().name
 
 
-def _open(job: Job) -> Recorded:
-    if not _is_scene(job.data):
-        return load_recorded(job.data, job.holdout, job.scale, job.frame, job.format)
-    t_s = job.frame / WORLD_FPS
-    still = synthetic(str(job.data), size=max(8, round(_SCENE_SIZE / job.scale)), t_s=t_s)
-    return Recorded(job.data, still.training, still.held_out, f"at {t_s:g} s")
+def _open(request: FitRequest) -> Recorded:
+    if not _is_scene(request.data):
+        return load_recorded(request.data, request.holdout, request.scale, request.frame, request.format)
+    t_s = request.frame / WORLD_FPS
+    still = synthetic_still(str(request.data), size=max(8, round(_SCENE_SIZE / request.scale)), t_s=t_s)
+    return Recorded(request.data, still.training, still.held_out, f"at {t_s:g} s")
 
 
 class _Run:
-    """One fit in progress: the files of ``out`` and the lines on the terminal."""
+    """A fit in progress: its files in ``out`` and its lines on the terminal."""
 
     def __init__(
-        self, job: Job, options: dict[str, Any], data: Recorded, model: Field, out: Path, lpips: Path | None
-    ) -> None:
-        self.job, self.options, self.data, self.model, self.out = job, options, data, model, out
+        self, request: FitRequest, options: dict[str, Any], data: Recorded, model: Field, out: Path,
+        lpips: Path | None,
+    ) -> None:  # fmt: skip
+        self.request, self.options, self.data, self.model, self.out = request, options, data, model, out
         metric, self.lpips_missing = open_lpips(lpips)
-        self.background = BACKGROUNDS[job.background]
+        self.background = BACKGROUNDS[request.background]
         self.scorer = Scorer(metric, background=self.background)
         self.views = data.held_out or data.training[:_SCORED_OF_TRAINING]
         self.rendered: NDArray[np.float32] | None = None
         self.rows: list[dict[str, Any]] = []
         self.processes: list[dict[str, Any]] = []
         self.spent_s, self.spent_steps = 0.0, 0
-        self.usage = Usage("fit")
+        self.load_meter = LoadMeter("fit")
 
     def headline(self) -> str:
         d, image = self.data, self.data.training[0].image
@@ -216,24 +215,22 @@ class _Run:
         return f"{d.file}{missing}: {len(d.training)} views of {sizes}{instant}, {held_out}"
 
     def load(self) -> None:
-        """Take up what ``save`` left. Raises FitError where that is not possible."""
+        """Load what ``finish`` left. FitError where there is nothing to go on from."""
         try:
             state, about = checkpoint.load(self.out / "field")
             self.model.load_state(state)
             self.spent_s, self.spent_steps = float(about["seconds"]), int(about["steps"])
-            self.rows = [json.loads(line) for line in (self.out / "series.jsonl").read_text().splitlines()]
-            self.processes = [
-                json.loads(line) for line in (self.out / "processes.jsonl").read_text().splitlines()
-            ]
+            self.rows = _read_lines(self.out / "series.jsonl")
+            self.processes = _read_lines(self.out / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise FitError(f"--resume: {self.out} holds no fit to go on from: {error}") from None
-        if self.spent_s >= self.job.seconds - 0.05:
+        if self.spent_s >= self.request.seconds - 0.05:
             raise FitError(
                 f"--resume: {self.out} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
             )
 
     def go(self) -> dict[str, Any]:
-        marks = marks_s(self.job.seconds)
+        marks = marks_s(self.request.seconds)
         try:
             done = fit_in_slices(
                 self.model,
@@ -251,7 +248,7 @@ class _Run:
         return self.finish()
 
     def _score(self) -> Score:
-        self.processes.append(self.usage.row(0.0))
+        self.processes.append(self.load_meter.row(0.0))
         score, self.rendered = evaluate(self.model, self.views, self.scorer)
         return score
 
@@ -260,8 +257,8 @@ class _Run:
         self.spent_s = at.seconds
         self.spent_steps = at.steps if at.steps is not None else self.spent_steps
         self.processes[-1]["t_s"] = round(at.seconds, 3)
-        outside = self.usage.outside(self.processes[-1])
-        self.usage.row(0.0)  # what evaluation used is nobody's load
+        outside = outside_cores(self.processes[-1])
+        self.load_meter.row(0.0)  # evaluation counts for nobody
         self.rows.append(
             {
                 "number": len(self.rows),
@@ -279,17 +276,17 @@ class _Run:
                 "scored_on": f"{len(self.data.held_out)} views" if self.data.held_out else "selected",
             }
         )
-        print(progress(at, outside), flush=True)
+        print(progress_line(at, outside), flush=True)
 
     def finish(self) -> dict[str, Any]:
-        """Write checkpoint, pictures and report."""
+        """Write checkpoint, images and report; returns report.json."""
         from edge_server.report import build_report  # draws with matplotlib
 
         about = {
-            "field": self.job.field,
+            "field": self.request.field,
             "options": self.options,
             "scenario": self._name(),
-            "seed": self.job.seed,
+            "seed": self.request.seed,
             "seconds": self.spent_s,
             "steps": self.spent_steps,
         }
@@ -310,8 +307,8 @@ class _Run:
         return {
             "kind": "fit",
             "scenario": self._name(),
-            "seed": self.job.seed,
-            "field": self.job.field,
+            "seed": self.request.seed,
+            "field": self.request.field,
             "options": self.options,
             "data": {
                 "file": self.data.file.name,
@@ -333,10 +330,10 @@ class _Run:
         return baseline(self.data.training, view.image, view.camera_to_world, self.background)
 
     def _name(self) -> str:
-        return f"fit {_called(self.job.data)}"
+        return f"fit {_data_name(self.request.data)}"
 
 
-def progress(at: Scored, outside: float | None) -> str:
+def progress_line(at: Scored, outside: float | None) -> str:
     """One line for people: time, steps, scores and how many cores others kept busy."""
     score = at.score
     words = [f"{at.seconds:7.1f} s {'-' if at.steps is None else at.steps:>7} steps"]
@@ -345,6 +342,10 @@ def progress(at: Scored, outside: float | None) -> str:
     words += [f"LPIPS {score.lpips:.3f}"] if score.lpips is not None else []
     words += [f"(others used {outside:.1f} cores)"] if outside is not None else []
     return "  ".join(words)
+
+
+def _read_lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def _write_lines(path: Path, rows: Sequence[dict[str, Any]]) -> None:

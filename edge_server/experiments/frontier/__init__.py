@@ -1,1 +1,1 @@
-"""``edge-server frontier``: what accuracy costs in time."""
+"""``edge-server frontier``: what fidelity costs in time."""

@@ -1,15 +1,15 @@
-"""``edge-server frontier``: what accuracy costs in time."""
+"""``edge-server frontier``: what fidelity costs in time."""
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,11 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic.scene import SCENES, SceneError
-from edge_server.experiments.common.result_store import settled
+from edge_server.experiments.common.result_store import ResultStore, content_key, settings_digest
 from edge_server.experiments.fitting.command import FitError, parse_options
 from edge_server.experiments.frontier import effort_sweep, update_time
 from edge_server.experiments.frontier.output import write_output
-from edge_server.experiments.scenes.multiview_still import Still, open_still
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
 from edge_server.experiments.virtual.virtual_deployment import Compute
 from edge_server.fidelity.lpips import Lpips
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -32,7 +32,7 @@ from freshfield.files import write_json
 from freshfield.scenario import ScenarioError
 
 DESCRIPTION = """\
-What accuracy costs in time, in two figures.
+What fidelity costs in time, in two figures.
 
   edge-server frontier --quick --out runs/frontier
   edge-server frontier --scene room --seeds 3 --lpips ~/data/lpips
@@ -57,13 +57,18 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is measured. planned_s: seconds of fitting from scratch. update_s: seconds an update takes.
-    run_s: virtual seconds of a moving run, or six updates where those take longer. efforts: of the levels,
-    those that moving runs are made with."""
+class Sweep:
+    """What is measured.
+
+    single_options: whether options alone are tried, too, in figure 1.
+    planned_s: seconds of fitting from scratch.
+    update_s: seconds an update takes.
+    run_s: virtual seconds of a moving run, or six updates where those take longer.
+    efforts: levels that moving runs are made with.
+    """
 
     seeds: int
-    knobs: bool
+    single_options: bool
     planned_s: tuple[float, ...]
     speeds: tuple[float, ...]
     update_s: tuple[float, ...]
@@ -71,12 +76,12 @@ class Plan:
     efforts: tuple[str, ...]
     warm_steps: int
     size: int
-    moving: update_time.Moving
+    moving: update_time.MovingScene
 
 
-QUICK = Plan(
+QUICK = Sweep(
     seeds=1,
-    knobs=False,
+    single_options=False,
     planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.1, 0.25, 0.5, 1.0, 2.0),
@@ -84,11 +89,11 @@ QUICK = Plan(
     efforts=("low", "medium"),
     warm_steps=150,
     size=128,
-    moving=update_time.Moving(cameras=13, size=64),
+    moving=update_time.MovingScene(cameras=13, size=64),
 )
-FULL = Plan(
+FULL = Sweep(
     seeds=3,
-    knobs=True,
+    single_options=True,
     planned_s=(0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0),
     speeds=(0.3, 1.0, 3.0),
     update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0),
@@ -96,14 +101,14 @@ FULL = Plan(
     efforts=("low", "medium", "high"),
     warm_steps=600,
     size=128,
-    moving=update_time.Moving(cameras=19, size=128),
+    moving=update_time.MovingScene(cameras=19, size=128),
 )
 
-# What is shipped for scenarios that name no frontier of their own. Unlike --quick, it charges steps what they
-# cost on views as many and as large as those they are made with.
+# Measured for the points that are shipped for scenarios without a frontier of their own. Unlike --quick, it
+# charges steps what they cost with as many and as large views as the runs have.
 SHIPPED = replace(
     FULL,
-    knobs=False,
+    single_options=False,
     planned_s=(0.5, 1.0, 2.0, 4.0, 8.0),
     update_s=(0.05, 0.1, 0.2, 0.35, 0.5, 1.0, 2.0),
     run_s=8.0,
@@ -115,14 +120,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
     try:
-        job = _job(args, QUICK if args.quick else SHIPPED if args.shipped else FULL)
+        frontier = _frontier(args, QUICK if args.quick else SHIPPED if args.shipped else FULL)
     except (DatasetError, SceneError, FitError, ScenarioError, ValueError) as error:
         print(f"edge-server frontier: {error}", file=sys.stderr)
         return 2
     try:
-        job.run()
+        frontier.run()
     except KeyboardInterrupt:
-        print(f"\nstopped; what was measured is in {job.store.path}: the same command goes on", flush=True)
+        print(
+            f"\nstopped; what was measured is in {frontier.file.path}: the same command goes on", flush=True
+        )
         return 130
     return 0
 
@@ -131,9 +138,9 @@ def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server frontier", description=DESCRIPTION, formatter_class=raw)
     add = parser.add_argument
-    plan = parser.add_mutually_exclusive_group().add_argument
-    plan("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
-    plan("--shipped", action="store_true", help="the points to ship, with --field all --points FILE")
+    size = parser.add_mutually_exclusive_group().add_argument
+    size("--quick", action="store_true", help="some four minutes on two cores, instead of one to two hours")
+    size("--shipped", action="store_true", help="the points to ship, with --field all --points FILE")
     add("--scene", default="room", metavar="NAME|DATA", help="room, tile or a data set [%(default)s]")
     add("--holdout", default="8", metavar="K|NAME,...", help="of a data set, as in fit [%(default)s]")
     add("--scale", type=float, default=1.0, metavar="K", help="of a data set, as in fit [%(default)g]")
@@ -150,35 +157,37 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _job(args: argparse.Namespace, plan: Plan) -> Frontier:
+def _frontier(args: argparse.Namespace, sweep: Sweep) -> Frontier:
     name, _, value = args.policy.partition(":")
     try:
         number = float(value) if value else None
     except ValueError:
         raise ValueError(f"--policy {args.policy}: {value!r} is not a number") from None
     policy = make_policy(name, number, np.random.default_rng(0))
-    plan = replace(plan, moving=replace(plan.moving, policy=name, policy_value=policy.value))
+    sweep = replace(sweep, moving=replace(sweep.moving, policy=name, policy_value=policy.value))
     if args.seeds is not None:
         if args.seeds < 1:
             raise ValueError(f"--seeds {args.seeds}: expected 1 or more")
-        plan = replace(plan, seeds=args.seeds)
+        sweep = replace(sweep, seeds=args.seeds)
     fields = field_names() if args.field == "all" else tuple(args.field.split(","))
     if unknown := set(fields) - set(field_names()):
         raise ValueError(f"no field is called {', '.join(unknown)}; there are: {', '.join(field_names())}")
     options = parse_options(args.option)
-    levels = [level for field in fields for level in effort_sweep.efforts(field, options, plan.knobs)]
+    levels = [
+        level for field in fields for level in effort_sweep.efforts(field, options, sweep.single_options)
+    ]
     for level in levels:
-        make_field(level.field, level.options)  # what cannot be is said now, not between two measurements
-    still = open_still(args.scene, plan.size, args.holdout, args.scale, args.frame)
+        make_field(level.field, level.options)  # refuses wrong options now, not between two measurements
+    still = open_still(args.scene, sweep.size, args.holdout, args.scale, args.frame)
     args.out.mkdir(parents=True, exist_ok=True)
-    store = Store(args.out / "frontier.json", args.fresh)
+    file = FrontierFile(args.out / "frontier.json", args.fresh)
     lpips, missing = open_lpips(args.lpips)
     return Frontier(
-        args.out, store, plan, still, args.scene, fields, levels, lpips, missing, args.seed, args.points
+        args.out, file, sweep, still, args.scene, fields, levels, lpips, missing, args.seed, args.points
     )
 
 
-class Store:
+class FrontierFile:
     """frontier.json: every finished point with the settings it was measured with, written as it goes."""
 
     def __init__(self, path: Path, fresh: bool = False) -> None:
@@ -189,17 +198,13 @@ class Store:
                 self.data["points"] = dict(json.loads(path.read_text())["points"])
             except (ValueError, KeyError, TypeError):
                 print(f"{path}: not readable, measured anew", flush=True)
+        self._store = ResultStore(self.data["points"], lambda *_: self.write())
 
-    def get(self, settings: Row, measure: Callable[[], Row]) -> tuple[Row, bool]:
+    def get(self, settings: Row, compute: Callable[[], Row]) -> tuple[Row, bool]:
         """The point of these settings, and whether it had to be measured."""
-        key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
-        known = self.data["points"].get(key)
-        if known is not None:
-            return known, False
-        point = {"settings": settings, **measure()}
-        self.data["points"][key] = point
-        self.write()
-        return point, True
+        key = content_key(settings)
+        known = self._store.find(key, settings=settings) is not None
+        return self._store.get(key, compute=compute, settings=settings), not known
 
     def write(self, **more: Any) -> None:
         self.data.update(more)
@@ -211,9 +216,9 @@ class Frontier:
     """One command: measures what is missing, then writes table, CSV, figures and conclusion."""
 
     out: Path
-    store: Store
-    plan: Plan
-    still: Still
+    file: FrontierFile
+    sweep: Sweep
+    still: MultiviewStill
     scene: str
     fields: tuple[str, ...]
     levels: list[effort_sweep.Effort]
@@ -234,11 +239,11 @@ class Frontier:
         else:
             updates = []
             print(f"figure 2 left out: {_why_still(self.scene)}", flush=True)
-        self.store.write(
+        self.file.write(
             scene=self.still.describe(),
             fields=list(self.fields),
-            policy=self.plan.moving.policy,
-            channel=self.plan.moving.channel,
+            policy=self.sweep.moving.policy,
+            channel=self.sweep.moving.channel,
             lpips_network=self.lpips.network if self.lpips else None,
             lpips_missing=self.lpips_missing,
             machine=machine(),
@@ -248,29 +253,26 @@ class Frontier:
             from_scratch=rows,
             updates=updates,
         )
-        print(write_output(self.out, self.store.data), flush=True)
+        print(write_output(self.out, self.file.data), flush=True)
         if self.points is not None:
-            told = ("scene", "fields", "policy", "channel", "machine")
-            whence = {key: self.store.data[key] for key in told}
-            write_json(self.points, {**whence, "updates": updates})
-        print(f"{self.store.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
+            about = {k: self.file.data[k] for k in ("scene", "fields", "policy", "channel", "machine")}
+            write_json(self.points, {**about, "updates": updates})
+        print(f"{self.file.path} ({time.perf_counter() - begun:.0f} s)", flush=True)
 
     @property
     def _seeds(self) -> range:
-        return range(self.seed, self.seed + self.plan.seeds)
+        return range(self.seed, self.seed + self.sweep.seeds)
 
     def _from_scratch(self) -> list[Row]:
-        todo = [(s, e, p) for s in self._seeds for e in self.levels for p in self.plan.planned_s]
+        todo = [(s, e, p) for s in self._seeds for e in self.levels for p in self.sweep.planned_s]
         points = []
         for number, (seed, effort, planned_s) in enumerate(todo, 1):
             settings: Row = {
-                "figure": 1, "scene": self.still.describe(), "field": effort.field,
-                "options": effort.options, "divided": effort.divided,
-                "defaults": settled(effort.field, effort.options), "seconds": planned_s,
-                "seed": seed, "lpips": self.lpips is not None,
+                "figure": 1, "scene": self.still.describe(), **_settings(effort), "divided": effort.divided,
+                "seconds": planned_s, "seed": seed, "lpips": self.lpips is not None,
             }  # fmt: skip
             measure = partial(effort_sweep.fit_from_scratch, effort, self.still, planned_s, seed, self.lpips)
-            point, new = self.store.get(settings, measure)
+            point, new = self.file.get(settings, measure)
             points.append({**point, "planned_s": planned_s, "effort": effort.label})
             print(
                 f"[{number}/{len(todo)}] {effort.label:22} {planned_s:5.2f} s {point['steps']:6d} steps  "
@@ -281,21 +283,20 @@ class Frontier:
 
     @property
     def _live(self) -> list[effort_sweep.Effort]:
-        return [e for e in self.levels if e.live and e.name in self.plan.efforts]
+        return [e for e in self.levels if e.live and e.name in self.sweep.efforts]
 
     def _charged(self) -> dict[str, Compute]:
-        """What virtual time charges the updates of each effort: what they take here, of pictures as many as
-        the moving scene's and as large as figure 1's."""
-        plan, found = self.plan, {}
-        moving, speed = replace(plan.moving, size=plan.size), plan.speeds[len(plan.speeds) // 2]
+        """What virtual time charges the updates of each effort: what they take on this machine with as many
+        images as the moving scene has, as large as those of figure 1."""
+        sweep, found = self.sweep, {}
+        moving, speed = replace(sweep.moving, size=sweep.size), sweep.speeds[len(sweep.speeds) // 2]
         for effort in self._live:
             settings: Row = {
-                "figure": "charged", **asdict(moving), "speed_m_per_s": speed, "field": effort.field,
-                "options": effort.options, "defaults": settled(effort.field, effort.options),
-                "warm_steps": plan.warm_steps,
+                "figure": "charged", **asdict(moving), "speed_m_per_s": speed, **_settings(effort),
+                "warm_steps": sweep.warm_steps,
             }  # fmt: skip
-            measure = partial(_charges, moving, speed, effort, plan.warm_steps)
-            row, new = self.store.get(settings, measure)
+            measure = partial(_measured_compute, moving, speed, effort, sweep.warm_steps)
+            row, new = self.file.get(settings, measure)
             compute = found[effort.label] = Compute(row["ms_per_step"], row["ms_per_update"])
             print(
                 f"updates of a moving scene, {effort.label}: {compute.ms_per_step:.1f} ms a step, "
@@ -305,65 +306,54 @@ class Frontier:
         return found
 
     def _updates(self, charged: dict[str, Compute]) -> list[Row]:
-        rows: list[Row] = []
-        total = len(charged) * len(self.plan.speeds) * len(self._seeds) * len(self.plan.update_s)
-        for effort in self._live:
+        """Figure 2: every update time of every effort, speed and seed, as means over the seeds."""
+        sweep, rows = self.sweep, []
+        runs = list(product(self._live, sweep.speeds, self._seeds))
+        for effort, speed, seed in runs:
+            # Made for the first new point only: a resumed sweep makes only what it still needs.
+            start = cache(partial(_warm_start, sweep, effort, speed, seed))
             compute = charged[effort.label]
-            for speed in self.plan.speeds:
-                for seed in self._seeds:
-                    rows += self._moving(effort, compute, speed, seed, len(rows), total)
+            for update_s in sweep.update_s:
+                seconds, steps = max(sweep.run_s, 6.0 * update_s), update_time.steps_for(update_s, compute)
+                settings: Row = {
+                    "figure": 2, **asdict(sweep.moving), "speed_m_per_s": speed, **_settings(effort),
+                    "warm_steps": sweep.warm_steps, "steps": steps, "seed": seed, "seconds": seconds,
+                    "compute": asdict(compute), "lpips": self.lpips is not None,
+                }  # fmt: skip
+                point, new = self.file.get(
+                    settings, partial(_moving_run, start, steps, compute, seconds, self.lpips)
+                )
+                rows.append({
+                    **point, "field": effort.field, "effort": effort.name, "options": effort.options,
+                    "speed_m_per_s": speed, "planned_update_s": update_s, "seed": seed,
+                })  # fmt: skip
+                print(
+                    f"[{len(rows)}/{len(runs) * len(sweep.update_s)}] {effort.label:16} {speed:g} m/s, "
+                    f"update {point['update_s']:5.2f} s  "
+                    f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
+                    flush=True,
+                )
         return update_time.mean_over_seeds(rows)
 
-    def _moving(
-        self, effort: effort_sweep.Effort, compute: Compute, speed: float, seed: int, done: int, total: int
-    ) -> list[Row]:
-        """Every update time of one effort, speed and seed."""
-        # Made with its first new point: a resumed sweep makes only what it still needs.
-        stage = cache(partial(self._stage, speed, effort, seed))
-        rows: list[Row] = []
-        for update_s in self.plan.update_s:
-            settings, measure = self._update_point(stage, speed, effort, seed, update_s, compute)
-            point, new = self.store.get(settings, measure)
-            rows.append({
-                **point, "field": effort.field, "effort": effort.name, "options": effort.options,
-                "speed_m_per_s": speed, "planned_update_s": update_s, "seed": seed,
-            })  # fmt: skip
-            print(
-                f"[{done + len(rows)}/{total}] {effort.label:16} {speed:g} m/s, "
-                f"update {point['update_s']:5.2f} s  "
-                f"PSNR {_db(point['psnr_db'])}  moving {_db(point['psnr_moving_db'])}{_known(new)}",
-                flush=True,
-            )
-        return rows
 
-    def _stage(self, speed: float, effort: effort_sweep.Effort, seed: int) -> update_time.Stage:
-        plan = self.plan
-        return update_time.Stage(plan.moving, speed, effort.field, effort.options, seed, plan.warm_steps)
-
-    def _update_point(
-        self,
-        stage: Callable[[], update_time.Stage],
-        speed: float,
-        effort: effort_sweep.Effort,
-        seed: int,
-        update_s: float,
-        compute: Compute,
-    ) -> tuple[Row, Callable[[], Row]]:
-        """The settings of one point of figure 2, and how to measure it."""
-        plan = self.plan
-        seconds = max(plan.run_s, 6.0 * update_s)
-        steps = update_time.steps_for(update_s, compute)
-        settings: Row = {
-            "figure": 2, **asdict(plan.moving), "speed_m_per_s": speed, "field": effort.field,
-            "options": effort.options, "defaults": settled(effort.field, effort.options),
-            "warm_steps": plan.warm_steps, "steps": steps, "seed": seed, "seconds": seconds,
-            "compute": asdict(compute), "lpips": self.lpips is not None,
-        }  # fmt: skip
-        return settings, lambda: stage().run(steps, compute, seconds, self.lpips)
+def _settings(effort: effort_sweep.Effort) -> Row:
+    """What of an effort decides a result."""
+    digest = settings_digest(effort.field, effort.options)
+    return {"field": effort.field, "options": effort.options, "defaults": digest}
 
 
-def _charges(moving: update_time.Moving, speed: float, effort: effort_sweep.Effort, warm_steps: int) -> Row:
-    compute = update_time.charges(moving, speed, effort.field, effort.options, warm_steps)
+def _warm_start(sweep: Sweep, effort: effort_sweep.Effort, speed: float, seed: int) -> update_time.WarmStart:
+    return update_time.WarmStart(sweep.moving, speed, effort.field, effort.options, seed, sweep.warm_steps)
+
+
+def _moving_run(start: Callable[[], update_time.WarmStart], *how: Any) -> Row:
+    return start().run(*how)
+
+
+def _measured_compute(
+    moving: update_time.MovingScene, speed: float, effort: effort_sweep.Effort, warm_steps: int
+) -> Row:
+    compute = update_time.measure_compute(moving, speed, effort.field, effort.options, warm_steps)
     return {"ms_per_step": compute.ms_per_step, "ms_per_update": compute.ms_per_update}
 
 

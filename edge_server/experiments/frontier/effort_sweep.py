@@ -1,4 +1,4 @@
-"""What accuracy costs in time, from scratch: effort levels of a field against seconds, Pareto front."""
+"""What fidelity costs in time, from scratch: effort levels of a field against seconds, Pareto front."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge_server.experiments.common.machine_load import Usage
 from edge_server.experiments.fitting.evaluate import evaluate
-from edge_server.experiments.scenes.multiview_still import Still
+from edge_server.experiments.scenes.multiview_still import MultiviewStill
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import efforts_of, make_field
+from freshfield.machine_load import LoadMeter
 
-# What one knob alone buys, against the level "medium" (only in the full sweep).
-_KNOBS: dict[str, dict[str, dict[str, Any]]] = {
+# What one option alone buys, against the level "medium" (only in the full sweep).
+_SINGLE_OPTIONS: dict[str, dict[str, dict[str, Any]]] = {
     "ngp": {
         "fewer samples": {"samples": 96},
         "more samples": {"samples": 288},
@@ -34,8 +34,13 @@ _KNOBS: dict[str, dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Effort:
-    """A named way to spend time. field: the representation. options: its settings. divided: training images
-    are divided by this; the score is always of the full ones. live: tried on the moving scene, too."""
+    """A named way to spend time.
+
+    field: the representation.
+    options: its settings.
+    divided: training images are divided by this; scores are always of full-size images.
+    live: tried on the moving scene, too.
+    """
 
     field: str
     name: str
@@ -48,20 +53,22 @@ class Effort:
         return f"{self.field} {self.name}"
 
 
-def efforts(field: str, options: dict[str, Any], knobs: bool) -> list[Effort]:
-    """The field's effort levels, cheapest first; with ``knobs`` also images of half the size, and each knob
-    turned alone. ``options`` apply to all of them."""
+def efforts(field: str, options: dict[str, Any], single_options: bool) -> list[Effort]:
+    """The field's effort levels, cheapest first; with ``single_options`` also images of half the size, and
+    each of ``_SINGLE_OPTIONS`` alone. ``options`` apply to all of them."""
     levels = [Effort(field, level, {"effort": level, **options}) for level in efforts_of(field)]
-    if knobs:
+    if single_options:
         levels += [replace(e, name=f"{e.name}, half size", divided=2.0, live=False) for e in levels]
         levels += [
-            Effort(field, n, {**turned, **options}, live=False) for n, turned in _KNOBS.get(field, {}).items()
+            Effort(field, n, {**changed, **options}, live=False)
+            for n, changed in _SINGLE_OPTIONS.get(field, {}).items()
         ]
     return levels
 
 
-def shrunk(views: Sequence[View], divided: float) -> tuple[View, ...]:
-    """The same views with images and lenses divided by ``divided``; alpha weighs what it covers."""
+def downscaled(views: Sequence[View], divided: float) -> tuple[View, ...]:
+    """The same views with images and intrinsics divided by ``divided``; colors are weighted by their
+    alpha."""
     if divided == 1.0:
         return tuple(views)
     small = []
@@ -80,15 +87,15 @@ def shrunk(views: Sequence[View], divided: float) -> tuple[View, ...]:
 
 
 def fit_from_scratch(
-    effort: Effort, still: Still, seconds: float, seed: int, lpips: PerceptualMetric | None
+    effort: Effort, still: MultiviewStill, seconds: float, seed: int, lpips: PerceptualMetric | None
 ) -> dict[str, Any]:
     """One point: a new field, ``seconds`` of fitting, the score on what is held out, and what it cost."""
     model = make_field(effort.field, effort.options, seed=seed)
-    still = replace(still, training=shrunk(still.training, effort.divided))
+    still = replace(still, training=downscaled(still.training, effort.divided))
     model.warm_up()
-    usage = Usage("fit")
+    load = LoadMeter()
     report = model.fit(still.training, Budget(seconds=seconds))
-    row = usage.row(seconds)
+    outside = load.outside_cores()
     score, _ = evaluate(model, still.held_out, Scorer(lpips, background=still.background))
     ms_per_step = 1e3 * report.seconds / max(report.steps, 1)
     return {
@@ -101,7 +108,7 @@ def fit_from_scratch(
         "psnr_db": score.psnr_db,
         "ssim": score.ssim,
         "lpips": score.lpips,
-        "outside_cores": usage.outside(row),
+        "outside_cores": outside,
     }
 
 
@@ -123,7 +130,7 @@ def medians(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mark_front(rows: Sequence[dict[str, Any]]) -> None:
-    """Set ``on_front`` of each row: no other row that was given as little time is as accurate (PSNR)."""
+    """Set ``on_front`` of each row: no row with as little planned time has as high a PSNR."""
     best = float("-inf")
     for row in sorted(rows, key=lambda r: (r["planned_s"], -r["psnr_db"])):
         row["on_front"] = row["psnr_db"] > best

@@ -1,14 +1,14 @@
-"""Writes what the frontier found: two CSV files, two figures, a table and a conclusion for people."""
+"""The output of the frontier: two CSV files, two figures, a table and a conclusion for people."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.frontier.update_time import best
 from edge_server.report.style import CYCLE, INK, figure
 
@@ -21,11 +21,11 @@ def write_output(out: Path, data: Row) -> str:
     """frontier.csv, frontier.png and, where something moved, updates.csv and updates.png; returns the text
     for the terminal."""
     rows, updates = data["from_scratch"], data["updates"]
-    _write_csv(out / "frontier.csv", rows)
+    write_csv(out / "frontier.csv", _flat(rows))
     draw_frontier(out / "frontier.png", rows, data)
     text = [table(rows)]
     if updates:
-        _write_csv(out / "updates.csv", updates)
+        write_csv(out / "updates.csv", _flat(updates))
         draw_updates(out / "updates.png", updates, data)
         text += [updates_table(updates), conclusion(updates)]
     return "\n\n".join(["", *text])
@@ -52,7 +52,7 @@ def updates_table(rows: Sequence[Row]) -> str:
     for row in rows:
         numbers = [row[k] for k in ("psnr_db", "psnr_moving_db", "seen_psnr_db", "seen_psnr_moving_db")]
         lines.append(
-            f"{_who(row):16} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
+            f"{_label(row):16} {row['speed_m_per_s']:4g} m/s {row['update_s']:6.2f} s {row['steps']:6.0f} "
             f"{row['aaoi_ms']:6.0f} ms " + " ".join("      -" if n is None else f"{n:7.2f}" for n in numbers)
         )
     return "\n".join([*lines, "seen: what a viewer sees on average, between publications too"])
@@ -66,11 +66,11 @@ def conclusion(rows: Sequence[Row]) -> str:
         whole, moving = best(group, "psnr_db"), best(group, "psnr_moving_db")
         if whole is None or moving is None:
             continue
-        longest = max((r for r in group if _who(r) == _who(moving)), key=lambda row: row["update_s"])
+        longest = max((r for r in group if _label(r) == _label(moving)), key=lambda row: row["update_s"])
         lost = moving["psnr_moving_db"] - (longest["psnr_moving_db"] or moving["psnr_moving_db"])
         parts.append(
-            f"at {speed:g} m/s {whole['update_s']:.2f} s ({_who(whole)}) for the whole image and "
-            f"{moving['update_s']:.2f} s ({_who(moving)}) where it moves "
+            f"at {speed:g} m/s {whole['update_s']:.2f} s ({_label(whole)}) for the whole image and "
+            f"{moving['update_s']:.2f} s ({_label(moving)}) where it moves "
             f"({longest['update_s']:.1f} s costs {lost:.1f} dB there)"
         )
     return "Best time to spend on an update: " + "; ".join(parts) + "."
@@ -80,7 +80,7 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
     """PSNR, SSIM and LPIPS of every effort level against seconds from scratch; the front in PSNR marked."""
     shown = [(key, label) for key, label in _METRICS if any(row[key] is not None for row in rows)]
     efforts = list(dict.fromkeys(row["effort"] for row in rows))
-    looks = _looks([tuple(effort.split(" ", 1)) for effort in efforts])
+    looks = _line_styles([tuple(effort.split(" ", 1)) for effort in efforts])
     front = sorted((r for r in rows if r["on_front"]), key=lambda r: r["seconds"])
     with figure(path, len(shown), height_inch=2.7, sharex=True) as (fig, axes):
         for ax, (key, label) in zip(axes[:, 0], shown):
@@ -104,9 +104,9 @@ def draw_frontier(path: Path, rows: Sequence[Row], data: Row) -> None:
 
 
 def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
-    """Fidelity at the present against seconds an update takes: a column for each speed, a colour for each
-    representation, a line for each effort, the best of all encircled. What is seen between updates is shown
-    of one of them."""
+    """Fidelity at the present against seconds an update takes: a column for each speed, a color for each
+    representation, a line style for each effort, the best of all encircled. The fidelity between updates is
+    drawn for one of them."""
     speeds = list(dict.fromkeys(row["speed_m_per_s"] for row in rows))
     efforts = list(dict.fromkeys((row["field"], row["effort"]) for row in rows))
     main = next((who for who in efforts if who[1] == "medium"), efforts[-1])
@@ -116,7 +116,7 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
             axes[row, 0].set_ylabel(label)
             for ax, speed in zip(axes[row], speeds):
                 here = [r for r in rows if r["speed_m_per_s"] == speed and r[key] is not None]
-                for who, look in zip(efforts, _looks(efforts)):
+                for who, look in zip(efforts, _line_styles(efforts)):
                     group = sorted((r for r in here if (r["field"], r["effort"]) == who),
                                    key=lambda r: r["update_s"])  # fmt: skip
                     x = [r["update_s"] for r in group]
@@ -141,8 +141,8 @@ def draw_updates(path: Path, rows: Sequence[Row], data: Row) -> None:
         fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
 
 
-def _looks(efforts: Sequence[tuple[str, ...]]) -> list[Row]:
-    """How to draw (representation, effort): a colour and a line."""
+def _line_styles(efforts: Sequence[tuple[str, ...]]) -> list[Row]:
+    """Color and line style of each (representation, effort)."""
     fields = list(dict.fromkeys(who[0] for who in efforts))
     return [
         {"color": CYCLE[fields.index(who[0]) % len(CYCLE)], "linestyle": _LINES.get(who[-1], "-")}
@@ -158,15 +158,12 @@ def _seconds_axis(axes: Axes, seconds: Sequence[float]) -> None:
     axes.minorticks_off()
 
 
-def _write_csv(path: Path, rows: Sequence[Row]) -> None:
-    flat = [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(flat[0]))
-        writer.writeheader()
-        writer.writerows(flat)
+def _flat(rows: Sequence[Row]) -> list[Row]:
+    """Without what is no single cell of a CSV file."""
+    return [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in rows]
 
 
-def _who(row: Row) -> str:
+def _label(row: Row) -> str:
     return f"{row['field']} {row['effort']}"
 
 

@@ -1,4 +1,4 @@
-"""How long should an update take? A moving scene in virtual time, fidelity at the present for each answer.
+"""How long an update should take: a moving scene in virtual time, and fidelity at the present for each time.
 
 The field is warm (it has settled on the scene as it stood at the start) and keeps what it knows. A longer
 update fits the views it was given better; meanwhile they age, and so does everything it will show.
@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from camera_node.capture import Camera
-from edge_server.experiments.virtual.from_scenario import deploy, training_cameras
-from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, Truth
+from edge_server.experiments.common.tables import mean_or_none
+from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth
 from edge_server.fidelity.scorer import PerceptualMetric, Score, Scorer
 from edge_server.fields import Budget, Field, View
 from edge_server.live.state import Publication
@@ -34,8 +35,8 @@ SEEN = ("seen_psnr_db", "seen_psnr_moving_db")
 
 
 @dataclass(frozen=True)
-class Moving:
-    """A moving scene and its network. speed_m_per_s: None leaves the scene's own (recordings)."""
+class MovingScene:
+    """A moving scene and its network."""
 
     scene: str = "room"
     cameras: int = 13
@@ -66,11 +67,18 @@ class Moving:
         )  # fmt: skip
 
 
-class Stage:
-    """One speed: cameras that share what they rendered, and a field that has settled on the first instant."""
+class WarmStart:
+    """Cameras at one speed, which share what they rendered, and a field that has settled on the first
+    instant."""
 
     def __init__(
-        self, moving: Moving, speed: float, field: str, options: dict[str, Any], seed: int, warm_steps: int
+        self,
+        moving: MovingScene,
+        speed: float,
+        field: str,
+        options: dict[str, Any],
+        seed: int,
+        warm_steps: int,
     ) -> None:
         from edge_server.fields.registry import make_field
 
@@ -86,53 +94,55 @@ class Stage:
         """Updates of ``steps`` for ``seconds`` of virtual time, from the warm field: mean scores."""
         self.field.load_state(self._warm)
         update_s = compute.charge_ns(steps) / 1e9
-        # A dozen and a half scores tell the mean of a run as well as hundreds of them.
-        terms = Terms(steps, compute=compute, score_every_ms=1e3 * seconds / 16)
+        # 16 scores give the mean of a run as well as hundreds of them.
+        terms = RunSettings(steps, compute=compute, score_every_ms=1e3 * seconds / 16)
         settled_s = _SETTLED_SHARE * seconds
-        seen = Seen(settled_s)
-        deployment = deploy(
+        viewer = ViewerScores(settled_s)
+        deployment = build_deployment(
             self.scenario, terms, field=self.field, scorer=Scorer(lpips), cameras=self.cameras,
-            on_published=lambda p: seen.published(p, self.field),
+            on_published=lambda p: viewer.published(p, self.field),
         )  # fmt: skip
-        seen.truth = deployment.truth
+        viewer.truth = deployment.truth
         publications = deployment.run(seconds)
-        seen.until(seconds)
+        viewer.score_until(seconds)
         scored = [p for p in publications if p.psnr_db is not None and p.t_s >= settled_s]
         return {
             "steps": steps,
             "update_s": update_s,
             "updates": len(publications),
             "scored": len(scored),
-            "aaoi_ms": _mean([p.aaoi_ms for p in publications]),
-            **{name: _mean([getattr(p, name) for p in scored]) for name in METRICS},
-            **seen.means(),
+            "aaoi_ms": mean_or_none([p.aaoi_ms for p in publications]),
+            **{name: mean_or_none([getattr(p, name) for p in scored]) for name in METRICS},
+            **viewer.means(),
             "frames": deployment.frames(),
         }
 
 
-def charges(moving: Moving, speed: float, field: str, options: dict[str, Any], warm_steps: int) -> Compute:
-    """What updates of a warm field take on this machine where the scene moves and every picture is new, as
-    virtual time charges them: ms_per_step a step, ms_per_update everything else (taking in the pictures,
-    finding and carrying along what moved, a snapshot). Medians of ``_UPDATES`` short and as many long
+def measure_compute(
+    moving: MovingScene, speed: float, field: str, options: dict[str, Any], warm_steps: int
+) -> Compute:
+    """What updates of a warm field take on this machine where the scene moves and every image is new, as
+    virtual time charges them: ms_per_step for a step, ms_per_update for everything else (taking in the
+    images, finding and following what moved, a snapshot). Medians of ``_UPDATES`` short and as many long
     updates."""
-    stage = Stage(moving, speed, field, options, 0, warm_steps)
-    stage.field.warm_up()
+    start = WarmStart(moving, speed, field, options, 0, warm_steps)
+    start.field.warm_up()
     taken: dict[int, list[float]] = {_FEW: [], _MANY: []}
     for number in range(1, 2 * _UPDATES + 3):
-        views = [_view(camera, number * _BETWEEN_NS) for camera in stage.cameras]
+        views = [_view(camera, number * _BETWEEN_NS) for camera in start.cameras]
         steps = (_FEW, _MANY)[number % 2]
         began = time.perf_counter()
-        stage.field.fit(views, Budget(steps=steps))
-        stage.field.snapshot()
-        if number > 2:  # the first of each know no motion yet
+        start.field.fit(views, Budget(steps=steps))
+        start.field.snapshot()
+        if number > 2:  # no motion is known in the first of each
             taken[steps].append(1e3 * (time.perf_counter() - began))
     few, many = (statistics.median(taken[steps]) for steps in (_FEW, _MANY))
     ms_per_step = max((many - few) / (_MANY - _FEW), 0.01)
     return Compute(round(ms_per_step, 3), round(max(few - _FEW * ms_per_step, 0.0), 3))
 
 
-class Seen:
-    """What a viewer saw at evenly spaced instants: the newest publication, up to an update old by then."""
+class ViewerScores:
+    """Scores of what a viewer sees at evenly spaced instants: the newest publication, up to an update old."""
 
     def __init__(self, from_s: float) -> None:
         self.truth: Truth | None = None
@@ -142,11 +152,11 @@ class Seen:
         self._scores: list[Score] = []
 
     def published(self, publication: Publication, field: Field) -> None:
-        """Another picture is shown from now on; score what was shown until now."""
-        self.until(publication.t_s)
+        """Score what was shown until now; from now on the new publication is shown."""
+        self.score_until(publication.t_s)
         self._shown = field.snapshot()
 
-    def until(self, t_s: float) -> None:
+    def score_until(self, t_s: float) -> None:
         """Score the instants up to ``t_s`` that are still open."""
         while (at_s := self._next * SEEN_EVERY_S) < t_s:
             self._next += 1
@@ -155,7 +165,7 @@ class Seen:
                 self._scores += [score] if score is not None else []
 
     def means(self) -> dict[str, float | None]:
-        return {name: _mean([getattr(s, name[5:]) for s in self._scores]) for name in SEEN}
+        return {name: mean_or_none([getattr(s, name[5:]) for s in self._scores]) for name in SEEN}
 
 
 def steps_for(update_s: float, compute: Compute) -> int:
@@ -164,7 +174,7 @@ def steps_for(update_s: float, compute: Compute) -> int:
 
 
 def best(rows: list[dict[str, Any]], metric: str = "psnr_moving_db") -> dict[str, Any] | None:
-    """The row with the highest ``metric``."""
+    """The row with the highest ``metric``; None where no row has it."""
     known = [row for row in rows if row[metric] is not None]
     return max(known, key=lambda row: row[metric]) if known else None
 
@@ -183,7 +193,7 @@ def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             "planned_update_s": planned_s, "seeds": len(group),
         }  # fmt: skip
         for name in ("update_s", "steps", "updates", "scored", "aaoi_ms", *METRICS, *SEEN):
-            row[name] = _mean([r[name] for r in group])
+            row[name] = mean_or_none([r[name] for r in group])
         for name in METRICS[:2]:
             known = [r[name] for r in group if r[name] is not None]
             many = len(known) > 1
@@ -197,8 +207,3 @@ def _view(camera: Camera, at_ns: int = 0) -> View:
     k = shot.intrinsics
     image = payload.decode(shot.payload, camera.codec, k.width, k.height)
     return View(camera.name, image, shot.pose.matrix(), k, at_ns)
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from camera_node.config import WorldConfig, source_config
-from edge_server.experiments.scenes.tile_scan import Scan, truth_of
+from edge_server.experiments.scenes.tile_scan import Scan, surface_truth
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fields import View
 from edge_server.surface.mesh import Mesh
@@ -18,33 +18,35 @@ from freshfield.scenario import load
 SPACING_M = 0.5 * WITHIN_M
 
 
-def measured(mesh: Mesh, scenario: str, views: Sequence[View]) -> dict[str, Any] | None:
-    """``surface.metrics.Comparison`` of ``mesh`` with what the cameras of ``views`` see of the scenario's
-    scene, and the targets; None where nobody knows the surface: recorded data, real cameras, a scene that
-    moves.
+def compare_with_scene(mesh: Mesh, scenario: str, views: Sequence[View]) -> tuple[dict[str, Any] | None, str]:
+    """What ``edge-server export --measure`` does: ``distances``, and one line for people."""
+    found = distances(mesh, scenario, views)
+    if found is None:
+        return None, "not measured: the true surface is known of synthetic scenes that stand still"
+    return found, (
+        f"chamfer {found['chamfer_mm']:.2f} mm (target {found['target_chamfer_mm']:g}), "
+        f"{100 * found['complete']:.1f} % of the surface within {found['within_mm']:g} mm "
+        f"(target {100 * found['target_complete']:g})"
+    )
 
-    Raises ScenarioError, and SurfaceError where one of the two is empty.
+
+def distances(mesh: Mesh, scenario: str, views: Sequence[View]) -> dict[str, Any] | None:
+    """``surface.metrics.Comparison`` of a mesh with what cameras see of a scenario's scene, and the targets.
+
+    None where nobody knows the surface: recorded data, real cameras, a scene that moves. Raises
+    ScenarioError, and SurfaceError where one of the two is empty.
     """
-    plan = load(scenario)
-    source = source_config(plan)
+    loaded = load(scenario)
+    source = source_config(loaded)
     if not isinstance(source, WorldConfig):
         return None
-    scene, _ = exact_scene(plan, source)
+    scene, _ = exact_scene(loaded, source)
     if scene.moving:
         return None
-    found = compare(mesh, truth_of(Scan(scene, tuple(views)), SPACING_M))
+    found = compare(mesh, surface_truth(Scan(scene, tuple(views)), SPACING_M))
     return {
         **dataclasses.asdict(found),
         "within_mm": 1e3 * WITHIN_M,
         "target_chamfer_mm": TARGET_CHAMFER_MM,
         "target_complete": TARGET_COMPLETE,
     }
-
-
-def in_words(found: dict[str, Any]) -> str:
-    """Both figures and both targets, in one line."""
-    return (
-        f"chamfer {found['chamfer_mm']:.2f} mm (target {found['target_chamfer_mm']:g}), "
-        f"{100 * found['complete']:.1f} % of the surface within {found['within_mm']:g} mm "
-        f"(target {100 * found['target_complete']:g})"
-    )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +15,25 @@ from camera_node.sources.datasets.records import DatasetError
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.scene import HELD_OUT
 from edge_server.experiments.scenes.recorded import split
-from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, NoiseEstimate, frames_at_lags
+from edge_server.experiments.virtual.truth import NOISE_FRAMES, noise_bound
+from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS, frames_at_lags
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fields import Renderer, View
 from freshfield.geometry import Pinhole
 
 Image = NDArray[np.uint8]
 
-_NOISE_FRAMES = 8
-
 
 @dataclass(frozen=True)
-class Film:
+class MultiviewSequence:
     """Frames 0, 1, 2, ... of a moving scene, without end: it repeats.
 
-    cameras: name -> (intrinsics, camera-to-world), in the order of training. held_out: of them, those that
-    are scored and not trained on. key: frame -> what names its pictures; equal keys, equal pictures.
-    image: (camera, key) -> picture. before: (camera, frame) -> what the camera saw ``LAGS_MS`` earlier.
-    bounds: by held-out camera, how much a pixel differs where it moves.
+    cameras: name -> (intrinsics, camera-to-world), in the order of training.
+    held_out: those of them that are scored and not trained on.
+    key: frame -> identity of its images; equal keys, equal images.
+    image: (camera, key) -> image.
+    before: (camera, frame) -> what the camera saw ``LAGS_MS`` earlier.
+    bounds: held-out camera -> by how much a pixel differs at least where it moves.
     """
 
     name: str
@@ -83,9 +83,9 @@ class Film:
         return View(camera, self._known[at], pose, lens, round(frame * self.period_ms * 1e6))
 
 
-def synthetic_film(
+def synthetic_sequence(
     name: str = "room", cameras: int = 19, size: int = 128, fps: float = 15.0, **params: Any
-) -> Film:
+) -> MultiviewSequence:
     """A scene of ours, its first camera held out. params: of the scene (``speed_m_per_s``). Raises
     camera_node's SceneError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size, **params})
@@ -93,13 +93,13 @@ def synthetic_film(
     known: dict[tuple[str, int], list[Image]] = {}
 
     def before(camera: str, frame: int) -> list[Image]:
-        # An analytic scene tells of any instant, also of those before the first and between two frames.
+        # An analytic scene is known at any instant, before the first frame and between two frames too.
         at = (camera, frame % loop)
         if at not in known:
             known[at] = [scene.render(camera, frame % loop / fps - lag / 1e3) for lag in LAGS_MS]
         return known[at]
 
-    return Film(
+    return MultiviewSequence(
         name=name,
         period_ms=1e3 / fps,
         cameras=scene.cameras,
@@ -111,7 +111,7 @@ def synthetic_film(
     )
 
 
-def recorded_film(path: Path, holdout: str, scale: float = 1.0) -> Film:
+def recorded_sequence(path: Path, holdout: str, scale: float = 1.0) -> MultiviewSequence:
     """A recording of several cameras, played back and forth. holdout: as in ``load_recorded``. Raises
     DatasetError, also for a data set in which nothing moves."""
     file, dataset = open_dataset(path, scale)
@@ -122,7 +122,7 @@ def recorded_film(path: Path, holdout: str, scale: float = 1.0) -> Film:
     if count < 2:
         raise DatasetError(f"{file}: one instant only: nothing moves in it")
     cameras = {c: (r[0].intrinsics, r[0].camera_to_world) for c, r in records.items()}
-    # Pictures are not needed to tell who is held out.
+    # The split needs no images.
     blank = np.zeros((1, 1, 3), np.uint8)
     _, held_out = split([View(c, blank, pose, lens) for c, (lens, pose) in cameras.items()], holdout)
     if not held_out:
@@ -147,7 +147,7 @@ def recorded_film(path: Path, holdout: str, scale: float = 1.0) -> Film:
         return known[camera, at]
 
     names = tuple(view.camera for view in held_out)
-    return Film(
+    return MultiviewSequence(
         name=file.resolve().parent.name,
         period_ms=period_ms,
         cameras=cameras,
@@ -155,17 +155,10 @@ def recorded_film(path: Path, holdout: str, scale: float = 1.0) -> Film:
         key=key,
         image=read,
         before=before,
-        bounds={c: _noise_bound([read(c, k) for k in range(min(count, _NOISE_FRAMES))]) for c in names},
+        bounds={c: noise_bound(read(c, k) for k in range(min(count, NOISE_FRAMES))) for c in names},
     )
 
 
 def _fps(times_s: Sequence[float | None]) -> float:
     known = [t for t in times_s if t is not None]
     return float(1.0 / np.median(np.diff(known)))
-
-
-def _noise_bound(images: Sequence[Image]) -> float:
-    estimate = NoiseEstimate()
-    for a, b in pairwise(images):
-        estimate.add(a, b)
-    return estimate.bound

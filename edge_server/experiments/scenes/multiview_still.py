@@ -17,7 +17,7 @@ WHITE: Color = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class Still:
+class MultiviewStill:
     """What a field is fitted to and scored on. background: under transparent images."""
 
     name: str
@@ -30,26 +30,30 @@ class Still:
         return f"{self.name}: {len(self.training)} views of {image.shape[1]} x {image.shape[0]}"
 
 
-def synthetic(name: str, cameras: int = 19, size: int = 128, t_s: float = 0.0) -> Still:
+def synthetic_still(name: str, cameras: int = 19, size: int = 128, t_s: float = 0.0) -> MultiviewStill:
     """The cameras of scene ``name`` at one instant, ``size`` pixels a side; cam00 is held out. Raises
     camera_node's SceneError."""
     scene = make_scene(name, {"count": cameras, "width": size, "height": size})
     views = [View(c, scene.render(c, t_s), pose, lens) for c, (lens, pose) in scene.cameras.items()]
     held_out = tuple(v for v in views if v.camera == HELD_OUT)
-    return Still(name, tuple(v for v in views if v.camera != HELD_OUT), held_out)
+    return MultiviewStill(name, tuple(v for v in views if v.camera != HELD_OUT), held_out)
 
 
-def open_still(scene: str, size: int = 128, holdout: str = "8", scale: float = 1.0, frame: int = 0) -> Still:
+def open_still(
+    scene: str, size: int = 128, holdout: str = "8", scale: float = 1.0, frame: int = 0
+) -> MultiviewStill:
     """A scene of ours by name, or the path of a recorded data set. Raises SceneError or DatasetError."""
     if scene in SCENES:
-        return synthetic(scene, size=size)
+        return synthetic_still(scene, size=size)
     data = load_recorded(Path(scene), holdout, scale, frame)
-    return Still(data.file.resolve().parent.name, data.training, data.held_out or data.training[:8], WHITE)
+    return MultiviewStill(
+        data.file.resolve().parent.name, data.training, data.held_out or data.training[:8], WHITE
+    )
 
 
-def smallest_angle_deg(still: Still) -> float:
-    """The angle between the directions in which a held-out and a training camera look, the least of all
-    pairs: how far the fields are asked to go beyond what they were shown."""
+def smallest_angle_deg(still: MultiviewStill) -> float:
+    """The smallest angle between the viewing directions of a held-out and a training camera: how far a field
+    has to go beyond its training views."""
     forward = [
         np.stack([v.camera_to_world[:3, 2] for v in views]) for views in (still.held_out, still.training)
     ]

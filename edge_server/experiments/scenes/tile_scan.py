@@ -1,7 +1,7 @@
 """A scan of ``tile`` from close by, and the exact surface it shows: what meshes are measured on.
 
-Cameras stand ``DISTANCE_M`` from a raster of points of the tile, as an arm would hold one: straight above
-each point, and leaning to four sides. They see neither the tile's lower side nor its carrier's walls head-on.
+Cameras stand ``DISTANCE_M`` from a grid of points on the tile, as an arm would hold one: straight above each
+point, and tilted to four sides. They see neither the tile's lower side nor its carrier's walls head-on.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ RASTER_M = tuple((x, y, 0.03) for y in (-0.13, 0.0, 0.13) for x in (-0.19, -0.06
 ANGLES_DEG = ((0.0, 88.0), (0.0, 45.0), (90.0, 45.0), (180.0, 45.0), (270.0, 45.0))
 SPACING_M = 0.0005  # between points of the truth
 _FINE = 3  # rays a pixel side for the truth: closer than its spacing
-_SAME = 2e-3  # of the distance, within which a ray has met the point it was sent to
+_SAME = 2e-3  # of the distance: a ray that ends this near to its target has reached it
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Scan:
 
     @property
     def options(self) -> dict[str, object]:
-        """What a cell knows about its scene and a field is told: where it is and what is behind it."""
+        """Settings of a field that a robot cell knows: where the scene is and what is behind it."""
         low, high = self.scene.bounds
         behind = "#" + "".join(f"{round(255 * c):02x}" for c in self.scene.background)
         return {
@@ -71,7 +71,7 @@ def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
     return renderer.distance()
 
 
-def truth_of(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
+def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
     """The surface that the scan's cameras see, see ``surface.metrics``."""
     placed = place_still(scan.scene.world.statics)
     points, normals = [], []

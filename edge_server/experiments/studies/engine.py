@@ -2,8 +2,8 @@
 run again.
 
 A trial's result depends on the trial and on nothing else, so who runs it and in which order makes no
-difference; a test compares the three. Results are kept in FOLDER by content: the trial, the program's own
-source and the data set. After Ctrl-C the same command goes on where it stopped.
+difference; a test compares the three. FOLDER/results.jsonl keeps results by content: the trial, the program's
+own source and the data set. After Ctrl-C the same command goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ import camera_node
 import channel_emu
 import edge_server
 import freshfield
-from edge_server.experiments.common.worker import begin
+from edge_server.experiments.common.result_store import ResultStore
+from edge_server.experiments.common.result_store import content_key as key_of
+from edge_server.experiments.common.worker import init_worker
 from edge_server.experiments.studies.trial import Folders, Row, Trial, run_trial
 from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE
 from edge_server.report.machine import versions
-from freshfield.files import write_json
 
 # Trials of one task: enough to share pictures, few enough that little is lost by Ctrl-C.
 _TRIALS_A_TASK = 6
@@ -58,36 +59,37 @@ def run_task(task: Task, folders: Folders) -> list[Row]:
 @dataclass
 class Engine:
     """jobs: processes; 1 runs everything in this one. ray: address of a cluster (``auto``, ``local`` or
-    host:port), instead of processes. known: results by content. say: called with each line of progress."""
+    host:port), instead of processes. say: called with each line of progress."""
 
     folder: Path
     folders: Folders = field(default_factory=Folders)
     jobs: int = 1
     ray: str | None = None
     say: Callable[[str], None] = print
-    known: dict[str, Row] = field(default_factory=dict)
+    _store: ResultStore | None = None
 
     def run(self, trials: Sequence[Trial], name: str = "study") -> list[Row]:
         """The result of each trial, in the order given. Raises StudyError; KeyboardInterrupt leaves what is
         finished in the folder."""
+        if not trials:
+            return []
+        store = self._store = self._store or ResultStore.in_lines(self.folder / "results.jsonl")
         keys = [content_key(trial, self.folders) for trial in trials]
         wanted: dict[str, Trial] = {}
         for key, trial in zip(keys, trials):
-            if key not in self.known and not self._load(key):
+            if store.find(key) is None:
                 wanted[key] = trial
         total, done, began = len(wanted), 0, time.monotonic()
         if total:
             self.say(f"{name}: {total} trials to run, {len(set(keys)) - total} known")
         for task, results in self._results(wanted):
             for key, result in zip(task, results):
-                self.known[key] = result
-                self._path(key).parent.mkdir(parents=True, exist_ok=True)
-                write_json(self._path(key), {"trial": wanted[key].mapping(), "result": result})
+                store.put(key, result={"trial": wanted[key].mapping(), "result": result})
             done += len(task)
             spent = time.monotonic() - began
             left = spent / done * (total - done)
             self.say(f"{name}: {done}/{total} trials, {spent:.0f} s, {left:.0f} s left")
-        return [self.known[key] for key in keys]
+        return [store.results[key]["result"] for key in keys]
 
     def _results(self, wanted: dict[str, Trial]) -> Iterator[tuple[list[str], list[Row]]]:
         """Each task's keys and results, as they come."""
@@ -106,7 +108,7 @@ class Engine:
     ) -> Iterator[tuple[list[str], list[Row]]]:
         # Fresh processes: forking one that has threads of kernels in it would hang.
         jobs = min(self.jobs, len(tasks))
-        pool = ProcessPoolExecutor(jobs, get_context("spawn"), begin, (_threads_each(jobs),))
+        pool = ProcessPoolExecutor(jobs, get_context("spawn"), init_worker, (_threads_each(jobs),))
         try:
             running: dict[Future[list[Row]], list[str]] = {
                 pool.submit(run_task, mappings, self.folders): task for task, mappings in zip(tasks, sent)
@@ -144,18 +146,6 @@ class Engine:
                 ray.cancel(reference, force=True)
             raise
 
-    def _path(self, key: str) -> Path:
-        return self.folder / key[:2] / f"{key}.json"
-
-    def _load(self, key: str) -> bool:
-        """Take a kept result; a torn or foreign file counts as none."""
-        try:
-            found = json.loads(self._path(key).read_text())["result"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return False
-        self.known[key] = found
-        return True
-
 
 def content_key(trial: Trial, folders: Folders) -> str:
     """What a result is kept under: the trial, the source that computes it, the data it reads."""
@@ -168,7 +158,7 @@ def content_key(trial: Trial, folders: Folders) -> str:
         "data": _data_digest(folders.data, scenario.source.get("data")),
         "lpips": _weights_digest(folders.lpips) if trial.lpips else None,
     }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:40]
+    return key_of(parts, 40)
 
 
 @cache

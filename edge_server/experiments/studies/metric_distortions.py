@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.drawing import draw_pictures
 from edge_server.experiments.studies.statistics import interval, negated, paired
 from edge_server.experiments.studies.study import Ask, Point, Table, Verdict, by_bool, tell
@@ -88,11 +89,12 @@ class Metrics:
                 pictures = [("reference", reference), *distortions(reference).items()]
         shown = [(label, (image * 255).astype(np.uint8)) for label, image in pictures]
         draw_pictures(ask.out / "metrics.png", [("room", shown)])
-        lines = ["case,psnr_db,ssim,lpips,seeds"]
+        rows = []
         for case, found in scores.items():
-            means = [tell(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips")]
-            lines.append(f"{case},{','.join(means)},{len(found['psnr'])}")
-        (ask.out / "metrics.csv").write_text("\n".join(lines) + "\n")
+            psnr_db, ssim_, lpips_ = (tell(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips"))
+            rows.append({"case": case, "psnr_db": psnr_db, "ssim": ssim_, "lpips": lpips_,
+                         "seeds": len(found["psnr"])})  # fmt: skip
+        write_csv(ask.out / "metrics.csv", rows)
         verdicts = [
             self._ordering(scores, "ssim", "lowest for the brightness shift", "brightness shift", True),
             self._ordering(scores, "ssim", "highest for ghosting, against the prose",

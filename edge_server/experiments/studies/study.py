@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from edge_server.experiments.common.tables import number as tell
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.statistics import Interval, interval, paired
 from edge_server.experiments.studies.trial import Folders, Row, Trial
@@ -124,13 +124,6 @@ class Table:
         """The label's values in order of appearance."""
         return list(dict.fromkeys(row[label] for row in self.rows if row.get(label) is not None))
 
-    def write_csv(self, path: Path) -> None:
-        names = list(dict.fromkeys(name for row in self.rows for name in row))
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, names, restval="")
-            writer.writeheader()
-            writer.writerows(self.rows)
-
 
 class Study(Protocol):
     """One study. name: of the command. title: one line for people."""
@@ -151,7 +144,7 @@ def run_study(study: Study, ask: Ask, engine: Engine) -> list[Verdict]:
     points = study.points(ask)
     table = Table(points, engine.run([p.trial for p in points], study.name))
     if table.rows:
-        table.write_csv(ask.out / f"{study.name}.csv")
+        write_csv(ask.out / f"{study.name}.csv", table.rows)
     verdicts = study.report(ask, table)
     text = "\n".join(["# " + study.title, "", *(f"- {v.line()}" for v in verdicts), ""])
     write_text(ask.out / f"{study.name}.md", text)
@@ -177,10 +170,6 @@ def to_win(table: Table, metric: str, **labels: Any) -> str:
 def mean_curve(curve: Curve) -> tuple[list[float], list[Interval]]:
     """Points and intervals of a curve, as a plot takes them."""
     return list(curve), [interval(list(values.values())) for values in curve.values()]
-
-
-def tell(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def by_bool(answer: bool | None) -> str:

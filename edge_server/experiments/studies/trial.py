@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from camera_node.capture import Camera
 from camera_node.config import source_config
 from edge_server.config import read_config
-from edge_server.experiments.virtual.from_scenario import deploy, training_cameras, truth_of
-from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, Truth, VirtualDeployment
+from edge_server.experiments.virtual.from_scenario import build_deployment, build_truth, training_cameras
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.live.state import Publication
@@ -103,9 +103,9 @@ class Trial:
         }  # fmt: skip
         return parse(data, Path(f"study {self.scene}"))
 
-    def terms(self) -> Terms:
+    def terms(self) -> RunSettings:
         first_ms = self.first_ms
-        return Terms(
+        return RunSettings(
             steps=self.steps,
             first_steps=self.first_steps,
             compute=Compute(**self.compute),
@@ -179,7 +179,7 @@ def picture(trial: Trial, folders: Folders) -> tuple[NDArray[np.uint8], NDArray[
 def _deploy(trial: Trial, folders: Folders, on_published: Any) -> VirtualDeployment:
     scenario = trial.scenario()
     stage = _stage(json.dumps(trial.stage), trial, folders)
-    deployment = deploy(
+    deployment = build_deployment(
         scenario, trial.terms(), field=_field(trial), cameras=stage.cameras, data=folders.data,
         on_published=on_published, truth=stage.truth,
     )  # fmt: skip
@@ -225,7 +225,7 @@ def _stage(key: str, trial: Trial, folders: Folders) -> Stage:
         scenario = trial.scenario()
         lpips = open_lpips(folders.lpips)[0] if trial.lpips else None
         edge = read_config(scenario)
-        truth = truth_of(scenario, source_config(scenario), edge, Scorer(lpips), folders.data)
+        truth = build_truth(scenario, source_config(scenario), edge, Scorer(lpips), folders.data)
         _STAGES[at] = Stage(training_cameras(scenario, folders.data), truth and KnownTruth(truth))
     return _STAGES[at]
 

@@ -14,7 +14,7 @@ from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from channel_emu.model.config import channel_from_mapping
 from edge_server.config import EdgeConfig, read_config
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Terms, Truth, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
 from edge_server.live.field_updater import open_updater
@@ -26,9 +26,9 @@ from freshfield.scenario import Scenario, ScenarioError
 _CACHE_BYTES = 512 * 2**20
 
 
-def deploy(
+def build_deployment(
     scenario: Scenario,
-    terms: Terms,
+    settings: RunSettings,
     *,
     field: Field | None = None,
     scorer: Scorer | None = None,
@@ -39,9 +39,14 @@ def deploy(
 ) -> VirtualDeployment:
     """``scenario`` in virtual time, from its seed.
 
-    field: one to go on with; None makes the scenario's. scorer: None scores without LPIPS. cameras: of
-    ``training_cameras``, when several runs share what was rendered. data: folder of recorded data sets.
-    truth: of ``truth_of``, when several runs share it.
+    settings: how it runs.
+    field: one to go on with; None makes the scenario's.
+    scorer: None scores without LPIPS.
+    cameras: of ``training_cameras``, where several runs share what was rendered.
+    data: folder of recorded data sets.
+    on_published: called with each publication.
+    truth: of ``build_truth``, where several runs share it.
+
     Raises ScenarioError or DatasetError.
     """
     edge = read_config(scenario)
@@ -56,16 +61,16 @@ def deploy(
         cameras or training_cameras(scenario, data),
         channel,
         open_updater(scenario, edge, policy, field, start_ns=0),
-        terms,
+        settings,
         scenario.seed,
-        truth or truth_of(scenario, source, edge, scorer or Scorer(), data),
+        truth or build_truth(scenario, source, edge, scorer or Scorer(), data),
         on_published,
     )
 
 
 def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camera]:
-    """The training cameras as a node would host them. Raises ScenarioError for real cameras, and for ones
-    that an arm carries: those keep real time."""
+    """The training cameras as a node would host them. ScenarioError for real cameras and for cameras on an
+    arm, which run in real time only."""
     source = source_config(scenario)
     if isinstance(source, LiveConfig) or getattr(source, "arm", None) is not None:
         raise ScenarioError(
@@ -75,7 +80,7 @@ def training_cameras(scenario: Scenario, data: Path | None = None) -> list[Camer
     return build_cameras(scenario, source, scenario.training, data, _CACHE_BYTES)
 
 
-def truth_of(
+def build_truth(
     scenario: Scenario, source: SourceConfig, edge: EdgeConfig, scorer: Scorer, data: Path | None = None
 ) -> Truth | None:
     """The exact scene where the world is synthetic, else the held-out captures; None where nothing is."""
@@ -97,9 +102,11 @@ def truth_of(
 
 
 def exact_scene(scenario: Scenario, source: WorldConfig) -> tuple[Scene, Effects]:
-    """The world as the held-out cameras see it, and the effects that are listed to be in the truth: those of
-    the kinds lens and exposure are the caller's to apply. Noise and wrong poses belong to captured frames, of
-    which an exact truth has none."""
+    """The world as the held-out cameras see it, and the effects that the scenario lists as part of the truth.
+
+    The caller applies effects of the kinds lens and exposure. Noise and wrong poses belong to captured
+    frames; an exact truth has none.
+    """
     try:
         scene = make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
     except ValueError as error:

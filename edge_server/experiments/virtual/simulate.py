@@ -17,8 +17,9 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import ComputeConfig, PolicyConfig, embedding_for, read_config
-from edge_server.experiments.virtual.from_scenario import deploy
-from edge_server.experiments.virtual.virtual_deployment import Terms, VirtualDeployment
+from edge_server.experiments.common.tables import mean_or_none, number
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.virtual_deployment import RunSettings, VirtualDeployment
 from edge_server.fidelity.lpips_weights import Network, open_lpips, weights_folder
 from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.live.output.decision_log import DecisionLog
@@ -42,7 +43,7 @@ one result: the digest that is printed is of every publication and of the field'
 """
 _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "perceptual", "aaoi_ms")
 # Seconds of virtual time between two lines of progress.
-_TOLD_EVERY_S = 1.0
+_PROGRESS_EVERY_S = 1.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         scenario = _scenario(args)
         config = read_config(scenario)
-        terms = Terms(
+        settings = RunSettings(
             steps=config.steps if args.steps is None else args.steps,
             first_steps=args.first_steps,
             compute=config.compute,
@@ -71,12 +72,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             if decisions is not None:
                 decisions.record(deployment.updates.policy, publication.number)
 
-        deployment = deploy(scenario, terms, scorer=scorer, data=base, on_published=published)
+        deployment = build_deployment(scenario, settings, scorer=scorer, data=base, on_published=published)
         if args.out is not None:
             decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
         if config.deadline_ms is not None:
             print(
-                f"  edge.deadline_ms: virtual time counts steps; an update is {terms.steps} of them, with "
+                f"  edge.deadline_ms: virtual time counts steps; an update is {settings.steps} of them, with "
                 "the field's options as they stand",
                 file=sys.stderr,
             )
@@ -86,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server simulate: {error}", file=sys.stderr)
         return 2
-    found = summary(scenario, terms, deployment, args.seconds)
+    found = summary(scenario, settings, deployment, args.seconds)
     if missing:
         found["lpips_missing"] = missing
     if args.out is not None:
@@ -96,9 +97,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def summary(
-    scenario: Scenario, terms: Terms, deployment: VirtualDeployment, seconds: float
+    scenario: Scenario, settings: RunSettings, deployment: VirtualDeployment, seconds: float
 ) -> dict[str, Any]:
-    """What a run came to: books, means over its last fifth, and the digest that tells runs apart."""
+    """A run's frame counts, means over its last fifth, and the digest that tells runs apart."""
     publications = deployment.publications
     late = [p for p in publications if p.t_s >= 0.8 * seconds]
     return {
@@ -107,13 +108,13 @@ def summary(
         "seconds": seconds,
         "policy": deployment.updates.policy.name,
         "value": deployment.updates.policy.value,
-        "steps": terms.steps,
-        "compute": dataclasses.asdict(terms.compute),
+        "steps": settings.steps,
+        "compute": dataclasses.asdict(settings.compute),
         "updates": len(publications),
         "frames": deployment.frames(),
-        "last_fifth": {name: _mean([getattr(p, name) for p in late]) for name in _METRICS},
-        "views": _mean([float(len(p.selected)) for p in publications]),
-        "update_ms": _mean([p.update_ms for p in publications]),
+        "last_fifth": {name: mean_or_none([getattr(p, name) for p in late]) for name in _METRICS},
+        "views": mean_or_none([float(len(p.selected)) for p in publications]),
+        "update_ms": mean_or_none([p.update_ms for p in publications]),
         "treated_ms_per_view": deployment.updates.treatment_cost.ms_per_view,
         "digest": digest(deployment),
         "versions": versions(),
@@ -143,15 +144,17 @@ def show(found: dict[str, Any]) -> str:
     value = "" if found["value"] is None else f" {found['value']:g}"
     cost = found["compute"]
     charged = f"{cost['ms_per_step']:g} ms a step, {cost['ms_per_update']:g} ms an update"
-    told = charged if any(cost.values()) else "free of charge"
+    cost_text = charged if any(cost.values()) else "free of charge"
     lines = [
         f"{found['scenario']}, seed {found['seed']}, {found['seconds']:g} s of virtual time, "
         f"{found['policy']}{value}",
-        f"  updates     {found['updates']} of {found['steps']} steps, {told}",
-        f"  views       {_n(found['views'], 1)} an update",
+        f"  updates     {found['updates']} of {found['steps']} steps, {cost_text}",
+        f"  views       {number(found['views'], 1)} an update",
         "  last fifth  "
         + ", ".join(
-            f"{k} {_n(v, 3)}" for k, v in found["last_fifth"].items() if k != "perceptual" or v is not None
+            f"{k} {number(v, 3)}"
+            for k, v in found["last_fifth"].items()
+            if k != "perceptual" or v is not None
         ),
         "  frames      " + ", ".join(f"{k} {v}" for k, v in found["frames"].items() if v),
         f"  digest      {found['digest'][:32]}",
@@ -162,15 +165,15 @@ def show(found: dict[str, Any]) -> str:
 def _run(deployment: VirtualDeployment, seconds: float, quiet: bool) -> None:
     began, done_s = time.monotonic(), 0.0
     while done_s < seconds:
-        step_s = min(_TOLD_EVERY_S, seconds - done_s)
+        step_s = min(_PROGRESS_EVERY_S, seconds - done_s)
         deployment.run(step_s)
         done_s += step_s
         if not quiet:
             spent = time.monotonic() - began
             left = spent / done_s * (seconds - done_s)
             found = deployment.publications
-            told = f", PSNR {_n(found[-1].psnr_db, 2)}" if found else ""
-            print(f"  {done_s:g} of {seconds:g} s: {len(found)} updates{told}; {left:.0f} s left", flush=True)
+            psnr = f", PSNR {number(found[-1].psnr_db, 2)}" if found else ""
+            print(f"  {done_s:g} of {seconds:g} s: {len(found)} updates{psnr}; {left:.0f} s left", flush=True)
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
@@ -213,31 +216,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--steps", type=int, metavar="N", help="of an update [edge.steps of the scenario, else 100]")
     add("--first-steps", type=int, default=0, metavar="N", help="of the first update [as the others]")
     add("--compute", metavar="zero|MS:MS", help="ms a step and ms an update [edge.compute, else zero]")
-    add(
-        "--epoch-ms",
-        type=float,
-        default=250.0,
-        metavar="MS",
-        help="between two decisions [%(default)g]",
-    )
+    add("--epoch-ms", type=float, default=250.0, metavar="MS", help="between two decisions [%(default)g]")
     add("--score-every-ms", type=float, default=250.0, metavar="MS", help="[%(default)g]")
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add(
-        "--lpips",
-        type=Path,
-        metavar="DIR",
-        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]",
-    )
+    add("--lpips", type=Path, metavar="DIR",
+        help="LPIPS weights [$FRESHFIELD_LPIPS, or lpips/ below the data]")  # fmt: skip
     add("--out", type=Path, metavar="DIR",
         help="write simulation.json and series.jsonl there, and what a learnt policy decided")  # fmt: skip
     add("--json", action="store_true", help="everything, as one JSON object")
     return parser
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None
-
-
-def _n(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -16,16 +16,17 @@ from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from freshfield import payload
 from freshfield.geometry import Pinhole
 
-_NOISE_FRAMES = 8
+NOISE_FRAMES = 8  # that the noise of a camera is estimated from
 # Image uint8 (H, W, 3), intrinsics, camera-to-world (4, 4).
 Seen = tuple[NDArray[np.uint8], Pinhole, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class ExactTruth:
-    """A synthetic scene rendered at the very instant: no truth is older or younger than the present.
+    """A synthetic scene rendered at the very instant: the truth is never older or younger than the present.
 
-    cameras: held-out ones, (intrinsics, camera-to-world). image: (camera, seconds) -> uint8 (H, W, 3).
+    cameras: held-out camera -> (intrinsics, camera-to-world).
+    image: (camera, seconds) -> uint8 (H, W, 3).
     """
 
     scorer: Scorer
@@ -37,8 +38,8 @@ class ExactTruth:
         return self.image(camera, present_ns / 1e9), *self.cameras[camera]
 
     def score(self, field: Any, present_ns: int) -> Score:
-        """Mean score over the held-out cameras; moving pixels by what the scene looked like before, which
-        an analytic scene tells of the time before it was looked at, too."""
+        """Mean score over the held-out cameras. Moving pixels come from the scene at earlier instants, which
+        an analytic scene has before the first frame, too."""
         lags_ns = [round(lag * 1e6) for lag in LAGS_MS]
         scores = []
         for camera, (intrinsics, pose) in self.cameras.items():
@@ -50,13 +51,18 @@ class ExactTruth:
 
 
 class CapturedTruth:
-    """Held-out cameras whose captures are the truth: the one nearest to the present, at most half a period
-    away. noisy: real video, so that the bound of moving pixels follows its noise."""
+    """The captures of held-out cameras: the one nearest to the present, at most half a period away.
+
+    noisy: real video, so that the bound of moving pixels follows its noise.
+    """
 
     def __init__(self, scorer: Scorer, cameras: Sequence[Camera], noisy: bool = False) -> None:
         self._scorer = scorer
         self._cameras = tuple(cameras)
-        self._bounds = {c.name: _noise_bound(c) if noisy else BOUND for c in cameras}
+        self._bounds = {
+            c.name: noise_bound(_image(c, c.capture(k)) for k in range(NOISE_FRAMES)) if noisy else BOUND
+            for c in cameras
+        }
 
     def view(self, camera: str, present_ns: int) -> Seen:
         """What a held-out camera captured nearest to an instant, its lens and its camera-to-world pose."""
@@ -97,9 +103,10 @@ def _image(camera: Camera, shot: EncodedShot) -> NDArray[np.uint8]:
     return payload.decode(shot.payload, camera.codec, shot.intrinsics.width, shot.intrinsics.height)
 
 
-def _noise_bound(camera: Camera) -> float:
+def noise_bound(images: Iterable[NDArray[np.uint8]]) -> float:
+    """By how much a pixel of real video differs at least where something moves: consecutive images of one
+    camera tell its noise."""
     estimate = NoiseEstimate()
-    images = [_image(camera, camera.capture(k)) for k in range(_NOISE_FRAMES)]
     for a, b in pairwise(images):
         estimate.add(a, b)
     return estimate.bound

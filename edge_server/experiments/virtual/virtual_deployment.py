@@ -5,7 +5,7 @@ bit for bit, faults included. What an update costs is charged as ``Compute`` say
 at which the charge is over.
 
 Pay late holds here too: a frame is captured, encoded and checksummed only when an update uses it or a fault
-damages it. Nobody can tell the difference, because until then nobody looks inside.
+damages it. That changes no result, because nothing reads a frame before.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from freshfield.frame import Frame, FrameRejected, from_request, to_request
 from freshfield.geometry import Pose
 
 SESSION = "virtual"
-# Where a camera looks is part of what a capture tells; nobody asks before the frame is used.
+# The pose comes with the capture; nothing reads it before the frame is used.
 _NO_POSE = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
@@ -42,14 +42,14 @@ Compute = ComputeConfig
 _FREE = Compute()
 
 
-class Wake(NamedTuple):
-    """When the edge goes on: at an instant, or at the next arrival where it waits for one."""
+class WakeCondition(NamedTuple):
+    """When the edge's loop continues: at an instant, or at the next arrival if that is earlier."""
 
     at_ns: int = NEVER_NS
     on_arrival: bool = False
 
 
-_AT_ARRIVAL = Wake(on_arrival=True)
+_AT_ARRIVAL = WakeCondition(on_arrival=True)
 
 
 class Truth(Protocol):
@@ -63,13 +63,19 @@ class Truth(Protocol):
 
 
 @dataclass(frozen=True)
-class Terms:
-    """How a deployment runs. steps: the optimiser's, of one update. first_steps: of the first update (0: as
-    the others). epoch_ms: least time between two decisions. grace_ms: how long the first update waits for
-    cameras that have not reported. score_every_ms: publications nearer than this to the last scored one are
-    not scored; None scores nothing. first_ms: no decision before this instant of the run, and from it on only
-    at whole numbers of epochs after it, so that policies that take different times decide at the same
-    instants. scratch: every update begins with a field that knows nothing, as in the thesis."""
+class RunSettings:
+    """How a deployment runs in virtual time.
+
+    steps: optimizer steps of an update.
+    first_steps: of the first update (0: as the others).
+    compute: what an update is charged.
+    epoch_ms: least time between two decisions.
+    grace_ms: how long the first update waits for cameras that have not reported.
+    score_every_ms: publications nearer than this to the last scored one are not scored; None scores nothing.
+    first_ms: no decision before this instant of the run, and later ones only at whole numbers of epochs after
+        it, so that policies that take different times decide at the same instants.
+    scratch: every update begins with a field that knows nothing, as in the thesis.
+    """
 
     steps: int
     first_steps: int = 0
@@ -103,8 +109,13 @@ class Terms:
 class VirtualDeployment:
     """Runs ``updates`` on what ``cameras`` send over the channel. ``run`` may be called again to go on.
 
-    cameras: the training cameras, as a node would host them; their names are the buffer's. seed: of the
-    channel. truth: what publications are scored against. on_published: called with each publication.
+    cameras: the training cameras, as a node would host them; their names are the buffer's.
+    channel: its model.
+    updates: the edge: buffer, policy and field.
+    settings: how it runs.
+    seed: of the channel.
+    truth: what publications are scored against.
+    on_published: called with each publication.
     """
 
     def __init__(
@@ -112,15 +123,15 @@ class VirtualDeployment:
         cameras: Sequence[Camera],
         channel: ChannelConfig,
         updates: FieldUpdater,
-        terms: Terms,
+        settings: RunSettings,
         seed: int,
         truth: Truth | None = None,
         on_published: Callable[[Publication], None] | None = None,
     ) -> None:
         self.clock = VirtualClock(updates.start_ns)
         self.updates = updates
-        updates.materialize = self.exposed
-        self.terms = terms
+        updates.materialize = self.with_images
+        self.settings = settings
         self.truth = truth
         self.publications: list[Publication] = []
         self.captured: Counter[str] = Counter()
@@ -141,7 +152,7 @@ class VirtualDeployment:
         self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
         self._tick = dict.fromkeys(self._cameras, 0)
         self._used: dict[str, tuple[Frame, ...]] = {}
-        """The last two frames of each camera that were made: one that is used again is the same object."""
+        """The last two frames of each camera that have images."""
         self._scored_ns: int | None = None
         self.decided_ns = updates.start_ns
         """Instant of the decision that is being carried out, or was last."""
@@ -159,7 +170,7 @@ class VirtualDeployment:
             if now_ns > end_ns:
                 break
             self.clock.advance_to(now_ns)
-            # What completes on a boundary makes room for what is offered there, and a decision sees both.
+            # At one instant links complete first, which makes room for captures; a decision sees both.
             if due_ns == now_ns:
                 for link in self._links.values():
                     self._take(link.advance(now_ns - self._origin_ns))
@@ -172,13 +183,27 @@ class VirtualDeployment:
         self.clock.advance_to(end_ns)
         return self.publications[known:]
 
-    def exposed(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
+    def with_images(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
         """Frames of the buffer with their images and poses, made now; without those that a source cannot
-        give. For who decides in the place of this deployment's own edge."""
-        return self._exposed_once(items)
+        give. A frame that is used again stays the same object and is decoded once. Public for those who
+        decide in the place of this deployment's own edge."""
+        made = []
+        for item in items:
+            camera, sequence = item.frame.camera, item.frame.sequence
+            known = self._used.get(camera, ())
+            used = next((frame for frame in known if frame.sequence == sequence), None)
+            if used is None:
+                try:
+                    used = self._with_image(item.frame)
+                except ValueError:
+                    self.failed[camera] += 1
+                    continue
+                self._used[camera] = (used, *known)[:2]
+            made.append(BufferedFrame(used, item.generated_ns, item.received_ns))
+        return tuple(made)
 
     def frames(self) -> dict[str, Any]:
-        """The books, with the terms of report.json; every captured frame is offered at once here."""
+        """Frame counts with the names of report.json; here every captured frame is offered at once."""
         sent = sum(self.captured.values())
         ends = {
             kind.value: sum(link.counts[kind] for link in self._links.values())
@@ -216,7 +241,7 @@ class VirtualDeployment:
             # A clock exchange that takes no time knows the offset exactly.
             clock_offset_ns=now_ns - stamped_ns,
         )
-        size = len(self._exposed(frame).payload) if self._weigh else 0
+        size = len(self._with_image(frame).payload) if self._weigh else 0
         self.captured[name] += 1
         self._take(self._links[name].offer(now_ns - self._origin_ns, frame, size)[1])
 
@@ -226,7 +251,7 @@ class VirtualDeployment:
                 self._deliver(event.transit.item, event.transit.flips)
 
     def _flush(self, now_ns: int) -> None:
-        """Break off what is on its way (thesis 6.5: none of it is considered to be in transit)."""
+        """Abort transmissions (thesis 6.5: nothing is considered to be in transit)."""
         for link in self._links.values():
             self._take(link.flush(now_ns - self._origin_ns))
 
@@ -238,7 +263,7 @@ class VirtualDeployment:
                     damage,  # loaded only where a scenario lists it
                 )
 
-                request = to_request(self._exposed(frame))
+                request = to_request(self._with_image(frame))
                 request.payload = damage(request.payload, flips)
                 frame = from_request(request)
             self._admission.admit(frame, now_ns)
@@ -248,9 +273,9 @@ class VirtualDeployment:
         self.delivered[frame.camera] += 1
         self.updates.buffer.put(frame, now_ns)
         if self._wake.on_arrival:
-            self._wake = Wake(now_ns)
+            self._wake = WakeCondition(now_ns)
 
-    def _exposed(self, frame: Frame) -> Frame:
+    def _with_image(self, frame: Frame) -> Frame:
         """The frame with its image and pose, made now."""
         shot = self._cameras[frame.camera].capture(frame.sequence)
         return dataclasses.replace(
@@ -263,14 +288,14 @@ class VirtualDeployment:
 
     # --- the edge -------------------------------------------------------------------------------------
 
-    def _run_edge(self) -> Iterator[Wake]:
-        """The edge's loop, which says after each step when it wants to go on."""
-        updates, terms = self.updates, self.terms
-        steps = terms.first_steps or terms.steps
-        if terms.first_ms is None:
+    def _run_edge(self) -> Iterator[WakeCondition]:
+        """The edge's loop; it yields when it wants to go on."""
+        updates, settings = self.updates, self.settings
+        steps = settings.first_steps or settings.steps
+        if settings.first_ms is None:
             yield from self._await_cameras()
-        else:  # whoever has reported by then: the instants are given
-            yield Wake(self._origin_ns + round(terms.first_ms * 1e6))
+        else:  # with the cameras that have reported by then: the instants are given
+            yield WakeCondition(self._origin_ns + round(settings.first_ms * 1e6))
         while True:
             decided_ns = self.decided_ns = self.clock.now_ns()
             plan = updates.plan(decided_ns)
@@ -278,57 +303,40 @@ class VirtualDeployment:
                 self._flush(decided_ns)
             while (selection := updates.select(plan, self.clock.now_ns())) is None:
                 waits = plan.wait_until_ns > self.clock.now_ns()
-                yield Wake(plan.wait_until_ns) if waits else _AT_ARRIVAL
-            if terms.scratch:
+                yield WakeCondition(plan.wait_until_ns) if waits else _AT_ARRIVAL
+            if settings.scratch:
                 updates.field.reset()
             treated = len(selection.items) if updates.policy.treatment is not None else 0
-            publishes_ns = self.clock.now_ns() + terms.compute.charge_ns(steps, treated)
-            fitted = updates.fit(self._exposed_all(selection), Budget(steps=steps), publishes_ns)
+            publishes_ns = self.clock.now_ns() + settings.compute.charge_ns(steps, treated)
+            fitted = updates.fit(self._selection_with_images(selection), Budget(steps=steps), publishes_ns)
             if fitted is None:
                 yield _AT_ARRIVAL  # every selected frame is damaged: newer ones will come
                 continue
             views, report = fitted
-            steps = terms.steps
-            yield Wake(self.clock.now_ns() + terms.compute.charge_ns(report.steps, treated))
+            steps = settings.steps
+            yield WakeCondition(self.clock.now_ns() + settings.compute.charge_ns(report.steps, treated))
             published_ns = self.clock.now_ns()
             self._publish(updates.publication(selection, views, report, published_ns))
-            next_ns = terms.next_ns(decided_ns, published_ns, self._origin_ns)
+            next_ns = settings.next_ns(decided_ns, published_ns, self._origin_ns)
             if next_ns > published_ns:
-                yield Wake(next_ns)
+                yield WakeCondition(next_ns)
             elif published_ns == decided_ns:
                 yield _AT_ARRIVAL  # free updates without epochs: once for every arrival, not for ever
 
-    def _await_cameras(self) -> Iterator[Wake]:
-        """As the live loop: give every camera a chance to report."""
+    def _await_cameras(self) -> Iterator[WakeCondition]:
+        """Give every camera a chance to report, as the live loop does."""
         buffer = self.updates.buffer
         while not buffer.newest():
             yield _AT_ARRIVAL
-        until_ns = self.clock.now_ns() + round(self.terms.grace_ms * 1e6)
+        until_ns = self.clock.now_ns() + round(self.settings.grace_ms * 1e6)
         while len(buffer.newest()) < len(self._cameras) and self.clock.now_ns() < until_ns:
-            yield Wake(until_ns, on_arrival=True)
+            yield WakeCondition(until_ns, on_arrival=True)
 
-    def _exposed_all(self, selection: Selection) -> Selection:
+    def _selection_with_images(self, selection: Selection) -> Selection:
         """The selection with images."""
-        earlier = self._exposed_once(selection.earlier)  # first: what a camera made last is kept longest
-        return dataclasses.replace(selection, items=self._exposed_once(selection.items), earlier=earlier)
-
-    def _exposed_once(self, items: Sequence[BufferedFrame]) -> tuple[BufferedFrame, ...]:
-        """With images, those that a source could give. A frame used again stays the same object: it is
-        decoded once."""
-        made = []
-        for item in items:
-            camera, sequence = item.frame.camera, item.frame.sequence
-            known = self._used.get(camera, ())
-            used = next((frame for frame in known if frame.sequence == sequence), None)
-            if used is None:
-                try:
-                    used = self._exposed(item.frame)
-                except ValueError:
-                    self.failed[camera] += 1
-                    continue
-                self._used[camera] = (used, *known)[:2]
-            made.append(BufferedFrame(used, item.generated_ns, item.received_ns))
-        return tuple(made)
+        # Earlier ones first: of a camera's frames the one made last is kept longest.
+        earlier = self.with_images(selection.earlier)
+        return dataclasses.replace(selection, items=self.with_images(selection.items), earlier=earlier)
 
     def _publish(self, publication: Publication) -> None:
         publication = self._with_score(publication)
@@ -337,7 +345,7 @@ class VirtualDeployment:
             self._on_published(publication)
 
     def _with_score(self, publication: Publication) -> Publication:
-        every_ms, present_ns = self.terms.score_every_ms, publication.published_ns
+        every_ms, present_ns = self.settings.score_every_ms, publication.published_ns
         if self.truth is None or every_ms is None:
             return publication
         if self._scored_ns is not None and present_ns - self._scored_ns < every_ms * 1e6:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export.run_source import open_source, poses_of
 from edge_server.fields import Budget, checkpoint
 from edge_server.fields.registry import field_names, make_field
@@ -25,7 +25,7 @@ def saved(folder, name: str, steps: int = 30):
     """A checkpoint of a field that has learnt ``tile`` a little, as a run leaves it."""
     options = OPTIONS.get(name, SMALL)
     field = make_field(name, options, seed=3)
-    field.fit(synthetic("tile", cameras=9, size=32).training, Budget(steps=steps))
+    field.fit(synthetic_still("tile", cameras=9, size=32).training, Budget(steps=steps))
     checkpoint.save(folder / "field.npz", field.state(), {"field": name, "options": {}, "seed": 3})
     return field
 
@@ -78,7 +78,7 @@ def test_a_mesh_of_a_known_scene_is_measured_against_it(run, tmp_path, capsys):
 
 def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    from edge_server.experiments.scenes.mesh_truth import measured
+    from edge_server.experiments.scenes.mesh_truth import distances
     from edge_server.experiments.scenes.tile_scan import exact_depth, scan
     from edge_server.surface.depth import depth_map
     from edge_server.surface.reconstruct import MeshSettings, mesh_of_maps
@@ -88,7 +88,7 @@ def test_a_mesh_of_exact_depth_is_measured_as_nearly_exact():
         depth_map(exact_depth(near.scene, v).astype(np.float32), v.image, v.camera_to_world, v.intrinsics)
         for v in near.views
     ]
-    found = measured(mesh_of_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
+    found = distances(mesh_of_maps(maps, MeshSettings(voxel_m=0.004)), "tile", near.views)
     assert found["chamfer_mm"] < 3.0 and found["complete"] > 0.7
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edge_server.config import read_config
-from edge_server.experiments.virtual.from_scenario import deploy
-from edge_server.experiments.virtual.virtual_deployment import Terms
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.virtual_deployment import RunSettings
 from edge_server.foreground import ForegroundConfig, ForegroundError, read_foreground
 from edge_server.foreground.foreground import make_foreground
 from freshfield.scenario import ScenarioError, load, parse
@@ -93,7 +93,9 @@ def test_the_loop_fits_to_cut_views(tmp_path):
         "channel": {"preset": "ch5"},
         "edge": {"field": "voxel", "foreground": {"box": [0.25, 0.25, 0.75, 0.75], "segment": "box"}},
     }
-    deployment = deploy(parse(data, tmp_path / "cut.yaml"), Terms(steps=1, score_every_ms=None))
+    deployment = build_deployment(
+        parse(data, tmp_path / "cut.yaml"), RunSettings(steps=1, score_every_ms=None)
+    )
     deployment.run(0.8)
     decoder = deployment.updates.decoder
     assert deployment.publications and decoder.foreground.counts.masked >= 2

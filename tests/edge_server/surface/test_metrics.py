@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from edge_server.experiments.scenes.tile_scan import exact_depth, scan, truth_of
+from edge_server.experiments.scenes.tile_scan import exact_depth, scan, surface_truth
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import depth_map
 from edge_server.surface.mesh import Mesh
@@ -77,7 +77,7 @@ def test_depth_error_tells_bias_from_spread():
 
 def test_the_truth_is_on_what_the_cameras_see():
     close = scan(24, raster=((-0.1, 0.0, 0.03), (0.1, 0.0, 0.03)))
-    found = truth_of(close, spacing_m=0.004)
+    found = surface_truth(close, spacing_m=0.004)
     assert len(close.views) == 10 and 0.2 < (found.cameras >= 2).mean() <= 1.0
     low, high = close.scene.bounds
     assert ((found.points >= low) & (found.points <= high)).all()

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import RUNS, Lesson, School, Taught, better, room
 from edge_server.experiments.studies.study import Ask, Table, Verdict
 from edge_server.experiments.training.scheduler.choices import choose, named
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
 from edge_server.experiments.training.scheduler.episode import Moment
-from edge_server.experiments.training.scheduler.evaluation import PerSeed, rivals, write_rows
+from edge_server.experiments.training.scheduler.evaluation import PerSeed, rivals
 from edge_server.experiments.training.scheduler.report import smoothed
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
 from edge_server.experiments.training.scheduler.trainer import Course
@@ -107,7 +108,7 @@ class Drift(Taught):
                     for r, run in enumerate(together) for policy, values in run.items()
                     for k, value in enumerate(values)
                 ]  # fmt: skip
-        write_rows(ask.out / f"{self.name}.csv", written)
+        write_csv(ask.out / f"{self.name}.csv", written)
         return found
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
     Learnt,
@@ -30,7 +31,6 @@ from edge_server.experiments.training.scheduler.evaluation import (
     PerSeed,
     rivals,
     rows,
-    write_rows,
 )
 from edge_server.experiments.training.scheduler.report import draw_curve, percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import Setting
@@ -91,7 +91,7 @@ class PpoSelect(Taught):
                 written += rows(same, **labels, judged_from="the same")
                 level = {n: interval(list(same.rewards(n).values())).mean for n in ("random", "learnt-0")}
                 draw_curve(ask.out / f"{learnt[0].lesson.name}.png", learnt[0].rows, level)
-        write_rows(ask.out / f"{self.name}.csv", written)
+        write_csv(ask.out / f"{self.name}.csv", written)
         return verdicts
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.predictability import by_ages
 from edge_server.experiments.studies.learning.setup import (
     School,
@@ -20,7 +21,7 @@ from edge_server.experiments.studies.learning.setup import (
 from edge_server.experiments.studies.statistics import Interval, crossed
 from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
 from edge_server.experiments.training.scheduler.report import percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import seeds
 from edge_server.experiments.training.scheduler.trainer import Course
@@ -71,7 +72,7 @@ class PpoWait(Taught):
                 verdicts += judge(case, channel, contest)
                 verdicts += [foreseen(case, kind, by_ages(contest, kind, moments)) for kind in KINDS]
                 written += rows(contest, channel=channel, age_weight=age, pixels=pixels)
-        write_rows(ask.out / f"{self.name}.csv", written)
+        write_csv(ask.out / f"{self.name}.csv", written)
         return verdicts
 
 

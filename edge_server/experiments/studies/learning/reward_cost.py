@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     Learnt,
     School,
@@ -23,7 +24,7 @@ from edge_server.experiments.studies.learning.workshop import PARTS, priced, wor
 from edge_server.experiments.studies.statistics import crossed
 from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
 from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.trainer import Course, Row, stage_file
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
@@ -56,7 +57,7 @@ class RewardCost(Taught):
             for part in ask.chosen(list(parts), list(parts)):
                 more, verdicts = parts[part](school, ask)
                 written, found = written + more, found + verdicts
-        write_rows(ask.out / f"{self.name}.csv", written)
+        write_csv(ask.out / f"{self.name}.csv", written)
         return found
 
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     School,
     Taught,
@@ -17,7 +18,7 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
 from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.trainer import Course
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -47,7 +48,7 @@ class Weights(Taught):
             contest.reward = reward
             written += rows(contest, judged_by=name)
             found += judge(contest, name, list(rewards))
-        write_rows(ask.out / f"{self.name}.csv", written)
+        write_csv(ask.out / f"{self.name}.csv", written)
         return found
 
 

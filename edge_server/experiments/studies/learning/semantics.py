@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.engine import StudyError
 from edge_server.experiments.studies.learning.setup import (
     School,
@@ -23,7 +24,7 @@ from edge_server.experiments.studies.learning.workshop import PARTS, priced, wor
 from edge_server.experiments.studies.statistics import interval
 from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import RIVALS, Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.evaluation import RIVALS, Contest, rivals, rows
 from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.setting import seeds
 from edge_server.experiments.training.scheduler.trainer import Course
@@ -80,7 +81,7 @@ class Semantics(Taught):
                 if speed:
                     moments = [m for e in school.crew.draw(setting, seeds(0, "test", count)) for m in e]
                     found += why(scene, contest, telling(sight, moments))
-        write_rows(ask.out / f"{self.name}.csv", written)
+        write_csv(ask.out / f"{self.name}.csv", written)
         draw(ask.out / f"{self.name}.png", written)
         return found
 

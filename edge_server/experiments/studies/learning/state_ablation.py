@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
     School,
@@ -18,7 +19,7 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.study import Ask, Table, Verdict
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
 from edge_server.experiments.training.scheduler.trainer import Course
 from edge_server.scheduler.learned.learner_spec import Spec
 
@@ -55,7 +56,7 @@ class Ablation(Taught):
                 **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
             }  # fmt: skip
             contest = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
-        write_rows(ask.out / f"{self.name}.csv", rows(contest))
+        write_csv(ask.out / f"{self.name}.csv", rows(contest))
         return judge(contest, list(variants))
 
 

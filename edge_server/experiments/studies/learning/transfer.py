@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     School,
     Taught,
@@ -17,7 +18,7 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.study import Ask, Table, Verdict
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.training.scheduler.trainer import Course
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -63,7 +64,7 @@ class Transfer(Taught):
                 contest = school.contest(setting, everybody, reward, len(ask.repeats(8, 100)))
                 written += rows(contest, place=place)
                 found += judge(place, contest)
-        write_rows(ask.out / f"{self.name}.csv", written)
+        write_csv(ask.out / f"{self.name}.csv", written)
         return found
 
 

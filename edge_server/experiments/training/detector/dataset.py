@@ -55,8 +55,8 @@ def render(purpose: str, shots: int, side: int, seed: int, folder: Path, workers
 
         with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
             for job, _ in zip(missing, pool.map(_render_shard, missing)):
-                progress.did(1)
-                progress.say(f"{purpose} pictures", f"{job[2] + job[3]} of {shots} worlds", "rendered")
+                progress.advance(1)
+                progress.report(f"{purpose} pictures", f"{job[2] + job[3]} of {shots} worlds", "rendered")
     found = [_load(job[-1]) for job in jobs]
     return joined([part for part in found if part is not None])
 

@@ -93,9 +93,9 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
             shown, truth = (p[first : first + _PART] / 255.0 for p in (pairs[:, 0], pairs[:, 1]))
             x.append(layers.differences(shown, truth))
             y.append(lpips.batch(shown, truth))
-            progress.did(len(shown))
+            progress.advance(len(shown))
             if first // _PART % _TOLD_EVERY == _TOLD_EVERY - 1:
-                progress.say(name, f"{first + len(shown)} of {len(pairs)} pairs", "compared")
+                progress.report(name, f"{first + len(shown)} of {len(pairs)} pairs", "compared")
         return np.concatenate(x), np.concatenate(y)
 
     folder = args.out / "pictures"

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic.scene import SCENES
 from edge_server.experiments.common.progress import Progress
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.registry import make_field
 
@@ -23,7 +23,7 @@ def field_renderings(side: int, seed: int) -> tuple[NDArray[np.uint8], list[str]
     pairs, names = [], []
     progress = Progress(len(SCENES) * sum(STEPS))
     for scene in SCENES:
-        still = synthetic(scene, size=side, t_s=INSTANT_S)
+        still = synthetic_still(scene, size=side, t_s=INSTANT_S)
         views: list[View] = [*still.held_out, *still.training]
         known = [view for k, view in enumerate(views) if k % 3]
         field, steps = make_field(FIELD, {}, seed=seed), 0
@@ -34,6 +34,6 @@ def field_renderings(side: int, seed: int) -> tuple[NDArray[np.uint8], list[str]
                 shown = field.render(view.camera_to_world, view.intrinsics).color
                 pairs.append((np.clip(np.rint(shown * 255.0), 0, 255).astype(np.uint8), view.image))
                 names.append(f"{scene} {steps} steps")
-            progress.did(more)
-        progress.say("field renderings", scene, f"{len(pairs)} pairs")
+            progress.advance(more)
+        progress.report("field renderings", scene, f"{len(pairs)} pairs")
     return np.array(pairs), names

@@ -77,9 +77,9 @@ def train(pictures: Pictures, settings: Settings, checkpoint: Path) -> tuple[Det
         seconds = round(time.perf_counter() - began, 1)
         log.append({"epoch": epoch + 1, "score_loss": score_loss, "box_loss": box_loss, "seconds": seconds})
         _save(checkpoint, settings, model, averaged, optimizer, log)
-        progress.did(1)
+        progress.advance(1)
         told = f"loss {score_loss:.3f} + {box_loss:.3f}"
-        progress.say("training", f"epoch {epoch + 1} of {settings.epochs}", told)
+        progress.report("training", f"epoch {epoch + 1} of {settings.epochs}", told)
     return averaged, log
 
 

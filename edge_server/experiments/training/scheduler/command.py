@@ -13,9 +13,10 @@ from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.config import open_embedder, read_config
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.evaluation import Contest, hold, rivals, write_rows
+from edge_server.experiments.training.scheduler.evaluation import Contest, hold, rivals
 from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
@@ -104,7 +105,7 @@ def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) 
         (args.out / name).unlink(missing_ok=True)
     rows = read_log(args.out)
     spent = sum(row["seconds"] for row in rows)
-    write_rows(args.out / "training.csv", rows)
+    write_csv(args.out / "training.csv", rows)
     print(f"  {course.episodes} episodes; trained for {spent:.0f} s in all", flush=True)
     if not args.test:
         draw_curve(args.out / "training.png", rows)
@@ -127,7 +128,7 @@ def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) 
 def _report(
     out: Path, contest: Contest, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]
 ) -> None:
-    write_rows(out / "contest.csv", rows_of(contest))
+    write_csv(out / "contest.csv", rows_of(contest))
     found = summary(contest, LEARNT, fixed)
     names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
     levels = {label: found["rewards"][name][0] for label, name in names.items()}

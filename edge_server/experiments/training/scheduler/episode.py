@@ -24,9 +24,14 @@ from camera_node.synthetic.effects import NO_EFFECTS
 from edge_server.config import read_config
 from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.setting import GRID_MS, Setting
-from edge_server.experiments.virtual.from_scenario import deploy, exact_scene, training_cameras, truth_of
+from edge_server.experiments.virtual.from_scenario import (
+    build_deployment,
+    build_truth,
+    exact_scene,
+    training_cameras,
+)
 from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Terms, Truth, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import RunSettings, Truth, VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.fields import Budget, Field, View
@@ -217,7 +222,7 @@ class Ground:
     def _stage(self, scenario: Scenario) -> Stage:
         # The truth is of who scores; none of the others that are held out is rendered.
         scoring = replace(scenario, held_out=self.setting.scoring)
-        truth = truth_of(scoring, source_config(scenario), self._edge, self._scorer, self.folders.data)
+        truth = build_truth(scoring, source_config(scenario), self._edge, self._scorer, self.folders.data)
         assert truth is not None  # a setting has a camera held out
         if isinstance(truth, ExactTruth):
             truth = replace(truth, image=_remembered(truth.image, self._period_ns))
@@ -244,9 +249,9 @@ class Episode:
         stage = ground.stage(seed)
         self._truth = stage.truth
         heard = tuple(c for c in scenario.cameras if c not in setting.silent)
-        self._deployment: VirtualDeployment = deploy(
+        self._deployment: VirtualDeployment = build_deployment(
             replace(scenario, cameras=heard),
-            Terms(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
+            RunSettings(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
             field=ground.field(seed),
             cameras=[camera for camera in stage.cameras if camera.name in heard],
             data=ground.folders.data,
@@ -337,7 +342,7 @@ class Episode:
         return Moment(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)
 
     def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[BufferedFrame, ...]:
-        return self._deployment.exposed([self._frames[a.camera, a.sequence] for a in arrivals])
+        return self._deployment.with_images([self._frames[a.camera, a.sequence] for a in arrivals])
 
     def _decoded(self, arrivals: Sequence[Arrival]) -> list[View]:
         """Views in the order given, each decoded once, without those that cannot be."""

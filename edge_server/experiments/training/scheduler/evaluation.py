@@ -6,11 +6,9 @@ differences are paired. The unit that repeats is the episode's seed.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -209,15 +207,6 @@ def rows(contest: Contest, **labels: Any) -> list[dict[str, Any]]:
             row |= {term: contest.term(name, term).mean for term in terms}
         found.append(row)
     return found
-
-
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """A CSV of mappings; what one of them lacks stays empty."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def _by_seed(values: Mapping[At, float | None], nobodys: Container[At] = ()) -> PerSeed:

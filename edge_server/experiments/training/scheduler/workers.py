@@ -7,8 +7,6 @@ decisions are evaluated there. What is known is not evaluated again; with a file
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -17,12 +15,12 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from edge_server.experiments.common.worker import begin
+from edge_server.experiments.common.result_store import ResultStore, content_key
+from edge_server.experiments.common.worker import init_worker
 from edge_server.experiments.studies.engine import source_digest
 from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.episode import Choice, Ground, Moment, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
-from freshfield.files import Lines
 
 Asked = tuple[int, int, Choice]
 """Seed of an episode, number of a decision, what was chosen."""
@@ -63,7 +61,7 @@ def _evaluate(setting: Setting, folders: Folders, asked: Sequence[Asked]) -> lis
 
 def _begin() -> None:
     """In a process of the crew: one thread."""
-    begin(threads=1)
+    init_worker(threads=1)
     import torch
 
     # How many threads share a convolution decides its last bits.
@@ -80,12 +78,16 @@ class Crew:
         """Evaluations that were carried out, not found."""
         self._pools: list[ProcessPoolExecutor] = []
         self._moments: dict[tuple[str, int], tuple[Moment, ...]] = {}
+        self._store = ResultStore() if known is None else ResultStore.in_lines(known)
         self._known: dict[str, Outcome] = {}
         self._cost_ms: dict[str, float] = {}
-        self._lines: Lines | None = None
-        if known is not None:
-            self._read(known)
-            self._lines = Lines(known)
+        for key, found in self._store.results.items():
+            try:
+                cost_ms = float(found["cost_ms"])
+                self._known[key] = Outcome(**{name: v for name, v in found.items() if name != "cost_ms"})
+                self._cost_ms[key] = cost_ms
+            except (ValueError, KeyError, TypeError):
+                continue  # of another version
 
     def __enter__(self) -> Crew:
         return self
@@ -101,9 +103,7 @@ class Crew:
                 for process in list((pool._processes or {}).values()):
                     process.terminate()
             pool.shutdown(wait=not at_once, cancel_futures=at_once)
-        if self._lines is not None:
-            self._lines.close()
-            self._lines = None
+        self._store.close()
 
     def draw(self, setting: Setting, seeds: Sequence[int]) -> list[tuple[Moment, ...]]:
         """The decisions of each episode, in the order of the seeds."""
@@ -135,8 +135,7 @@ class Crew:
             for name, (outcome, cost_ms) in zip(names, found):
                 self._known[name], self._cost_ms[name] = outcome, cost_ms
                 self.evaluated += 1
-                if self._lines is not None:
-                    self._lines.write(json.dumps({"key": name, "cost_ms": cost_ms, **asdict(outcome)}))
+                self._store.put(name, result={"cost_ms": cost_ms, **asdict(outcome)})
             done += len(names)
             if say is not None:
                 say(done, len(wanted))
@@ -181,7 +180,7 @@ class Crew:
     def _key(self, setting: Setting, asked: Asked) -> str:
         seed, number, choice = asked
         parts = [source_digest(), setting.key, self._weights, seed, number, asdict(choice)]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+        return content_key(parts, 32)
 
     @property
     def _weights(self) -> str:
@@ -190,16 +189,3 @@ class Crew:
             if self.folders.lpips is None
             else str(sorted(p.name for p in self.folders.lpips.glob("*.npz")))
         )
-
-    def _read(self, path: Path) -> None:
-        """Take what an earlier run knew; a torn line counts as none."""
-        if not path.exists():
-            return
-        for line in path.read_text().splitlines():
-            try:
-                found = json.loads(line)
-                key, cost_ms = str(found.pop("key")), float(found.pop("cost_ms"))
-                self._known[key] = Outcome(**found)
-                self._cost_ms[key] = cost_ms
-            except (ValueError, KeyError, TypeError):
-                continue

@@ -52,7 +52,7 @@ def test_embed(tmp_path, capsys, monkeypatch):
 @pytest.mark.slow
 def test_field(tmp_path, monkeypatch):
     monkeypatch.delenv("FRESHFIELD_DATA", raising=False)
-    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(1, (0.3, 2.0), (2.0,), 1))
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(1, (0.3, 2.0), (2.0,), 1))
     found = bench("field", tmp_path / "bench.json", "--field", "ngp")
     assert found["start"]["ngp"]["peak_rss_mb"] > 50.0
     for scene in ("tile", "room"):
@@ -82,7 +82,7 @@ def test_the_tables_of_field_hold_what_the_json_holds(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_field, "_curve", lambda name, *rest: asked.append(name) or _curve(name, *rest))
     monkeypatch.setattr(bench_field, "_rates", lambda name, still, repeats: dict(rates))
     monkeypatch.setattr(bench_field, "_start_up", lambda name, quick, folder: dict(starts))
-    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(2, (0.5, 1.0), (), 1))
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
     path = tmp_path / "results" / "field.json"
     found = bench("field", path, "--field", "ngp")
     text = path.with_suffix(".md").read_text()
@@ -124,7 +124,7 @@ def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_field, "_start_up", lambda name, *_: asked.append(f"start {name}") or {})
     monkeypatch.setattr(bench_field, "table", lambda figures: "")
     monkeypatch.setattr(bench_field, "draw", lambda figures, path: None)
-    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(2, (0.5, 1.0), (), 1))
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(2, (0.5, 1.0), (), 1))
     words = ("--resume", "--field", "ngp,voxel")
     bench("field", tmp_path / "bench.json", *words)
     everything = ["start ngp", "start voxel", "ngp", "voxel", "ngp", "voxel"]
@@ -136,7 +136,7 @@ def test_a_row_of_another_default_is_measured_anew(tmp_path, monkeypatch):
     bench("field", tmp_path / "bench.json", *words)
     assert asked == ["start ngp", "ngp", "ngp"]
     asked.clear()
-    monkeypatch.setattr(bench_field, "QUICK", bench_field.Effort(3, (0.5, 1.0), (), 1))
+    monkeypatch.setattr(bench_field, "QUICK", bench_field.Workload(3, (0.5, 1.0), (), 1))
     bench("field", tmp_path / "bench.json", *words)
     assert asked == [name for name in everything if not name.startswith("start")]
 
@@ -182,7 +182,7 @@ def test_limits(tmp_path):
 def test_peers_are_raced_on_recorded_data(tmp_path, monkeypatch):
     monkeypatch.setenv("FRESHFIELD_DATA", str(data_dir("lego_synthetic").parent))
     monkeypatch.setattr(peer, "QUICK_S", 5.0)
-    monkeypatch.setattr(peer, "_SCENES", {"lego": ("lego_synthetic", "8", 8.0)})
+    monkeypatch.setattr(peer, "SCALES", {"lego": 8.0})
     found = bench("peer", tmp_path / "bench.json")
     assert found["lego"]["ngp"]["20_db_s"] < 5.0
     assert found["lego"]["plain_torch"]["20_db_ratio"] > 1.0

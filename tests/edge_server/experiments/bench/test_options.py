@@ -13,37 +13,37 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.experiments.bench import options as bench_options
 from edge_server.experiments.bench.option_ablation import (
-    CHOICES,
     MOVING,
+    OPTIONS,
     SCENES,
-    Choice,
+    Option,
     Scene,
     displaced,
     missing,
     with_gains,
 )
-from edge_server.experiments.bench.options import Effort, label
-from edge_server.experiments.scenes.multiview_sequence import synthetic_film
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.bench.options import Workload, label
+from edge_server.experiments.scenes.multiview_sequence import synthetic_sequence
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields.registry import field_names, make_field
 
-TINY = Effort(1, 3, (0.1,), 2, 2, (0.1,), 4)
+TINY = Workload(1, 3, (0.1,), 2, 2, (0.1,), 4)
 TRIED = (
-    Choice("colour", {"harmonics": 1}, {"harmonics": 4}, ("still",)),
-    Choice("distortion", {"distortion": 0.0}, {"distortion": 0.01}, ("still",)),
-    Choice("sharpness", {"sharpness": 0.0}, {"sharpness": 1.0}, ("still",)),
-    Choice("changed", {"changed_share": 0.0}, {"changed_share": 0.25}, ("room, late",)),
+    Option("colour", {"harmonics": 1}, {"harmonics": 4}, ("still",)),
+    Option("distortion", {"distortion": 0.0}, {"distortion": 0.01}, ("still",)),
+    Option("sharpness", {"sharpness": 0.0}, {"sharpness": 1.0}, ("still",)),
+    Option("changed", {"changed_share": 0.0}, {"changed_share": 0.25}, ("room, late",)),
 )
 
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    film = partial(synthetic_film, "room", 5, 24, speed_m_per_s=1.0)
+    sequence = partial(synthetic_sequence, "room", 5, 24, speed_m_per_s=1.0)
     scenes = {
-        "still": ("small", lambda: Scene(synthetic("tile", 5, 24))),
-        "room, late": ("small, too", lambda: Scene(film=film(), late=2)),
+        "still": ("small", lambda: Scene(synthetic_still("tile", 5, 24))),
+        "room, late": ("small, too", lambda: Scene(sequence=sequence(), late=2)),
     }
-    monkeypatch.setattr(bench_options, "CHOICES", TRIED)
+    monkeypatch.setattr(bench_options, "OPTIONS", TRIED)
     monkeypatch.setattr(bench_options, "SCENES", scenes)
     monkeypatch.setattr(bench_options, "QUICK", TINY)
 
@@ -90,11 +90,11 @@ def test_what_is_known_is_not_measured_again(tmp_path, tiny, monkeypatch):
     path, asked = tmp_path / "bench.json", []
     point = bench_options._point
 
-    def counted(name, make, scene, options, effort):
+    def counted(name, make, scene, options, workload):
         asked.append((scene, dict(options)))
         if len(asked) == 3:
             raise KeyboardInterrupt
-        return point(name, make, scene, options, effort)
+        return point(name, make, scene, options, workload)
 
     monkeypatch.setattr(bench_options, "_point", counted)
     assert bench(path, "--only", "colour", "--only", "distortion") == 130
@@ -119,19 +119,19 @@ def test_an_option_that_does_not_exist_is_refused(tmp_path, tiny, capsys):
     assert "no option is called taste: colour, distortion" in capsys.readouterr().err
 
 
-def test_every_choice_is_one_of_some_representation_and_has_scenes():
-    for choice in CHOICES:
-        assert choice.scenes and set(choice.scenes) <= set(SCENES)
-        assert set(choice.off) == set(choice.on)
+def test_every_option_is_one_of_some_representation_and_has_scenes():
+    for option in OPTIONS:
+        assert option.scenes and set(option.scenes) <= set(SCENES)
+        assert set(option.off) == set(option.on)
         having = []
         for name in field_names():
             try:
-                make_field(name, choice.on), make_field(name, choice.off)
+                make_field(name, option.on), make_field(name, option.off)
                 having.append(name)
             except ValueError:
                 continue
-            assert label(name, choice.on) != label(name, choice.off)
-        assert having, f"no representation has {choice.name}"
+            assert label(name, option.on) != label(name, option.off)
+        assert having, f"no representation has {option.name}"
     assert set(MOVING) <= set(SCENES)
 
 
@@ -145,7 +145,7 @@ def test_scenes_without_their_data_are_left_out(monkeypatch, tmp_path, capsys):
 
 
 def test_gains_and_displaced_poses_are_as_large_as_said():
-    views = synthetic("tile", 13, 16).training
+    views = synthetic_still("tile", 13, 16).training
     bright = with_gains(views, 0.2)
     ratio = np.array([b.image.mean((0, 1)) / v.image.mean((0, 1)) for b, v in zip(bright, views)])
     assert np.exp(np.log(ratio).mean()) == pytest.approx(1.0, abs=0.05)  # clipping takes a little

@@ -8,13 +8,13 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.bench import surface
-from edge_server.experiments.bench.surface import Effort
+from edge_server.experiments.bench.surface import Workload
 
 
 @pytest.mark.slow
 def test_a_small_scan_from_fit_to_table(tmp_path, monkeypatch, capsys):
     pytest.importorskip("skimage", reason="scikit-image is not installed (extra surface)")
-    monkeypatch.setattr(surface, "QUICK", Effort(40, (2.0,), (8.0,), ("splat",)))
+    monkeypatch.setattr(surface, "QUICK", Workload(40, (2.0,), (8.0,), ("splat",)))
     words = ["bench", "surface", "--quick", "--json", str(tmp_path / "s.json")]
     assert edge_server(words) == 0
     found = json.loads((tmp_path / "s.json").read_text())["surface"]

@@ -11,11 +11,11 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.bench import track
-from edge_server.experiments.bench.track import Plan, gaps
+from edge_server.experiments.bench.track import Workload, gaps
 from edge_server.fields import Budget, FitReport, Rendering
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_recording
 
-TINY = Plan(updates=3, samples=2, cameras=5, size=24)
+TINY = Workload(updates=3, samples=2, cameras=5, size=24)
 
 
 class Flat:

@@ -14,10 +14,10 @@ PARENT = """
 import os, time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from edge_server.experiments.common.worker import begin
+from edge_server.experiments.common.worker import init_worker
 
 if __name__ == "__main__":
-    pool = ProcessPoolExecutor(1, get_context("spawn"), begin, (1,))
+    pool = ProcessPoolExecutor(1, get_context("spawn"), init_worker, (1,))
     print(pool.submit(os.getpid).result(), flush=True)
     pool.submit(time.sleep, 600.0).result()
 """

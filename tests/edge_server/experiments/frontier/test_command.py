@@ -12,22 +12,28 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import command, effort_sweep
 from edge_server.experiments.frontier.output import conclusion
-from edge_server.experiments.frontier.update_time import Moving, Stage, charges, mean_over_seeds, steps_for
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.frontier.update_time import (
+    MovingScene,
+    WarmStart,
+    mean_over_seeds,
+    measure_compute,
+    steps_for,
+)
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.experiments.virtual.virtual_deployment import Compute
 from edge_server.fields.voxel import settings
 from edge_server.live.update_budget import read_frontier
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS, write_photos
 
-TINY = Moving(cameras=4, size=32)
+TINY = MovingScene(cameras=4, size=32)
 COMPUTE = Compute(ms_per_step=30.0, ms_per_update=10.0)
 
 
 def test_an_update_time_point_is_the_same_bit_for_bit():
     points = []
     for _ in range(2):
-        stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
-        points.append(stage.run(3, COMPUTE, seconds=1.0))
+        start = WarmStart(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
+        points.append(start.run(3, COMPUTE, seconds=1.0))
     assert points[0] == points[1]
     assert points[0]["update_s"] == 0.1 and 5 <= points[0]["updates"] <= 9
     assert points[0]["psnr_db"] is not None and points[0]["psnr_moving_db"] is not None
@@ -53,23 +59,23 @@ def test_updates_are_charged_what_they_take_where_everything_is_new(monkeypatch)
 
     monkeypatch.setattr("edge_server.fields.registry.make_field", lambda *args, **more: Slow())
     monkeypatch.setattr("edge_server.experiments.frontier.update_time.time.perf_counter", lambda: clock[0])
-    found = charges(TINY, 1.0, "ngp", {}, warm_steps=5)
+    found = measure_compute(TINY, 1.0, "ngp", {}, warm_steps=5)
     assert found.ms_per_step == pytest.approx(5.0) and found.ms_per_update == pytest.approx(90.0)
     stamps = [{v.generated_ns for v in views} for views in seen]
     assert all(len(s) == 1 for s in stamps) and len(set().union(*stamps)) == len(seen)
     assert not np.array_equal(seen[1][0].image, seen[-1][0].image), "nothing moved: nothing was new"
 
 
-def test_every_point_of_a_stage_starts_from_the_same_warm_field():
-    stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
-    first = stage.run(3, COMPUTE, seconds=0.6)
-    stage.run(9, COMPUTE, seconds=0.6)
-    assert stage.run(3, COMPUTE, seconds=0.6) == first
+def test_every_point_starts_from_the_same_warm_field():
+    start = WarmStart(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=5)
+    first = start.run(3, COMPUTE, seconds=0.6)
+    start.run(9, COMPUTE, seconds=0.6)
+    assert start.run(3, COMPUTE, seconds=0.6) == first
 
 
 def test_longer_updates_show_older_views():
-    stage = Stage(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=2)
-    short, long = (stage.run(steps, COMPUTE, seconds=1.5) for steps in (1, 12))
+    start = WarmStart(TINY, 1.0, "ngp", SMALL, seed=5, warm_steps=2)
+    short, long = (start.run(steps, COMPUTE, seconds=1.5) for steps in (1, 12))
     assert long["aaoi_ms"] - short["aaoi_ms"] == pytest.approx(11 * 30.0, abs=60.0)
 
 
@@ -117,8 +123,8 @@ def test_the_conclusion_names_the_best_time_of_each_speed():
 
 
 def test_images_of_half_the_size_keep_what_a_camera_sees():
-    still = synthetic("tile", cameras=3, size=32)
-    (small, *_) = effort_sweep.shrunk(still.training, 2.0)
+    still = synthetic_still("tile", cameras=3, size=32)
+    (small, *_) = effort_sweep.downscaled(still.training, 2.0)
     view = still.training[0]
     assert small.image.shape == (16, 16, 3) and small.intrinsics.fx == view.intrinsics.fx / 2
     assert np.allclose(small.image, view.image.reshape(16, 2, 16, 2, 3).mean(axis=(1, 3)), atol=1.0)
@@ -126,22 +132,22 @@ def test_images_of_half_the_size_keep_what_a_camera_sees():
     see_through[:2, :, :] = (200, 100, 50, 255)
     see_through[2:, :, :3] = 255  # what a transparent pixel is coloured must not bleed
     lens = view.intrinsics.scaled(4 / 32)
-    (small,) = effort_sweep.shrunk([replace(view, image=see_through, intrinsics=lens)], 4.0)
+    (small,) = effort_sweep.downscaled([replace(view, image=see_through, intrinsics=lens)], 4.0)
     assert small.image.tolist() == [[[200, 100, 50, 128]]]
-    assert effort_sweep.shrunk(still.training, 1.0) == still.training
+    assert effort_sweep.downscaled(still.training, 1.0) == still.training
 
 
 @pytest.fixture
-def tiny_plan(monkeypatch):
-    plan = replace(
+def tiny_sweep(monkeypatch):
+    sweep = replace(
         command.QUICK, planned_s=(0.2, 0.4), speeds=(1.0,), update_s=(0.1, 0.4), run_s=0.8, warm_steps=3,
         size=32, moving=TINY,
     )  # fmt: skip
-    monkeypatch.setattr(command, "QUICK", plan)
-    return plan
+    monkeypatch.setattr(command, "QUICK", sweep)
+    return sweep
 
 
-def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
+def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_sweep):
     words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
     assert edge_server(words) == 0
     first = capsys.readouterr().out
@@ -149,7 +155,9 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
     for name in ("frontier.png", "updates.png", "frontier.csv", "updates.csv", "frontier.json"):
         assert (tmp_path / name).stat().st_size > 100, name
     data = json.loads((tmp_path / "frontier.json").read_text())
-    assert set(data["ms_per_step"]) == {e.label for e in effort_sweep.efforts("ngp", {}, knobs=False)}
+    assert set(data["ms_per_step"]) == {
+        e.label for e in effort_sweep.efforts("ngp", {}, single_options=False)
+    }
     assert all(ms > 0 for ms in data["ms_per_step"].values())
     with (tmp_path / "updates.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 4  # two efforts, two update times
@@ -168,10 +176,10 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, tiny_plan):
 
 def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch):
     still, (effort, *_) = (
-        synthetic("tile", cameras=3, size=16),
-        effort_sweep.efforts("voxel", {}, knobs=False),
+        synthetic_still("tile", cameras=3, size=16),
+        effort_sweep.efforts("voxel", {}, single_options=False),
     )
-    plan = replace(command.QUICK, planned_s=(0.5,))
+    sweep = replace(command.QUICK, planned_s=(0.5,))
     measured = []
 
     def fit(*args):
@@ -180,27 +188,27 @@ def test_a_point_of_another_default_is_not_taken_for_known(tmp_path, monkeypatch
 
     monkeypatch.setattr(effort_sweep, "fit_from_scratch", fit)
     for _ in range(2):
-        store = command.Store(tmp_path / "frontier.json")
+        file = command.FrontierFile(tmp_path / "frontier.json")
         command.Frontier(
-            tmp_path, store, plan, still, "tile", ("voxel",), [effort], None, "none", 0
+            tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0
         )._from_scratch()
     assert len(measured) == 1
     monkeypatch.setitem(settings.EFFORTS, effort.name, {"rays": 77})
     command.Frontier(
-        tmp_path, store, plan, still, "tile", ("voxel",), [effort], None, "none", 0
+        tmp_path, file, sweep, still, "tile", ("voxel",), [effort], None, "none", 0
     )._from_scratch()
     assert len(measured) == 2
 
 
 def test_what_is_shipped_charges_steps_for_the_views_they_are_made_with():
     """By several seeds, and from below the shortest deadline worth setting."""
-    plan, still = command.SHIPPED, synthetic("room", size=command.SHIPPED.size)
-    assert len(still.training) == plan.moving.cameras - len(still.held_out)
-    assert still.training[0].image.shape[:2] == (plan.moving.size, plan.moving.size)
-    assert plan.seeds >= 3 and plan.update_s[0] <= 0.05
+    sweep, still = command.SHIPPED, synthetic_still("room", size=command.SHIPPED.size)
+    assert len(still.training) == sweep.moving.cameras - len(still.held_out)
+    assert still.training[0].image.shape[:2] == (sweep.moving.size, sweep.moving.size)
+    assert sweep.seeds >= 3 and sweep.update_s[0] <= 0.05
 
 
-def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_plan):
+def test_a_data_set_gets_the_first_figure_alone(tmp_path, capsys, tiny_sweep):
     write_photos(tmp_path / "set", 5)
     words = ["frontier", "--quick", "--scene", str(tmp_path / "set"), "--out", str(tmp_path / "out")]
     assert edge_server([*words, *SMALL_WORDS]) == 0

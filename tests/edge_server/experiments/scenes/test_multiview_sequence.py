@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments.scenes.multiview_sequence import Film, recorded_film, synthetic_film
+from edge_server.experiments.scenes.multiview_sequence import (
+    MultiviewSequence,
+    recorded_sequence,
+    synthetic_sequence,
+)
 from edge_server.fidelity.moving_pixels import BOUND, LAGS_MS
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Rendering
@@ -25,11 +29,11 @@ class Shows:
 
 
 @pytest.fixture(scope="module")
-def room() -> Film:
-    return synthetic_film("room", cameras=4, size=32, fps=15.0, speed_m_per_s=1.0)
+def room() -> MultiviewSequence:
+    return synthetic_sequence("room", cameras=4, size=32, fps=15.0, speed_m_per_s=1.0)
 
 
-def test_a_synthetic_scene_repeats_but_its_time_goes_on(room: Film) -> None:
+def test_a_synthetic_scene_repeats_but_its_time_goes_on(room: MultiviewSequence) -> None:
     first = room.training(0)
     assert [v.camera for v in first] == ["cam01", "cam02", "cam03"] and room.held_out == ("cam00",)
     loop = next(k for k in range(1, 1000) if room.key(k) == room.key(0))
@@ -39,7 +43,7 @@ def test_a_synthetic_scene_repeats_but_its_time_goes_on(room: Film) -> None:
     assert any(np.any(a.image != b.image) for a, b in zip(first, room.training(4)))
 
 
-def test_scores_tell_moving_pixels_from_the_rest(room: Film) -> None:
+def test_scores_tell_moving_pixels_from_the_rest(room: MultiviewSequence) -> None:
     truth = room.truth(6)[0].image
     late = room.score(Shows(room.truth(0)[0].image), 6, Scorer())
     assert late.psnr_moving_db is not None and late.psnr_moving_db < late.psnr_db - 3.0
@@ -49,14 +53,14 @@ def test_scores_tell_moving_pixels_from_the_rest(room: Film) -> None:
 
 
 def test_a_recording_is_played_back_and_forth(tmp_path) -> None:
-    film = recorded_film(write_recording(tmp_path, cameras=4, instants=4), "cam00")
-    assert [film.key(k) for k in range(8)] == [0, 1, 2, 3, 2, 1, 0, 1]
-    assert film.period_ms == pytest.approx(100.0)
-    assert [v.generated_ns for v in film.training(5)] == [500_000_000] * 3
+    sequence = recorded_sequence(write_recording(tmp_path, cameras=4, instants=4), "cam00")
+    assert [sequence.key(k) for k in range(8)] == [0, 1, 2, 3, 2, 1, 0, 1]
+    assert sequence.period_ms == pytest.approx(100.0)
+    assert [v.generated_ns for v in sequence.training(5)] == [500_000_000] * 3
     # 60 and 120 ms before lies one frame, 200 ms two and 300 ms three; at the turn some are the same.
-    seen = [next(k for k in range(4) if film.image("cam00", k) is i) for i in film.before("cam00", 4)]
+    seen = [next(k for k in range(4) if sequence.image("cam00", k) is i) for i in sequence.before("cam00", 4)]
     assert seen == [3, 2, 1]
-    assert film.bounds["cam00"] >= BOUND
+    assert sequence.bounds["cam00"] >= BOUND
 
 
 @pytest.mark.parametrize(
@@ -64,25 +68,25 @@ def test_a_recording_is_played_back_and_forth(tmp_path) -> None:
 )
 def test_what_cannot_be_followed_is_said(tmp_path, make, told: str) -> None:
     with pytest.raises(DatasetError, match=told):
-        recorded_film(make(tmp_path), "0")
+        recorded_sequence(make(tmp_path), "0")
 
 
 def test_a_recording_of_one_instant_does_not_move(tmp_path) -> None:
     with pytest.raises(DatasetError, match="nothing moves"):
-        recorded_film(write_recording(tmp_path, instants=1), "cam00")
+        recorded_sequence(write_recording(tmp_path, instants=1), "cam00")
 
 
-def test_views_can_be_late(room: Film) -> None:
+def test_views_can_be_late(room: MultiviewSequence) -> None:
     views = room.training(6, late=1)
     assert [v.generated_ns for v in views] == pytest.approx([6e9 / 15, 5e9 / 15, 6e9 / 15], abs=1)
     assert views[1].image is room.training(5)[1].image
 
 
 def test_the_real_recording_is_followed_frame_by_frame() -> None:
-    film = recorded_film(data_dir("blender_kitchen") / "transforms.json", "cam00")
-    assert film.period_ms == pytest.approx(1e3 / 30) and film.held_out == ("cam00",)
-    assert len(film.training(0)) == 18 and film.key(45) == 43 and film.key(88) == 0
-    late = film.score(Shows(film.truth(9)[0].image), 12, Scorer())  # 100 ms ago
+    sequence = recorded_sequence(data_dir("blender_kitchen") / "transforms.json", "cam00")
+    assert sequence.period_ms == pytest.approx(1e3 / 30) and sequence.held_out == ("cam00",)
+    assert len(sequence.training(0)) == 18 and sequence.key(45) == 43 and sequence.key(88) == 0
+    late = sequence.score(Shows(sequence.truth(9)[0].image), 12, Scorer())  # 100 ms ago
     # Measured apart from this code: 100 ms of motion and the noise of the renderer leave 26.2 dB.
     assert late.psnr_db == pytest.approx(26.2, abs=1.5) and late.psnr_moving_db < late.psnr_db - 2.0
-    assert 0.03 <= film.bounds["cam00"] < 0.1 and 0.03 < late.moving_share < 0.4
+    assert 0.03 <= sequence.bounds["cam00"] < 0.1 and 0.03 < late.moving_share < 0.4

@@ -120,7 +120,7 @@ def test_what_is_known_is_not_run_again_and_a_stop_loses_only_what_runs(tmp_path
 def test_a_torn_result_is_run_again(tmp_path: Path):
     engine = Engine(tmp_path, say=quiet)
     expected = engine.run([TRIAL])
-    (path,) = tmp_path.rglob("*.json")
+    path = tmp_path / "results.jsonl"
     assert json.loads(path.read_text())["trial"]["seed"] == 1
     path.write_text(path.read_text()[:40])
     assert Engine(tmp_path, say=quiet).run([TRIAL]) == expected

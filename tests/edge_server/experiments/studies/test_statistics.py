@@ -9,6 +9,7 @@ import pytest
 
 from edge_server.experiments.studies.statistics import (
     Interval,
+    at_its_best,
     crossed,
     interval,
     negated,
@@ -63,6 +64,17 @@ def test_a_flat_curve_is_not_given_an_optimum():
     """The best of five equal points, measured on the seeds that chose it, would look better than the ends."""
     claimed = sum(optimum(curve_of(lambda x: 0.0, seed=s)).interior() is True for s in range(60))
     assert claimed <= 6
+
+
+def test_a_best_point_is_measured_on_seeds_that_did_not_choose_it():
+    """Even seeds have their best at 1, odd ones at 2: what one half prefers is the worse one for the
+    other."""
+    curve = {1.0: {s: 10.0 * (s % 2 == 0) for s in range(8)}, 2.0: {s: 10.0 * (s % 2) for s in range(8)}}
+    assert at_its_best(curve) == dict.fromkeys(range(8), 0.0)  # chosen by themselves all would have 10
+    assert at_its_best(curve, lower_is_better=True) == dict.fromkeys(range(8), 10.0)
+    found = optimum(curve)
+    assert (found.over_first.mean, found.over_last.mean) == (-5.0, -5.0)
+    assert at_its_best({}) == at_its_best({1.0: {0: None}}) == {}
 
 
 def test_seeds_that_lack_a_point_are_left_out():

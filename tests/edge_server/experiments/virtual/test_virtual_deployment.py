@@ -12,14 +12,14 @@ import pytest
 from camera_node.synthetic.effects import NAMES
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
-from edge_server.experiments.virtual.from_scenario import deploy
+from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.truth import ExactTruth
-from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, VirtualDeployment
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
 from freshfield.scenario import Scenario, parse
 from tests.conftest import data_dir
 from tests.edge_server.experiments.sets import SMALL, write_recording
 
-TERMS = Terms(steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0))
+SETTINGS = RunSettings(steps=2, compute=Compute(ms_per_step=40.0, ms_per_update=20.0))
 
 
 def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any) -> Scenario:
@@ -37,8 +37,8 @@ def scenario(channel: dict[str, Any] | None = None, seed: int = 3, **other: Any)
     return parse({**data, **other}, Path("virtual.yaml"))
 
 
-def run(what: Scenario, terms: Terms = TERMS, seconds: float = 1.0) -> VirtualDeployment:
-    deployment = deploy(what, terms)
+def run(what: Scenario, settings: RunSettings = SETTINGS, seconds: float = 1.0) -> VirtualDeployment:
+    deployment = build_deployment(what, settings)
     deployment.run(seconds)
     return deployment
 
@@ -97,7 +97,7 @@ def test_treated_views_are_the_same_in_every_run(policy, channel):
 
 def test_going_on_is_the_same_as_running_through():
     through = run(scenario(), seconds=1.2)
-    parts = deploy(scenario(), TERMS)
+    parts = build_deployment(scenario(), SETTINGS)
     found = parts.run(0.5) + parts.run(0.3) + parts.run(0.4)
     assert found == through.publications and parts.frames() == through.frames()
 
@@ -118,7 +118,7 @@ def test_the_books_close_with_every_fault_and_damage_is_refused():
 )  # fmt: skip
 def test_the_links_decide_as_the_simulation_does(channel):
     what = scenario(channel)
-    deployment = run(what, Terms(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
+    deployment = run(what, RunSettings(steps=1, compute=Compute(ms_per_update=500.0)), seconds=2.0)
     config = channel_from_mapping(what.channel)
     alone = simulate(config, list(what.training), 2.0, what.seed, frame_period_ms=1e3 / 15, engine="python")
     expected = {r.camera: r.count("delivered") for r in alone.runs}
@@ -134,16 +134,16 @@ def test_the_present_is_when_the_charge_is_over():
 
 
 def test_free_compute_publishes_at_the_decision_and_never_spins():
-    free = run(scenario({}), Terms(steps=1, compute=Compute()), seconds=0.5)
+    free = run(scenario({}), RunSettings(steps=1, compute=Compute()), seconds=0.5)
     assert {p.update_ms for p in free.publications} == {0.0}
     assert len(free.publications) == 8, "once an arrival instant: ticks 0 to 7 of 15 a second"
-    epochs = run(scenario({}), Terms(steps=1, epoch_ms=200.0), seconds=1.0)
+    epochs = run(scenario({}), RunSettings(steps=1, epoch_ms=200.0), seconds=1.0)
     times = [p.published_ns for p in epochs.publications]
     assert np.diff(times).tolist() == [200_000_000] * (len(times) - 1)
 
 
 def test_ideal_channel_delivers_everything_at_no_age():
-    deployment = run(scenario({}), Terms(steps=1), seconds=1.0)
+    deployment = run(scenario({}), RunSettings(steps=1), seconds=1.0)
     frames = deployment.frames()
     assert frames["delivered"] == frames["captured"] == 4 * 16 and closes(frames)
     assert {age for p in deployment.publications for age in p.ages_ms} == {0.0}
@@ -151,7 +151,9 @@ def test_ideal_channel_delivers_everything_at_no_age():
 
 def test_wait_uses_only_what_was_generated_after_the_decision():
     edge = {"field": "ngp", "field_options": SMALL, "policy": {"name": "wait", "value": 150.0}}
-    deployment = run(scenario(edge=edge), Terms(steps=1, compute=Compute(ms_per_update=10.0)), seconds=2.0)
+    deployment = run(
+        scenario(edge=edge), RunSettings(steps=1, compute=Compute(ms_per_update=10.0)), seconds=2.0
+    )
     assert len(deployment.publications) > 3
     for p in deployment.publications:
         assert p.update_ms >= 10.0 and max(p.ages_ms) <= 150.0 + 10.0 + 200.0
@@ -160,8 +162,8 @@ def test_wait_uses_only_what_was_generated_after_the_decision():
 
 def test_a_camera_that_reports_late_is_waited_for_only_as_long_as_the_grace():
     channel = {"service": {"law": "deterministic", "mean_ms": 700.0}}
-    terms = Terms(steps=1, grace_ms=0.0)
-    deployment = run(scenario(channel), terms, seconds=1.5)
+    settings = RunSettings(steps=1, grace_ms=0.0)
+    deployment = run(scenario(channel), settings, seconds=1.5)
     assert deployment.publications[0].published_ns == 700_000_000
 
 
@@ -220,7 +222,7 @@ def test_every_effect_at_once_repeats_bit_for_bit():
 
 def test_the_exact_truth_is_seen_through_what_is_listed_to_be_in_it():
     def truth(effects: dict[str, Any]) -> np.ndarray:
-        found = deploy(scenario(source=world_with(effects)), TERMS).truth
+        found = build_deployment(scenario(source=world_with(effects)), SETTINGS).truth
         assert isinstance(found, ExactTruth)
         return found.image("cam00", 0.4)
 
@@ -229,7 +231,7 @@ def test_the_exact_truth_is_seen_through_what_is_listed_to_be_in_it():
     # The field is asked for what is claimed of the lens.
     for calibrated, distortion in ((True, -0.05), (False, 0.0)):
         lens = {"k1": -0.05, "k2": 0.0, "p1": 0.0, "p2": 0.0, "calibrated": calibrated, "in_truth": True}
-        found = deploy(scenario(source=world_with({"lens_distortion": lens})), TERMS).truth
+        found = build_deployment(scenario(source=world_with({"lens_distortion": lens})), SETTINGS).truth
         assert isinstance(found, ExactTruth) and found.cameras["cam00"][0].distortion[0] == distortion
     for name in ("vignetting", "fog", "lens_distortion"):
         assert not np.array_equal(truth({name: {"in_truth": True}}), plain), name

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import shared_pool
@@ -90,7 +90,7 @@ def test_two_views_have_none_and_refused_ones_no_say() -> None:
 @pytest.mark.parametrize("name", GUIDED)
 def test_it_is_worth_decibels_where_few_cameras_look(name: str) -> None:
     """Every third of 18 cameras of ``tile``: a third of the pictures, most of the scene unseen by two."""
-    still = synthetic("tile", cameras=19, size=64)
+    still = synthetic_still("tile", cameras=19, size=64)
     few = still.training[::3]
     gain = []
     for seed in (0, 1, 2):
@@ -107,7 +107,7 @@ def test_it_is_used_where_it_is_called_for() -> None:
     sky, room = small("ngp"), small("ngp")
     sky.fit(SEEN, Budget(steps=1))
     assert sky._present_guide_weight() > 0.0
-    views = synthetic("room", cameras=13, size=32).training
+    views = synthetic_still("room", cameras=13, size=32).training
     room.fit(views, Budget(steps=1))
     assert room._present_guide_weight() == 0.0
     few = small("ngp")
@@ -140,7 +140,7 @@ def test_no_sweep_where_none_is_called_for_or_the_budget_is_too_short(monkeypatc
 
     monkeypatch.setattr("edge_server.fields.common.plane_sweep.depth_guide", slow)
     room = small("ngp")
-    room.fit(synthetic("room", cameras=13, size=32).training, Budget(steps=2))
+    room.fit(synthetic_still("room", cameras=13, size=32).training, Budget(steps=2))
     exposed = small("ngp", exposure=True)
     exposed.fit(SEEN, Budget(steps=1))
     assert swept == []

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields.common.scene_box import converging_point, plain_background, scene_box
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import ring
@@ -87,7 +87,7 @@ def test_a_camera_that_looks_elsewhere_does_not_move_the_box(aside_m: float) -> 
 @pytest.mark.parametrize("off_m", [30.0, 1e3, 1e6])
 def test_a_camera_that_is_far_away_does_not_move_the_box(scene: str, off_m: float) -> None:
     """Whichever it is, and in whatever direction: ahead, behind and aside of where it looks among them."""
-    views = synthetic(scene, cameras=13, size=16).training
+    views = synthetic_still(scene, cameras=13, size=16).training
     expected, rng = scene_box(views), np.random.default_rng(0)
     for k, view in enumerate(views):
         aside = rng.normal(size=3)

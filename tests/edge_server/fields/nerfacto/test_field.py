@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.experiments.scenes.multiview_still import synthetic
+from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import EFFORTS, NerfactoSettings, help_text, make_settings
@@ -76,7 +76,7 @@ def test_it_is_registered_and_its_options_are_checked() -> None:
 
 def test_appearances_take_up_what_differs_between_cameras() -> None:
     """A room's pictures with gains of 0.7 to 1.4; scored against the picture at the mean exposure."""
-    still = synthetic("room", cameras=13, size=48)
+    still = synthetic_still("room", cameras=13, size=48)
     gains = np.exp(np.random.default_rng(2).permutation(np.linspace(-0.35, 0.35, 12)))
     views = [
         replace(v, image=np.clip(v.image * g + 0.5, 0, 255).astype(np.uint8))

@@ -10,8 +10,8 @@ import pytest
 from edge_server.experiments.training.scheduler.choices import choices, choose, named, of_action
 from edge_server.experiments.training.scheduler.episode import Choice, Ground
 from edge_server.experiments.training.scheduler.setting import GRID_MS, PURPOSES, seeds
-from edge_server.experiments.virtual.from_scenario import deploy
-from edge_server.experiments.virtual.virtual_deployment import Compute, Terms, VirtualDeployment
+from edge_server.experiments.virtual.from_scenario import build_deployment
+from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
 from edge_server.fields.registry import make_field
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -32,9 +32,9 @@ def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) ->
     """The same deployment with its own edge, which decides first at an instant."""
     what = scenario(**more)
     edge = {**what.edge, "policy": {"name": policy, "value": value}}
-    terms = Terms(steps=4, epoch_ms=60_000.0, first_ms=at_ns / 1e6, scratch=True, compute=Compute(5.0))
+    terms = RunSettings(steps=4, epoch_ms=60_000.0, first_ms=at_ns / 1e6, scratch=True, compute=Compute(5.0))
     field = make_field("splat", FIELD, seed=setting().field_seed(seed))
-    return deploy(dataclasses.replace(what, edge=edge, seed=seed), terms, field=field)
+    return build_deployment(dataclasses.replace(what, edge=edge, seed=seed), terms, field=field)
 
 
 @pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])

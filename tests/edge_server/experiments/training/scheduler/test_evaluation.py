@@ -107,6 +107,17 @@ def test_the_best_of_several_is_chosen_by_one_fit_and_measured_by_the_other():
     assert found.rewards("a") == {0: 1.75} and found.rewards("c") == {0: None}
 
 
+def test_the_best_fixed_value_is_chosen_on_seeds_that_it_is_not_measured_on():
+    found = Contest(BY_PSNR)
+    found.outcomes = {
+        "threshold:1": {(s, 0): outcome(10.0 if s % 2 else 0.0) for s in range(6)},
+        "threshold:2": {(s, 0): outcome(0.0 if s % 2 else 10.0) for s in range(6)},
+        "wait:3": {(s, 0): outcome(99.0) for s in range(6)},
+    }
+    best, name = found.best_fixed("threshold")
+    assert best == dict.fromkeys(range(6), 0.0) and name in ("threshold:1", "threshold:2")
+
+
 def test_a_base_that_may_be_zero_has_no_percentage():
     base: dict[int, float | None] = {0: 1.0, 1: 1.1, 2: 0.9}
     assert percent({seed: 1.5 * value for seed, value in base.items() if value}, base) == "+50.0 %"

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
+from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main, reward_of
-from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, hold, rivals, rows, write_rows
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, hold, rivals, rows
 from edge_server.experiments.training.scheduler.fit_problem import KEPT, FitProblem
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
 from edge_server.experiments.training.scheduler.setting import seeds
@@ -158,7 +159,7 @@ def test_hindsight_and_the_best_fixed_are_measured_where_they_were_not_chosen(co
 
 
 def test_a_contest_is_told_in_a_table_and_in_words(contest, tmp_path: Path):
-    write_rows(tmp_path / "contest.csv", rows(contest))
+    write_csv(tmp_path / "contest.csv", rows(contest))
     found = {row["policy"]: row for row in csv.DictReader((tmp_path / "contest.csv").open())}
     assert found.keys() == {*contest.outcomes, HINDSIGHT}
     assert float(found["all"]["views"]) >= 3.0 and float(found["random"]["share"]) == 0.0

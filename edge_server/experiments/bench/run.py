@@ -1,0 +1,92 @@
+"""What the parts of the bench share: what each is given, the recordings, the size of a measurement."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from camera_node.sources.datasets.records import DatasetError
+from edge_server.experiments.common.result_store import ResultStore, settings_digest
+from edge_server.experiments.scenes.multiview_still import MultiviewStill, open_still
+from edge_server.fidelity.baselines import baseline
+from edge_server.fidelity.images import BLACK, Color
+from edge_server.fields import View
+
+# Recordings below the data folder: what is opened, and what is held out.
+RECORDINGS = {
+    "kitchen": ("blender_kitchen/transforms.json", "cam00"),
+    "lego": ("lego_synthetic", "8"),
+    "fox": ("fox/transforms_2.json", "8"),
+}
+
+
+class BenchError(RuntimeError):
+    """A measurement that could not be taken; the message says what stood in its way."""
+
+
+@dataclass
+class BenchRun:
+    """One part of the bench, as asked for. A part takes of it what it needs.
+
+    quick: fewer repetitions.
+    folder: an empty folder for the part's temporary files.
+    lpips: folder of LPIPS weights; None: that of the environment.
+    fields: the representations to measure; none: all there are.
+    store: results of this part, those of an earlier run among them.
+    scenes, updates, update_s, steps, samples, options: of track and drift, see the command; None: the
+        part's own.
+    only: names of options to try; none: all.
+    model: a YOLO ONNX file instead of the shipped ones.
+    """
+
+    quick: bool
+    folder: Path = Path()
+    lpips: Path | None = None
+    fields: tuple[str, ...] = ()
+    store: ResultStore = field(default_factory=ResultStore)
+    scenes: tuple[str, ...] = ()
+    updates: int | None = None
+    update_s: tuple[float, ...] | None = None
+    steps: int | None = None
+    samples: int | None = None
+    options: Mapping[str, Any] | None = None
+    only: tuple[str, ...] = ()
+    model: Path | None = None
+
+
+def result_settings(
+    workload: Any, name: str, options: Mapping[str, Any] | None = None, **more: Any
+) -> dict[str, Any]:
+    """The settings that a result is stored with: how much was measured, and the representation's own.
+
+    workload: a dataclass. name, options: of the representation.
+    """
+    return {**dataclasses.asdict(workload), "defaults": settings_digest(name, options), **more}
+
+
+def data_file(name: str) -> Path:
+    """A file or folder of the data folder. DatasetError where FRESHFIELD_DATA is not set."""
+    data = os.environ.get("FRESHFIELD_DATA")
+    if not data:
+        raise DatasetError(f"set FRESHFIELD_DATA to the folder that holds {name.split('/')[0]}")
+    return Path(data) / name
+
+
+def open_recording(name: str, scale: float) -> MultiviewStill:
+    """One of ``RECORDINGS``, its images divided by ``scale``. DatasetError where it is not there."""
+    path, holdout = RECORDINGS[name]
+    return open_still(str(data_file(path)), holdout=holdout, scale=scale)
+
+
+def mean_baselines(
+    training: Sequence[View], held_out: Sequence[View], color: Color = BLACK
+) -> dict[str, Any]:
+    """What needs no field, means over the held-out cameras. color: the background."""
+    found = [baseline(training, v.image, v.camera_to_world, color) for v in held_out]
+    names = ("mean_colour_db", "nearest_view_db")
+    return {name: statistics.fmean(getattr(b, name) for b in found) for name in names}

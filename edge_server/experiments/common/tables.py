@@ -1,0 +1,46 @@
+"""Tables of results: Markdown for people, CSV for programs. Figures have ``edge_server.report.style``."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A Markdown table.
+
+    head: the names of the columns.
+    rows: the cells of each row; None is an empty cell.
+    """
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join('' if c is None else str(c) for c in cells)} |" for cells in lines)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """A CSV file of mappings, one a row; what one of them lacks stays empty."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def number(value: float | None, digits: int = 2, sign: str = "") -> str:
+    """A number with so many decimals; "-" where there is none. sign: "+" shows that of positive numbers."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:{sign}.{digits}f}"
+
+
+def grouped(value: float | None, digits: int = 2) -> str:
+    """As ``number``, but from 1000 on whole and with commas between thousands."""
+    return f"{value:,.0f}" if value is not None and abs(value) >= 1000 else number(value, digits)
+
+
+def mean_or_none(values: Iterable[float | None]) -> float | None:
+    """The mean of the values that are known; None where none is."""
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,147 @@
+"""How busy a machine is: what this process uses, what another one uses, and what others keep busy.
+
+Everything comes from /proc; a value that the system does not tell is None, never a guess.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+_PROC = Path("/proc")
+
+
+class LoadMeter:
+    """Cores that this process and the whole machine used since the last call of ``row`` or ``outside_cores``.
+
+    name: what rows call this process.
+    """
+
+    def __init__(self, name: str = "bench") -> None:
+        self._name = name
+        self._last = (time.perf_counter(), _own_s(), _busy_s())
+
+    def row(self, t_s: float) -> dict[str, Any]:
+        """A line of ``processes.jsonl``: ``{"t_s", NAME: {"rss_mb", "cpu", "pid"}, "machine": {"cpu"}}``."""
+        now = (time.perf_counter(), _own_s(), _busy_s())
+        (then_s, own_then, busy_then), self._last = self._last, now
+        wall = max(now[0] - then_s, 1e-6)
+        row: dict[str, Any] = {
+            "t_s": round(t_s, 3),
+            self._name: {
+                "rss_mb": rss_mb(),
+                "cpu": round((now[1] - own_then) / wall, 2),
+                "pid": os.getpid(),
+            },
+        }
+        if now[2] is not None and busy_then is not None:
+            row["machine"] = {"cpu": round((now[2] - busy_then) / wall, 2)}
+        return row
+
+    def outside_cores(self) -> float | None:
+        """Cores that others kept busy."""
+        return outside_cores(self.row(0.0))
+
+
+def outside_cores(row: Mapping[str, Any]) -> float | None:
+    """Cores that others kept busy: what a row's machine used minus what its processes used."""
+    found = _outside(row)
+    return None if found is None else round(found, 2)
+
+
+def outside_load(processes: Sequence[dict[str, Any]], proc: Path = _PROC) -> dict[str, Any]:
+    """How many cores others kept busy during a whole run.
+
+    processes: rows of ``processes.jsonl``.
+
+    Returns {cores, ours, method}. ``cores`` is the median of ``outside_cores`` over the rows that say what
+    the machine used. Where none does, it is the load average of the last minute minus what ours used then:
+    rougher, because the load average counts our waiting threads too. None where neither is known.
+    """
+    ours = [_ours(row) for row in processes]
+    others = [cores for row in processes if (cores := _outside(row)) is not None]
+    used = round(statistics.median(ours), 2) if ours else None
+    if others:
+        return {"cores": round(statistics.median(others), 2), "ours": used, "method": "machine minus ours"}
+    load = load_average(proc)
+    if load is None or used is None:
+        return {"cores": None, "ours": used, "method": None}
+    last_s = processes[-1]["t_s"]
+    recent = statistics.fmean(o for o, row in zip(ours, processes) if row["t_s"] > last_s - 60.0)
+    return {"cores": round(max(0.0, load - recent), 2), "ours": used, "method": "load average minus ours"}
+
+
+def load_average(proc: Path = _PROC) -> float | None:
+    """Load average of the last minute."""
+    try:
+        return float((proc / "loadavg").read_text().split()[0])
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def rss_mb(pid: int | str = "self") -> float | None:
+    """Resident memory of a process in MB (10^6 bytes)."""
+    try:
+        pages = int((_PROC / str(pid) / "statm").read_text().split()[1])
+    except (OSError, ValueError, IndexError):
+        return None
+    return round(pages * resource.getpagesize() / 1e6, 1)
+
+
+def peak_rss_mb() -> float:
+    """The most memory this process has had resident, in MB (10^6 bytes)."""
+    try:
+        line = next(w for w in (_PROC / "self" / "status").read_text().splitlines() if w.startswith("VmHWM:"))
+        return round(int(line.split()[1]) * 1024 / 1e6, 1)
+    except (OSError, ValueError, IndexError, StopIteration):
+        pass
+    # The second choice only: on Linux a process inherits this value from the one that starts it.
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Linux counts kibibytes, macOS bytes.
+    return round(peak * (1 if os.uname().sysname == "Darwin" else 1024) / 1e6, 1)
+
+
+def cpu_s(pid: int) -> float | None:
+    """Processor time that a process has used, in core-seconds."""
+    try:
+        words = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def machine_ticks() -> list[int] | None:
+    """Processor time of the whole machine since it started, in ticks: user, nice, system, idle, iowait, irq,
+    softirq, steal. Guest time is within user already."""
+    try:
+        return [int(word) for word in (_PROC / "stat").read_text().split("\n", 1)[0].split()[1:9]]
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def _own_s() -> float:
+    times = os.times()
+    return times.user + times.system
+
+
+def _busy_s() -> float | None:
+    """Core-seconds that the whole machine has been busy since it started."""
+    ticks = machine_ticks()
+    return None if not ticks else float(sum(ticks[:3]) + sum(ticks[5:8])) / os.sysconf("SC_CLK_TCK")
+
+
+def _ours(row: Mapping[str, Any]) -> float:
+    return sum(v["cpu"] for k, v in row.items() if k != "machine" and _has_cpu(v))
+
+
+def _outside(row: Mapping[str, Any]) -> float | None:
+    return max(0.0, row["machine"]["cpu"] - _ours(row)) if _has_cpu(row.get("machine")) else None
+
+
+def _has_cpu(value: Any) -> bool:
+    return isinstance(value, dict) and isinstance(value.get("cpu"), int | float)

@@ -1,0 +1,79 @@
+"""What a measurement cost: this process's own cores and memory, and the machine's."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from freshfield.machine_load import (
+    LoadMeter,
+    cpu_s,
+    load_average,
+    outside_cores,
+    outside_load,
+    peak_rss_mb,
+    rss_mb,
+)
+
+
+@pytest.mark.alone
+def test_a_busy_loop_is_counted_as_ours_and_not_as_others():
+    meter = LoadMeter("me")
+    before, until = time.process_time(), time.perf_counter() + 0.5
+    while time.perf_counter() < until:
+        pass
+    used = time.process_time() - before
+    row = meter.row(1.0)
+    assert row["t_s"] == 1.0 and row["me"]["pid"] == os.getpid()
+    assert abs(row["me"]["cpu"] - used / 0.5) < 0.15
+    outside = outside_cores(row)
+    assert outside is not None and 0.0 <= outside <= (os.cpu_count() or 1) + 0.2
+
+
+def test_memory_and_processor_time_of_a_process():
+    block = np.ones(8 * 2**20)  # 64 MB that are touched
+    assert rss_mb() > 60.0 and peak_rss_mb() >= rss_mb() * 0.9
+    assert cpu_s(os.getpid()) > 0.0 and block[0] == 1.0
+
+
+def test_the_peak_of_a_child_is_its_own():
+    block = np.ones(60 * 2**20)  # 500 MB that are touched; numpy and OpenCV alone take less than 200
+    program = "from freshfield.machine_load import peak_rss_mb; print(peak_rss_mb())"
+    child = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert peak_rss_mb() > 500.0 and block[-1] == 1.0
+    assert float(child.stdout) < 400.0
+
+
+def test_a_process_that_is_gone_tells_nothing():
+    assert rss_mb(2**22 + 1) is None and cpu_s(2**22 + 1) is None
+
+
+def use(cpu):
+    return {"rss_mb": 1.0, "cpu": cpu, "pid": 1}
+
+
+def test_outside_load_is_what_the_machine_used_minus_ours():
+    rows = [{"t_s": 2.0 * i, "machine": {"cpu": 2.0}, "edge": use(1.2), "node": use(0.1)} for i in range(5)]
+    assert outside_load(rows) == {"cores": pytest.approx(0.7), "ours": 1.3, "method": "machine minus ours"}
+
+
+def test_without_the_machines_own_count_the_load_average_must_do(tmp_path):
+    (tmp_path / "loadavg").write_text("2.50 1.00 0.50 3/200 999\n")
+    rows = [{"t_s": t, "edge": use(cpu)} for t, cpu in ((0.0, 9.0), (100.0, 1.0), (110.0, 2.0))]
+    found = outside_load(rows, tmp_path)
+    assert found["cores"] == 1.0 and found["method"] == "load average minus ours"  # 2.5 less a mean of 1.5
+
+
+def test_ours_can_be_more_than_the_load_average_but_others_never_negative(tmp_path):
+    (tmp_path / "loadavg").write_text("0.10 1.00 0.50 3/200 999\n")
+    assert outside_load([{"t_s": 0.0, "edge": use(1.0)}], tmp_path)["cores"] == 0.0
+
+
+def test_nothing_known_is_none(tmp_path):
+    assert load_average(tmp_path) is None
+    assert outside_load([], tmp_path) == {"cores": None, "ours": None, "method": None}
