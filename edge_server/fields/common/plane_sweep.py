@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.plane_sweep import (
     MOST_VIEWS,
     NOT_SEEN,
@@ -23,7 +24,6 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox, plain_background
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
-from edge_server.fields.splat.buffers import camera_rows
 
 TOLERANCE = 0.08  # of a color, summed over channels: with more, walls are found where there are none
 GUIDE_CELLS = 96  # a side: finer cells hardly guide better, and cost their cube

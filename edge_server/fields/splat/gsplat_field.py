@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.fields import View
+from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, TIME
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.training_schedule import step_key
 from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
@@ -24,17 +25,12 @@ from edge_server.fields.splat.cpu_field import SplatField
 from edge_server.fields.splat.kernels.optimizer_step import GRADIENT_LIMIT, clamp_gaussians
 from edge_server.fields.splat.kernels.project import (
     COLOR,
-    LENS,
-    NEAR,
     OPACITY,
-    ORIGIN,
     QUATERNION,
     RAW_OPACITY,
     SCALE,
     SCALE_HIGH,
     SCALE_LOW,
-    SIZE,
-    TIME,
 )
 from edge_server.fields.splat.motion import SceneChange
 from edge_server.fields.splat.settings import SplatSettings

@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.kernels.camera import ORIGIN, SIZE
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
-from edge_server.fields.splat.kernels.project import ORIGIN, QUATERNION, SCALE, SIZE, Gaussians
+from edge_server.fields.splat.kernels.project import QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole, quaternion_multiply, quaternion_normalize, quaternion_to_matrix

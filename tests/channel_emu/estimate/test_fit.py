@@ -22,7 +22,7 @@ from channel_emu.model.chain import transition_matrix, two_state_generator
 from channel_emu.model.config import channel_from_mapping
 from freshfield import scenario
 from tests.channel_emu.estimate.recordings import write_rows, write_trace
-from tests.channel_emu.live.emulator import rig
+from tests.channel_emu.live.emulator import emulate
 from tests.channel_emu.live.test_frame_stream import FAST
 
 # A slow Gilbert-Elliott channel: periodic frames, delays of 20 and 120 ms.

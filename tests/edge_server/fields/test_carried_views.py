@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from edge_server.fields import Budget
+from edge_server.fields.common.kernels.camera import TIME
 from edge_server.fields.common.view_outliers import pixel_weights
 from edge_server.fields.splat.field import SplatField
-from edge_server.fields.splat.kernels.project import TIME
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import ring
 

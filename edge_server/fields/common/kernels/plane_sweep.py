@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, distort, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.rays import HORIZON, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.kernels.project import LENS, NEAR, ORIGIN, distort, load_camera
 
 MOST_VIEWS = 32  # that vote
 NOT_SEEN = -2.0

@@ -11,6 +11,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from edge_server.fields.common.kernels.camera import SIZE, load_camera
 from edge_server.fields.common.kernels.jit import kernel, part
 from edge_server.fields.common.kernels.simd import draw, fetch_add, is_finite, log32
 from edge_server.fields.splat.kernels.project import (
@@ -22,8 +23,6 @@ from edge_server.fields.splat.kernels.project import (
     QUATERNION,
     RADIUS,
     SCALE,
-    SIZE,
-    load_camera,
 )
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,

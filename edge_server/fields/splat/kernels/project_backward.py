@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from edge_server.fields.common.kernels.camera import LENS, ORIGIN, TIME
 from edge_server.fields.common.kernels.jit import part
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.splat.kernels.project import (
@@ -18,15 +19,12 @@ from edge_server.fields.splat.kernels.project import (
     CONIC_A,
     CONIC_B,
     CONIC_C,
-    LENS,
     OPACITY,
-    ORIGIN,
     QUATERNION,
     RAW_OPACITY,
     SCALE,
     SCALE_HIGH,
     SCALE_LOW,
-    TIME,
     exp_scale,
     lens_terms,
     rotate_to_camera,

@@ -7,17 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.kernels.camera import LENS, NEAR, load_camera
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.kernels.project import (
-    BLOCK,
-    COLOR,
-    LENS,
-    NEAR,
-    camera_point,
-    lens_terms,
-    load_camera,
-)
+from edge_server.fields.splat.kernels.project import BLOCK, COLOR, camera_point, lens_terms
 
 MAX_ERROR = 0.5  # bound of a view's color error: the Gaussian may be hidden there
 _TRANSPARENT = 128  # of 255: a pixel of less alpha shows nothing

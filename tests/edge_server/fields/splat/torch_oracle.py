@@ -10,16 +10,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from edge_server.fields.common.kernels.camera import LENS, LIMITS, NEAR, ORIGIN
 from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
 from edge_server.fields.splat.kernels.project import (
     ALPHA_MIN,
     COLOR,
-    LENS,
-    LIMITS,
     LOW_PASS,
-    NEAR,
     OPACITY,
-    ORIGIN,
     QUATERNION,
     RAW_OPACITY,
     SCALE,

@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.splat.buffers import camera_rows
+from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.splat.kernels.composite import (
     PIXELS,
     SAVED,

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
+from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.kernels.camera import ORIGIN
 from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.buffers import RasterBuffers, camera_rows
+from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import (
@@ -21,11 +23,10 @@ from edge_server.fields.splat.kernels.project import (
     MEAN_X,
     MEAN_Y,
     OPACITY,
-    ORIGIN,
     QUATERNION,
     SCALE,
     Gaussians,
-)  # fmt: skip
+)
 from edge_server.fields.splat.kernels.rasterize import ALPHA_MAX
 from edge_server.fields.splat.kernels.rasterize_planes import accumulate_normals, render_planes
 from edge_server.fields.splat.planar import (

@@ -1,0 +1,47 @@
+"""A camera as a row of float32 that kernels read (``common.camera_rows``), and its lens."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_server.fields.common.kernels.jit import part
+
+# Columns: the rotation's nine numbers first. LENS: fx, fy, cx, cy, k1, k2, p1, p2. LIMITS: lowest and highest
+# x / z, then y / z. SIZE: width, height. TIME: seconds from the instant of the Gaussians' parameters.
+ORIGIN, LENS, LIMITS, NEAR, SIZE, TIME, CAMERA = 9, 12, 20, 24, 25, 27, 28
+
+_F1, _F2 = np.float32(1.0), np.float32(2.0)
+
+
+@part
+def load_camera(cams, b):
+    """Camera b's columns as a tuple of CAMERA numbers. From a tuple, a loop that writes to arrays need not
+    read the camera again for every Gaussian, which would keep LLVM from vectorizing it; and no array object
+    is made of the row, whose references the threads would count."""
+    return (
+        cams[b, 0], cams[b, 1], cams[b, 2], cams[b, 3], cams[b, 4], cams[b, 5], cams[b, 6],
+        cams[b, 7], cams[b, 8], cams[b, 9], cams[b, 10], cams[b, 11], cams[b, 12], cams[b, 13],
+        cams[b, 14], cams[b, 15], cams[b, 16], cams[b, 17], cams[b, 18], cams[b, 19], cams[b, 20],
+        cams[b, 21], cams[b, 22], cams[b, 23], cams[b, 24], cams[b, 25], cams[b, 26], cams[b, 27],
+    )  # fmt: skip
+
+
+@part
+def distort(cam, x, y):
+    """Distorted normalized coordinates of (x, y), their Jacobian (symmetric: distortion is a gradient) and
+    its derivatives xxx, xxy, xyy, yyy. cam: see ``load_camera``."""
+    k1, k2, p1, p2 = cam[LENS + 4], cam[LENS + 5], cam[LENS + 6], cam[LENS + 7]
+    six, eight = np.float32(6.0), np.float32(8.0)
+    r2 = x * x + y * y
+    radial = _F1 + r2 * (k1 + r2 * k2)
+    g = k1 + _F2 * k2 * r2
+    u = x * radial + _F2 * p1 * x * y + p2 * (r2 + _F2 * x * x)
+    v = y * radial + p1 * (r2 + _F2 * y * y) + _F2 * p2 * x * y
+    dxx = radial + _F2 * x * x * g + _F2 * p1 * y + six * p2 * x
+    dxy = _F2 * x * y * g + _F2 * p1 * x + _F2 * p2 * y
+    dyy = radial + _F2 * y * y * g + six * p1 * y + _F2 * p2 * x
+    xxx = six * x * g + eight * k2 * x * x * x + six * p2
+    xxy = _F2 * y * g + eight * k2 * x * x * y + _F2 * p1
+    xyy = _F2 * x * g + eight * k2 * x * y * y + _F2 * p2
+    yyy = six * y * g + eight * k2 * y * y * y + six * p1
+    return u, v, dxx, dxy, dyy, xxx, xxy, xyy, yyy
