@@ -64,9 +64,9 @@ class DelayStats:
     """
 
     def __init__(self, total: DelayStats | None = None) -> None:
-        self.drawn = Histogram(total and total.drawn)
-        self.latency = Histogram(total and total.latency)
-        self.error = Histogram(total and total.error)
+        self.drawn: Histogram = Histogram(None if total is None else total.drawn)
+        self.latency: Histogram = Histogram(None if total is None else total.latency)
+        self.error: Histogram = Histogram(None if total is None else total.error)
 
 
 class ServedCall:
