@@ -64,9 +64,9 @@ class DelayStats:
     """
 
     def __init__(self, total: DelayStats | None = None) -> None:
-        self.drawn: Histogram = Histogram(total.drawn if total else None)
-        self.latency: Histogram = Histogram(total.latency if total else None)
-        self.error: Histogram = Histogram(total.error if total else None)
+        self.drawn: Histogram = Histogram(None if total is None else total.drawn)
+        self.latency: Histogram = Histogram(None if total is None else total.latency)
+        self.error: Histogram = Histogram(None if total is None else total.error)
 
 
 class ServedCall:

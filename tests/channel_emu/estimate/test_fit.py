@@ -418,7 +418,7 @@ def test_a_live_recording_is_fitted_to_the_channel_that_made_it(tmp_path: Path) 
     section = {**FAST, "chain": {"mu1_per_ms": 1 / 400, "mu2_per_ms": 1 / 400}}
 
     async def live() -> None:
-        async with rig(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
+        async with emulate(tmp_path, section, trace=tmp_path / "t.jsonl") as r:
             await asyncio.gather(*(c.stream(2000, 0.005) for c in r.cameras.values()))
             await r.settled()
 
