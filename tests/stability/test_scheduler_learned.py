@@ -22,22 +22,29 @@ EXTREME_AGES_MS = [0.0, -0.0, 1e12, -1e12, np.inf, -np.inf, np.nan, 5e-324, 1.7e
 EXTREMES = np.array([np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e-45, 0.0, -0.0, 1.0, 1e20])
 
 
-def finite(learner: Learner, told: Diagnostics | None = None) -> None:
+def finite(learner: Learner, diagnostics: Diagnostics | None = None) -> None:
     assert all(np.isfinite(w).all() for w in learner.actor.weights.values())
-    if told is not None:
-        figures = (told.policy_loss, told.value_loss, told.entropy, told.moved, told.clipped, told.gradient)
+    if diagnostics is not None:
+        figures = (
+            diagnostics.policy_loss,
+            diagnostics.value_loss,
+            diagnostics.entropy,
+            diagnostics.moved,
+            diagnostics.clipped,
+            diagnostics.gradient,
+        )
         assert np.isfinite(figures).all()
-        assert told.skipped == 0
+        assert diagnostics.skipped == 0
 
 
 def decide_and_learn(learner: Learner, states: list[State], rewards=None) -> Diagnostics:
     actions, logps = learner.act(states)
     assert np.isfinite(logps).all() and (logps <= 1e-9).all()
     given = np.random.default_rng(0).standard_normal(len(states)) if rewards is None else rewards
-    told = learner.update(learner.batch(states, actions, logps, given))
-    finite(learner, told)
+    diagnostics = learner.update(learner.batch(states, actions, logps, given))
+    finite(learner, diagnostics)
     assert np.isfinite(learner.value(states)).all()
-    return told
+    return diagnostics
 
 
 def learns_on(learner: Learner, problem) -> None:
@@ -78,8 +85,8 @@ def test_a_camera_whose_age_is_no_number_is_as_silent_as_one_that_never_reported
 def test_all_cameras_silent(spec):
     learner = Learner(spec, 0)
     silent = [state(5, np.random.default_rng(i), d=4, silent=5) for i in range(8)]
-    told = decide_and_learn(learner, silent)
-    assert told.dropped == 0
+    diagnostics = decide_and_learn(learner, silent)
+    assert diagnostics.dropped == 0
     actions, logps = learner.act(silent)
     if spec.action == "select":
         assert not actions.any() and not logps.any()
@@ -123,8 +130,8 @@ def test_constant_reward_moves_the_policy_nowhere(spec, reward):
     before = learner.actor.weights
     states = [state(6, np.random.default_rng(i), d=4) for i in range(32)]
     for _ in range(10):
-        told = decide_and_learn(learner, states, np.full(32, reward))
-        assert told.explained is None and told.reward == pytest.approx(reward)
+        diagnostics = decide_and_learn(learner, states, np.full(32, reward))
+        assert diagnostics.explained is None and diagnostics.reward == pytest.approx(reward)
     assert all(np.array_equal(w, learner.actor.weights[name]) for name, w in before.items())
 
 
@@ -154,8 +161,8 @@ def test_the_unit_of_a_reward_does_not_matter(size):
 
     learner, problem = Learner(Spec("select", FreshOnes.layout), 0), FreshOnes()
     for number in range(8):
-        told = learner.update(scaled(collect(learner, problem, range(64 * number, 64 * number + 64))))
-        finite(learner, told)
+        diagnostics = learner.update(scaled(collect(learner, problem, range(64 * number, 64 * number + 64))))
+        finite(learner, diagnostics)
     assert regret(learner, problem) < 0.03
 
 
@@ -164,15 +171,15 @@ def test_rewards_that_are_no_numbers_are_left_out_and_counted():
     for number in range(10):
         batch = collect(learner, problem, range(64 * number, 64 * number + 64))
         batch.rewards[::3] = [np.nan, np.inf, -np.inf, 1e200] * 5 + [np.nan, -1e300]
-        told = learner.update(batch)
-        finite(learner, told)
-        assert told.dropped == 22
+        diagnostics = learner.update(batch)
+        finite(learner, diagnostics)
+        assert diagnostics.dropped == 22
     assert regret(learner, problem) < 0.03
     nothing = collect(learner, problem, range(8))
     nothing.rewards[:] = np.nan
     before = learner.actor.weights
-    told = learner.update(nothing)
-    assert told.steps == 0 and told.dropped == 8 and told.reward is None
+    diagnostics = learner.update(nothing)
+    assert diagnostics.steps == 0 and diagnostics.dropped == 8 and diagnostics.reward is None
     assert all(np.array_equal(w, learner.actor.weights[k]) for k, w in before.items())
 
 
@@ -229,8 +236,8 @@ def test_ratios_that_overflow(spec, claimed):
     rewards = np.random.default_rng(1).standard_normal(32)
     for _ in range(5):
         finite(learner, learner.update(learner.batch(states, actions, np.full(32, claimed), rewards)))
-    told = learner.update(learner.batch(states, actions, np.full(32, np.nan), rewards))
-    assert told.dropped == 32
+    diagnostics = learner.update(learner.batch(states, actions, np.full(32, np.nan), rewards))
+    assert diagnostics.dropped == 32
 
 
 @pytest.mark.parametrize("n", [1, pytest.param(200, marks=pytest.mark.slow)])

@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         decision = found.decision
         explanation = explain(decision.actor, decision.state, decision.action)
         camera = _camera(args.camera, found, explanation)
-        regions = None if camera is None else _regions_or_why(found, camera, asked=args.camera is not None)
+        regions = None if camera is None else _regions(found, camera, asked=args.camera is not None)
         picture = args.picture or args.run / f"decision-{decision.number:06d}.png"
         draw(explanation, picture, camera, found.images.get(camera or ""), regions)
         if args.json is not None:
@@ -72,24 +72,19 @@ def _camera(asked: str | None, found: RecordedDecision, explanation: Explanation
     return max(found.images, key=lambda camera: share.get(camera, 0.0))
 
 
-def _regions_or_why(found: RecordedDecision, camera: str, asked: bool) -> NDArray[np.float64] | None:
+def _regions(found: RecordedDecision, camera: str, asked: bool) -> NDArray[np.float64] | None:
     """Shares of the regions of the camera's image. Where frames cannot be embedded again (the model's file is
     gone, the extra is not installed) this prints why and returns None, unless the user asked for the
     camera."""
+    decision, image = found.decision, found.images[camera]
     try:
-        return _regions(found, camera)
+        number = decision.state.cameras.index(camera)
+        return occlusion_map(decision.actor, decision.state, decision.action, number, image, _embedder(found))
     except ValueError as error:
         if asked:
             raise
         print(f"edge-server explain: no regions of a picture: {error}", file=sys.stderr)
         return None
-
-
-def _regions(found: RecordedDecision, camera: str) -> NDArray[np.float64]:
-    decision = found.decision
-    number = decision.state.cameras.index(camera)
-    embed = _embedder(found)
-    return occlusion_map(decision.actor, decision.state, decision.action, number, found.images[camera], embed)
 
 
 def _embedder(found: RecordedDecision) -> EmbedImages:

@@ -9,7 +9,7 @@ import pytest
 
 from edge_server.live.buffer import BufferedFrame
 from edge_server.scheduler.learned.observation import observe
-from edge_server.scheduler.learned.state import State, StateLayout
+from edge_server.scheduler.learned.state import StateLayout
 from freshfield.geometry import Pose, look_at, so3_exp
 from tests.edge_server.frames import frame
 from tests.edge_server.scheduler.learned.problems import state
@@ -157,9 +157,3 @@ def test_nobody_has_reported_and_one_camera_alone():
     assert not layout.features(s).any()
     alone = {"c0": rig()["c0"]}
     assert np.isfinite(layout.features(observe(("c0", "c1"), alone, 0, Colours()))).all()
-
-
-def test_a_state_is_plain_data():
-    s = state(2, np.random.default_rng(0))
-    assert isinstance(s, State)
-    assert len(s) == 2

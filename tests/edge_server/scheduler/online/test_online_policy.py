@@ -1,8 +1,9 @@
-"""A learned policy that goes on learning: it follows a change, stays on its leash, falls back and returns."""
+"""A policy that learns while it decides: it follows a change, stays in its limits, falls back and returns."""
 
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,9 +36,10 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def settings(**more) -> OnlineSettings:
-    """Judged from the first decision on."""
-    return OnlineSettings(**{"warmup": 0, **more})
+def online(learner: Learner, seed: int = 2, **settings) -> OnlinePolicy:
+    """Beside threshold:80; compared from the first decision on unless ``settings`` say otherwise."""
+    fixed = make_policy("threshold", 80.0, rng())
+    return OnlinePolicy(learner, fixed, "bandit:x", rng(seed), OnlineSettings(**{"warmup": 0, **settings}))
 
 
 def taught(worth, updates: int = 25) -> Learner:
@@ -79,9 +81,8 @@ def long(omega: float) -> float:
     return omega / 100.0
 
 
-def test_it_falls_back_when_what_pays_has_changed_and_returns_once_it_has_learned():
-    fixed = make_policy("threshold", 80.0, rng())
-    policy = OnlinePolicy(taught(short), fixed, "bandit:x", rng(2), settings(share=0.3, max_kl=50.0))
+def test_it_falls_back_after_a_change_and_returns_once_it_has_learned():
+    policy = online(taught(short), share=0.3, max_kl=50.0)
     before = use(policy, short, 150)
     assert not policy.fallen_back and np.mean(before) < 60.0
     drifted = use(policy, long, 250, 150)
@@ -95,39 +96,21 @@ def test_it_falls_back_when_what_pays_has_changed_and_returns_once_it_has_learne
     assert np.mean(use(policy, long, 100, 4000)) > 200.0
 
 
-def test_the_trust_region_holds_whatever_is_rewarded():
-    policy = OnlinePolicy(
-        Learner(SPEC, 1),
-        make_policy("threshold", 80.0, rng()),
-        "bandit:x",
-        rng(2),
-        settings(max_kl=0.2, batch=16),
-    )
+def test_the_trust_region_holds_for_any_reward():
+    policy = online(Learner(SPEC, 1), max_kl=0.2, batch=16)
     for first in range(0, 600, 50):
         use(policy, long, 50, first)
         assert policy.kl_from_loaded <= 0.2
     assert policy.updates > 10 and policy.shortened > 0
-    free = OnlinePolicy(
-        Learner(replace(SPEC, target_kl=50.0), 1),
-        make_policy("threshold", 80.0, rng()),
-        "bandit:x",
-        rng(2),
-        settings(max_kl=50.0, batch=16),
-    )
+    free = online(Learner(replace(SPEC, target_kl=50.0), 1), max_kl=50.0, batch=16)
     use(free, long, 600)
     assert free.kl_from_loaded > 0.2 and free.shortened == 0
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_one_update_moves_it_no_further_than_the_specification_says(seed: int):
+def test_one_update_moves_it_by_at_most_target_kl(seed: int):
     spec = replace(SPEC, learning_rate=3e-2)
-    policy = OnlinePolicy(
-        Learner(spec, seed),
-        make_policy("threshold", 80.0, rng()),
-        "b",
-        rng(2),
-        settings(max_kl=50.0, batch=16),
-    )
+    policy = online(Learner(spec, seed), max_kl=50.0, batch=16)
     steps = []
     for number in range(400):
         at = epoch(number)
@@ -135,19 +118,21 @@ def test_one_update_moves_it_no_further_than_the_specification_says(seed: int):
         policy.select(at, plan)
         if policy.add_reward(number, (long if number < 200 else short)(plan.omega_ms)):
             before = policy._learner.actor
-            told = policy.learn()
+            figures = policy.learn()
             batch = spec.layout.batch([epoch(k).state() for k in range(number + 1)])
             steps.append(mean_kl(before, policy._learner.actor, batch))
-            assert told["step_kl"] <= spec.target_kl
+            assert figures["step_kl"] <= spec.target_kl
     assert len(steps) > 10 and policy.shortened > 0
     assert np.mean(steps) > 0.1 * spec.target_kl, "it is held back, not held"
 
 
 @pytest.mark.parametrize(("action", "cameras"), [("select", 18), ("select", 200), ("threshold", 18)])
-def test_it_is_compared_with_what_acted_chance_included(action: str, cameras: int):
-    """In the first pass nothing has been learned yet: a policy that is nearly sure has moved by nothing."""
+def test_it_is_compared_with_the_exploring_policy_that_acted(action: str, cameras: int):
+    """In the first pass nothing has been learned yet, so that even a nearly sure policy has not moved."""
     spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, start=0.99, passes=1)
-    policy = OnlinePolicy(Learner(spec, 1), make_policy("all", None, rng()), "b", rng(3), settings(batch=32))
+    policy = OnlinePolicy(
+        Learner(spec, 1), make_policy("all", None, rng()), "b", rng(3), OnlineSettings(warmup=0)
+    )
     for number in range(60):
         seen = state(cameras, rng(number))
         now_ns = 10**12 + number * 100 * MS
@@ -156,12 +141,12 @@ def test_it_is_compared_with_what_acted_chance_included(action: str, cameras: in
         policy.select(at, policy.plan(at))
         if policy.add_reward(number, float(rng(number).standard_normal())):
             break
-    told = policy.learn()
-    assert told is not None and told["kl_from_acted"] == pytest.approx(0.0, abs=1e-12)
+    figures = policy.learn()
+    assert figures is not None and figures["kl_from_acted"] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_what_was_trained_on_differences_learns_live_wherever_the_rewards_zero_lies():
-    """Training compares the actions of one decision; live there is one, and its reward is what it is."""
+def test_the_offset_of_live_rewards_does_not_matter():
+    """Training compares the actions of one decision; live there is only one, with its plain reward."""
 
     def trained() -> Learner:
         learner, states = Learner(SPEC, 1), [state(5, rng(k)) for k in range(64)]
@@ -173,8 +158,7 @@ def test_what_was_trained_on_differences_learns_live_wherever_the_rewards_zero_l
 
     learned = []
     for zero in (0.0, -1.2, 30.0):
-        fixed = make_policy("threshold", 80.0, rng())
-        policy = OnlinePolicy(trained(), fixed, "b", rng(2), settings(max_kl=50.0))
+        policy = online(trained(), max_kl=50.0)
         use(policy, lambda omega, zero=zero: zero + 0.3 * (omega == 320.0), 200)
         assert policy.updates >= 4
         learned.append(policy._bandit.actor)
@@ -186,11 +170,10 @@ def test_what_was_trained_on_differences_learns_live_wherever_the_rewards_zero_l
 
 
 @pytest.mark.parametrize("fallen_back", [False, True])
-def test_who_decides_is_not_changed_by_chance(fallen_back: bool):
-    """Rewards that nobody has a hand in, and that stay high or low for a while, as those of a field do."""
-    fixed = make_policy("threshold", 80.0, rng())
+def test_who_decides_does_not_change_by_chance(fallen_back: bool):
+    """Rewards independent of the policy that stay high or low for a while, as those of a field do."""
     for seed in range(6):
-        policy = OnlinePolicy(Learner(SPEC, 1), fixed, "b", rng(seed), settings(batch=10**6))
+        policy = online(Learner(SPEC, 1), seed, batch=10**6)
         if fallen_back:
             policy._switch()
         noise, found = rng(100 + seed), 0.0
@@ -202,11 +185,8 @@ def test_who_decides_is_not_changed_by_chance(fallen_back: bool):
             assert policy.fallen_back is fallen_back
 
 
-def test_the_same_seed_does_the_same_and_saves_what_goes_on(tmp_path: Path):
-    made = [
-        OnlinePolicy(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings())
-        for _ in range(2)
-    ]
+def test_the_same_seed_repeats_and_the_learner_is_saved(tmp_path: Path):
+    made = [online(taught(short)) for _ in range(2)]
     first, second = (use(a, long, 200) for a in made)
     assert first == second and made[0].status() == made[1].status() and made[0].updates > 0
     made[0].save(tmp_path / "learnt.npz")
@@ -214,8 +194,8 @@ def test_the_same_seed_does_the_same_and_saves_what_goes_on(tmp_path: Path):
     assert all(np.array_equal(w, other[n]) for n, w in saved.items())
 
 
-def test_late_missing_and_broken_rewards_teach_nothing_and_harm_nothing():
-    policy = OnlinePolicy(taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings())
+def test_late_missing_and_broken_rewards_are_ignored():
+    policy = online(taught(short))
     before = policy._bandit.actor.weights
     for number in range(200):
         at = epoch(number)
@@ -227,26 +207,23 @@ def test_late_missing_and_broken_rewards_teach_nothing_and_harm_nothing():
     assert policy.status()["learnt_reward"]["count"] == 0 and "not known yet" in policy.summary()
 
 
-def test_nobody_is_judged_by_a_field_that_only_begins():
-    fixed = make_policy("threshold", 80.0, rng())
-    policy = OnlinePolicy(taught(short), fixed, "b", rng(2), OnlineSettings(warmup=50))
-    use(policy, long, 50, 1000)  # an edge that was restarted goes on counting
+def test_decisions_of_the_warmup_do_not_count():
+    policy = online(taught(short), warmup=50)
+    use(policy, long, 50, 1000)  # a restarted edge continues to count
     assert policy.status()["learnt_reward"]["count"] == policy.status()["fixed_reward"]["count"] == 0
     use(policy, long, 30, 1050)
     counts = [policy.status()[f"{who}_reward"]["count"] for who in ("learnt", "fixed")]
     assert sum(counts) == 30
 
 
-def test_no_verdict_on_a_few_decisions():
-    policy = OnlinePolicy(
-        taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings(share=0.5)
-    )
+def test_few_decisions_are_not_compared():
+    policy = online(taught(short), share=0.5)
     use(policy, long, MIN_REWARDS)  # of both together: too few of either
     assert not policy.fallen_back
 
 
 @pytest.mark.parametrize("action", ["select", "threshold"])
-def test_divergence_is_the_one_of_torch_and_finite_at_the_edges(action):
+def test_mean_kl_agrees_with_torch_and_is_finite_at_the_edges(action):
     spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, hidden=8)
     a, b = (Learner(spec, s).actor for s in (1, 2))
     a, b = (Actor(spec, {n: w + 0.5 * rng(9).standard_normal(w.shape) * k for n, w in x.weights.items()})
@@ -270,7 +247,7 @@ def test_divergence_is_the_one_of_torch_and_finite_at_the_edges(action):
     assert np.isfinite(mean_kl(a, far, features))
 
 
-def test_the_reward_and_the_fall_back_are_those_of_the_training(tmp_path: Path):
+def test_reward_and_fallback_default_to_those_of_the_training(tmp_path: Path):
     taught(short, 1).save(tmp_path / "policy.npz")
     summary = {"reward_name": "thesis", "on": "moving", "best_fixed": "threshold:150"}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
@@ -293,10 +270,8 @@ class Score:
         self.aaoi_ms = aaoi_ms
 
 
-def test_lessons_are_given_on_a_thread_of_their_own_and_written_down(tmp_path: Path):
-    policy = OnlinePolicy(
-        taught(short), make_policy("threshold", 80.0, rng()), "b", rng(2), settings(batch=8)
-    )
+def test_the_trainer_learns_on_its_own_thread_and_logs_updates(tmp_path: Path):
+    policy = online(taught(short), batch=8)
     reward = make_reward("corrected", psnr=0.0, ssim=0.0, distance=0.0, age=-0.01)
     trainer = OnlineTrainer(policy, reward, tmp_path)
     trainer.start()
@@ -308,7 +283,7 @@ def test_lessons_are_given_on_a_thread_of_their_own_and_written_down(tmp_path: P
     for _ in range(200):
         if policy.updates:
             break
-        threading_wait()
+        time.sleep(0.02)
     trainer.stop()
     trainer.close()
     lines = [json.loads(line) for line in (tmp_path / "learning.jsonl").read_text().splitlines()]
@@ -317,7 +292,7 @@ def test_lessons_are_given_on_a_thread_of_their_own_and_written_down(tmp_path: P
 
 
 @pytest.mark.parametrize("action", ["select", "wait"])
-def test_chance_has_its_share_in_every_action_and_the_probability_told_is_the_true_one(action):
+def test_exploration_is_part_of_every_action_and_of_its_probability(action):
     spec = Spec(action, StateLayout(("age",)), () if action == "select" else OMEGAS, hidden=8)
     weights = dict(Learner(spec, 1).actor.weights)
     weights["out_b"] = np.full_like(weights["out_b"], 1e3)  # as sure as can be, of cameras
@@ -331,11 +306,7 @@ def test_chance_has_its_share_in_every_action_and_the_probability_told_is_the_tr
         assert np.allclose(draws.mean(axis=0), 0.9, atol=0.04)
         return
     assert np.allclose(np.bincount(draws, minlength=3) / 600, [1 - 0.4 / 3, 0.2 / 3, 0.2 / 3], atol=0.04)
-    told = {int(a): float(p) for k in range(60) for a, p in [np.ravel(chance.act([seen], rng(k)))]}
-    assert np.exp(told[0]) == pytest.approx(1 - 0.4 / 3) and np.exp(told[1]) == pytest.approx(0.2 / 3)
-
-
-def threading_wait() -> None:
-    import time
-
-    time.sleep(0.02)
+    probabilities = {int(a): float(p) for k in range(60) for a, p in [np.ravel(chance.act([seen], rng(k)))]}
+    assert np.exp(probabilities[0]) == pytest.approx(1 - 0.4 / 3) and np.exp(
+        probabilities[1]
+    ) == pytest.approx(0.2 / 3)
