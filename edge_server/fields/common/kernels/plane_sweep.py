@@ -31,7 +31,8 @@ def _spread(u):
 def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
     """Which pixel shows each cell of a row: pixels, int32 (cells,), receives its number, or ``nowhere``.
 
-    cam: of ``held``. first: the picture's first pixel. row: float32 (3, cells), the cells' centers.
+    cam: a camera's columns as a tuple. first: the picture's first pixel.
+    row: float32 (3, cells), the cells' centers.
     """
     for k in range(pixels.size):
         x, y, z = row[0, k] - cam[ORIGIN], row[1, k] - cam[ORIGIN + 1], row[2, k] - cam[ORIGIN + 2]
