@@ -72,7 +72,7 @@ class TrainedField:
 
     name: ClassVar[str]
     shape: ClassVar[tuple[str, ...]]
-    _encoding: Any  # a named tuple with a ``table`` of float32 parameters, as kernels.model wants it
+    _encoding: Any  # a named tuple with a ``table`` of float32 parameters, see ``kernels.radiance_model``
     _net: Net
     _batch: Batch
     _cameras: CameraRefinement
@@ -109,18 +109,18 @@ class TrainedField:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
         step_budget = StepBudget(budget, self.now)
         with self._lock:
-            intake = self.view_store.add(views)
-            if intake.box_changed:
+            update = self.view_store.add(views)
+            if update.box_changed:
                 self._forget_parameters()
-            if intake.visibility_changed:
+            if update.visibility_changed:
                 self._occupancy.recount_views(self.pool, self.view_store)
             assert self.view_store.box is not None
             box, cameras = self.view_store.box, self._cameras
-            data = intake.data
+            data = update.data
             if not cameras.enabled:
-                data = self.view_store.without_outliers(views, intake, self.step, self._live())
+                data = self.view_store.without_outliers(views, update, self.step, self._live())
             data = cameras.corrected(views, data, box)
-            data = self._add_depth_guide(views, data, box, step_budget, intake.has_new_images)
+            data = self._add_depth_guide(views, data, box, step_budget, update.has_new_images)
             counted = len(views) if cameras.exposures is not None else 0
             sums = np.zeros((len(self._batch.samples), counted, 3, 5))
             self._batch = self._batch._replace(exposure=sums)

@@ -98,14 +98,14 @@ class CameraLooks(CameraRefinement):
 
     def learn(
         self, views: Sequence[View], data: Views, box: SceneBox, step: int, seed: int,
-        sums: NDArray[np.float64], live: Callable[[], RaySnapshot],
+        sums: NDArray[np.float64], make_renderer: Callable[[], RaySnapshot],
     ) -> Views:  # fmt: skip
         """After ``step``: learn from it; returns the corrected data."""
         if self.appearances is not None:
             cameras = [v.camera for v in views]
             self.appearances.learn(cameras, self.gradient, self.rays)
             self.now = self.appearances.rows(cameras)
-        return super().learn(views, data, box, step, seed, sums, live)
+        return super().learn(views, data, box, step, seed, sums, make_renderer)
 
     def meta(self) -> dict[str, Any]:
         """What a state keeps, ready for JSON, to the last bit."""

@@ -14,8 +14,7 @@ from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.supervision import CameraMemory, remember_views, without_views
 from edge_server.fields.common.view_outliers import MOST_REFUSALS, find_outliers, pixel_weights
 from edge_server.fields.common.view_store import ViewStore
-from edge_server.fields.ngp.settings import NgpSettings, make_settings
-from edge_server.fields.splat.settings import make_settings as make_splat_settings
+from edge_server.fields.ngp.settings import NgpSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring
 from tests.edge_server.fields.small import SMALL, every_field, small
 
@@ -123,9 +122,9 @@ def test_clocks_that_lie_do_no_harm() -> None:
 @pytest.mark.parametrize("name", ["age_tau_ms", "mask_stale_ms", "mask_grow_px_s", "refuse_beyond"])
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
 def test_options_are_checked(name: str, value: float) -> None:
-    for make in (make_settings, make_splat_settings):
+    for settings in SMALL.values():
         with pytest.raises(ValueError, match=f"{name} must be in"):
-            make({name: value})
+            replace(settings, **{name: value})
 
 
 def test_every_representation_has_the_same_options() -> None:

@@ -1,0 +1,42 @@
+"""The step that representations with a network share: which regularizers reach the kernels."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from edge_server.fields import Budget
+from tests.edge_server.fields.small import SEEN, small
+
+
+@pytest.mark.parametrize("name", ["ngp", "nerfacto", "tensorf"])
+def test_shipped_settings_regularize(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The weights that a field gives its kernels where nothing is asked for."""
+    field, given = small(name), []
+    train = field._train
+
+    def noted(data, recipe, space, weights) -> None:
+        given.append(weights)
+        train(data, recipe, space, weights)
+
+    monkeypatch.setattr(field, "_train", noted)
+    field.fit(SEEN, Budget(steps=1))
+    assert given[0].distortion == np.float32(0.01) and given[0].guide == np.float32(0.1)
+    assert given[0].sparsity == given[0].near == 0.0
+
+
+def test_the_distortion_loss_lowers_the_spread_of_weight_along_rays() -> None:
+    spread = {}
+    for weight in (3.0, 0.0):
+        field = small("ngp", threads=1, distortion=weight, depth_guide=0.0)
+        field.fit(SEEN, Budget(steps=60))
+        scratch, rays = field._scratch, int(field._batch.rays[-1])
+        by_ray, first = scratch.by_ray[0], scratch.ray_first[0]
+        total = 0.0
+        for a, b in pairwise(first[: rays + 1]):
+            t, w = by_ray[8, a:b], by_ray[10, a:b]
+            total += float(w @ np.abs(t[:, None] - t) @ w)
+        spread[weight] = total / rays
+    assert spread[3.0] < 0.6 * spread[0.0]
