@@ -16,7 +16,7 @@ from channel_emu.live.camera_lane import HardLimit
 from channel_emu.live.frame_proxy import Proxy, ProxyOptions
 from channel_emu.live.upstream import CREDITS
 from channel_emu.model.config import channel_from_mapping
-from edge_server.report.frame_accounting import close_books
+from edge_server.report.frame_accounting import account_frames
 from freshfield.frame import to_request
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc
@@ -43,9 +43,9 @@ def run(coroutine) -> None:
 
 
 def books_of(out: Path):
-    books = close_books(out)
-    assert not books.contradictions and books.total.closes
-    return books.total
+    accounting = account_frames(out)
+    assert not accounting.contradictions and accounting.total.balanced
+    return accounting.total
 
 
 SHARED = {"service": {"law": "exponential", "mean_ms": 1.5}, "queue_limit": 6}
