@@ -11,7 +11,7 @@ from edge_server.config import ExportConfig
 from edge_server.report import build_report
 from edge_server.report.report import METRICS, SERIES, assemble, fidelity, updates
 from edge_server.report.run_files import read_run_files
-from freshfield_up.summary import summarise
+from freshfield_up.summary import summarize
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
 
 
@@ -115,7 +115,7 @@ def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
         (tmp_path / "mesh.json").write_text(json.dumps({**mesh, "measured": found}))
         report = build_report(tmp_path)
         assert report["mesh"] == {**mesh, "measured": found}
-        page, last = (tmp_path / "report.html").read_text(), summarise(tmp_path)
+        page, last = (tmp_path / "report.html").read_text(), summarize(tmp_path)
         assert ("6.93 mm" in page and "60.7 %" in page) == (found is not None)
         assert ("chamfer 6.93 mm (target 1.5), 61 % of the" in last) == (found is not None)
         assert "tile.ply: 19,794 triangles, made in 12 s" in last
