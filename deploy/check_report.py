@@ -1,6 +1,6 @@
 """Checks the report of a run: ``python deploy/check_report.py OUT``; exit code 1 if it is wrong.
 
-Used by continuous integration after a short demo: it asks for what every healthy run has, not for figures.
+Continuous integration runs it after a short demo. It checks what every healthy run has, and no figures.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def problems(out: Path) -> list[str]:
-    """What is wrong with the report in ``out``, one line each."""
+    """The problems of the report in ``out``, one line each."""
     for name in ("report.json", "report.html"):
         if not (out / name).is_file():
             return [f"{out / name} is missing"]
@@ -20,22 +20,26 @@ def problems(out: Path) -> list[str]:
     frames, fidelity = report["frames"], report["fidelity"]
     updates, baseline = report["updates"], fidelity["baseline"]
     checks = {
-        "the books close": frames["closes"],
+        "every frame is accounted for": frames["closes"],
         "frames were delivered": frames["delivered"] > 0,
         "no frame was rejected": not frames["rejected"],
         "the field was updated at least three times": updates["count"] >= 3,
         "every frame could be decoded": updates["undecodable"] == 0,
         "the held-out view was scored": fidelity["final"]["psnr_db"] is not None,
-        "the field beats a plane of mean colour": (fidelity["final"]["psnr_db"] or 0.0)
+        "the field beats an image of the mean color": (fidelity["final"]["psnr_db"] or 0.0)
         > (baseline["mean_colour_db"] or 0.0),
-        "every camera was heard": all(age is not None for age in report["age_ms"]["by_camera"].values()),
+        "every camera reported": all(age is not None for age in report["age_ms"]["by_camera"].values()),
     }
-    return [f"not so: {what}" for what, holds in checks.items() if not holds]
+    return [f"not true: {what}" for what, holds in checks.items() if not holds]
 
 
 def main() -> int:
     found = problems(Path(sys.argv[1]))
-    print("\n".join(found) if found else f"{sys.argv[1]}: the report is complete and its books close")
+    print(
+        "\n".join(found)
+        if found
+        else f"{sys.argv[1]}: the report is complete and every frame is accounted for"
+    )
     return 1 if found else 0
 
 

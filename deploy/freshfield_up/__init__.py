@@ -1,1 +1,1 @@
-"""The command ``freshfield-up``: starts every process of one scenario on one machine and watches them."""
+"""The command ``freshfield-up``: starts and supervises every process of a scenario on one machine."""

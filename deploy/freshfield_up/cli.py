@@ -1,12 +1,12 @@
-"""Starts every process of one scenario on this machine, watches them, and writes the report at the end.
+"""Starts every process of a scenario on this machine, supervises them, and writes the report at the end.
 
     freshfield-up SCENARIO [--for 60s] [--out DIR] [--port 8080] [--data DIR] [--seed N]
                            [--policy NAME[:VALUE]] [--learn [REWARD]]
 
-In a checkout: ``python deploy/up.py SCENARIO``. It starts the three commands that run by hand on separate
-machines: camera-node, channel-emu and edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of --for
-stops them in the order of the data. Exit code: 0 for a run that ended as asked, 1 if a process died, 2 if it
-could not begin.
+In a checkout: ``python deploy/up.py SCENARIO``. It starts the three commands that otherwise run by hand on
+separate machines: camera-node, channel-emu and edge-server. Ctrl-C, SIGTERM, a closed terminal or the end of
+--for stops them in the order of the data. Exit code: 0 for a run that ended as asked, 1 if a process died, 2
+if the run could not start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from freshfield_up.net import is_free
 def main(arguments: list[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
     try:
-        from freshfield_up.run import Options, Run
+        from freshfield_up.run import Launcher, Options
     except ModuleNotFoundError as error:
         return _refuse(f"{error.name} is not installed: pip install 'freshfield[edge,embed,up]'")
     try:
@@ -34,8 +34,8 @@ def main(arguments: list[str] | None = None) -> int:
             return _refuse(f"port {args.port} is taken by another program; choose one with --port (PORT=)")
         if args.data is not None and not args.data.is_dir():
             return _refuse(f"{args.data}: no such folder of recorded data (--data)")
-        if _lies_in(args.policy, args.out):
-            return _refuse(f"--policy {args.policy}: {args.out} is emptied first; name another --out")
+        if _is_inside(args.policy, args.out):
+            return _refuse(f"--policy {args.policy}: {args.out} is emptied first; choose another --out")
         options = Options(
             out=args.out,
             duration_s=args.duration_s,
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
             process_per_camera=args.process_per_camera,
             edge=_edge_options(args),
         )
-        return Run(scenario, options).main()
+        return Launcher(scenario, options).run()
     except (scenarios.ScenarioError, FolderError, MissingCommand) as error:
         return _refuse(str(error))
 
@@ -66,14 +66,14 @@ def _port(text: str) -> int:
     return int(text)
 
 
-def _lies_in(policy: str | None, out: Path) -> bool:
-    """Whether what was learnt is a file of the earlier run that this one replaces."""
+def _is_inside(policy: str | None, out: Path) -> bool:
+    """Whether the learned policy is a file of the earlier run that this one replaces."""
     kind, _, file = (policy or "").partition(":")
     return kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(out.resolve())
 
 
 def _edge_options(args: argparse.Namespace) -> tuple[str, ...]:
-    """Words for the edge server, which knows what they may be. One word each: a value may be empty."""
+    """Arguments for the edge server, which checks them. One argument each, because a value may be empty."""
     given = (("policy", args.policy), ("learn", args.learn), ("fallback", args.fallback))
     return tuple(f"--{name}={value}" for name, value in given if value is not None)
 
@@ -88,16 +88,24 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scenario", help="a scenario file, or the name of a shipped one (room, tile, ideal, ...)")
     add("--for", dest="duration_s", type=seconds, default=60.0, metavar="TIME", help="default 60s; 0: no end")
-    add("--out", type=Path, default=Path("runs/demo"), help="folder of the run; an earlier run is replaced")
-    add("--port", type=_port, default=8080, help="of the page, on 127.0.0.1 (default 8080)")
+    add("--out", type=Path, default=Path("runs/demo"), help="folder of the run; replaces an earlier run")
+    add("--port", type=_port, default=8080, help="port of the page on 127.0.0.1 (default 8080)")
     add("--data", type=Path, help="folder of recorded data, for scenarios that stream it")
-    add("--seed", type=int, help="instead of the scenario's own")
-    add("--policy", metavar="NAME[:VALUE]", help="instead of the scenario's: threshold:120, bandit:FILE")
+    add("--seed", type=int, help="seed in place of the scenario's")
+    add(
+        "--policy",
+        metavar="NAME[:VALUE]",
+        help="in place of the scenario's: threshold:120, bandit:FILE",
+    )
     add(
         "--learn", nargs="?", const="", metavar="REWARD[:moving]",
-        help="bandit:FILE goes on learning, by this reward (default: the one it was trained with)",
+        help="bandit:FILE keeps learning from this reward (default: the one it was trained with)",
     )  # fmt: skip
-    add("--fallback", metavar="NAME[:VALUE]", help="beside what learns (default: the best of its training)")
+    add(
+        "--fallback",
+        metavar="NAME[:VALUE]",
+        help="beside a learning policy (default: the best of its training)",
+    )
     add(
         "--restart", action="store_true", help="start a process again when it dies, instead of ending the run"
     )

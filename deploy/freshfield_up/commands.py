@@ -1,6 +1,6 @@
-"""The commands of one scenario's processes, wired together by free loopback ports.
+"""The commands of a scenario's processes, connected by free loopback ports: node -> emulator -> edge.
 
-node -> emulator -> edge: the nodes are told the emulator's address and nothing else.
+The nodes know only the emulator's address.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from freshfield.scenario import Scenario
 from freshfield_up.net import LOOPBACK, free_ports
 from freshfield_up.processes import Child
 
-# Libraries start a thread for each core unless told otherwise. Nodes and emulator have none to gain, and
-# the field brings its own pool: the others' threads would only take turns with it.
-_ONE_THREAD = (
+# Libraries start a thread for each core by default. Nodes and emulator gain nothing from these threads, which
+# would compete with the field's own pool.
+_SINGLE_THREADED = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -26,18 +26,18 @@ _ONE_THREAD = (
     "NUMBA_NUM_THREADS",
     "OPENCV_FOR_THREADS_NUM",
 )
-_ARM_PORT = 30004  # of every controller's state (RTDE); clients know it by heart
+_ARM_PORT = 30004  # RTDE, the fixed port for the state of every controller
 _EDGE_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 class MissingCommand(RuntimeError):
-    """A command of the project is not installed; the message says how to install it."""
+    """Something is not installed; the message says how to install it."""
 
 
 @dataclass(frozen=True)
 class ProcessSet:
-    """The processes of one scenario. ``nodes`` is never empty; ``arms`` and ``drivers`` hold one each where
-    the scenario has a simulated arm and a path for it."""
+    """The processes of one scenario. ``nodes`` is never empty. ``arms`` holds a process if the scenario has a
+    simulated arm, ``drivers`` one if that arm has a path."""
 
     edge: Child
     emulator: Child
@@ -50,12 +50,12 @@ class ProcessSet:
 
     @property
     def children(self) -> list[Child]:
-        """All of them in the order in which they stop: nobody sends to what is gone."""
+        """All processes in the order in which they stop: senders before receivers."""
         return [child for group in self.groups for child in group]
 
     @property
     def groups(self) -> list[list[Child]]:
-        """Those of ``children`` that may stop together."""
+        """``children`` in groups that may stop together."""
         return [self.drivers, self.nodes, self.arms, [self.emulator], [self.edge]]
 
 
@@ -68,13 +68,17 @@ def process_set(
     process_per_camera: bool = False,
     edge_options: Sequence[str] = (),
 ) -> ProcessSet:
-    """Commands, addresses and log files of a run into ``out``. edge_options: further words for the edge
-    server."""
+    """Commands, addresses and log files of a run.
+
+    out: folder of the run. page_port: loopback port of the page. data: folder of recorded data, if any.
+    seed: in place of the scenario's. process_per_camera: one node for each camera instead of one for all.
+    edge_options: further arguments for the edge server.
+    """
     edge_port, emulator_port = free_ports(2)
     edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
     file = str(scenario.path)
     common = ["--out", str(out), *(["--seed", str(seed)] if seed is not None else [])]
-    one = _threads(_ONE_THREAD, 1)
+    one = _threads(_SINGLE_THREADED, 1)
     recorded = ["--data", str(data)] if data is not None else []
     edge = Child(
         "edge",
@@ -122,7 +126,7 @@ def process_set(
 
 
 def program(name: str) -> str:
-    """Path of one of the project's commands: that of this interpreter's environment first."""
+    """Path of one of the project's commands, from this interpreter's environment if it is there."""
     beside = Path(sys.executable).parent / name
     found = str(beside) if beside.exists() else shutil.which(name)
     if found is None:
@@ -138,5 +142,5 @@ def _cores() -> int:
 
 
 def _threads(variables: tuple[str, ...], count: int) -> dict[str, str]:
-    """Limits for what the person who runs this has not set themselves."""
+    """Values for the variables that the user has not set."""
     return {name: str(count) for name in variables if name not in os.environ}

@@ -1,12 +1,11 @@
-"""What the person at the terminal sees: a live table, or a line now and then where there is no terminal."""
+"""The display of a run: a live table on a terminal, else a line every few seconds."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Mapping
-from types import TracebackType
-from typing import Protocol
+from typing import Self
 
 from rich import box
 from rich.console import Console, Group
@@ -14,52 +13,33 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from freshfield_up.resources import Use
-from freshfield_up.status import RunStatus, Words, number
+from freshfield_up.resources import ResourceUse
+from freshfield_up.status import RunStatus, Status, fmt, number
 
 LINE_EVERY_S = 5.0
-_COLUMNS_FROM = 12
-"""From this many cameras on the table has two columns, so that it fits a small terminal."""
+# From this many cameras on, the table has two columns to fit a small terminal.
+_TWO_COLUMNS_FROM = 12
 _FRESH_MS, _STALE_MS = 250.0, 1000.0
 
 
-class Display(Protocol):
-    def __enter__(self) -> Display: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None: ...
-
-    def say(self, text: str) -> None:
-        """A message that stays."""
-
-    def show(self, status: RunStatus, headline: str, use: Mapping[str, Use]) -> None:
-        """The state of things as of now."""
-
-
-def make_display(table: bool) -> Display:
-    """The table where stdout is a terminal and it is wanted, else lines."""
-    return LiveTable() if table and sys.stdout.isatty() else Lines()
-
-
-class Lines:
-    """Plain lines for logs and pipes."""
+class Display:
+    """Plain lines, for logs and pipes. A context manager."""
 
     def __init__(self) -> None:
         self._next_s = 0.0
 
-    def __enter__(self) -> Lines:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         pass
 
-    def say(self, text: str) -> None:
+    def message(self, text: str) -> None:
+        """Print a message that stays."""
         print(text, flush=True)
 
-    def show(self, status: RunStatus, headline: str, use: Mapping[str, Use]) -> None:
+    def update(self, status: RunStatus, headline: str, use: Mapping[str, ResourceUse]) -> None:
+        """Show the current state of the run. use: by process name."""
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
@@ -73,30 +53,33 @@ class Lines:
         )
 
 
-class LiveTable:
+class LiveTable(Display):
     """A table that is redrawn in place; messages scroll above it."""
 
     def __init__(self, console: Console | None = None) -> None:
         self._live = Live(console=console, auto_refresh=False, transient=False)
 
-    def __enter__(self) -> LiveTable:
+    def __enter__(self) -> Self:
         self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._live.stop()
 
-    def say(self, text: str) -> None:
+    def message(self, text: str) -> None:
         self._live.console.print(Text(text))
 
-    def show(self, status: RunStatus, headline: str, use: Mapping[str, Use]) -> None:
+    def update(self, status: RunStatus, headline: str, use: Mapping[str, ResourceUse]) -> None:
         self._live.update(draw(status, headline, use), refresh=True)
 
 
-def draw(status: RunStatus, headline: str, use: Mapping[str, Use]) -> Group:
-    """The whole table as something rich can print."""
+def make_display(table: bool) -> Display:
+    """A live table where one is wanted and stdout is a terminal, else plain lines."""
+    return LiveTable() if table and sys.stdout.isatty() else Display()
+
+
+def draw(status: RunStatus, headline: str, use: Mapping[str, ResourceUse]) -> Group:
+    """The whole table as a rich renderable."""
     processes = "   ".join(f"{name} {u.cpu:.2f} cores {u.rss_mb:.0f} MB" for name, u in use.items())
     return Group(
         Text(headline, style="bold"),
@@ -107,8 +90,8 @@ def draw(status: RunStatus, headline: str, use: Mapping[str, Use]) -> Group:
     )
 
 
-def _camera_table(cameras: tuple[Words, ...]) -> Table:
-    columns = 2 if len(cameras) >= _COLUMNS_FROM else 1
+def _camera_table(cameras: tuple[Status, ...]) -> Table:
+    columns = 2 if len(cameras) >= _TWO_COLUMNS_FROM else 1
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for _ in range(columns):
         table.add_column("camera", no_wrap=True)
@@ -125,7 +108,7 @@ def _camera_table(cameras: tuple[Words, ...]) -> Table:
     return table
 
 
-def _camera_cells(camera: Words) -> list[Text]:
+def _camera_cells(camera: Status) -> list[Text]:
     age = number(camera, "age_ms")
     style = "dim" if age is None else "green" if age < _FRESH_MS else "yellow" if age < _STALE_MS else "red"
     name = f"{camera['camera']} (held out)" if camera.get("held_out") else str(camera["camera"])
@@ -133,13 +116,13 @@ def _camera_cells(camera: Words) -> list[Text]:
         name += " (no connection)"
     return [
         Text(name),
-        Text(_figure(age, ".0f"), style),
-        Text(_figure(number(camera, "sent"), ".0f")),
-        Text(_figure(number(camera, "delivered"), ".0f")),
+        Text(fmt(age, ".0f"), style),
+        Text(fmt(number(camera, "sent"), ".0f")),
+        Text(fmt(number(camera, "delivered"), ".0f")),
     ]
 
 
-def _channel_line(channel: Words) -> str:
+def _channel_line(channel: Status) -> str:
     if not channel:
         return "no channel yet"
     parts = [str(channel.get("preset") or "custom")]
@@ -147,28 +130,24 @@ def _channel_line(channel: Words) -> str:
     share = number(channel, "state_share", str(state))
     if state:
         parts.append(f"state {state}" + (f" ({share:.0%} of the time)" if share is not None else ""))
-    parts.append(f"forwarded {_figure(number(channel, 'counts', 'forwarded'), '.0f')}")
+    parts.append(f"forwarded {fmt(number(channel, 'counts', 'forwarded'), '.0f')}")
     for fate in ("dropped_busy", "superseded", "skipped", "lost", "broken"):
         if count := number(channel, "counts", fate):
             parts.append(f"{fate.replace('_', ' ')} {count:.0f}")
-    parts.append(f"delay error p99 {_figure(number(channel, 'delay_error_ms', 'p99'), '.2f')} ms")
+    parts.append(f"delay error p99 {fmt(number(channel, 'delay_error_ms', 'p99'), '.2f')} ms")
     return ", ".join(parts)
 
 
-def _edge_line(edge: Words) -> str:
+def _edge_line(edge: Status) -> str:
     updates = number(edge, "updates", "count")
     if not updates:
         return str(edge.get("doing") or "no update yet")
     parts = [
         f"{updates:.0f} updates",
-        f"{_figure(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
-        f"PSNR {_figure(number(edge, 'scores', 'psnr_db'), '.2f')} dB",
-        f"moving {_figure(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
-        f"aAoI {_figure(number(edge, 'last', 'aaoi_ms'), '.0f')} ms",
+        f"{fmt(number(edge, 'updates', 'ms_p50'), '.0f')} ms each",
+        f"PSNR {fmt(number(edge, 'scores', 'psnr_db'), '.2f')} dB",
+        f"moving {fmt(number(edge, 'scores', 'psnr_moving_db'), '.2f')} dB",
+        f"aAoI {fmt(number(edge, 'last', 'aaoi_ms'), '.0f')} ms",
         f"policy {edge.get('policy', '-')}",
     ]
     return ", ".join(parts) + (" (paused)" if edge.get("paused") else "")
-
-
-def _figure(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

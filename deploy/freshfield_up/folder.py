@@ -1,4 +1,4 @@
-"""The folder of a run: a new one, or that of an earlier run, which is then replaced. Never anything else."""
+"""The folder of a run: a new one, or that of an earlier run, which is replaced. Any other is refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Any
 
 MARKER = "run.json"
-"""Written first into every run's folder: what may be replaced is what holds one."""
+"""Written first into every run's folder. Only a folder that holds one may be replaced."""
 
 
 class FolderError(ValueError):
@@ -19,8 +19,8 @@ class FolderError(ValueError):
 def prepare(out: Path, about: dict[str, Any]) -> IO[str]:
     """Make ``out`` an empty run folder with a marker, locked for as long as the returned file is open.
 
-    about: contents of the marker. Raises FolderError where the folder holds anything but an earlier run, or
-    a run that is still going on.
+    about: contents of the marker. Raises FolderError if the folder holds anything but an earlier run, or a
+    run that is still going on.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -11,18 +11,16 @@ from freshfield_up.commands import MissingCommand, program
 from freshfield_up.processes import Child
 from freshfield_up.status import number, read_json
 
-FIGURES = "mesh.json"
 
-
-def wanted(scenario: Scenario) -> dict[str, Any] | None:
-    """The section ``edge.export``; the edge server has checked it by the time that a mesh is made."""
+def export_section(scenario: Scenario) -> dict[str, Any] | None:
+    """The section ``edge.export``, or None. The edge server has checked it before a mesh is made."""
     section = scenario.edge.get("export")
     return section if isinstance(section, dict) else None
 
 
 def check(scenario: Scenario) -> None:
-    """Raises MissingCommand before the run, not after it, where a mesh could not be made."""
-    if wanted(scenario) and importlib.util.find_spec("skimage") is None:
+    """Raises MissingCommand before the run if the mesh that is asked for could not be made."""
+    if export_section(scenario) and importlib.util.find_spec("skimage") is None:
         raise MissingCommand(
             f"{scenario.path}: edge.export: a mesh needs scikit-image: pip install 'freshfield[surface]', or "
             "take the key out"
@@ -30,17 +28,17 @@ def check(scenario: Scenario) -> None:
 
 
 def possible(out: Path) -> bool:
-    """Whether the field of the run in ``out`` has made an update: before, there is nothing to export."""
+    """Whether the field of the run in ``out`` was updated; before, there is nothing to export."""
     return bool(number(read_json(out / "edge.json"), "updates", "count"))
 
 
-def child(scenario: Scenario, out: Path) -> Child | None:
-    """What makes the mesh of the run in ``out``, and measures it; None where none is asked for."""
-    section = wanted(scenario)
+def export_process(scenario: Scenario, out: Path) -> Child | None:
+    """The process that makes and measures the mesh of the run in ``out``; None if none is asked for."""
+    section = export_section(scenario)
     if section is None:
         return None
     command = [program("edge-server"), "export", str(out), "--mesh", str(out / str(section["mesh"]))]
     if section.get("voxel_mm") is not None:
         command += ["--voxel", str(section["voxel_mm"])]
-    command += ["--measure", str(scenario.path), "--json", str(out / FIGURES)]
+    command += ["--measure", str(scenario.path), "--json", str(out / "mesh.json")]
     return Child("export", "the export", command, out / "log-export.txt")

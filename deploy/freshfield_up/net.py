@@ -1,4 +1,4 @@
-"""Ports of this machine: free ones, taken ones, and whether somebody answers on them yet."""
+"""Ports of this machine: which are free, and which servers answer yet."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import http.client
 import os
 import socket
 
-# Children are started by fork and exec. gRPC would first bring its own threads to rest, and now and then that
-# never ends: the launcher hangs between two processes. What execs needs nothing of it.
+# Child processes are started by fork and exec. gRPC's fork handlers would first stop gRPC's threads, which
+# now and then never ends: the launcher hangs. A process that calls exec does not need the handlers.
 os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
 
 import grpc
@@ -17,8 +17,8 @@ LOOPBACK = "127.0.0.1"
 
 
 def free_ports(count: int) -> list[int]:
-    """Different free loopback ports. Another program could take one before we do: then the process that
-    gets it says so and the run ends."""
+    """Different free loopback ports. If another program takes one first, the process that was to listen there
+    reports it and the run ends."""
     sockets = [socket.socket() for _ in range(count)]
     try:
         for s in sockets:
@@ -30,9 +30,9 @@ def free_ports(count: int) -> list[int]:
 
 
 def is_free(port: int) -> bool:
-    """Whether nobody listens on the loopback port."""
+    """Whether nothing listens on the loopback port."""
     with socket.socket() as s:
-        s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do: TIME_WAIT is no occupant
+        s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do: ignores TIME_WAIT
         try:
             s.bind((LOOPBACK, port))
         except OSError:
@@ -53,7 +53,7 @@ def is_serving(address: str, timeout_s: float = 0.5) -> bool:
 
 
 def accepts(address: str, timeout_s: float = 0.5) -> bool:
-    """Whether anybody takes a connection at ``host:port``."""
+    """Whether a server accepts connections at ``host:port``."""
     host, _, port = address.rpartition(":")
     try:
         socket.create_connection((host, int(port)), timeout_s).close()

@@ -1,4 +1,4 @@
-"""Child processes: start them apart from the terminal, keep their logs, say how they died, stop them."""
+"""Child processes: start them apart from the terminal, log their output, describe their exit, stop them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 GRACE_S = 8.0
-"""How long a process may take to end after SIGTERM before it is killed."""
+"""Time for a process to end after SIGTERM before it is killed."""
 
 _TAIL_BYTES = 16_384
 _PR_SET_PDEATHSIG = 1
-# Loaded here and not in the child: between fork and exec nothing should be imported.
+# Loaded here because a child must import nothing between fork and exec.
 _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
 @dataclass
 class Child:
-    """One process of the run. ``role`` is what a person calls it, for example ``edge-server``."""
+    """One process of the run. role: its name in messages, for example ``the edge server``. killed: it did not
+    end in time and had to be killed."""
 
     name: str
     role: str
@@ -34,10 +35,9 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
     killed: bool = False
-    """True once it did not end in time and had to be killed."""
 
     def start(self) -> None:
-        """Start it in a session of its own: Ctrl-C reaches the launcher alone, which keeps the order."""
+        """Start it in its own session: Ctrl-C reaches only the launcher, which stops processes in order."""
         with self.log.open("ab") as log:
             log.write(f"$ {' '.join(self.command)}\n".encode())
             log.flush()
@@ -61,10 +61,10 @@ class Child:
         return self.process.pid if self.process is not None else None
 
     def exit_summary(self) -> str:
-        """How it ended and the last lines of its log, for a person. Only for a process that has ended."""
+        """How the process ended, and the last lines of its log. It must have ended."""
         assert self.process is not None and self.process.returncode is not None
         age_s = time.monotonic() - self.started_s
-        lines = [f"{self.role} {how_it_ended(self.process.returncode)}, {age_s:.1f} s after its start."]
+        lines = [f"{self.role} {describe_exit(self.process.returncode)}, {age_s:.1f} s after its start."]
         last = tail(self.log, 12)
         if last:
             lines.append(f"The last lines of {self.log}:")
@@ -75,7 +75,7 @@ class Child:
 
 
 def stop(children: Sequence[Child], grace_s: float = GRACE_S) -> None:
-    """SIGTERM to all of them at once, SIGKILL to those still there after ``grace_s`` seconds."""
+    """Send SIGTERM to all at once, and SIGKILL to those still running after ``grace_s`` seconds."""
     for child in children:
         if child.running:
             child.process.send_signal(signal.SIGTERM)  # type: ignore[union-attr]
@@ -91,7 +91,7 @@ def stop(children: Sequence[Child], grace_s: float = GRACE_S) -> None:
 
 
 def kill(child: Child) -> None:
-    """End it at once, with everything it started (its process group)."""
+    """Kill the process and everything that it started (its process group)."""
     if child.process is None or child.process.poll() is not None:
         return
     try:
@@ -101,8 +101,8 @@ def kill(child: Child) -> None:
     child.process.wait()
 
 
-def how_it_ended(returncode: int) -> str:
-    """An exit status in words."""
+def describe_exit(returncode: int) -> str:
+    """The meaning of a ``subprocess`` return code, in words."""
     if returncode >= 0:
         return f"ended by itself with exit code {returncode}"
     try:
@@ -110,7 +110,7 @@ def how_it_ended(returncode: int) -> str:
     except ValueError:
         name = f"signal {-returncode}"
     why = {
-        "SIGKILL": " (by somebody, or by the system for lack of memory)",
+        "SIGKILL": " (by a person, or by the system because memory ran out)",
         "SIGSEGV": " (a crash in native code)",
         "SIGABRT": " (a native library gave up)",
         "SIGILL": " (an instruction this processor does not have)",
@@ -120,7 +120,7 @@ def how_it_ended(returncode: int) -> str:
 
 
 def tail(path: Path, lines: int) -> list[str]:
-    """The last lines of a text file that may be large, be missing, or end in half a character."""
+    """The last non-empty lines of a log that may be large, be missing, or end in half a character."""
     try:
         with path.open("rb") as file:
             file.seek(0, os.SEEK_END)
@@ -131,11 +131,11 @@ def tail(path: Path, lines: int) -> list[str]:
         return []
     found = [line.rstrip() for line in text.splitlines() if line.strip()]
     if size > _TAIL_BYTES and found:
-        found = found[1:]  # the first one is cut
+        found = found[1:]  # the first line is incomplete
     return [line for line in found if not line.startswith("$ ")][-lines:]
 
 
 def _die_with_parent() -> None:
-    """Runs in the child: a launcher that is killed outright must not leave cameras streaming for ever."""
+    """Runs in the child. Without it, a launcher that is killed would leave its processes running."""
     assert _libc is not None
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""One run from start to report: the order of starting, watching, stopping and telling."""
+"""One run from start to report: starts, supervises and stops its processes, then exports and reports."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from freshfield_up import folder, mesh, net
 from freshfield_up.commands import ProcessSet, process_set, program
 from freshfield_up.display import Display, make_display
 from freshfield_up.processes import GRACE_S, Child, kill, stop
-from freshfield_up.resources import Resources
+from freshfield_up.resources import ResourceMonitor
 from freshfield_up.status import read_json, read_status
-from freshfield_up.summary import summarise
+from freshfield_up.summary import summarize
 
 TICK_S = 0.25
 READY_WITHIN_S = 600.0
-"""A first start compiles the field's kernels: a minute of work, more on a busy machine."""
+"""A first start compiles the field's kernels: a minute, or more on a busy machine."""
 _COMPILING = "compiling"
-"""What the edge is doing, in its own words, before it can make a first update."""
+"""Start of the edge's status text until it can make a first update."""
 MAX_RESTARTS = 20
 REPORT_WITHIN_S = 300.0
 EXPORT_WITHIN_S = 1200.0
@@ -31,8 +31,8 @@ EXPORT_WITHIN_S = 1200.0
 
 @dataclass(frozen=True)
 class Options:
-    """out: folder of the run. duration_s: from when everything is up; 0: until told to stop. edge: further
-    words for the edge server's command."""
+    """out: folder of the run. duration_s: seconds from when everything is up; 0: no end. edge: further
+    arguments for the edge server."""
 
     out: Path
     duration_s: float = 60.0
@@ -45,8 +45,8 @@ class Options:
     edge: tuple[str, ...] = ()
 
 
-class Run:
-    """Starts a scenario's processes and sees them through. Use ``main`` once."""
+class Launcher:
+    """Runs a scenario's processes. ``run`` may be called once."""
 
     def __init__(self, scenario: Scenario, options: Options) -> None:
         self.scenario = scenario
@@ -54,15 +54,15 @@ class Run:
         self.processes: ProcessSet
         self._display: Display
         self._signals: list[str] = []
-        self._asked = threading.Event()
+        self._stop_requested = threading.Event()
         self._began_s = time.monotonic()
         self._ready_s: float | None = None
-        self._page_told = False
+        self._page_announced = False
         self._failures: list[str] = []
         self._restart_at: dict[str, float] = {}
 
-    def main(self) -> int:
-        """Run to the end; 0 if it ended as asked. Raises FolderError or MissingCommand before any start."""
+    def run(self) -> int:
+        """Run to the end. Returns the exit code. Raises FolderError or MissingCommand before any start."""
         options = self.options
         mesh.check(self.scenario)
         self.processes = process_set(
@@ -82,9 +82,13 @@ class Run:
         self._display = make_display(options.table)
         try:
             with self._display:
-                self._introduce()
+                cameras = f"{len(self.scenario.training)} cameras"
+                if self.scenario.held_out:
+                    cameras += f" + {len(self.scenario.held_out)} held out"
+                self._display.message(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
+                self._display.message(f"logs and results: {options.out}")
                 try:
-                    self._watch()
+                    self._supervise()
                 finally:
                     self._stop()
             self._export()
@@ -93,33 +97,26 @@ class Run:
             lock.close()
         return 1 if self._failures else 0
 
-    def _introduce(self) -> None:
-        cameras = f"{len(self.scenario.training)} cameras"
-        if self.scenario.held_out:
-            cameras += f" + {len(self.scenario.held_out)} held out"
-        self._display.say(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
-        self._display.say(f"logs and results: {self.options.out}")
-
-    def _watch(self) -> None:
-        """Start, then look around every tick until there is a reason to stop."""
-        # The nodes render ahead while the edge loads its libraries. The emulator opens its door last: no
-        # frame is offered before there is somebody to take it, and none is lost to the start.
+    def _supervise(self) -> None:
+        """Start the processes, then check them every tick until there is a reason to stop."""
+        # The nodes render ahead while the edge loads its libraries. The emulator starts last, so that no
+        # frame is sent before the edge can take it, and none is lost to the start.
         self.processes.edge.start()
         for arm in self.processes.arms:
             arm.start()
         if not self.processes.arms:
             self._start_nodes()
-        resources = Resources(self.options.out / "processes.jsonl")
-        while not self._asked.wait(TICK_S):
+        resources = ResourceMonitor(self.options.out / "processes.jsonl")
+        while not self._stop_requested.wait(TICK_S):
             now_s = time.monotonic()
-            if not self._all_alive(now_s):
+            if not self._check_alive(now_s):
                 return
             if self._ready_s is None:
-                self._get_ready(now_s)
+                self._continue_start(now_s)
                 if self._failures:
                     return
             resources.sample(now_s - self._began_s, self.processes.children)
-            self._display.show(
+            self._display.update(
                 read_status(self.options.out, self.scenario.cameras), self._headline(now_s), resources.latest
             )
             if self._ready_s and self.options.duration_s and now_s - self._ready_s >= self.options.duration_s:
@@ -129,32 +126,32 @@ class Run:
         for child in self.processes.nodes:
             child.start()
 
-    def _get_ready(self, now_s: float) -> None:
-        """One step of the start: nodes once an arm they need is there, emulator once the edge serves, and the
-        address once the page answers."""
+    def _continue_start(self, now_s: float) -> None:
+        """One step of the start: the nodes once their arm answers, the emulator once the edge serves, and the
+        page's address once the page answers."""
         emulator = self.processes.emulator
         if self.processes.nodes[0].process is None and net.accepts(self.processes.arm_address):
             self._start_nodes()
         if emulator.process is None and net.is_serving(self.processes.edge_address):
             emulator.start()
-        if not self._page_told and net.page_answers(self.options.port):
-            self._page_told = True
-            port = self.options.port
-            self._display.say(f"page: http://{net.LOOPBACK}:{port}   (after {now_s - self._began_s:.0f} s)")
-            self._display.say(
-                f"      from another machine first: ssh -L {port}:{net.LOOPBACK}:{port} THIS-MACHINE"
+        if not self._page_announced and net.page_answers(self.options.port):
+            self._page_announced = True
+            here, port, after_s = net.LOOPBACK, self.options.port, now_s - self._began_s
+            self._display.message(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
+            self._display.message(
+                f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE"
             )
-        waited_for = self._not_ready()
+        waited_for = self._waiting_for()
         if waited_for is None:
             self._ready_s = now_s
             for driver in self.processes.drivers:
-                driver.start()  # before, the arm would make its tour for a field that cannot learn yet
+                driver.start()  # last: the arm must not tour before the field can learn
         elif now_s - self._began_s > READY_WITHIN_S:
             self._fail(f"{waited_for.role} was not ready after {READY_WITHIN_S:.0f} s; see {waited_for.log}")
 
-    def _not_ready(self) -> Child | None:
-        """Whoever is being waited for."""
-        if self.processes.emulator.process is None or not self._page_told:
+    def _waiting_for(self) -> Child | None:
+        """The process that is not ready yet, if any."""
+        if self.processes.emulator.process is None or not self._page_announced:
             return self.processes.edge
         if not net.is_serving(self.processes.emulator_address):
             return self.processes.emulator
@@ -164,8 +161,8 @@ class Run:
         doing = str(read_json(self.options.out / "edge.json").get("doing") or _COMPILING)
         return self.processes.edge if doing.startswith(_COMPILING) else None
 
-    def _all_alive(self, now_s: float) -> bool:
-        """Look for the dead; with --restart, start them again after a second. False if the run is over."""
+    def _check_alive(self, now_s: float) -> bool:
+        """Look for processes that ended; with --restart, restart them after a second. False ends the run."""
         for child in self.processes.children:
             if child.process is None or child.running:
                 continue
@@ -174,7 +171,7 @@ class Run:
                 if not self.options.restart or child.restarts >= MAX_RESTARTS:
                     self._fail(child.exit_summary())
                     continue
-                self._display.say(f"{child.exit_summary()}\nIt is started again in a second (--restart).")
+                self._display.message(f"{child.exit_summary()}\nIt is started again in a second (--restart).")
                 self._restart_at[child.name] = now_s + 1.0
             elif now_s >= due_s:
                 del self._restart_at[child.name]
@@ -184,7 +181,7 @@ class Run:
 
     def _fail(self, text: str) -> None:
         self._failures.append(text)
-        self._display.say(text)
+        self._display.message(text)
 
     def _headline(self, now_s: float) -> str:
         if self._ready_s is None:
@@ -198,36 +195,35 @@ class Run:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._signals.append(signal.Signals(number).name)
-        self._asked.set()
+        self._stop_requested.set()
 
     def _stop(self) -> None:
-        """Nodes first, edge last, so that what is on the way still arrives. A second Ctrl-C hurries."""
+        """Stop nodes first and the edge last, so that frames on the way arrive. A second Ctrl-C kills."""
         why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
-        self._display.say(f"stopping{reason}: cameras, channel, edge")
+        self._display.message(f"stopping{reason}: cameras, channel, edge")
         for group in self.processes.groups:
             stop(group, 0.0 if len(self._signals) > 1 else GRACE_S)
             for child in group:
                 if child.killed:
-                    self._display.say(f"{child.role} did not end in time and was killed; see {child.log}")
+                    self._display.message(f"{child.role} did not end in time and was killed; see {child.log}")
 
     def _export(self) -> None:
-        """Make what the scenario asks for besides the report. A signal, the second one of a run that was
-        stopped by one, breaks it off."""
-        export = mesh.child(self.scenario, self.options.out)
+        """Make the mesh if the scenario asks for one. A further signal cancels it."""
+        export = mesh.export_process(self.scenario, self.options.out)
         if export is None or self._failures:
             return
         if not mesh.possible(self.options.out):
-            self._display.say("no mesh: nothing to export yet, the field has made no update")
+            self._display.message("no mesh: nothing to export yet, the field was never updated")
             return
-        self._display.say(f"making the mesh (Ctrl-C leaves it out); see {export.log}")
+        self._display.message(f"making the mesh (Ctrl-C cancels it); see {export.log}")
         signals, begin_s = len(self._signals), time.monotonic()
         export.start()
         while export.running:
             time.sleep(TICK_S)
             if len(self._signals) > signals:
                 kill(export)
-                self._display.say("no mesh: broken off")
+                self._display.message("no mesh: cancelled")
                 return
             if time.monotonic() - begin_s > EXPORT_WITHIN_S:
                 kill(export)
@@ -238,10 +234,10 @@ class Run:
             self._fail(export.exit_summary())
 
     def _report(self) -> None:
-        """Join the books and write the report, whatever happened before."""
+        """Write the report, whatever happened before."""
         out = self.options.out
         if not any(out.glob("ledger-*.tsv")):
-            self._display.say("no process got as far as its first entry in the books: there is no report")
+            self._display.message("no report: no process has written about a frame")
             return
         report = Child(
             "report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt"
@@ -257,4 +253,4 @@ class Run:
         if code != 0:
             self._fail(report.exit_summary())
             return
-        self._display.say(summarise(out))
+        self._display.message(summarize(out))

@@ -1,7 +1,7 @@
-"""What the processes say about themselves, read from the files they keep fresh in the run's folder.
+"""Reads the status files that the processes of a run keep up to date in its folder.
 
-``edge.json`` and ``channel.json`` are the edge's and the emulator's, ``node-*.json`` the nodes'. A file that
-is missing or has other contents than expected leaves a gap in the display and nothing else.
+The edge writes ``edge.json``, the emulator ``channel.json`` and the nodes ``node-*.json``. A file that is
+missing or unexpected leaves a gap in the display and has no other effect.
 """
 
 from __future__ import annotations
@@ -11,48 +11,53 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-Words = dict[str, Any]
+Status = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class RunStatus:
-    """cameras: one mapping a camera, the nodes' view and the edge's merged, in the scenario's order."""
+    """cameras: the status of each camera, merged from its node's and the edge's, in the scenario's order."""
 
-    cameras: tuple[Words, ...]
-    channel: Words
-    edge: Words
+    cameras: tuple[Status, ...]
+    channel: Status
+    edge: Status
 
 
 def read_status(out: Path, cameras: tuple[str, ...]) -> RunStatus:
-    """The newest status of everybody."""
+    """The newest status of every process."""
     edge = read_json(out / "edge.json")
-    merged: dict[str, Words] = {camera: {"camera": camera} for camera in cameras}
+    merged: dict[str, Status] = {camera: {"camera": camera} for camera in cameras}
     for file in sorted(out.glob("node-*.json")):
-        for camera, words in _by_camera(read_json(file)).items():
-            merged.setdefault(camera, {}).update(words)
-    for camera, words in _by_camera(edge).items():
-        merged.setdefault(camera, {}).update(words)
+        for camera, status in _by_camera(read_json(file)).items():
+            merged.setdefault(camera, {}).update(status)
+    for camera, status in _by_camera(edge).items():
+        merged.setdefault(camera, {}).update(status)
     return RunStatus(tuple(merged.values()), read_json(out / "channel.json"), edge)
 
 
-def number(words: Words, *path: str) -> float | None:
+def number(status: Status, *path: str) -> float | None:
     """The number at a path of keys, or None."""
-    found: Any = words
+    found: Any = status
     for key in path:
         found = found.get(key) if isinstance(found, dict) else None
     return float(found) if isinstance(found, int | float) and not isinstance(found, bool) else None
 
 
-def _by_camera(words: Words) -> dict[str, Words]:
-    """The ``cameras`` of a status file, which is a list of mappings that name their camera, or a mapping."""
-    cameras = words.get("cameras", {})
+def fmt(value: float | None, spec: str) -> str:
+    """``value`` in a format such as ``.1f``; a dash for None."""
+    return "-" if value is None else format(value, spec)
+
+
+def _by_camera(status: Status) -> dict[str, Status]:
+    """The ``cameras`` of a status file: a mapping by name, or a list of mappings with a key ``camera``."""
+    cameras = status.get("cameras", {})
     if isinstance(cameras, dict):
         return {name: {"camera": name, **w} for name, w in cameras.items() if isinstance(w, dict)}
     return {w["camera"]: w for w in cameras if isinstance(w, dict) and isinstance(w.get("camera"), str)}
 
 
-def read_json(path: Path) -> Words:
-    """A status file's contents; empty if there is none to be read."""
+def read_json(path: Path) -> Status:
+    """The contents of a status file; {} if it cannot be read."""
     try:
         found = json.loads(path.read_bytes())
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The end of a run in a few lines, from its report.json."""
+"""A run in a few lines, from its report.json."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from freshfield_up.status import fmt
 
-def summarise(out: Path) -> str:
-    """What a person wants to know first, and where the rest is. Missing figures are shown as ``-``."""
+
+def summarize(out: Path) -> str:
+    """The main results and where the report is. Missing numbers are shown as ``-``."""
     report: dict[str, Any] = json.loads((out / "report.json").read_text())
     frames, age = report.get("frames", {}), report.get("age_ms", {})
     updates, fidelity = report.get("updates", {}), report.get("fidelity", {})
@@ -16,17 +18,17 @@ def summarise(out: Path) -> str:
     rejected = sum(frames.get("rejected", {}).values())
     lines = [
         "",
-        f"fidelity   PSNR {_f(final.get('psnr_db'), '.2f')} dB over the last fifth of the run "
-        f"(moving parts {_f(final.get('psnr_moving_db'), '.2f')} dB, SSIM {_f(final.get('ssim'), '.3f')}, "
-        f"LPIPS {_f(final.get('lpips'), '.3f')})",
-        f"baselines  mean colour {_f(baseline.get('mean_colour_db'), '.1f')} dB, "
-        f"nearest view {_f(baseline.get('nearest_view_db'), '.1f')} dB",
-        f"age        mean {_f(age.get('mean'), '.0f')} ms, p95 {_f(age.get('p95'), '.0f')} ms",
-        f"updates    {_f(updates.get('count'), 'd')} of {_f(updates.get('ms_p50'), '.0f')} ms "
-        f"(p95 {_f(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}",
-        f"frames     {_f(frames.get('captured'), 'd')} captured, {_f(frames.get('sent'), 'd')} sent, "
-        f"{_f(frames.get('delivered'), 'd')} delivered, {rejected} rejected; "
-        f"the books {'close' if frames.get('closes') else 'DO NOT CLOSE'}",
+        f"fidelity   PSNR {fmt(final.get('psnr_db'), '.2f')} dB over the last fifth of the run "
+        f"(moving pixels {fmt(final.get('psnr_moving_db'), '.2f')} dB, SSIM {fmt(final.get('ssim'), '.3f')}, "
+        f"LPIPS {fmt(final.get('lpips'), '.3f')})",
+        f"baselines  mean color {fmt(baseline.get('mean_colour_db'), '.1f')} dB, "
+        f"nearest view {fmt(baseline.get('nearest_view_db'), '.1f')} dB",
+        f"age        mean {fmt(age.get('mean'), '.0f')} ms, p95 {fmt(age.get('p95'), '.0f')} ms",
+        f"updates    {fmt(updates.get('count'), 'd')} of {fmt(updates.get('ms_p50'), '.0f')} ms "
+        f"(p95 {fmt(updates.get('ms_p95'), '.0f')} ms), the first after {_seconds(updates.get('first_ms'))}",
+        f"frames     {fmt(frames.get('captured'), 'd')} captured, {fmt(frames.get('sent'), 'd')} sent, "
+        f"{fmt(frames.get('delivered'), 'd')} delivered, {rejected} rejected; "
+        f"{'all accounted for' if frames.get('closes') else 'the counts DO NOT ADD UP'}",
         *_mesh(report.get("mesh")),
         f"report     {out / 'report.html'}   {out / 'report.json'}",
     ]
@@ -34,7 +36,7 @@ def summarise(out: Path) -> str:
 
 
 def _mesh(mesh: dict[str, Any] | None) -> list[str]:
-    """A line where the scenario asked for a mesh."""
+    """A line if the run made a mesh."""
     if not mesh:
         return []
     found = mesh.get("measured")
@@ -46,10 +48,6 @@ def _mesh(mesh: dict[str, Any] | None) -> list[str]:
             f"(target {100 * found['target_complete']:g})"
         )
     return [line]
-
-
-def _f(value: Any, form: str) -> str:
-    return "-" if value is None else format(value, form)
 
 
 def _seconds(value_ms: float | None) -> str:

@@ -1,6 +1,6 @@
-"""Why a learnt policy decided as it did: what spoke for it and against it, and where in a picture.
+"""Why a learned policy decided as it did: what spoke for it and against it, and where in a picture.
 
-Nothing of it is loaded, and nothing shown, while the policy is not one that was learnt.
+Nothing of it is loaded, and nothing shown, while the policy is not one that was learned.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.live.state import EdgeState
 from edge_server.page import markup
-from edge_server.page.colours import AGAINST, FOR
+from edge_server.page.colors import AGAINST, FOR
 from freshfield import payload
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class Why:
 
 
 def painted(image: NDArray[np.uint8], regions: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """``image`` (H, W, 3), WIDTH wide, with regions in the colours of for and against, as strongly as they
+    """``image`` (H, W, 3), WIDTH wide, with regions in the colors of for and against, as strongly as they
     count."""
     height = max(1, round(WIDTH * image.shape[0] / max(1, image.shape[1])))
     large = cv2.resize(np.ascontiguousarray(image), (WIDTH, height), interpolation=cv2.INTER_LINEAR)
@@ -101,6 +101,6 @@ def painted(image: NDArray[np.uint8], regions: NDArray[np.float64]) -> NDArray[n
     grid = regions / limit if limit > 0 else np.zeros_like(regions)
     # Smooth edges are easier to look through than those of the grid; the grid is coarse anyway.
     share = cv2.resize(grid, (WIDTH, height), interpolation=cv2.INTER_LINEAR)[..., None]
-    colour = np.where(share >= 0, np.array(FOR, float), np.array(AGAINST, float))
-    mixed = large + STRENGTH * np.abs(share) * (colour - large)
+    color = np.where(share >= 0, np.array(FOR, float), np.array(AGAINST, float))
+    mixed = large + STRENGTH * np.abs(share) * (color - large)
     return np.clip(np.rint(mixed), 0, 255).astype(np.uint8)

@@ -8,19 +8,19 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from edge_server.live.state import CameraView
-from edge_server.page.colours import (
+from edge_server.page.colors import (
     AGAINST,
     FOR,
     FRESH_MS,
     HELD_OUT,
     RGB,
     STALE_MS,
-    age_colour,
+    age_color,
     css,
-    scale_colour,
+    scale_color,
 )
 
-if TYPE_CHECKING:  # loaded only where a policy was learnt
+if TYPE_CHECKING:  # loaded only where a policy was learned
     from edge_server.scheduler.learned.explain import Explanation
 
 # Cameras that the explanation of a decision shows.
@@ -57,7 +57,7 @@ class Summary:
 
 def status(s: Summary) -> str:
     """Status line and six tiles."""
-    dot = css(scale_colour(0.0 if s.condition == "live" else 0.5))
+    dot = css(scale_color(0.0 if s.condition == "live" else 0.5))
     head = (
         f'<div style="padding:.45em .9em;font-size:.85em"><span style="color:{dot}">&#9679;</span> '
         f"<b>{escape(s.scenario)}</b> &middot; {escape(s.field or 'no field')} &middot; "
@@ -80,7 +80,7 @@ def status(s: Summary) -> str:
 
 
 def _tile(name: str, value: str, unit: str, age_ms: float | None = None) -> str:
-    edge = f"border-left:3px solid {css(age_colour(age_ms))};" if age_ms is not None else ""
+    edge = f"border-left:3px solid {css(age_color(age_ms))};" if age_ms is not None else ""
     big = "font-size:1.15em;font-weight:600;font-variant-numeric:tabular-nums"
     return (
         f'<div style="{_CARD};{edge}padding:.3em .55em;white-space:nowrap;overflow:hidden">'
@@ -91,8 +91,8 @@ def _tile(name: str, value: str, unit: str, age_ms: float | None = None) -> str:
 
 
 def legend() -> str:
-    """The age scale, the held-out camera's colour."""
-    stops = ",".join(css(scale_colour(i / 8)) for i in range(9))
+    """The age scale, the held-out camera's color."""
+    stops = ",".join(css(scale_color(i / 8)) for i in range(9))
     middle = (FRESH_MS * STALE_MS) ** 0.5
     return (
         '<div style="padding:.5em .9em .2em;font-size:.75em">'
@@ -122,13 +122,13 @@ def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
 
 
 def _row(camera: CameraView, used: bool) -> str:
-    colour = css(HELD_OUT if camera.held_out else age_colour(camera.age_ms))
+    color = css(HELD_OUT if camera.held_out else age_color(camera.age_ms))
     cell = "padding:.1em .35em;text-align:right"
     age = "no frame yet" if camera.age_ms is None else f"{number(camera.age_ms)} ms"
     tick = "truth" if camera.held_out else ("&#10003;" if used else "")
-    rejected = f"color:{css(scale_colour(1.0))}" if camera.rejected else _DIM
+    rejected = f"color:{css(scale_color(1.0))}" if camera.rejected else _DIM
     return (
-        f'<tr><td style="{cell};text-align:left"><span style="color:{colour}">&#9632;</span> '
+        f'<tr><td style="{cell};text-align:left"><span style="color:{color}">&#9632;</span> '
         f"{escape(camera.camera)}</td>"
         f'<td style="{cell}">{age}</td><td style="{cell}">{tick}</td>'
         f'<td style="{cell}">{camera.delivered}</td>'
@@ -148,10 +148,10 @@ def comparison_caption(camera: str, psnr_db: float | None, number_: int) -> str:
 
 
 def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], note_: str = "") -> str:
-    """A chart's title at the left, its lines' names in their colours at the right."""
+    """A chart's title at the left, its lines' names in their colors at the right."""
     names = " ".join(
-        f'<span style="color:{css(colour)};margin-left:.6em">&#9473; {escape(name)}</span>'
-        for name, colour in lines
+        f'<span style="color:{css(color)};margin-left:.6em">&#9473; {escape(name)}</span>'
+        for name, color in lines
     )
     right = f'<span style="{_DIM}">{escape(note_)}</span>' if note_ else names
     return (
@@ -161,7 +161,7 @@ def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], note_: str = "")
 
 
 def why(e: Explanation) -> str:
-    """Why a learnt policy decided as it did: bars of the parts of the state and of the strongest cameras."""
+    """Why a learned policy decided as it did: bars of the parts of the state and of the strongest cameras."""
     largest = sorted(zip(e.names, e.cameras.tolist()), key=lambda pair: -abs(pair[1]))[:CAMERAS_WHY]
     widest = max((abs(share) for share in (*e.parts.values(), *(s for _, s in largest))), default=0.0)
     bars = "".join(_share(name, share, widest) for name, share in e.parts.items())

@@ -13,7 +13,7 @@ from edge_server.live.state import CameraView, Comparison, EdgeState, Publicatio
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
 from edge_server.page.decision_explanation import Why
-from edge_server.page.surface import SurfaceLayer
+from edge_server.page.mesh_layer import MeshLayer
 from edge_server.page.timelines import History, Timelines
 
 MAIN_WIDTH = 372
@@ -21,7 +21,7 @@ SIDE_WIDTH = 356
 # Two images and the gap between them, as they stand in the panel.
 PAIR_WIDTH = 640
 GAP = 8
-PANEL_COLOUR = (36, 36, 36)
+PANEL_COLOR = (36, 36, 36)
 
 
 class Panel:
@@ -42,7 +42,7 @@ class Panel:
         self._folder = gui.add_folder("Controls")
         with self._folder:
             self.controls = ControlPanel(server, state)
-            self.surface = SurfaceLayer(server, state)
+            self.surface = MeshLayer(server, state)
         self._why = Why(gui, state)
         side = gui.add_panel()
         with side.add_tab("Time lines"):
@@ -116,11 +116,11 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
 
 
 def side_by_side(truth: NDArray[np.uint8], rendered: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Two images of any size as one (H, PAIR_WIDTH, 3), a gap in the panel's colour between them."""
+    """Two images of any size as one (H, PAIR_WIDTH, 3), a gap in the panel's color between them."""
     width = (PAIR_WIDTH - GAP) // 2
     height = max(1, round(width * truth.shape[0] / max(1, truth.shape[1])))
     out = np.empty((height, PAIR_WIDTH, 3), np.uint8)
-    out[:] = PANEL_COLOUR
+    out[:] = PANEL_COLOR
     for image, left in ((truth, 0), (rendered, PAIR_WIDTH - width)):
         small = np.ascontiguousarray(image[..., :3])
         shrinks = small.shape[1] > width

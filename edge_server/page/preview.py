@@ -45,14 +45,14 @@ class BallScene:
 
     def __init__(self, t_s: float) -> None:
         angle = 2 * np.pi * t_s / PERIOD_S
-        self.centre = np.array(
+        self.center = np.array(
             [ORBIT_RADIUS_M * np.cos(angle), ORBIT_RADIUS_M * np.sin(angle), BALL_RADIUS_M]
         )
         self.spin = 3.0 * angle
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         origin, rays = world_rays(intrinsics, camera_to_world)
-        toward = origin - self.centre
+        toward = origin - self.center
         b = rays @ toward
         root = b * b - (toward @ toward - BALL_RADIUS_M**2)
         ball = np.where(root > 0, -b - np.sqrt(np.maximum(root, 0)), np.inf)
@@ -64,7 +64,7 @@ class BallScene:
         depth = np.minimum(ball, floor)
         seen = np.isfinite(depth)
         hit = origin + rays * np.where(seen, depth, 0.0)[..., None]
-        color = np.where((ball <= floor)[..., None], self._ball_colour(hit), self._floor_colour(hit))
+        color = np.where((ball <= floor)[..., None], self._ball_color(hit), self._floor_color(hit))
         color = np.where(seen[..., None], color, EMPTY)
         return Rendering(
             color.astype(np.float32),
@@ -77,23 +77,23 @@ class BallScene:
         rng = np.random.default_rng(0)
         directions = rng.normal(size=(half, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        ball = self.centre + BALL_RADIUS_M * directions
+        ball = self.center + BALL_RADIUS_M * directions
         radius, angle = FLOOR_RADIUS_M * np.sqrt(rng.random(half)), 2 * np.pi * rng.random(half)
         floor = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(half)], axis=1)
-        colors = np.concatenate([self._ball_colour(ball), self._floor_colour(floor)])
+        colors = np.concatenate([self._ball_color(ball), self._floor_color(floor)])
         return np.concatenate([ball, floor]).astype(np.float32), colors.astype(np.float32)
 
-    def _ball_colour(self, at: NDArray) -> NDArray:
-        normal = (at - self.centre) / BALL_RADIUS_M
+    def _ball_color(self, at: NDArray) -> NDArray:
+        normal = (at - self.center) / BALL_RADIUS_M
         turned = np.arctan2(normal[..., 1], normal[..., 0]) - self.spin
         stripe = 0.5 + 0.5 * np.sign(np.sin(6 * turned) * np.sin(9 * normal[..., 2]))
         base = np.where(stripe[..., None] > 0.5, (0.93, 0.42, 0.20), (0.98, 0.86, 0.66))
         return base * (0.35 + 0.65 * np.clip(normal @ _SUN, 0, 1))[..., None]
 
-    def _floor_colour(self, at: NDArray) -> NDArray:
+    def _floor_color(self, at: NDArray) -> NDArray:
         checks = (np.floor(at[..., 0] * 2) + np.floor(at[..., 1] * 2)) % 2
         base = np.where(checks[..., None] > 0.5, (0.55, 0.62, 0.66), (0.30, 0.37, 0.43))
-        gap = np.hypot(at[..., 0] - self.centre[0], at[..., 1] - self.centre[1]) / BALL_RADIUS_M
+        gap = np.hypot(at[..., 0] - self.center[0], at[..., 1] - self.center[1]) / BALL_RADIUS_M
         return base * (1 - 0.55 * np.exp(-(gap**2)))[..., None]
 
 

@@ -69,7 +69,7 @@ class Visitor:
 
 
 class RenderLoop:
-    """The thread. ``show_points(points, colours)`` is called with the field's own points while ``mode`` or
+    """The thread. ``show_points(points, colors)`` is called with the field's own points while ``mode`` or
     the field's youth asks for them, and with None when it no longer does."""
 
     def __init__(self, state: EdgeState, show_points: Any) -> None:
@@ -275,7 +275,7 @@ class RenderLoop:
 
 
 def presentable(image: Rendering, camera: Pinhole) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """What a browser is sent: colour uint8 (H, W, 3) and depth float32 (h, w) along the view axis, metres.
+    """What a browser is sent: color uint8 (H, W, 3) and depth float32 (h, w) along the view axis, metres.
 
     Whatever the field rendered is safe to show: what is not a number becomes empty space.
     """

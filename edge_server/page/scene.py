@@ -13,7 +13,7 @@ import viser
 from numpy.typing import NDArray
 
 from edge_server.live.state import CameraView, EdgeState
-from edge_server.page.colours import HELD_OUT, RGB, age_colour
+from edge_server.page.colors import HELD_OUT, RGB, age_color
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint, initial_viewpoint
 from freshfield import payload
 from freshfield.frame import Frame
@@ -38,7 +38,7 @@ class _Shown:
 
     handle: Any
     pose: Pose
-    colour: RGB
+    color: RGB
     thumbnail_of: tuple[str, int] | None = None
     thumbnail_at: float = -1e9
 
@@ -70,36 +70,36 @@ class Scene:
                 self._frustum(camera, camera.newest)
         self._thumbnails([c for c in cameras if c.newest is not None])
 
-    def show_points(self, points: NDArray | None, colours: NDArray | None) -> None:
-        """Points (N, 3) and uint8 colours (N, 3), or None to show no points."""
-        if points is None or colours is None:
+    def show_points(self, points: NDArray | None, colors: NDArray | None) -> None:
+        """Points (N, 3) and uint8 colors (N, 3), or None to show no points."""
+        if points is None or colors is None:
             if self._points is not None:
                 self._points.remove()
                 self._points = None
             return
         radius = self._viewpoint.radius_m if self._viewpoint else 1.0
         self._points = self._server.scene.add_point_cloud(
-            "/field/points", points, colours, point_size=radius * 0.006, point_shape="circle",
+            "/field/points", points, colors, point_size=radius * 0.006, point_shape="circle",
             precision="float32", point_shading="flat",
         )  # fmt: skip
 
     # --- frustums -------------------------------------------------------------------------------
 
     def _frustum(self, camera: CameraView, frame: Frame) -> None:
-        colour = HELD_OUT if camera.held_out else age_colour(camera.age_ms)
+        color = HELD_OUT if camera.held_out else age_color(camera.age_ms)
         shown = self._shown.get(camera.camera)
         if shown is None:
-            self._shown[camera.camera] = self._add(camera, frame, colour)
+            self._shown[camera.camera] = self._add(camera, frame, color)
             return
         if frame.pose != shown.pose:
             shown.pose = frame.pose
             shown.handle.wxyz = frame.pose.quaternion
             shown.handle.position = frame.pose.translation_m
-        if colour != shown.colour:
-            shown.colour = colour
-            shown.handle.color = colour
+        if color != shown.color:
+            shown.color = color
+            shown.handle.color = color
 
-    def _add(self, camera: CameraView, frame: Frame, colour: RGB) -> _Shown:
+    def _add(self, camera: CameraView, frame: Frame, color: RGB) -> _Shown:
         assert self._viewpoint is not None
         k, size = frame.intrinsics, self._viewpoint.radius_m * FRUSTUM_OF_RADIUS
         handle = self._server.scene.add_camera_frustum(
@@ -109,7 +109,7 @@ class Scene:
             scale=size,
             thickness=3.0 if camera.held_out else 2.0,
             thickness_units="screen",
-            color=colour,
+            color=color,
             format="jpeg",
             jpeg_quality=75,
             wxyz=frame.pose.quaternion,
@@ -125,7 +125,7 @@ class Scene:
                 f"/cameras/{camera.camera}/label", "held out: the truth", anchor="bottom-center",
                 position=above, font_screen_scale=0.85,
             )  # fmt: skip
-        return _Shown(handle, frame.pose, colour)
+        return _Shown(handle, frame.pose, color)
 
     def _look_through(self, client: Any, camera: str) -> None:
         """Stand where a camera stands, with its lens."""

@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from edge_server.live.state import CameraView, Publication
-from edge_server.page.colours import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
+from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
 from edge_server.page.markup import chart_caption
 
 WINDOW_S = 120.0
@@ -92,7 +92,7 @@ class Timelines:
 
 
 class _Chart:
-    """A caption with the lines' colours, and the curves once there is something to connect.
+    """A caption with the lines' colors, and the curves once there is something to connect.
 
     uPlot takes a NaN for a number and then finds no ends for its axis, so gaps are filled with what was
     known before them, and a line that has no values is left out: the chart is made anew without it.
@@ -132,10 +132,10 @@ class _Chart:
 
     def _make(self, lines: Sequence[tuple[str, RGB]], data: tuple[NDArray, ...]) -> Any:
         series: list[Any] = [{"label": "s"}]
-        for label, colour in lines:
-            line: dict[str, Any] = {"label": label, "stroke": css(colour), "width": LINE_PX}
+        for label, color in lines:
+            line: dict[str, Any] = {"label": label, "stroke": css(color), "width": LINE_PX}
             line |= {"points": {"show": False}}
-            series.append(line | ({"fill": css(colour) + "30"} if self._stepped else {}))
+            series.append(line | ({"fill": css(color) + "30"} if self._stepped else {}))
         axis: dict[str, Any] = {"font": "10px sans-serif", "gap": 3, "ticks": {"size": 3}}
         scales: dict[str, Any] = {"x": {"time": False}}
         if self._zero:

@@ -79,27 +79,27 @@ def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> View
     poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
     up = world_up(poses)
-    centre = convergence(poses)
+    center = convergence(poses)
     box = None if bounds is None else np.asarray(bounds, dtype=np.float64)
-    if centre is None and box is not None and np.all(np.isfinite(box)):
-        centre = box.mean(axis=0)
-    if centre is None:
+    if center is None and box is not None and np.all(np.isfinite(box)):
+        center = box.mean(axis=0)
+    if center is None:
         spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).mean())
         ahead = axes.mean(axis=0) if np.linalg.norm(axes.mean(axis=0)) > _SCATTERED else axes[0]
-        centre = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(3.0 * spread, 1.0)
-    radius = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
+        center = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(3.0 * spread, 1.0)
+    radius = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     radius = max(radius, 1e-2)
-    direction = _outward(eyes - centre, up, radius)
+    direction = _outward(eyes - center, up, radius)
     tangent = MARGIN * np.tan(0.5 * VERTICAL_FOV_RAD)
     for distance in DISTANCES * radius:
-        position = centre + direction * distance
-        if _share_seen(eyes, position, centre, up, tangent) >= SEEN_SHARE:
+        position = center + direction * distance
+        if _share_seen(eyes, position, center, up, tangent) >= SEEN_SHARE:
             break
-    return Viewpoint(position, centre, up, radius)
+    return Viewpoint(position, center, up, radius)
 
 
 def _outward(offsets: Array, up: Array, radius: float) -> Array:
-    """Unit vector from the centre to the visitor: above the middle of the rig. offsets: (N, 3) metres."""
+    """Unit vector from the center to the visitor: above the middle of the rig. offsets: (N, 3) metres."""
     flat = offsets - (offsets @ up)[:, None] * up
     behind = flat.mean(axis=0)
     if np.linalg.norm(behind) < _SCATTERED * radius:  # a ring of cameras: stand behind the first
@@ -115,9 +115,9 @@ def _outward(offsets: Array, up: Array, radius: float) -> Array:
     return behind * np.cos(elevation) + up * np.sin(elevation)
 
 
-def _share_seen(eyes: Array, position: Array, centre: Array, up: Array, tangent: float) -> float:
+def _share_seen(eyes: Array, position: Array, center: Array, up: Array, tangent: float) -> float:
     """Share of ``eyes`` within a square view whose half angle has this tangent."""
-    local = (eyes - position) @ look_at(position, centre, up)[:3, :3]
+    local = (eyes - position) @ look_at(position, center, up)[:3, :3]
     inside = (local[:, 2] > 0) & (np.abs(local[:, :2]) < tangent * local[:, 2:]).all(axis=1)
     return float(inside.mean())
 

@@ -1,4 +1,4 @@
-"""What a run leaves to be read: report.json, report.html and figures, from the files in its folder."""
+"""The report of a run: report.json, report.html and figures, made from the files in its folder."""
 
 from edge_server.report.report import build_report
 

@@ -1,4 +1,4 @@
-"""The figures of a report, one function each; a figure whose data are missing is not drawn."""
+"""The figures of a report, one function each. A function returns False where its data are missing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from edge_server.report.run_files import Records, Row
+from edge_server.report.run_files import Row, RunFiles
 from edge_server.report.style import (
     BLUE,
     GREEN,
@@ -24,24 +24,24 @@ from edge_server.report.style import (
 )
 
 Report = dict[str, Any]
-# Errors are shown this many times as bright, or nobody would see them.
+# Factor by which errors are brightened to be visible.
 _ERROR_GAIN = 4.0
-_MOST_LABELS = 24
+_MAX_LABELS = 24
 
 
-def draw_all(report: Report, records: Records) -> dict[str, Path]:
-    """Write every figure there are data for into the run's folder; returns their paths by name, in the
-    order of reading. Figures of an earlier report that are not drawn this time are removed."""
+def draw_all(report: Report, files: RunFiles) -> dict[str, Path]:
+    """Write every figure that has data into the run's folder. Returns their paths by name, in reading order.
+    Figures of an earlier report that are not drawn again are removed."""
     drawn = {}
     for name, draw in FIGURES.items():
-        path = records.out / f"figure-{name}.png"
+        path = files.out / f"figure-{name}.png"
         path.unlink(missing_ok=True)
-        if draw(report, records, path):
+        if draw(report, files, path):
             drawn[name] = path
     return drawn
 
 
-def draw_fidelity(report: Report, records: Records, path: Path) -> bool:
+def draw_fidelity(report: Report, files: RunFiles, path: Path) -> bool:
     """PSNR (whole image, moving pixels, both baselines), SSIM and LPIPS at every publication."""
     series, found = report["fidelity"]["series"], report["fidelity"]
     psnr, moving = _points(series, "psnr_db"), _points(series, "psnr_moving_db")
@@ -53,7 +53,7 @@ def draw_fidelity(report: Report, records: Records, path: Path) -> bool:
         top.plot(*psnr, color=BLUE, label="whole image")
         if len(moving[0]):
             top.plot(*moving, color=VERMILION, label="moving pixels")
-        flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean colour"}
+        flat = {"nearest_view_db": "nearest view", "mean_colour_db": "mean color"}
         for (key, label), dash in zip(flat.items(), ("--", ":")):
             if found["baseline"].get(key) is not None:
                 top.axhline(found["baseline"][key], color=GREY, linestyle=dash, linewidth=1.2, label=label)
@@ -72,9 +72,9 @@ def draw_fidelity(report: Report, records: Records, path: Path) -> bool:
     return True
 
 
-def draw_ages(report: Report, records: Records, path: Path) -> bool:
+def draw_ages(report: Report, files: RunFiles, path: Path) -> bool:
     """Age over time (median and range over cameras, mean age of what was selected), and by camera."""
-    rows = [r for r in records.ages if any(a is not None for a in (r.get("age_ms") or {}).values())]
+    rows = [r for r in files.ages if any(a is not None for a in (r.get("age_ms") or {}).values())]
     if not rows or report["age_ms"] is None:
         return False
     spreads = {c: s for c, s in report["age_ms"]["by_camera"].items() if s is not None}
@@ -96,7 +96,7 @@ def draw_ages(report: Report, records: Records, path: Path) -> bool:
         mean, p50, p95 = (np.array([s[k] for s in spreads.values()]) for k in ("mean", "p50", "p95"))
         by_camera.vlines(x, p50, p95, color=SKY, linewidth=5, label="median to 95 %")
         by_camera.plot(x, mean, "o", color=BLUE, markersize=4.5, label="mean")
-        step = max(1, -(-len(x) // _MOST_LABELS))
+        step = max(1, -(-len(x) // _MAX_LABELS))
         by_camera.set_xticks(x[::step], list(spreads)[::step], rotation=60, ha="right", fontsize=8)
         by_camera.set_ylim(bottom=0)
         by_camera.grid(axis="x", visible=False)
@@ -104,13 +104,13 @@ def draw_ages(report: Report, records: Records, path: Path) -> bool:
     return True
 
 
-def draw_updates(report: Report, records: Records, path: Path) -> bool:
+def draw_updates(report: Report, files: RunFiles, path: Path) -> bool:
     """Time of every update, and how many views it used."""
     series = report["fidelity"]["series"]
     spent = _points(series, "update_ms")
     if not len(spent[0]) or report["kind"] == "fit":
         return False
-    counts = [(r["t_s"], _how_many(r.get("selected"))) for r in series]
+    counts = [(r["t_s"], _count(r.get("selected"))) for r in series]
     with figure(path, 2, height_inch=1.9, sharex=True) as (_, axes):
         top, bottom = axes[:, 0]
         top.plot(*spent, ".", color=BLUE, markersize=4, label="each update")
@@ -123,7 +123,7 @@ def draw_updates(report: Report, records: Records, path: Path) -> bool:
     return True
 
 
-def draw_channel(report: Report, records: Records, path: Path) -> bool:
+def draw_channel(report: Report, files: RunFiles, path: Path) -> bool:
     """Share of time in each state of the chain, and the histogram of drawn delays."""
     if report["channel"] is None:
         return False
@@ -138,7 +138,7 @@ def draw_channel(report: Report, records: Records, path: Path) -> bool:
         left.set_xticks(range(len(shares)), list(shares))
         left.set_ylim(0, 100)
         left.grid(axis="x", visible=False)
-        label_lines(left, "% of the time", "state of the channel", "Where the chain was")
+        label_lines(left, "% of the time", "state of the channel", "Channel states")
         if len(counts):
             width = np.diff(edges)
             right.bar(edges[:-1], counts / counts.sum() / width, width, align="edge", color=BLUE, alpha=0.85)
@@ -148,16 +148,16 @@ def draw_channel(report: Report, records: Records, path: Path) -> bool:
                 right.legend()
             right.set_xlim(0, edges[-1])
             right.set_yticks([])
-            label_lines(right, "density", "drawn delay (ms)", "Delays the channel drew")
+            label_lines(right, "density", "drawn delay (ms)", "Drawn delays")
         else:
             right.set_axis_off()
             right.text(0.5, 0.5, "no delays were drawn", ha="center", color=GREY)
     return True
 
 
-def draw_comparison(report: Report, records: Records, path: Path) -> bool:
-    """The last scored truth beside the field's rendering of it, and the absolute error."""
-    truth, rendered = _picture(records, "truth"), _picture(records, "rendered")
+def draw_comparison(report: Report, files: RunFiles, path: Path) -> bool:
+    """The last held-out image beside the field's rendering of it, and the absolute error."""
+    truth, rendered = _image(files, "truth"), _image(files, "rendered")
     if truth is None or rendered is None or truth.shape != rendered.shape:
         return False
     error = np.clip(np.abs(truth - rendered) * _ERROR_GAIN, 0.0, 1.0)
@@ -172,31 +172,31 @@ def draw_comparison(report: Report, records: Records, path: Path) -> bool:
     return True
 
 
-def draw_processes(report: Report, records: Records, path: Path) -> bool:
+def draw_processes(report: Report, files: RunFiles, path: Path) -> bool:
     """Memory and processor time of every process."""
-    names = sorted({n for row in records.processes for n, v in row.items() if _is_use(v)} - {"machine"})
+    names = sorted({n for row in files.processes for n, v in row.items() if _is_usage(v)} - {"machine"})
     if not names:
         return False
-    # Many camera processes: their sum says what matters, and the legend stays readable.
+    # Camera processes can be many: their sum keeps the legend readable.
     groups: dict[str, list[str]] = {}
     for name in names:
         groups.setdefault(name if name in ("edge", "emulator") else "camera nodes", []).append(name)
     with figure(path, 2, height_inch=1.9, sharex=True) as (_, axes):
         top, bottom = axes[:, 0]
-        for (group, members), colour in zip(groups.items(), (BLUE, VERMILION, GREEN, PURPLE)):
-            rows = [r for r in records.processes if any(_is_use(r.get(m)) for m in members)]
+        for (group, members), color in zip(groups.items(), (BLUE, VERMILION, GREEN, PURPLE)):
+            rows = [r for r in files.processes if any(_is_usage(r.get(m)) for m in members)]
             t = [r["t_s"] for r in rows]
             for ax, key, label in ((top, "rss_mb", group), (bottom, "cpu", None)):
-                total = [sum(r[m][key] for m in members if _is_use(r.get(m))) for r in rows]
-                ax.plot(t, total, color=colour, label=label)
+                total = [sum(r[m][key] for m in members if _is_usage(r.get(m))) for r in rows]
+                ax.plot(t, total, color=color, label=label)
         top.set_ylim(bottom=0)
         bottom.set_ylim(bottom=0)
-        label_lines(top, "resident (MB)", title="What the processes cost")
+        label_lines(top, "resident (MB)", title="Memory and processor time of the processes")
         label_lines(bottom, "cores", "seconds since the start")
     return True
 
 
-FIGURES: dict[str, Callable[[Report, Records, Path], bool]] = {
+FIGURES: dict[str, Callable[[Report, RunFiles, Path], bool]] = {
     "comparison": draw_comparison,
     "fidelity": draw_fidelity,
     "ages": draw_ages,
@@ -206,9 +206,9 @@ FIGURES: dict[str, Callable[[Report, Records, Path], bool]] = {
 }
 
 
-def _picture(records: Records, name: str) -> np.ndarray | None:
-    """A picture of the run as RGB (H, W, 3) in [0, 1], or None."""
-    image = cv2.imread(str(records.pictures[name])) if name in records.pictures else None
+def _image(files: RunFiles, name: str) -> np.ndarray | None:
+    """An image of the run as RGB (H, W, 3) in [0, 1], or None."""
+    image = cv2.imread(str(files.images[name])) if name in files.images else None
     return None if image is None else np.asarray(image)[..., ::-1] / 255.0
 
 
@@ -219,11 +219,11 @@ def _points(series: list[Row], name: str) -> tuple[list[float], list[float]]:
 
 
 def _robust_top(values: list[float]) -> float:
-    """An axis limit that one outlier (a start, a kill) does not own."""
+    """An axis limit that a single outlier (a start, a kill) does not set."""
     return 1.25 * float(np.percentile(values, 99)) + 1e-9 if len(values) else 1.0
 
 
-def _how_many(selected: Any) -> int:
+def _count(selected: Any) -> int:
     return len(selected) if isinstance(selected, list) else int(selected or 0)
 
 
@@ -234,19 +234,19 @@ def _shares(found: Any) -> dict[str, float]:
 
 
 def _histogram(found: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Bin edges (n + 1,) in ms and counts (n,) of the emulator's ``histogram``; both empty where there is
-    none, or nothing in it."""
-    nothing = (np.zeros(0), np.zeros(0))
+    """Bin edges (n + 1,) in ms and counts (n,) of the emulator's ``histogram``; both empty where it is
+    missing or counts nothing."""
+    empty = (np.zeros(0), np.zeros(0))
     if not isinstance(found, dict):
-        return nothing
+        return empty
     try:
         edges = np.array(found.get("edges_ms"), dtype=np.float64)
         counts = np.array(found.get("counts"), dtype=np.float64)
     except (TypeError, ValueError):
-        return nothing
+        return empty
     usable = edges.ndim == counts.ndim == 1 and len(edges) == len(counts) + 1 and counts.sum() > 0
-    return (edges, counts) if usable else nothing
+    return (edges, counts) if usable else empty
 
 
-def _is_use(value: Any) -> bool:
+def _is_usage(value: Any) -> bool:
     return isinstance(value, dict) and "rss_mb" in value and "cpu" in value

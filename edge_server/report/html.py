@@ -1,4 +1,4 @@
-"""report.html: one self-contained page with the figures inside, for people."""
+"""report.html: one self-contained page with the figures inside."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def render_html(report: Report, figures: dict[str, Path]) -> str:
     sections = [
         _head(report),
         _tiles(report),
-        _section("What the field shows", _figure(figures, "comparison"), _fidelity_table(report)),
+        _section("Rendering of a held-out view", _figure(figures, "comparison"), _fidelity_table(report)),
         _section("Fidelity over time", _figure(figures, "fidelity")),
         _section("Mesh", _mesh_table(report)),
         _section("Age", _figure(figures, "ages"), _details("By camera", _age_table(report))),
         _section("Updates", _figure(figures, "updates"), _updates_line(report)),
-        _section("Frames", _books(report), _details("By camera", _books_by_camera(report))),
+        _section("Frames", _frames_table(report), _details("By camera", _frames_by_camera(report))),
         _section("Channel", _figure(figures, "channel"), _channel_table(report)),
-        _section("What it ran on", _figure(figures, "processes"), _machine_table(report)),
+        _section("Machine", _figure(figures, "processes"), _machine_table(report)),
         _notes(report),
     ]
     title = escape(str(report["scenario"] or "run"))
@@ -113,24 +113,24 @@ def _fidelity_table(report: Report) -> str:
     fit = report["kind"] == "fit"
     for name, label in (("final", "at the end" if fit else "last fifth of the run"), ("mean", "whole run")):
         if fit and name == "mean":
-            continue  # the mean of a learning curve says nothing
+            continue  # the mean of a learning curve is no result
         rows.append([label, *(_n(found[name][metric], digits) for metric, digits in metrics.items())])
-    for name, label in (("nearest_view_db", "nearest training view"), ("mean_colour_db", "mean colour")):
+    for name, label in (("nearest_view_db", "nearest training view"), ("mean_colour_db", "mean color")):
         rows.append([label, _n(found["baseline"][name], 2), *[""] * (len(metrics) - 1)])
-    said = []
+    remarks = []
     if found["scored_on"] == ["selected"]:
-        said.append("No camera is held out: scored on the selected views themselves (6.21-6.22).")
+        remarks.append("No camera is held out: scored on the selected views themselves (6.21-6.22).")
     elif found["scored_on"]:
-        said.append(f"Held out: {', '.join(found['scored_on'])}.")
+        remarks.append(f"Held out: {', '.join(found['scored_on'])}.")
     if found["series"] and not fit:
-        said.append(f"{found['scored']} of {len(found['series'])} publications have a truth near enough.")
+        remarks.append(f"{found['scored']} of {len(found['series'])} publications were scored.")
     if found["lpips_missing"]:
-        said.append(f"LPIPS: {found['lpips_missing']}.")
-    return _table(rows) + f"<p class=soft>{escape(' '.join(said))}</p>"
+        remarks.append(f"LPIPS: {found['lpips_missing']}.")
+    return _table(rows) + f"<p class=soft>{escape(' '.join(remarks))}</p>"
 
 
 def _mesh_table(report: Report) -> str:
-    """Nothing where the scenario asks for no mesh."""
+    """Empty where the scenario asks for no mesh."""
     mesh = report.get("mesh")
     if not mesh:
         return ""
@@ -175,7 +175,7 @@ def _updates_line(report: Report) -> str:
     )
 
 
-def _books(report: Report) -> str:
+def _frames_table(report: Report) -> str:
     f = report["frames"]
     if f is None:
         return ""
@@ -187,33 +187,37 @@ def _books(report: Report) -> str:
         ("dropped_busy", "discarded: the link was busy"),
         ("superseded", "a newer frame took its place in the link"),
         ("lost", "lost by the channel"),
-        ("broken", "its stream ended under it"),
+        ("broken", "its stream ended on the way"),
         ("delivered", "in the edge's buffer, or the held-out truth"),
-        ("in_flight", "sent, and no process wrote its end"),
+        ("in_flight", "sent; no process recorded its end"),
     ]
     rows = [["frames", "", ""]]
     rows += [
         ["captured", f"{f['captured']:,}", "= replaced + waiting + sent"],
         ["replaced", f"{f['replaced']:,}", "a newer frame came before the stream was free"],
-        ["waiting", f"{f['waiting']:,}", "at the node when it ended"],
+        ["waiting", f"{f['waiting']:,}", "still at the node when it ended"],
         ["sent", f"{f['sent']:,}", "handed to the stream"],
         ["duplicated", f"{f['duplicated']:,}", "further copies; sent + duplicated = all below"],
     ]
     rows += [[name.replace("_", " "), f"{f[name]:,}", text] for name, text in ends]
     rows.append(["rejected", f"{rejected:,}", ", ".join(f"{k} {v:,}" for k, v in f["rejected"].items())])
-    verdict = "<p class=ok>The books close." if f["closes"] else "<p class=bad>The books do not close."
-    if f["contradiction_count"]:
-        verdict += f" <span class=bad>{f['contradiction_count']} frames contradict themselves:</span></p><ul>"
-        verdict += "".join(f"<li><code>{escape(c)}</code></li>" for c in f["contradictions"]) + "</ul>"
+    result = (
+        "<p class=ok>Every frame is accounted for."
+        if f["closes"]
+        else "<p class=bad>The counts of frames do not add up."
+    )
+    if count := f["contradiction_count"]:
+        result += f" <span class=bad>The ledgers contradict each other on {count} frames:</span></p><ul>"
+        result += "".join(f"<li><code>{escape(c)}</code></li>" for c in f["contradictions"]) + "</ul>"
     else:
-        verdict += f" {f['ledgers']} ledgers joined, no contradictions.</p>"
+        result += f" {f['ledgers']} ledgers joined, no contradictions.</p>"
     if strangers := f["strangers"]["count"]:
-        why = ", ".join(f"{escape(k)} {v:,}" for k, v in f["strangers"]["reasons"].items())
-        verdict += f"<p>Refused besides, of unknown origin and in no row below: {strangers:,} ({why}).</p>"
-    return verdict + _table(rows, left=(0, 2))
+        reasons = ", ".join(f"{escape(k)} {v:,}" for k, v in f["strangers"]["reasons"].items())
+        result += f"<p>Refused frames of unknown origin, not counted below: {strangers:,} ({reasons}).</p>"
+    return result + _table(rows, left=(0, 2))
 
 
-def _books_by_camera(report: Report) -> str:
+def _frames_by_camera(report: Report) -> str:
     names = ("captured", "replaced", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
              "delivered", "in_flight")  # fmt: skip
     rows = [["camera", *(n.replace("_", " ") for n in names), "rejected"]]
@@ -253,7 +257,7 @@ def _notes(report: Report) -> str:
     if not report["notes"]:
         return ""
     items = "".join(f"<li>{escape(str(note))}</li>" for note in report["notes"])
-    return f"<h2>What was missing or torn</h2><ul class=soft>{items}</ul>"
+    return f"<h2>Missing or damaged files</h2><ul class=soft>{items}</ul>"
 
 
 def _section(title: str, *parts: str) -> str:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.report.frame_accounting import close_books
+from edge_server.report.frame_accounting import account_frames
 from edge_server.report.machine import machine, versions
-from edge_server.report.run_files import Records, Row, read_records
+from edge_server.report.run_files import Row, RunFiles, read_run_files
 from freshfield.files import write_json, write_text
 from freshfield.machine_load import outside_load
 
@@ -25,33 +25,31 @@ FINAL_SHARE = 0.2
 def build_report(out_dir: str | Path) -> dict[str, Any]:
     """Write report.json, report.html and PNGs into the run's folder; returns what report.json holds.
 
-    Works on whatever is there: killed runs, other machines' files missing, no channel. What was missing is
-    said in ``notes``. Raises FileNotFoundError if the folder does not exist.
+    Works on what is there: after a kill, without the files of other machines, without a channel. ``notes``
+    says what was missing. Raises FileNotFoundError if the folder does not exist.
     """
-    # Drawing loads matplotlib, which the figures alone need.
+    # Lazy: only the figures need matplotlib.
     from edge_server.report.figures import draw_all
     from edge_server.report.html import render_html
 
     out = Path(out_dir)
-    records = read_records(out)
-    report = assemble(records)
+    files = read_run_files(out)
+    report = assemble(files)
     write_json(out / "report.json", report, indent=1)
-    figures = draw_all(report, records)
+    figures = draw_all(report, files)
     write_text(out / "report.html", render_html(report, figures))
     return report
 
 
-def assemble(records: Records) -> dict[str, Any]:
-    """The contents of report.json, without writing anything but what the ledgers' reading needs.
-
-    ``kind``: live, or fit for a recorded data set without a network, whose books, ages and channel are None.
-    """
-    edge, series = records.edge, records.series
-    notes = list(records.notes)
+def assemble(files: RunFiles) -> dict[str, Any]:
+    """The contents of report.json. ``kind``: live, or fit for a recorded data set without a network, whose
+    frames, ages and channel are None."""
+    edge, series = files.edge, files.series
+    notes = list(files.notes)
     if lost := _number(edge.get("lines_lost")):
-        notes.append(f"the edge could not write {lost:.0f} lines of its account (a full disk?)")
+        notes.append(f"the edge could not write {lost:.0f} lines of its results (a full disk?)")
     kind = "fit" if edge.get("kind") == "fit" else "live"
-    books = close_books(records.out)
+    accounting = account_frames(files.out)
     last_s = series[-1]["t_s"] if series else 0.0
     seconds = max(_number(edge.get("seconds", edge.get("uptime_s"))) or 0.0, last_s)
     report = {
@@ -63,18 +61,18 @@ def assemble(records: Records) -> dict[str, Any]:
         "policy": {"name": edge.get("policy"), "value": edge.get("value")},
         "versions": versions(),
         "machine": machine(),
-        "outside_load": outside_load(records.processes),
-        "frames": {**books.as_dict(), "ledgers": books.ledgers},
-        "age_ms": ages(records.ages),
+        "outside_load": outside_load(files.processes),
+        "frames": {**accounting.as_dict(), "ledgers": accounting.ledgers},
+        "age_ms": ages(files.ages),
         "updates": updates(series, edge.get("updates") or {}),
         "fidelity": fidelity(series, seconds, edge),
         "channel": {
-            name: records.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")
+            name: files.channel.get(name) for name in ("state_share", "drawn_delay_ms", "delay_error_ms")
         },
-        "notes": notes + books.notes,
+        "notes": notes + accounting.notes,
     }
-    if records.mesh:
-        report["mesh"] = records.mesh
+    if files.mesh:
+        report["mesh"] = files.mesh
     if kind == "fit":
         report |= {"data": edge.get("data"), "frames": None, "age_ms": None, "channel": None, "notes": []}
     cleaned: dict[str, Any] = _finite(report)
@@ -82,8 +80,8 @@ def assemble(records: Records) -> dict[str, Any]:
 
 
 def ages(rows: Sequence[Row]) -> dict[str, Any]:
-    """Time averages of the newest buffered frame's age: {mean, p50, p95, by_camera: {camera: the same, or
-    None if it never reported}}. Samples are evenly spaced, so their mean is the age's time average."""
+    """Age of the newest buffered frame, averaged over time: {mean, p50, p95, by_camera: {camera: the same, or
+    None if it never reported}}. Samples are evenly spaced, so their mean is the time average."""
     samples: dict[str, list[float]] = {}
     for row in rows:
         for camera, age in (row.get("age_ms") or {}).items():
@@ -96,14 +94,17 @@ def ages(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
-    """{count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication, undecodable,
-    without_step: those that had no time to learn, refused: {camera: how often the field left its picture
-    out}}, and where the scenario sets one deadline_ms and met_share, of the updates within it. ``edge``: the
-    same as the edge knew it, for lines that were not written any more."""
+    """Number and duration of updates, from the rows of ``series``.
+
+    edge: the same as counted by the edge, for rows that were not written any more. Returns {count, ms_p50,
+    ms_p95, first_ms: from the start of the edge to the first publication, undecodable, without_step: updates
+    without time for an optimizer step, refused: {camera: how often the field left its image out}}. Where the
+    scenario sets a deadline, also deadline_ms and met_share: the share of updates within it.
+    """
     spent = _known(row.get("update_ms") for row in series)
     first = series[0]["t_s"] * 1e3 if series else None
     deadline_ms = _number(edge.get("deadline_ms"))
-    told = {
+    result = {
         "count": max(len(series), int(_number(edge.get("count")) or 0)),
         "ms_p50": float(np.percentile(spent, 50)) if spent else edge.get("ms_p50"),
         "ms_p95": float(np.percentile(spent, 95)) if spent else edge.get("ms_p95"),
@@ -114,13 +115,13 @@ def updates(series: Sequence[Row], edge: Row) -> dict[str, Any]:
     }
     if deadline_ms is not None:
         met = [ms <= deadline_ms for ms in spent]
-        told |= {"deadline_ms": deadline_ms, "met_share": float(np.mean(met)) if met else None}
-    return told
+        result |= {"deadline_ms": deadline_ms, "met_share": float(np.mean(met)) if met else None}
+    return result
 
 
 def fidelity(series: Sequence[Row], seconds: float, edge: Row) -> dict[str, Any]:
-    """Scores against the truth at the present: {final, mean, baseline, lpips_missing, lpips_network,
-    scored_on, series}. ``final``: publications in the last fifth of the run's ``seconds``."""
+    """Scores against the held-out views at publication: {final, mean, baseline, lpips_missing, lpips_network,
+    scored_on, scored, series}. ``final``: mean over the last fifth of the run's ``seconds``."""
     late = [row for row in series if row["t_s"] >= (1.0 - FINAL_SHARE) * seconds]
     baseline = edge.get("baseline") or {}
     return {

@@ -1,4 +1,4 @@
-"""Reads what a run left in its folder. Missing, torn and strange files cost a note, never the report."""
+"""Reads what a run left in its folder. A missing, torn or unexpected file adds a note; the report goes on."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ MEASURED = (
 
 
 @dataclass
-class Records:
-    """Contents of a run's folder. ages: rows {t_s, age_ms: {camera: ms or None}}; processes: rows
-    {t_s, name: {rss_mb, cpu, pid}}; mesh: as ``edge-server export --json`` writes it; series: rows as in
-    state.Publication; pictures: by name, those that exist. notes: one line for people for whatever was
-    missing or torn."""
+class RunFiles:
+    """Contents of a run's folder.
+
+    edge, channel: status files of the edge and the emulator. series: rows as in state.Publication.
+    ages: rows {t_s, age_ms: {camera: ms or None}}. processes: rows {t_s, name: {rss_mb, cpu, pid}}.
+    mesh: as ``edge-server export --json`` writes it. images: those that exist, by name.
+    notes: one line for people on whatever was missing or torn.
+    """
 
     out: Path
     edge: Row = field(default_factory=dict)
@@ -29,36 +32,36 @@ class Records:
     ages: list[Row] = field(default_factory=list)
     processes: list[Row] = field(default_factory=list)
     mesh: Row = field(default_factory=dict)
-    pictures: dict[str, Path] = field(default_factory=dict)
+    images: dict[str, Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
-def read_records(out: Path) -> Records:
-    """Everything a report needs from ``out``. Raises FileNotFoundError only if there is no such folder."""
+def read_run_files(out: Path) -> RunFiles:
+    """Everything a report needs from ``out``. Raises FileNotFoundError only if the folder does not exist."""
     if not out.is_dir():
         raise FileNotFoundError(f"{out} is not a folder: give the folder of a run (its --out)")
-    records = Records(out)
-    records.edge = _read_json(out / "edge.json", records.notes)
-    records.channel = _read_json(out / "channel.json", records.notes)
-    records.series = _continuous(_read_lines(out / "series.jsonl", records.notes))
-    records.ages = _continuous(_read_lines(out / "ages.jsonl", records.notes))
+    files = RunFiles(out)
+    files.edge = _read_json(out / "edge.json", files.notes)
+    files.channel = _read_json(out / "channel.json", files.notes)
+    files.series = _continuous(_read_lines(out / "series.jsonl", files.notes))
+    files.ages = _continuous(_read_lines(out / "ages.jsonl", files.notes))
     if (out / "processes.jsonl").exists():  # written only where one command started all processes
-        records.processes = _continuous(_read_lines(out / "processes.jsonl", records.notes))
+        files.processes = _continuous(_read_lines(out / "processes.jsonl", files.notes))
     if (out / "mesh.json").exists():  # only where the scenario asks for one
-        records.mesh = _mesh(_read_json(out / "mesh.json", records.notes), records.notes)
+        files.mesh = _mesh(_read_json(out / "mesh.json", files.notes), files.notes)
     for name in ("truth", "rendered"):
         path = out / f"{name}.png"
         if path.is_file():
-            records.pictures[name] = path
-    return records
+            files.images[name] = path
+    return files
 
 
 def _mesh(data: Row, notes: list[str]) -> Row:
-    """``data`` if it is what the export writes, else nothing and a note."""
+    """``data`` if it has the keys that the export writes; else {} and a note."""
     try:
-        found = data["measured"]
+        measured = data["measured"]
         numbers = [data["triangles"], data["seconds"], *data["stages_s"].values()]
-        numbers += [] if found is None else [found[name] for name in MEASURED]
+        numbers += [] if measured is None else [measured[name] for name in MEASURED]
         if isinstance(data["file"], str) and all(isinstance(n, int | float) for n in numbers):
             return data
     except (KeyError, TypeError, AttributeError):
@@ -83,7 +86,7 @@ def _read_json(path: Path, notes: list[str]) -> Row:
 
 
 def _read_lines(path: Path, notes: list[str]) -> list[Row]:
-    """Rows of a JSON-lines file that are objects with a time ``t_s``; the others are counted in a note."""
+    """Rows of a JSON-lines file that are objects with a finite ``t_s``; a note counts the others."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError:
@@ -106,7 +109,7 @@ def _read_lines(path: Path, notes: list[str]) -> list[Row]:
 
 
 def _continuous(rows: list[Row]) -> list[Row]:
-    """A process that was restarted counts its seconds from zero again: put its rows after the others."""
+    """Put rows of a restarted process, which counts its seconds from zero again, after the earlier ones."""
     shift = previous = 0.0
     for row in rows:
         if row["t_s"] + shift < previous:

@@ -1,4 +1,4 @@
-"""One look for all figures: quiet axes, readable sizes, colours that colour-blind readers can tell apart."""
+"""One look for all figures: quiet axes, readable sizes, colors that color-blind readers can tell apart."""
 
 from __future__ import annotations
 

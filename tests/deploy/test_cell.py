@@ -1,4 +1,4 @@
-"""A scenario with a simulated arm: who is started, in which order, and a field that sees the tile."""
+"""A scenario with a simulated arm: which processes start in which order, and a mesh of the tile."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_simulated_arm_and_its_driver_belong_to_the_run(process_set) -> None:
     found = process_set(CELL)
     assert [child.command[1] for child in found.arms + found.drivers] == ["simulate-arm", "drive-arm"]
     assert found.arm_address == "127.0.0.2:30004"
-    # Nobody sends to what is gone: driver, cameras, arm, channel, edge.
+    # Senders stop before receivers: driver, cameras, arm, channel, edge.
     assert [child.name for child in found.children] == ["driver", "node", "arm", "emulator", "edge"]
 
 
@@ -49,11 +49,11 @@ def test_a_mesh_is_made_where_the_scenario_asks_for_one(monkeypatch, tmp_path: P
     from freshfield_up import commands, mesh
 
     monkeypatch.setattr(mesh, "program", lambda name: name)
-    asked = mesh.child(CELL, tmp_path)
+    asked = mesh.export_process(CELL, tmp_path)
     assert asked is not None
     words = f"edge-server export {tmp_path} --mesh {tmp_path / 'tile.ply'} --measure {CELL.path}"
     assert " ".join(asked.command) == f"{words} --json {tmp_path / 'mesh.json'}"
-    assert mesh.child(load("tile"), tmp_path) is None
+    assert mesh.export_process(load("tile"), tmp_path) is None
     monkeypatch.setattr(mesh.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(commands.MissingCommand, match=r"edge.export: a mesh needs scikit-image: pip install"):
         mesh.check(CELL)

@@ -103,7 +103,7 @@ def engine() -> tuple[list[str], str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
-def test_the_deployment_streams_and_its_books_close(tmp_path: Path) -> None:
+def test_the_deployment_streams_and_accounts_for_every_frame(tmp_path: Path) -> None:
     command, below = engine()
     compose = [*command, "-f", str(FILE)]
 

@@ -1,4 +1,4 @@
-"""What the terminal shows, drawn from status files as the processes write them."""
+"""The display on a terminal, drawn from status files as the processes write them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from freshfield_up.display import LiveTable, draw
-from freshfield_up.resources import Use
+from freshfield_up.resources import ResourceUse
 from freshfield_up.status import read_status
 
 CAMERAS = tuple(f"cam{i:02d}" for i in range(13))
@@ -40,7 +40,7 @@ def write_status(out: Path) -> None:
 
 def drawn(out: Path, width: int = 100) -> str:
     console = Console(width=width, record=True, file=(out / "screen").open("w"))
-    console.print(draw(read_status(out, CAMERAS), "12 of 60 s", {"edge": Use(512.0, 1.5, 17)}))
+    console.print(draw(read_status(out, CAMERAS), "12 of 60 s", {"edge": ResourceUse(512.0, 1.5, 17)}))
     return console.export_text()
 
 
@@ -61,13 +61,13 @@ def test_the_table_of_thirteen_cameras_fits_a_small_terminal(tmp_path: Path) -> 
     assert all(any(c in line for line in lines) for c in CAMERAS)
 
 
-def test_before_anybody_has_written_there_is_a_table_all_the_same(tmp_path: Path) -> None:
+def test_there_is_a_table_before_any_process_has_written(tmp_path: Path) -> None:
     text = drawn(tmp_path)
     assert "no channel yet" in text and "no update yet" in text
     assert all(c in text for c in CAMERAS)
 
 
-def test_strange_files_leave_gaps_and_nothing_else(tmp_path: Path) -> None:
+def test_damaged_status_files_leave_gaps(tmp_path: Path) -> None:
     write_status(tmp_path)
     (tmp_path / "channel.json").write_text("[1, 2")
     (tmp_path / "edge.json").write_text(json.dumps({"cameras": "none", "updates": {"count": "many"}}))
@@ -79,8 +79,8 @@ def test_messages_and_table_share_the_terminal(tmp_path: Path) -> None:
     with (tmp_path / "screen").open("w") as file:
         console = Console(file=file, force_terminal=True, width=100, height=40)
         with LiveTable(console) as table:
-            table.show(read_status(tmp_path, CAMERAS), "1 of 60 s", {})
-            table.say("page: http://127.0.0.1:8080 [not markup]")
-            table.show(read_status(tmp_path, CAMERAS), "2 of 60 s", {})
+            table.update(read_status(tmp_path, CAMERAS), "1 of 60 s", {})
+            table.message("page: http://127.0.0.1:8080 [not markup]")
+            table.update(read_status(tmp_path, CAMERAS), "2 of 60 s", {})
     text = (tmp_path / "screen").read_text()
     assert "[not markup]" in text and "2 of 60 s" in text

@@ -1,4 +1,4 @@
-"""Starting, stopping and mourning processes, with real ones."""
+"""Starting, stopping and describing the exit of real processes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def wait_for(what, seconds: float = 10.0) -> None:
         time.sleep(0.02)
 
 
-def test_an_obituary_names_the_exit_code_and_the_last_words(tmp_path: Path) -> None:
+def test_the_exit_summary_names_the_exit_code_and_the_last_lines(tmp_path: Path) -> None:
     child = python(tmp_path, "print('reading'); raise SystemExit('the lens cap is on')")
     child.start()
     wait_for(lambda: not child.running)
@@ -37,7 +37,7 @@ def test_an_obituary_names_the_exit_code_and_the_last_words(tmp_path: Path) -> N
     assert str(child.log) in text
 
 
-def test_an_obituary_names_the_signal(tmp_path: Path) -> None:
+def test_the_exit_summary_names_the_signal(tmp_path: Path) -> None:
     child = python(tmp_path, "import time; time.sleep(60)")
     child.start()
     os.kill(child.pid, signal.SIGKILL)
@@ -46,22 +46,22 @@ def test_an_obituary_names_the_signal(tmp_path: Path) -> None:
     assert "wrote nothing" in child.exit_summary()
 
 
-def test_stop_is_gentle_first_and_firm_afterwards(tmp_path: Path) -> None:
-    polite = python(tmp_path, "import signal, sys, time\n"
+def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) -> None:
+    obedient = python(tmp_path, "import signal, sys, time\n"
                     "signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('goodbye')))\n"
-                    "print('up')\ntime.sleep(60)", "polite")  # fmt: skip
-    deaf = python(tmp_path, "import signal, time\n"
+                    "print('up')\ntime.sleep(60)", "obedient")  # fmt: skip
+    stubborn = python(tmp_path, "import signal, time\n"
                   "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
-                  "print('up')\ntime.sleep(60)", "deaf")  # fmt: skip
-    for child in (polite, deaf):
+                  "print('up')\ntime.sleep(60)", "stubborn")  # fmt: skip
+    for child in (obedient, stubborn):
         child.start()
         wait_for(lambda child=child: "\nup\n" in child.log.read_text())
     began = time.monotonic()
-    processes.stop([polite, deaf], grace_s=1.0)
+    processes.stop([obedient, stubborn], grace_s=1.0)
     assert time.monotonic() - began < 5.0
-    assert not polite.running and not deaf.running
-    assert not polite.killed and polite.process.returncode == 0 and "goodbye" in polite.log.read_text()
-    assert deaf.killed and deaf.process.returncode == -signal.SIGKILL
+    assert not obedient.running and not stubborn.running
+    assert not obedient.killed and obedient.process.returncode == 0 and "goodbye" in obedient.log.read_text()
+    assert stubborn.killed and stubborn.process.returncode == -signal.SIGKILL
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells children that their parent is gone")
@@ -89,7 +89,7 @@ def _lives(pid: int) -> bool:
         state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
     except FileNotFoundError:
         return False
-    return state != "Z"  # an orphan that nobody has collected yet is dead enough
+    return state != "Z"  # a zombie has ended
 
 
 def test_the_tail_of_a_large_log_has_whole_lines_only(tmp_path: Path) -> None:
@@ -100,8 +100,8 @@ def test_the_tail_of_a_large_log_has_whole_lines_only(tmp_path: Path) -> None:
     assert processes.tail(tmp_path / "missing", 5) == []
 
 
-def test_starting_a_process_is_no_business_of_grpc(tmp_path: Path) -> None:
-    """With its handlers of fork at work, the launcher hung now and then between two processes."""
+def test_grpc_does_not_act_when_a_process_starts(tmp_path: Path) -> None:
+    """With gRPC's fork handlers, the launcher sometimes hung between two processes."""
     code = """
         import subprocess, sys
         from concurrent import futures

@@ -1,4 +1,4 @@
-"""The last lines of a run say what its report says."""
+"""The summary of a run says what its report says."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import json
 
 import pytest
 
-from freshfield_up.summary import summarise
+from freshfield_up.summary import summarize
 
 
-@pytest.mark.parametrize("closes, said", [(True, "the books close"), (False, "the books DO NOT CLOSE")])
-def test_the_reports_own_verdict_on_the_books_is_shown(tmp_path, closes, said):
+@pytest.mark.parametrize(
+    "closes, expected", [(True, "all accounted for"), (False, "the counts DO NOT ADD UP")]
+)
+def test_it_says_whether_all_frames_are_accounted_for(tmp_path, closes, expected):
     frames = {"captured": 3, "sent": 3, "delivered": 3, "rejected": {}, "closes": closes}
     (tmp_path / "report.json").write_text(json.dumps({"frames": frames}))
-    assert said in summarise(tmp_path)
+    assert expected in summarize(tmp_path)

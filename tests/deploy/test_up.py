@@ -1,4 +1,4 @@
-"""The launcher with the real processes: a run that ends as asked, and runs in which something dies."""
+"""The launcher with the real processes: runs that end as asked, and runs in which a process dies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from typing import Any
 
 import pytest
 
+from freshfield_up.status import read_json
 from tests.conftest import ROOT
+from tests.ports import free_port
 
 SMALL = """
 name: small
@@ -33,7 +35,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class Up:
-    """One ``up.py`` at work in a folder; its output goes to a file, as with nohup."""
+    """A running ``up.py``; its output goes to a file, as with nohup."""
 
     def __init__(self, folder: Path, *options: str, scenario: str = SMALL) -> None:
         self.out = folder / "run"
@@ -80,19 +82,6 @@ class Up:
         return self.process.wait(seconds)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        return {}
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
-
-
 @pytest.fixture
 def up(tmp_path: Path) -> Iterator[Callable[..., Up]]:
     started: list[Up] = []
@@ -128,7 +117,7 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
     assert "0.0.0.0" not in run.output
     assert f"ssh -L {run.port}:127.0.0.1:{run.port}" in run.output
     assert re.search(r"\[\d+ of 6 s\] 4/4 cameras, age \d+ ms", run.output)
-    assert "the books close" in run.output and str(run.out / "report.html") in run.output
+    assert "all accounted for" in run.output and str(run.out / "report.html") in run.output
     report = run.report()
     assert report["frames"]["closes"] and report["frames"]["delivered"] > 20
     assert report["updates"]["count"] >= 3
@@ -138,7 +127,7 @@ def test_a_run_ends_when_its_time_is_up_with_a_report(up: Callable[..., Up]) -> 
 
 
 @pytest.mark.parametrize("name, role", [("node", "the camera node"), ("edge", "the edge server")])
-def test_a_killed_process_is_named_and_the_report_still_closes(
+def test_a_killed_process_is_named_and_the_report_still_accounts_for_every_frame(
     up: Callable[..., Up], name: str, role: str
 ) -> None:
     run = up("--for", "0")
@@ -199,7 +188,7 @@ def refusal(*words: str) -> str:
         [sys.executable, str(ROOT / "deploy" / "up.py"), *words], capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 2, done.stdout + done.stderr
-    assert done.stderr.count("\n") == 1, "one line says it"
+    assert done.stderr.count("\n") == 1, "the message is one line"
     return done.stderr
 
 
@@ -219,13 +208,14 @@ def test_a_taken_port_is_refused_before_anything_starts(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_what_an_earlier_run_has_learnt_is_not_thrown_away_by_the_next_one(tmp_path: Path) -> None:
+def test_a_run_does_not_delete_the_policy_that_it_loads(tmp_path: Path) -> None:
     (out := tmp_path / "run").mkdir()
     (out / "run.json").write_text("{}")
-    (learnt := out / "learnt.npz").write_bytes(b"weights")
-    words = ("room", "--out", str(out), "--port", str(free_port()), "--policy", f"bandit:{learnt}", "--learn")
-    assert "is emptied first; name another --out" in refusal(*words)
-    assert learnt.read_bytes() == b"weights"
+    (learned := out / "learned.npz").write_bytes(b"weights")
+    policy = ("--policy", f"bandit:{learned}", "--learn")
+    words = ("room", "--out", str(out), "--port", str(free_port()), *policy)
+    assert "is emptied first; choose another --out" in refusal(*words)
+    assert learned.read_bytes() == b"weights"
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
@@ -251,7 +241,7 @@ def test_times_are_read_as_people_write_them(text: str, seconds: float) -> None:
         (["--learn", "set", "--fallback", "all"], ["--learn=set", "--fallback=all"]),
     ],
 )
-def test_who_decides_and_whether_it_learns_is_passed_on_to_the_edge(
+def test_policy_options_are_passed_on_to_the_edge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], expected: list[str]
 ) -> None:
     from freshfield.scenario import load

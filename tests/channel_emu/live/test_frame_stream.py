@@ -15,7 +15,7 @@ from channel_emu.live.live_link import HardLimit
 from channel_emu.live.upstream import CREDITS, PUSH
 from channel_emu.model import trace
 from channel_emu.virtual.replay import compare
-from edge_server.report.frame_accounting import close_books
+from edge_server.report.frame_accounting import account_frames
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc
 from freshfield.v1 import frames_pb2 as pb
@@ -34,8 +34,8 @@ QUICK = {"service": {"law": "exponential", "mean_ms": 4.0}}
 
 def frame_account(out: Path):
     """The account of every frame, over the ledgers of all processes; it must close."""
-    account = close_books(out)
-    assert not account.contradictions and account.total.closes
+    account = account_frames(out)
+    assert not account.contradictions and account.total.balanced
     return account.total
 
 

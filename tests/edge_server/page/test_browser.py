@@ -45,7 +45,7 @@ def test_the_page_says_what_is_going_on_and_stays_live(shown):
 
 def test_the_picture_shows_scene_cameras_and_panels(shown, tmp_path):
     _, _, browser = shown
-    browser.wait_for(lambda: _centre(browser.screenshot()).std() > 15, "a picture of the scene")
+    browser.wait_for(lambda: _center(browser.screenshot()).std() > 15, "a picture of the scene")
     image = browser.screenshot(tmp_path / "page.png")
     assert image.shape == (900, 1600, 3) and (tmp_path / "page.png").stat().st_size > 50_000
     orange = (image[..., 0] > 150) & (image[..., 0] > 1.4 * image[..., 2]) & (image[..., 1] < 190)
@@ -111,7 +111,7 @@ def test_turning_the_view_renders_from_the_new_place(shown):
     browser.wait_for(lambda: np.linalg.norm(client.camera.position - at) > 0.5, "the movement")
     time.sleep(2.0)  # the finer image
     after = browser.screenshot()
-    assert np.abs(_centre(before).astype(float) - _centre(after)).mean() > 3
+    assert np.abs(_center(before).astype(float) - _center(after)).mean() > 3
 
 
 def test_clicking_a_camera_looks_through_it(shown):
@@ -145,7 +145,7 @@ def test_clicking_a_camera_looks_through_it(shown):
     assert np.allclose(quaternion_to_matrix(client.camera.wxyz)[:, 2], poses[i, :3, 2], atol=1e-2)
 
 
-def _centre(image: np.ndarray) -> np.ndarray:
+def _center(image: np.ndarray) -> np.ndarray:
     return image[250:650, 450:1150]
 
 

@@ -1,4 +1,4 @@
-"""The folder that says why: shown for learnt policies only, computed once a decision, regions on demand."""
+"""The folder that says why: shown for learned policies only, computed once a decision, regions on demand."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import viser
 
 from edge_server.page import markup
-from edge_server.page.colours import AGAINST, FOR, css
+from edge_server.page.colors import AGAINST, FOR, css
 from edge_server.page.decision_explanation import WIDTH, Why, painted
 from edge_server.scheduler.learned.explain import explain
 from tests.edge_server.page.test_page import bare_state
@@ -23,11 +23,11 @@ def gui():
     server.stop()
 
 
-def colours(images):
+def colors(images):
     return np.array([image.mean(axis=(0, 1)) / 64.0 for image in images], np.float32)
 
 
-def test_it_is_hidden_while_nothing_was_learnt(gui):
+def test_it_is_hidden_while_nothing_was_learned(gui):
     why = Why(gui, bare_state())
     why.refresh()
     assert not why._folder.visible
@@ -53,7 +53,7 @@ def test_a_decision_is_explained_once(gui):
 
 def test_regions_are_shown_when_somebody_asks(gui):
     state, now = bare_state(), a_decision(3)
-    state.decision, state.embed = lambda: now, colours
+    state.decision, state.embed = lambda: now, colors
     why = Why(gui, state)
     why.refresh()
     assert why._button.visible and why._picture is None
@@ -68,7 +68,7 @@ def test_a_picture_that_cannot_be_decoded_is_passed_over(gui):
     frames = {c: replace(f, payload=b"\xff\xd8 nothing") for c, f in given.state.frames.items()}
     now = replace(given, state=replace(given.state, frames=frames))
     state = bare_state()
-    state.decision, state.embed = lambda: now, colours
+    state.decision, state.embed = lambda: now, colors
     why = Why(gui, state)
     why._clicked(None)
     why.refresh()

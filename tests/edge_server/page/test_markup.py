@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from edge_server.live.state import CameraView
 from edge_server.page import markup
-from edge_server.page.colours import HELD_OUT, STALE, css
+from edge_server.page.colors import HELD_OUT, STALE, css
 
 
 def summary(**changes) -> markup.Summary:

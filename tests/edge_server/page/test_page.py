@@ -196,7 +196,7 @@ def test_rates_are_bounded_however_fast_the_field_publishes(tmp_path):
             time.sleep(0.005)
         sent = visitor.counts - before
         assert 2 <= visitor.images - images <= 25 * seconds
-        # Two refreshes a second of some ten elements, nine frustums' colours and pictures.
+        # Two refreshes a second of some ten elements, nine frustums' colors and pictures.
         assert sent["GuiUpdateMessage"] <= 2 * 12 * (seconds + 1)
         assert sent["SceneNodeUpdateMessage"] <= 9 * 5 * (seconds + 1)
         assert visitor.bytes / seconds < 3e6

@@ -41,7 +41,7 @@ def test_parallel_diverging_and_single_cameras_meet_nowhere():
     assert convergence(parallel) is None
     assert convergence(rig(1, 0)) is None
     outward = rig(6, 90)
-    outward[:, :3, 0] *= -1  # turned half about their y axis: they look away from the centre
+    outward[:, :3, 0] *= -1  # turned half about their y axis: they look away from the center
     outward[:, :3, 2] *= -1
     assert convergence(outward) is None
 

@@ -1,4 +1,4 @@
-"""Writes real ledgers by hand: one call a process, one tuple a line."""
+"""Writes real ledgers: one call for each process, one tuple for each line."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from freshfield.ledger import Ledger
 
 
 def write(out: Path, role: str, lines, name: str = "x", start_ns: int = 1, closed: bool = True) -> Path:
-    """lines: (sequence, event) or (sequence, event, detail) of camera "a", session "s"; or with camera and
-    session before them: (camera, session, sequence, event[, detail])."""
+    """lines: (sequence, event[, detail]) of camera "a", session "s", or (camera, session, sequence, event[,
+    detail])."""
     ledger = Ledger(out, role, name, start_ns)
     for t_ns, line in enumerate(lines):
         if isinstance(line[0], int):

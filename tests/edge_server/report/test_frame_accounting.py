@@ -1,10 +1,11 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections import Counter
 
 import pytest
 
-from edge_server.report.frame_accounting import close_books
+from edge_server.report.frame_accounting import FrameCounts, account_frames
 from tests.edge_server.report.ledgers import write
 
 
@@ -14,69 +15,61 @@ def sent(*sequences):
 
 def counts(out, **expected):
     """Join the ledgers under ``out``; every count not in ``expected`` must be zero."""
-    books = close_books(out)
-    found = books.as_dict()
+    accounting = account_frames(out)
+    found = accounting.as_dict()
     assert found["closes"], found
     flat = {k: v for k, v in found.items() if isinstance(v, int) and not isinstance(v, bool) and v}
     if found["rejected"]:
         flat["rejected"] = found["rejected"]
     assert flat == expected
-    return books
+    return accounting
 
 
-def test_every_way_a_frame_can_go(tmp_path):
-    write(
-        tmp_path,
-        "node",
-        [*sent(*range(10)), (10, "captured"), (10, "replaced"), (11, "captured")],
-    )
+def test_counts_balance_only_if_both_sums_hold():
+    counts = {
+        "captured": 5,
+        "replaced": 1,
+        "waiting": 1,
+        "sent": 3,
+        "duplicated": 1,
+        "delivered": 2,
+        "lost": 1,
+    }
+    balanced = FrameCounts(**counts, rejected=Counter(crc=1))
+    assert balanced.balanced
+    for name in vars(balanced):
+        wrong = FrameCounts(**counts, rejected=Counter(crc=1))
+        wrong.count_end(name)
+        assert not wrong.balanced, name
+
+
+def test_every_end_of_a_frame_is_counted(tmp_path):
+    write(tmp_path, "node", [*sent(*range(10)), (10, "captured"), (10, "replaced"), (11, "captured")])
     ends = ["skipped", "dropped_busy", "superseded", "lost", "broken"]
     lines = [(i, "received") for i in range(9)]
     lines += [(i, end) for i, end in enumerate(ends)]
     lines += [(5, "rejected", "crc"), (6, "forwarded"), (7, "forwarded")]
     write(tmp_path, "emulator", lines)
     write(tmp_path, "edge", [(6, "delivered"), (7, "rejected", "time_reversed")])
-    books = counts(
-        tmp_path,
-        captured=12,
-        replaced=1,
-        waiting=1,
-        sent=10,
-        skipped=1,
-        dropped_busy=1,
-        superseded=1,
-        lost=1,
-        broken=1,
-        delivered=1,
-        rejected={"crc": 1, "time_reversed": 1},
-        in_flight=2,
-    )
+    accounting = counts(
+        tmp_path, captured=12, replaced=1, waiting=1, sent=10, skipped=1, dropped_busy=1, superseded=1,
+        lost=1, broken=1, delivered=1, rejected={"crc": 1, "time_reversed": 1}, in_flight=2,
+    )  # fmt: skip
     # One was inside the emulator, one had not reached it.
-    assert sum("1 in flight, last written by ledger-" in note for note in books.notes) == 2
+    assert sum("1 in flight, last written by ledger-" in note for note in accounting.notes) == 2
 
 
-def test_copies_are_accounted_one_by_one(tmp_path):
+def test_each_copy_is_counted(tmp_path):
     write(tmp_path, "node", sent(0, 1, 2))
     lines = []
     for i in range(3):
         lines += [(i, "received"), (i, "duplicated"), (i, "forwarded")]
     lines += [(0, "forwarded"), (1, "broken")]  # of frame 2's copies, one is still inside
     write(tmp_path, "emulator", lines)
-    write(
-        tmp_path,
-        "edge",
-        [(0, "delivered"), (0, "rejected", "replayed_sequence"), (1, "delivered"), (2, "delivered")],
-    )
-    counts(
-        tmp_path,
-        captured=3,
-        sent=3,
-        duplicated=3,
-        delivered=3,
-        rejected={"replayed_sequence": 1},
-        broken=1,
-        in_flight=1,
-    )
+    edge = [(0, "delivered"), (0, "rejected", "replayed_sequence"), (1, "delivered"), (2, "delivered")]
+    write(tmp_path, "edge", edge)
+    rejected = {"replayed_sequence": 1}
+    counts(tmp_path, captured=3, sent=3, duplicated=3, delivered=3, rejected=rejected, broken=1, in_flight=1)
 
 
 def test_a_node_without_emulator(tmp_path):
@@ -85,19 +78,19 @@ def test_a_node_without_emulator(tmp_path):
     counts(tmp_path, captured=2, sent=2, delivered=1, rejected={"too_old": 1})
 
 
-def test_the_edges_word_counts_more_than_a_broken_stream(tmp_path):
+def test_a_delivery_at_the_edge_outranks_a_broken_stream(tmp_path):
     write(tmp_path, "node", [*sent(0, 1), (0, "broken"), (1, "broken")])
     write(tmp_path, "emulator", [(0, "received"), (0, "forwarded"), (0, "broken")])
     write(tmp_path, "edge", [(0, "delivered")])
     counts(tmp_path, captured=2, sent=2, delivered=1, broken=1)
 
 
-def test_a_restarted_node_is_a_new_session_and_nothing_mixes(tmp_path):
+def test_a_restarted_node_is_a_new_session(tmp_path):
     write(tmp_path, "node", [("a", "one", 0, "captured"), ("a", "one", 0, "sent")], start_ns=1, closed=False)
     write(tmp_path, "node", [("a", "two", 0, "captured"), ("a", "two", 0, "sent")], start_ns=2)
     write(tmp_path, "edge", [("a", "two", 0, "delivered")])
-    books = counts(tmp_path, captured=2, sent=2, delivered=1, in_flight=1)
-    assert any("ledger-node-x-1.tsv: not closed" in note for note in books.notes)
+    accounting = counts(tmp_path, captured=2, sent=2, delivered=1, in_flight=1)
+    assert any("ledger-node-x-1.tsv: not closed" in note for note in accounting.notes)
 
 
 def test_killed_processes_and_torn_lines(tmp_path):
@@ -110,9 +103,9 @@ def test_killed_processes_and_torn_lines(tmp_path):
         file.write(b"78\ta\ts\t1\tforw")
     write(tmp_path, "edge", [(0, "delivered"), (1, "delivered")], closed=False)
     # Frame 1 reached the edge although nobody had time to write "forwarded": no contradiction.
-    books = counts(tmp_path, captured=4, sent=3, waiting=1, delivered=2, in_flight=1)
-    assert sum("unreadable line" in note for note in books.notes) == 2
-    assert sum("not closed" in note for note in books.notes) == 3
+    accounting = counts(tmp_path, captured=4, sent=3, waiting=1, delivered=2, in_flight=1)
+    assert sum("unreadable line" in note for note in accounting.notes) == 2
+    assert sum("not closed" in note for note in accounting.notes) == 3
 
 
 def test_a_node_killed_before_it_wrote_sent(tmp_path):
@@ -124,11 +117,11 @@ def test_a_node_killed_before_it_wrote_sent(tmp_path):
 def test_a_process_killed_before_its_first_line_was_complete(tmp_path):
     write(tmp_path, "node", sent(0))
     (tmp_path / "ledger-edge-x-9.tsv").write_bytes(b"#freshfield-le")
-    books = counts(tmp_path, captured=1, sent=1, in_flight=1)
-    assert any("ledger-edge-x-9.tsv left out" in note for note in books.notes)
+    accounting = counts(tmp_path, captured=1, sent=1, in_flight=1)
+    assert any("ledger-edge-x-9.tsv left out" in note for note in accounting.notes)
 
 
-def test_a_restarted_edge_has_two_ledgers_and_one_account(tmp_path):
+def test_the_two_ledgers_of_a_restarted_edge_are_joined(tmp_path):
     write(tmp_path, "node", sent(0, 1))
     write(tmp_path, "edge", [(0, "delivered")], start_ns=1, closed=False)
     write(tmp_path, "edge", [(1, "delivered")], start_ns=2)
@@ -137,84 +130,50 @@ def test_a_restarted_edge_has_two_ledgers_and_one_account(tmp_path):
 
 def test_frames_whose_node_wrote_elsewhere_are_counted_with_a_note(tmp_path):
     write(tmp_path, "emulator", [(0, "received"), (0, "forwarded"), (1, "received"), (1, "lost")])
-    write(
-        tmp_path,
-        "edge",
-        [(0, "delivered"), ("?", "?", 0, "rejected", "bad_id"), ("?", "?", 0, "rejected", "bad_id")],
-    )
-    books = counts(tmp_path, captured=4, sent=4, delivered=1, lost=1, rejected={"bad_id": 2})
-    assert any("no node's ledger" in note for note in books.notes)
+    garbled = ("?", "?", 0, "rejected", "bad_id")
+    write(tmp_path, "edge", [(0, "delivered"), garbled, garbled])
+    accounting = counts(tmp_path, captured=4, sent=4, delivered=1, lost=1, rejected={"bad_id": 2})
+    assert any("no node's ledger" in note for note in accounting.notes)
 
 
-def test_an_answer_is_believed_where_the_emulators_ledger_is_elsewhere(tmp_path):
-    write(
-        tmp_path,
-        "node",
-        [
-            *sent(0, 1, 2),
-            (0, "answered", "dropped-busy"),
-            (1, "answered", "rejected:crc"),
-            (2, "answered", "accepted"),
-        ],
-    )
+def test_an_answer_counts_where_the_emulators_ledger_is_elsewhere(tmp_path):
+    answers = enumerate(("dropped-busy", "rejected:crc", "accepted"))
+    write(tmp_path, "node", [*sent(0, 1, 2), *((i, "answered", answer) for i, answer in answers)])
     write(tmp_path, "edge", [(2, "delivered")])
     counts(tmp_path, captured=3, sent=3, dropped_busy=1, delivered=1, rejected={"crc": 1})
 
 
+LOST, DELIVERED = (0, "lost"), (0, "delivered")
+
+
 @pytest.mark.parametrize(
-    "node, emulator, edge, said, expected",
+    "node, emulator, edge, message, expected",
     [
-        (
-            sent(0),
-            [(0, "received"), (0, "dropped_busy")],
-            [(0, "delivered")],
-            "dropped_busy 1 times at the emulator, with 0",
-            {"delivered": 1},
-        ),
-        (
-            sent(0),
-            [(0, "received"), (0, "forwarded")],
-            [(0, "delivered"), (0, "delivered")],
-            "reached the edge 2 times but only 1",
-            {"delivered": 2, "duplicated": 1},
-        ),
-        (
-            [(0, "captured"), (0, "replaced")],
-            [(0, "received"), (0, "lost")],
-            [],
-            "replaced at the node, yet sent",
-            {"lost": 1},
-        ),
-        ([(0, "captured")], [], [(0, "delivered")], "never wrote that it was sent", {"delivered": 1}),
-        (
-            sent(0),
-            [(0, "received"), (0, "lost"), (0, "skipped")],
-            [],
-            "with 0 copies left",
-            {"lost": 1},
-        ),
-        (
-            sent(0),
-            [(0, "received"), (0, "lost"), (0, "forwarded")],
-            [],
-            "1 forwarded and 1 ended before",
-            {"lost": 1},
-        ),
-        ([(0, "sent")], [], [(0, "delivered")], "wrote captured 0 times", {"delivered": 1}),
+        (sent(0), [(0, "received"), (0, "dropped_busy")], [DELIVERED],
+         "dropped_busy 1 times at the emulator, with 0", {"delivered": 1}),
+        (sent(0), [(0, "received"), (0, "forwarded")], [DELIVERED, DELIVERED],
+         "reached the edge 2 times but only 1", {"delivered": 2, "duplicated": 1}),
+        ([(0, "captured"), (0, "replaced")], [(0, "received"), LOST], [],
+         "replaced at the node, yet sent", {"lost": 1}),
+        ([(0, "captured")], [], [DELIVERED], "never wrote that it was sent", {"delivered": 1}),
+        (sent(0), [(0, "received"), LOST, (0, "skipped")], [], "with 0 copies left", {"lost": 1}),
+        (sent(0), [(0, "received"), LOST, (0, "forwarded")], [],
+         "1 forwarded and 1 ended before", {"lost": 1}),
+        ([(0, "sent")], [], [DELIVERED], "wrote captured 0 times", {"delivered": 1}),
     ],
-)
-def test_contradictions_are_listed_and_the_account_still_closes(
-    tmp_path, node, emulator, edge, said, expected
+)  # fmt: skip
+def test_contradictions_are_listed_and_the_counts_still_balance(
+    tmp_path, node, emulator, edge, message, expected
 ):
     write(tmp_path, "node", node)
     if emulator:
         write(tmp_path, "emulator", emulator)
     write(tmp_path, "edge", edge)
-    books = close_books(tmp_path)
-    assert any(said in line and line.startswith("a s 0: ") for line in books.contradictions), (
-        books.contradictions
+    accounting = account_frames(tmp_path)
+    assert any(message in line and line.startswith("a s 0: ") for line in accounting.contradictions), (
+        accounting.contradictions
     )
-    found = books.as_dict()
+    found = accounting.as_dict()
     assert found["closes"] and found["captured"] == found["sent"] == 1
     ends = {k: found[k] for k in ("delivered", "lost", "skipped", "in_flight", "duplicated") if found[k]}
     assert ends == expected
@@ -222,44 +181,44 @@ def test_contradictions_are_listed_and_the_account_still_closes(
 
 def test_many_contradictions_are_counted_but_not_all_listed(tmp_path):
     write(tmp_path, "node", [(i, "sent") for i in range(100)])
-    books = close_books(tmp_path)
-    assert books.contradiction_count == 100 and len(books.contradictions) == 20
+    accounting = account_frames(tmp_path)
+    assert accounting.contradiction_count == 100 and len(accounting.contradictions) == 20
 
 
 def test_an_unknown_event_is_noted_and_left_out(tmp_path):
     write(tmp_path, "node", [*sent(0), (0, "teleported")])
-    books = counts(tmp_path, captured=1, sent=1, in_flight=1)
-    assert any("teleported" in note for note in books.notes)
+    accounting = counts(tmp_path, captured=1, sent=1, in_flight=1)
+    assert any("teleported" in note for note in accounting.notes)
 
 
-def test_an_empty_folder_closes_at_zero(tmp_path):
-    assert close_books(tmp_path).ledgers == 0
+def test_an_empty_folder_counts_nothing(tmp_path):
+    assert account_frames(tmp_path).ledgers == 0
     counts(tmp_path)
 
 
-def test_cameras_add_up_to_the_total(tmp_path):
+def test_counts_by_camera_add_up_to_the_total(tmp_path):
     lines = [(c, "s", i, e) for c in ("a", "b") for i in range(5) for e in ("captured", "sent")]
     write(tmp_path, "node", lines)
     write(tmp_path, "edge", [("a", "s", 1, "delivered"), ("b", "s", 2, "rejected", "crc")])
-    found = close_books(tmp_path).as_dict()
+    found = account_frames(tmp_path).as_dict()
     assert found["by_camera"]["a"]["delivered"] == 1 and found["by_camera"]["b"]["rejected"] == {"crc": 1}
     for name in ("captured", "sent", "in_flight", "delivered"):
         assert found[name] == sum(camera[name] for camera in found["by_camera"].values())
 
 
-def test_frames_of_unknown_origin_stand_apart(tmp_path):
+def test_frames_of_unknown_origin_are_counted_apart(tmp_path):
     write(tmp_path, "node", sent(0, 1))
     write(tmp_path, "emulator", [("intruder", "x", 0, "rejected", "unknown_camera")])
     edge = [("?", "?", 0, "rejected", "bad_id")] * 3
     edge += [("a", "?", 7, "rejected", "bad_id"), ("mars", "s", 1, "rejected", "unknown_camera")]
-    # Camera b's node wrote its ledger elsewhere: the edge took its frames, so it is no stranger.
+    # Camera b's node wrote its ledger elsewhere: the edge took its frames, so b is a known camera.
     edge += [(0, "delivered"), ("b", "s", 0, "delivered"), ("b", "s", 1, "rejected", "too_old")]
     write(tmp_path, "edge", edge)
-    books = counts(tmp_path, captured=4, sent=4, delivered=2, rejected={"too_old": 1}, in_flight=1)
-    found = books.as_dict()
+    accounting = counts(tmp_path, captured=4, sent=4, delivered=2, rejected={"too_old": 1}, in_flight=1)
+    found = accounting.as_dict()
     assert found["strangers"] == {"count": 6, "reasons": {"bad_id": 4, "unknown_camera": 2}}
     assert set(found["by_camera"]) == {"a", "b"}
-    assert any("6 frames of unknown origin" in note for note in books.notes)
+    assert any("6 frames of unknown origin" in note for note in accounting.notes)
 
 
 def test_lines_lost_to_a_full_disk_are_noted_and_no_contradiction(tmp_path):
@@ -268,8 +227,8 @@ def test_lines_lost_to_a_full_disk_are_noted_and_no_contradiction(tmp_path):
     with path.open("a") as file:
         file.write("5\t\t\t0\tlost_lines\t12\n6\t\t\t0\tclosed\t12\n")
     write(tmp_path, "edge", [(0, "delivered")])
-    books = counts(tmp_path, captured=1, sent=1, delivered=1)
-    assert books.contradictions == [] and any("12 lines were lost" in note for note in books.notes)
+    accounting = counts(tmp_path, captured=1, sent=1, delivered=1)
+    assert accounting.contradictions == [] and any("12 lines were lost" in note for note in accounting.notes)
 
 
 def test_a_long_run_is_joined_in_little_memory(tmp_path):
@@ -288,8 +247,10 @@ def test_a_long_run_is_joined_in_little_memory(tmp_path):
                     file.write(f"{i}\tcam{i % 8:02}\tsession\t{i // 8}\t{event}\t{detail}\n")
             file.write("9\t\t\t0\tclosed\t\n")
     tracemalloc.start()
-    books = close_books(tmp_path)
+    accounting = account_frames(tmp_path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert books.total.delivered == books.total.captured == frames and books.contradictions == []
+    assert (
+        accounting.total.delivered == accounting.total.captured == frames and accounting.contradictions == []
+    )
     assert peak < 300 * frames, f"{peak / frames:.0f} bytes a frame"

@@ -1,4 +1,4 @@
-"""Random deployments with random kills: the account always closes, and equals what really happened."""
+"""Random deployments with random kills: the counts always balance, and equal what really happened."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_server.report.frame_accounting import ENDS, close_books
+from edge_server.report.frame_accounting import ENDS, account_frames
 from tests.edge_server.report.ledgers import write
 
 EVENTS = {
@@ -30,76 +30,78 @@ def lines_of(role):
 
 @settings(max_examples=200, deadline=None)
 @given(st.fixed_dictionaries({role: st.lists(lines_of(role), max_size=2) for role in EVENTS}), st.booleans())
-def test_any_ledgers_at_all_close(ledgers, closed):
-    """Even nonsense is a partition: no frame is lost from the account, and no count is negative."""
+def test_any_ledgers_balance(ledgers, closed):
+    """Even nonsense is partitioned: no frame is missing from the counts, and no count is negative."""
     with tempfile.TemporaryDirectory() as folder:
         keys = set()
         for role, files in ledgers.items():
             for start, lines in enumerate(files):
                 write(Path(folder), role, lines, start_ns=start, closed=closed)
                 keys |= {line[:3] for line in lines}
-        found = close_books(Path(folder)).as_dict()
+        found = account_frames(Path(folder)).as_dict()
     assert found["closes"]
     assert found["captured"] + found["strangers"]["count"] >= len(keys)
     rejected = found["rejected"].values()
     assert all(found[end] >= 0 for end in ENDS if end != "rejected") and all(n > 0 for n in rejected)
 
 
-# One frame's true fate, as a simple world knows it.
+# What really becomes of one frame.
 FATES = st.sampled_from(
     ["waiting", "replaced", "sent", "received", "skipped", "dropped_busy", "superseded", "lost", "forwarded",
      "delivered", "rejected", "doubled"]
 )  # fmt: skip
 
 
-def story(fate):
-    """The lines that each process writes, in order of time, for a frame with this fate."""
+def ledger_lines(fate):
+    """The lines (role, event, detail) that processes write about a frame with this fate, in order of time."""
     node = [("node", "captured", "")]
     if fate == "waiting":
         return node
     if fate == "replaced":
         return [*node, ("node", "replaced", "")]
-    told = [*node, ("node", "sent", "")]
+    lines = [*node, ("node", "sent", "")]
     if fate == "sent":
-        return told
-    told.append(("emulator", "received", ""))
+        return lines
+    lines.append(("emulator", "received", ""))
     if fate == "received":
-        return told
+        return lines
     if fate in ("skipped", "dropped_busy", "superseded", "lost"):
-        return [*told, ("emulator", fate, "")]
+        return [*lines, ("emulator", fate, "")]
     if fate == "doubled":
-        told.append(("emulator", "duplicated", ""))
-    told.append(("emulator", "forwarded", ""))
+        lines.append(("emulator", "duplicated", ""))
+    lines.append(("emulator", "forwarded", ""))
     if fate == "forwarded":
-        return told
-    told.append(("edge", "rejected", "crc") if fate == "rejected" else ("edge", "delivered", ""))
+        return lines
+    lines.append(("edge", "rejected", "crc") if fate == "rejected" else ("edge", "delivered", ""))
     if fate == "doubled":
-        told += [("emulator", "forwarded", ""), ("edge", "rejected", "replayed_sequence")]
-    return told
+        lines += [("emulator", "forwarded", ""), ("edge", "rejected", "replayed_sequence")]
+    return lines
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(FATES, max_size=30), st.data())
-def test_true_histories_are_told_truly_also_when_everything_is_killed(fates, data):
-    """Frames one after another; at a random instant all processes die. No kill makes a contradiction, and
-    each frame's state is the last thing that was written about it."""
-    told = [(i, *line) for i, fate in enumerate(fates) for line in story(fate)]
-    alive = data.draw(st.integers(0, len(told)))
-    lost_last = {role: data.draw(st.integers(0, 1)) for role in EVENTS} if alive < len(told) else {}
+def test_counts_are_true_even_if_every_process_is_killed(fates, data):
+    """All processes die at a random instant. No kill makes a contradiction, and each frame's state is the
+    last event that was written about it."""
+    written = [(i, *line) for i, fate in enumerate(fates) for line in ledger_lines(fate)]
+    alive = data.draw(st.integers(0, len(written)))
+    lost_last = {role: data.draw(st.integers(0, 1)) for role in EVENTS} if alive < len(written) else {}
     with tempfile.TemporaryDirectory() as folder:
         kept = []
         for role in EVENTS:
-            lines = [line for line in told[:alive] if line[1] == role]
+            lines = [line for line in written[:alive] if line[1] == role]
             # A kill may tear each process's own last line.
             torn = lines[-1:] if lost_last.get(role) else []
             lines = lines[: len(lines) - len(torn)]
-            path = write(Path(folder), role, [(i, e, d) for i, _, e, d in lines], closed=alive == len(told))
+            path = write(
+                Path(folder), role, [(i, e, d) for i, _, e, d in lines], closed=alive == len(written)
+            )
             if torn:
                 with path.open("ab") as file:
                     file.write(b"99\ta\ts\t" + str(torn[0][0]).encode())
             kept += lines
-        books = close_books(Path(folder))
-    found = books.as_dict()
+        accounting = account_frames(Path(folder))
+    found = accounting.as_dict()
     assert found["closes"]
     truth = Counter()
     for i in {line[0] for line in kept}:
@@ -122,4 +124,4 @@ def test_true_histories_are_told_truly_also_when_everything_is_killed(fates, dat
     flat = {**found, "rejected": sum(found["rejected"].values())}
     for name in ("waiting", "replaced", "sent", "duplicated", "delivered", "rejected", "in_flight", "lost"):
         assert flat[name] == truth[name], name
-    assert books.contradictions == []
+    assert accounting.contradictions == []

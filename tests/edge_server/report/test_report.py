@@ -11,8 +11,8 @@ import pytest
 from edge_server.config import ExportConfig
 from edge_server.report import build_report
 from edge_server.report.report import METRICS, SERIES, assemble, fidelity, updates
-from edge_server.report.run_files import read_records
-from freshfield_up.summary import summarise
+from edge_server.report.run_files import read_run_files
+from freshfield_up.summary import summarize
 from tests.edge_server.report.sample_run import CAMERAS, CHANNEL, SECONDS, publication, write_run
 
 
@@ -23,15 +23,10 @@ def run(tmp_path_factory):
     return out, build_report(out)
 
 
-def test_report_json_holds_what_is_returned_and_every_key_that_was_promised(run):
+def test_report_json_holds_what_is_returned_and_every_documented_key(run):
     out, report = run
     assert json.loads((out / "report.json").read_text()) == report
-    promised = {
-        "scenario": "sample",
-        "seed": 7,
-        "seconds": SECONDS,
-    }
-    assert {k: report[k] for k in promised} == promised
+    assert (report["scenario"], report["seed"], report["seconds"]) == ("sample", 7, SECONDS)
     assert set(report["frames"]) >= {
         "captured", "replaced", "waiting", "sent", "skipped", "dropped_busy", "superseded", "lost", "broken",
         "duplicated", "delivered", "rejected", "in_flight",
@@ -71,7 +66,7 @@ def test_a_field_that_stopped_early_has_no_final_score():
     assert found["final"]["psnr_db"] is None and found["mean"]["psnr_db"] == 20.0
 
 
-def test_ages_are_time_averages_and_silence_is_none(run):
+def test_ages_are_time_averages_and_none_without_a_report(run):
     ages = run[1]["age_ms"]
     assert ages["by_camera"]["never"] is None
     means = [ages["by_camera"][c]["mean"] for c in CAMERAS[1:]]
@@ -87,12 +82,12 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
     assert updates["without_step"] == 0
 
 
-def test_updates_that_had_no_time_to_learn_are_counted_and_shown():
+def test_updates_that_had_no_time_to_learn_are_counted():
     rows = [{"t_s": 0.1 * k, "update_ms": 60.0, "steps": steps} for k, steps in enumerate((0, 3, 0))]
     assert updates(rows, {})["without_step"] == 2
 
 
-def test_the_page_tells_of_updates_that_made_no_step(tmp_path):
+def test_the_report_shows_updates_that_made_no_step(tmp_path):
     write_run(tmp_path)
     file = tmp_path / "series.jsonl"
     lines = file.read_text().splitlines()
@@ -108,10 +103,10 @@ def test_every_figure_is_drawn_and_inside_the_page(run):
     assert sorted(p.name for p in out.glob("figure-*.png")) == sorted(f"figure-{n}.png" for n in names)
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(names)
-    assert "The books close." in page and "LPIPS-alex" in page
+    assert "Every frame is accounted for." in page and "LPIPS-alex" in page
 
 
-def test_a_mesh_is_told_of_where_there_is_one(run, tmp_path):
+def test_a_mesh_is_reported_where_there_is_one(run, tmp_path):
     assert "mesh" not in run[1] and "<h2>Mesh" not in (run[0] / "report.html").read_text()
     measured = {"chamfer_mm": 6.926, "complete": 0.6074, "accuracy_median_mm": 1.1, "within_mm": 3.0,
                 "target_chamfer_mm": 1.5, "target_complete": 0.95}  # fmt: skip
@@ -121,7 +116,7 @@ def test_a_mesh_is_told_of_where_there_is_one(run, tmp_path):
         (tmp_path / "mesh.json").write_text(json.dumps({**mesh, "measured": found}))
         report = build_report(tmp_path)
         assert report["mesh"] == {**mesh, "measured": found}
-        page, last = (tmp_path / "report.html").read_text(), summarise(tmp_path)
+        page, last = (tmp_path / "report.html").read_text(), summarize(tmp_path)
         assert ("6.93 mm" in page and "60.7 %" in page) == (found is not None)
         assert ("chamfer 6.93 mm (target 1.5), 61 % of the" in last) == (found is not None)
         assert "tile.ply: 19,794 triangles, made in 12 s" in last
@@ -131,7 +126,7 @@ def test_a_mesh_is_told_of_where_there_is_one(run, tmp_path):
     "torn",
     ['{"file": "a.ply"}', '{"file": "a.ply", "measured": {}, "stages_s": [], "triangles": 1}', "{", "[]"],
 )
-def test_a_mesh_file_that_is_none_costs_a_note(tmp_path, torn):
+def test_a_damaged_mesh_file_adds_a_note(tmp_path, torn):
     write_run(tmp_path)
     (tmp_path / "mesh.json").write_text(torn)
     report = build_report(tmp_path)
@@ -146,7 +141,7 @@ def test_an_export_that_cannot_be_made_is_refused_when_the_scenario_is_read(wron
         ExportConfig(**wrong)
 
 
-def test_the_page_needs_nothing_from_anywhere(run):
+def test_the_page_loads_nothing_from_elsewhere(run):
     page = (run[0] / "report.html").read_text()
     for foreign in ("http://", "https://", "<script", "<link", "@import", 'src="/'):
         assert foreign not in page
@@ -161,7 +156,7 @@ def test_a_report_of_the_same_files_is_the_same(run):
     assert {p.name: p.read_bytes() for p in out.glob("figure-*.png")} == before
 
 
-def test_a_killed_run_reports_what_it_left_and_says_what_is_torn(tmp_path):
+def test_a_killed_run_is_reported_with_notes_on_what_is_torn(tmp_path):
     write_run(tmp_path)
     for name in ("series.jsonl", "ages.jsonl"):
         data = (tmp_path / name).read_bytes()
@@ -170,13 +165,13 @@ def test_a_killed_run_reports_what_it_left_and_says_what_is_torn(tmp_path):
     (tmp_path / "edge.json").unlink()
     (tmp_path / "rendered.png").write_bytes(b"\x89PNG torn")
     report = build_report(tmp_path)
-    said = " | ".join(report["notes"])
+    notes = " | ".join(report["notes"])
     for part in ("edge.json is missing", "channel.json left out", "series.jsonl: 1 of", "ages.jsonl: 1 of"):
-        assert part in said
+        assert part in notes
     assert report["scenario"] is None and report["updates"]["count"] > 10
     assert report["fidelity"]["final"]["psnr_db"] is not None
     assert not (tmp_path / "figure-comparison.png").exists()
-    assert "What was missing or torn" in (tmp_path / "report.html").read_text()
+    assert "Missing or damaged files" in (tmp_path / "report.html").read_text()
 
 
 def test_an_empty_folder_gives_a_report_that_says_so(tmp_path):
@@ -197,7 +192,7 @@ def test_a_process_that_started_again_goes_on_in_time(tmp_path):
     line = (tmp_path / "series.jsonl").read_text().splitlines()[0]
     with (tmp_path / "series.jsonl").open("a") as file:
         file.write(line + "\n")
-    times = [row["t_s"] for row in read_records(tmp_path).series]
+    times = [row["t_s"] for row in read_run_files(tmp_path).series]
     assert times == sorted(times) and len(times) == 6 and times[5] > times[4]
 
 
@@ -206,7 +201,7 @@ def test_nan_in_a_file_does_not_become_nan_in_the_report(tmp_path):
     with (tmp_path / "series.jsonl").open("a") as file:
         file.write('{"t_s": 9.0, "psnr_db": NaN, "update_ms": Infinity}\n')
         file.write('{"t_s": NaN}\n{"t_s": "8"}\n[1]\n{}\nnull\n')
-    report = assemble(read_records(tmp_path))
+    report = assemble(read_run_files(tmp_path))
     json.dumps(report, allow_nan=False)
     assert report["fidelity"]["series"][-1]["psnr_db"] is None
     assert "series.jsonl: 5 of 9 lines unreadable (killed while writing?)" in report["notes"]
@@ -230,16 +225,16 @@ def test_scores_on_selected_views_are_called_that(tmp_path):
     assert "No camera is held out" in (tmp_path / "report.html").read_text()
 
 
-def test_importing_the_books_loads_neither_matplotlib_nor_torch():
+def test_importing_the_report_loads_neither_matplotlib_nor_torch():
     code = "import sys, edge_server.report.report; print({'matplotlib', 'torch'} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "set()"
 
 
-def test_a_deadline_is_told_with_the_share_of_updates_that_met_it():
+def test_a_deadline_is_reported_with_the_share_of_updates_that_met_it():
     series = [{"t_s": float(i), "update_ms": ms} for i, ms in enumerate((80.0, 90.0, 100.0, 130.0))]
-    told = updates(series, {"deadline_ms": 100.0})
-    assert (told["deadline_ms"], told["met_share"]) == (100.0, 0.75)
+    found = updates(series, {"deadline_ms": 100.0})
+    assert (found["deadline_ms"], found["met_share"]) == (100.0, 0.75)
     assert "deadline_ms" not in updates(series, {})
 
 
@@ -263,5 +258,5 @@ def test_the_stand_in_distance_is_never_shown_as_lpips(tmp_path, monkeypatch):
     )
     for row in report["fidelity"]["series"]:
         row["perceptual"], row["lpips"] = row["lpips"], None
-    assert draw_fidelity(report, read_records(tmp_path), tmp_path / "fidelity.png")
+    assert draw_fidelity(report, read_run_files(tmp_path), tmp_path / "fidelity.png")
     assert [label for label in labels if "LPIPS" in label] == ["perceptual, not LPIPS (lower is better)"]

@@ -1,4 +1,4 @@
-"""Ages as colours: one scale for frustums, tables and the legend, readable by colour-blind people.
+"""Ages as colors: one scale for frustums, tables and the legend, readable by color-blind people.
 
 Bluish green, yellow, vermillion after Okabe and Ito's palette, on a logarithmic axis: a network's delays
 spread over decades, and what matters is whether an age is tens, hundreds or thousands of milliseconds.
@@ -25,7 +25,7 @@ fresh green to a tritanope."""
 FOR: RGB = (0, 114, 178)
 AGAINST: RGB = (213, 94, 0)
 """What spoke for a decision and what against it: blue and vermillion, as in the figures."""
-# Frustums change colour in steps, so that a page at rest sends next to nothing.
+# Frustums change color in steps, so that a page at rest sends next to nothing.
 STEPS = 24
 
 
@@ -37,19 +37,19 @@ def age_fraction(age_ms: float) -> float:
     return min(1.0, place)
 
 
-def age_colour(age_ms: float | None) -> RGB:
-    """Colour of an age in milliseconds; grey for None."""
+def age_color(age_ms: float | None) -> RGB:
+    """Color of an age in milliseconds; grey for None."""
     if age_ms is None:
         return UNKNOWN
-    return scale_colour(round(age_fraction(age_ms) * STEPS) / STEPS)
+    return scale_color(round(age_fraction(age_ms) * STEPS) / STEPS)
 
 
-def scale_colour(fraction: float) -> RGB:
-    """Colour at ``fraction`` of the scale: green, yellow at the middle, vermillion."""
+def scale_color(fraction: float) -> RGB:
+    """Color at ``fraction`` of the scale: green, yellow at the middle, vermillion."""
     r, g, b = (np.interp(fraction, (0.0, 0.5, 1.0), stops) for stops in zip(FRESH, MIDDLE, STALE))
     return round(float(r)), round(float(g)), round(float(b))
 
 
-def css(colour: RGB) -> str:
-    """The colour as HTML writes it."""
-    return "#{:02x}{:02x}{:02x}".format(*colour)
+def css(color: RGB) -> str:
+    """The color as HTML writes it."""
+    return "#{:02x}{:02x}{:02x}".format(*color)

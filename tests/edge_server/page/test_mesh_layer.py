@@ -12,7 +12,7 @@ import pytest
 import viser
 
 from edge_server.fields import View
-from edge_server.page.surface import NODE, SurfaceLayer
+from edge_server.page.mesh_layer import NODE, MeshLayer
 from tests.edge_server.page.test_page import bare_state, publication
 from tests.edge_server.surface.shapes import LENS, BallRenderer, around
 
@@ -34,7 +34,7 @@ def server():
     server.stop()
 
 
-def press(layer: SurfaceLayer, client: Client) -> None:
+def press(layer: MeshLayer, client: Client) -> None:
     layer._pressed(SimpleNamespace(client=client))
     end = time.monotonic() + 60
     while layer.button.disabled:
@@ -48,7 +48,7 @@ def test_a_mesh_comes_and_goes(server):
     picture = np.zeros((64, 64, 3), np.uint8)
     cameras = tuple(View(f"cam{k}", picture, pose, LENS) for k, pose in enumerate(around(10)))
     state.publish(publication(0), BallRenderer(cameras))
-    layer = SurfaceLayer(server, state)
+    layer = MeshLayer(server, state)
     press(layer, client)
     assert client.told == [] and layer.button.label == "hide mesh"
     assert layer._node is not None and layer._node.name == NODE
@@ -58,7 +58,7 @@ def test_a_mesh_comes_and_goes(server):
 
 def test_a_field_that_has_seen_nothing_has_no_mesh(server):
     client = Client()
-    layer = SurfaceLayer(server, bare_state())
+    layer = MeshLayer(server, bare_state())
     press(layer, client)
     assert client.told == [("No mesh", "the field has not been trained yet")]
     assert layer.button.label == "show mesh" and layer._node is None

@@ -18,7 +18,7 @@ MEMORY_MB = 512.0
 NOTICE_S = 10.0
 
 
-class SurfaceLayer:
+class MeshLayer:
     """A button in the present GUI container that shows a mesh of the field, and hides it again.
 
     The work is done by a thread of its own, one mesh at a time, from an immutable snapshot: neither the loop

@@ -1,4 +1,4 @@
-"""The age scale: right at its ends, monotone, and told apart by colour-blind people."""
+"""The age scale: right at its ends, monotone, and told apart by color-blind people."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.page.colours import (
+from edge_server.page.colors import (
     FRESH,
     FRESH_MS,
     HELD_OUT,
@@ -16,10 +16,10 @@ from edge_server.page.colours import (
     STALE,
     STALE_MS,
     UNKNOWN,
-    age_colour,
+    age_color,
     age_fraction,
     css,
-    scale_colour,
+    scale_color,
 )
 
 # Machado, Oliveira and Fernandes (2009), severity 1, acting on linear RGB.
@@ -34,16 +34,16 @@ DEFICIENCIES = {
 
 
 def test_ends_and_middle_of_the_scale():
-    assert age_colour(0.0) == age_colour(FRESH_MS) == FRESH
-    assert age_colour(STALE_MS) == age_colour(1e9) == STALE
-    assert age_colour(math.sqrt(FRESH_MS * STALE_MS)) == MIDDLE
+    assert age_color(0.0) == age_color(FRESH_MS) == FRESH
+    assert age_color(STALE_MS) == age_color(1e9) == STALE
+    assert age_color(math.sqrt(FRESH_MS * STALE_MS)) == MIDDLE
 
 
-def test_what_is_no_age_has_a_colour_too():
-    assert age_colour(None) == UNKNOWN
-    assert age_colour(float("nan")) == STALE
-    assert age_colour(float("inf")) == STALE
-    assert age_colour(-30.0) == FRESH  # a clock a little ahead
+def test_what_is_no_age_has_a_color_too():
+    assert age_color(None) == UNKNOWN
+    assert age_color(float("nan")) == STALE
+    assert age_color(float("inf")) == STALE
+    assert age_color(-30.0) == FRESH  # a clock a little ahead
 
 
 def test_older_is_never_drawn_as_fresher():
@@ -52,8 +52,8 @@ def test_older_is_never_drawn_as_fresher():
     assert fractions[0] == 0.0 and fractions[-1] == 1.0
 
 
-def test_few_distinct_colours_so_that_a_resting_page_is_quiet():
-    assert len({age_colour(float(a)) for a in np.linspace(0, 5000, 5001)}) <= 25
+def test_few_distinct_colors_so_that_a_resting_page_is_quiet():
+    assert len({age_color(float(a)) for a in np.linspace(0, 5000, 5001)}) <= 25
 
 
 def test_css():
@@ -61,17 +61,17 @@ def test_css():
 
 
 @pytest.mark.parametrize("deficiency", DEFICIENCIES)
-def test_the_scale_survives_colour_blindness(deficiency):
+def test_the_scale_survives_color_blindness(deficiency):
     matrix = DEFICIENCIES[deficiency]
-    scale = [_lab(scale_colour(f), matrix) for f in np.linspace(0, 1, 25)]
+    scale = [_lab(scale_color(f), matrix) for f in np.linspace(0, 1, 25)]
     fresh, middle, stale = scale[0], scale[12], scale[24]
     # CIE76, in which 2.3 is just noticeable: the scale's ends and middle must be unmistakable.
     assert min(np.linalg.norm(a - b) for a, b in ((fresh, middle), (middle, stale), (fresh, stale))) > 40
-    assert min(np.linalg.norm(_lab(HELD_OUT, matrix) - colour) for colour in scale) > 25
+    assert min(np.linalg.norm(_lab(HELD_OUT, matrix) - color) for color in scale) > 25
 
 
-def _lab(colour: tuple[int, int, int], matrix: list[list[float]]) -> np.ndarray:
-    rgb = np.array(colour) / 255
+def _lab(color: tuple[int, int, int], matrix: list[list[float]]) -> np.ndarray:
+    rgb = np.array(color) / 255
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     seen = np.clip(np.array(matrix) @ linear, 0, 1)
     back = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
