@@ -9,7 +9,6 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import View
 from freshfield.frame import Frame
 
 # Frames whose embeddings are kept: several rounds of the largest rigs. A kilobyte each at most.
@@ -31,6 +30,13 @@ class EmbedderLike(Protocol):
     def embed(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]: ...
 
 
+class HasImage(Protocol):
+    """A decoded frame."""
+
+    @property
+    def image(self) -> NDArray[np.uint8]: ...
+
+
 class HasFrame(Protocol):
     """A frame with whatever its owner keeps beside it."""
 
@@ -48,7 +54,7 @@ class EmbeddingCache(Generic[Item]):
     """
 
     def __init__(
-        self, embedder: EmbedderLike, decode: Callable[[Item], View | None], capacity: int = CAPACITY
+        self, embedder: EmbedderLike, decode: Callable[[Item], HasImage | None], capacity: int = CAPACITY
     ) -> None:
         """decode: gives the view of a frame, None where it is damaged. Share it with the field's decoder, so
         that a frame that both use is decoded once."""

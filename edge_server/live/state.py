@@ -21,7 +21,7 @@ from edge_server.fields import Renderer
 from freshfield.frame import Frame
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
-    from edge_server.scheduler.learned.bandit import Decision
+    from edge_server.scheduler.learned.decision import Decision
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from edge_server.page.colors import AGAINST, FOR
 from freshfield import payload
 
 if TYPE_CHECKING:
-    from edge_server.scheduler.learned.bandit import Decision
+    from edge_server.scheduler.learned.decision import Decision
 
 WIDTH = 320
 # A region that decided everything is painted over by so much.

@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:  # loaded only by the policies that need them
-    from edge_server.scheduler.learned.bandit import Decision
-    from edge_server.scheduler.learned.state import State
-    from edge_server.treatments import Treatment
+from edge_server.scheduler.learned.state import STATE_PARTS, State
 
-STATE_PARTS = ("semantics", "age", "pose")
-"""Parts of the state that a learned policy may look at, in the order of (6.33)."""
+if TYPE_CHECKING:  # loaded only by the policies that need them
+    from edge_server.scheduler.learned.decision import Decision
+    from edge_server.treatments import Treatment
 
 
 class Observer(Protocol):

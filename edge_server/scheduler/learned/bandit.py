@@ -6,7 +6,6 @@ wait; by default the most probable action, with ``explore`` a sampled one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.state import State
+from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 from edge_server.scheduler.threshold import within_threshold
 from edge_server.scheduler.wait import generated_in, wait_window
-
-
-@dataclass(frozen=True)
-class Decision:
-    """A learned policy's decision: number and time of its epoch, the state it saw, its action ((N,) bool, or
-    an index of the omegas), the action's log-probability, and the actor that took it."""
-
-    number: int
-    now_ns: int
-    state: State
-    action: NDArray[Any]
-    logp: float
-    actor: Actor
-
-    def without_frames(self) -> Decision:
-        """The same without the frames, which are large and only needed for explanations."""
-        return replace(self, state=replace(self.state, frames={}))
 
 
 class BanditPolicy(Policy):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.bandit import Decision
+from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.state import State
 from freshfield import payload
 

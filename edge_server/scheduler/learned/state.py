@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler.policy import STATE_PARTS
-
 if TYPE_CHECKING:
     from freshfield.frame import Frame
+
+STATE_PARTS = ("semantics", "age", "pose")
+"""Parts of the state that a learned policy may look at, in the order of (6.33)."""
+
 
 POSE_WIDTH = 6
 # The widest configurable embedding (edge_server.embed).

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.bandit import BanditPolicy, Decision
+from edge_server.scheduler.learned.bandit import BanditPolicy
+from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.online.sequential_test import SequentialTest
 from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.bandit import Decision
+from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.scheduler.learned.bandit import Decision
+from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.decision_record import DecisionWriter
 from edge_server.scheduler.learned.explain_command import main
 from edge_server.scheduler.learned.learner_spec import Spec
