@@ -85,7 +85,7 @@ _COMMANDS = {
         "measure this machine: field, track, limits, ingest and more (bench --help)",
     ),
     "explain": (
-        "scheduler.learned.explain_command",
+        "report.explain_command",
         "what moved a decision of a run: part of the state, camera, region of its picture",
     ),
     "export": (

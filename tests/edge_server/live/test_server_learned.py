@@ -12,8 +12,8 @@ pytest.importorskip("onnx", reason="the extra embed is not installed")
 
 from edge_server.config import read_config
 from edge_server.live.server import EdgeServer, ServerOptions
+from edge_server.report.explain_command import main as explain
 from edge_server.scheduler.learned.decision_record import read_decision
-from edge_server.scheduler.learned.explain_command import main as explain
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import StateLayout

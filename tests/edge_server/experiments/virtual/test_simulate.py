@@ -12,8 +12,8 @@ import yaml
 from edge_server.config import ComputeConfig, read_config
 from edge_server.experiments.virtual.from_scenario import training_cameras
 from edge_server.experiments.virtual.simulate import main
+from edge_server.report.explain_command import main as explain
 from edge_server.scheduler.learned.decision_record import read_decision
-from edge_server.scheduler.learned.explain_command import main as explain
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import StateLayout

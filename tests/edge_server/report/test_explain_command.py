@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from edge_server.report.explain_command import main
 from edge_server.scheduler.learned.decision import Decision
 from edge_server.scheduler.learned.decision_record import DecisionWriter
-from edge_server.scheduler.learned.explain_command import main
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.state import StateLayout
