@@ -14,6 +14,7 @@ TINY = SplatSettings(gaussians=400, start=250, seed_cells=16, densify_every=10, 
 POISONED = SplatSettings(
     gaussians=600, start=400, seed_cells=24, densify_every=20, views_a_step=3, threads=2
 )  # fmt: skip
+FINITE = ("params", "m", "v", "slope", "looks", "reach", "behind")
 REACHED_DB = {
     "held out": 23.1, "moved": 22.69, "one view": 33.09, "after noise": 22.17, "moving cameras": 25.86,
     "after no weights": 23.01,

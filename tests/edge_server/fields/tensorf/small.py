@@ -20,6 +20,7 @@ POISONED = TensorfSettings(
     color_rank=8, resolution_start=16, resolution=48, upsample=(40, 100), hidden=16, rays=512,
     batch_samples=4096, samples=64, samples_ramp=100, cells=32, threads=2,
 )  # fmt: skip
+FINITE = ("table", "net", "density", "behind")
 REACHED_DB = {
     "held out": 24.76, "moved": 24.16, "one view": 20.18, "after noise": 19.19, "moving cameras": 27.27,
     "after no weights": 18.68,

@@ -9,6 +9,7 @@ FIELD = VoxelField
 SMALL = VoxelSettings(sizes=(16, 32, 48), refine_at=(20, 60), rays=1024, cells=32, threads=2)
 TINY = VoxelSettings(sizes=(12, 20, 32), refine_at=(10, 25), rays=512, cells=16, threads=2)
 POISONED = SMALL
+FINITE = ("table", "density", "behind")
 REACHED_DB = {
     "held out": 22.64, "moved": 22.4, "one view": 27.01, "after noise": 18.81, "moving cameras": 28.12,
     "after no weights": 26.43,
