@@ -263,7 +263,7 @@ class OakConfig(LiveConfig):
 
 @dataclass(frozen=True)
 class RealsenseConfig(LiveConfig):
-    """Intel RealSense D400 cameras, their colour stream (extra ``realsense``)."""
+    """Intel RealSense D400 cameras, their color stream (extra ``realsense``)."""
 
 
 @dataclass(frozen=True)
