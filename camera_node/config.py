@@ -264,7 +264,7 @@ class OakConfig(LiveConfig):
 
 @dataclass(frozen=True)
 class RealsenseConfig(LiveConfig):
-    """Intel RealSense D400 cameras, their colour stream (extra ``realsense``)."""
+    """Intel RealSense D400 cameras, their color stream (extra ``realsense``)."""
 
 
 @dataclass(frozen=True)

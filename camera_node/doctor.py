@@ -139,17 +139,17 @@ def _package(extra: str) -> str:
 def _clock() -> str:
     """What the kernel says of the clock's discipline (adjtimex)."""
     if sys.platform != "linux":
-        raise CheckFailed("whether the clock is synchronised can only be asked on Linux")
+        raise CheckFailed("whether the clock is synchronized can only be asked on Linux")
     buffer = ctypes.create_string_buffer(_TIMEX_BYTES)
     if ctypes.CDLL(None, use_errno=True).adjtimex(buffer) < 0:
-        raise CheckFailed("the kernel does not say whether the clock is synchronised (adjtimex)")
+        raise CheckFailed("the kernel does not say whether the clock is synchronized (adjtimex)")
     # struct timex: unsigned modes; long offset, freq, maxerror, esterror; int status.
     word = ctypes.sizeof(ctypes.c_long)
     longs = [ctypes.c_long.from_buffer(buffer, word * k).value for k in range(1, 5)]
     status = ctypes.c_int.from_buffer(buffer, word * 5).value
     if status & _UNSYNCHRONISED:
-        raise CheckFailed("the clock is not synchronised: install chrony, or timedatectl set-ntp true")
-    return f"synchronised, off by {longs[2] / 1e3:.1f} ms at most"
+        raise CheckFailed("the clock is not synchronized: install chrony, or timedatectl set-ntp true")
+    return f"synchronized, off by {longs[2] / 1e3:.1f} ms at most"
 
 
 def _disk(out: Path) -> str:

@@ -38,7 +38,7 @@ def cell_at(folder: Path, host: str, **arm) -> str:
 def test_without_a_scenario_the_machine_is_examined(capsys, tmp_path):
     _, parts = examined(capsys, "--out", str(tmp_path / "not" / "there" / "yet"))
     assert parts["python"][0] and parts["disk"][0] and "GB free" in parts["disk"][1]
-    assert parts["clock"][0] is not None and "synchronised" in parts["clock"][1]
+    assert parts["clock"][0] is not None and "synchronized" in parts["clock"][1]
     assert parts["network"][0] is None and parts["scenario"][0] is None
 
 

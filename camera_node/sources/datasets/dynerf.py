@@ -3,7 +3,7 @@
 A row a camera, in the order of the videos' names: a 3 x 5 matrix row by row, whose columns are the camera's
 down, right and backwards axes in the world, its position, and (height, width, focal length) of the images the
 focal length was found on; then the nearest and furthest depth, which nobody needs here. The principal point
-is the centre, there is no distortion.
+is the center, there is no distortion.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@
 without folder and extension), ``width`` and ``height`` of the full size, ``K`` (3 x 3) and ``T`` (4 x 4,
 world to OpenCV camera axes), both **column by column**, and ``distortionModel``: RadialAndTangential [k1 k2
 p1 p2 k3] or Fisheye [k1 k2 k3 - - - p1 p2] (equidistant). The world's y points up and becomes our z here;
-metres.
+meters.
 
 ``cameras.xml`` holds the same as Metashape wrote it: OpenCV camera axes in a chunk with a transform
-of its own, tangential coefficients in the other order, principal points from the centre. The images stand
+of its own, tangential coefficients in the other order, principal points from the center. The images stand
 scaled in ``images-jpeg-1k`` to ``images-jpeg`` (full size); ``splits.json`` names those for testing.
 """
 

@@ -150,5 +150,5 @@ def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     straight = _undistorted(lens)
     u, v = np.meshgrid(np.arange(straight.width) + 0.5, np.arange(straight.height) + 0.5)
     x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
-    at = lens.project(np.stack([x, y, np.ones_like(x)], axis=-1)) - 0.5  # OpenCV counts pixel centres
+    at = lens.project(np.stack([x, y, np.ones_like(x)], axis=-1)) - 0.5  # OpenCV counts pixel centers
     return at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)

@@ -4,7 +4,7 @@
                  "ims": [{"ims": ["Camera_B1/000000.jpg", ...]}, ...]}
 
 each list of ``cams`` with an entry a camera, ``ims`` with one an instant, paths in the cameras' order. ``R``
-and ``T`` take world points to OpenCV camera axes; ``T`` is in millimetres. ``K`` counts pixel centres as
+and ``T`` take world points to OpenCV camera axes; ``T`` is in millimeters. ``K`` counts pixel centers as
 whole numbers and gains 0.5 here; ``D`` is OpenCV's k1 k2 p1 p2 k3. Masks lie in folders of their own
 (``mask``, ``mask_cihp``), as PNG files named like the images.
 """

@@ -358,7 +358,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("name", list(WRITERS))
-def test_formats_are_recognised_and_streamed_at_their_pace(tmp_path, name):
+def test_formats_are_recognized_and_streamed_at_their_pace(tmp_path, name):
     cameras = sets.rig(3)
     folder = WRITERS[name](tmp_path / "set", cameras)
     _, dataset = open_dataset(folder)
