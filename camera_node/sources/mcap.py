@@ -19,10 +19,10 @@ from camera_node.config import McapConfig, SourceConfig, find_data
 from camera_node.sources import Shot, Source
 from camera_node.sources.assignment import assigned
 from camera_node.sources.datasets.records import DatasetError
-from freshfield.frame import pose_and_lens
+from freshfield.frame import CODEC_NAMES, pose_and_lens
 from freshfield.geometry import Pinhole
 from freshfield.scenario import Scenario, ScenarioError
-from freshfield.session import CODEC_NAMES, SessionError
+from freshfield.session import SessionError
 
 if TYPE_CHECKING:
     from freshfield.session.reader import Session, SessionFrame

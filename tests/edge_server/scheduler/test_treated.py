@@ -83,7 +83,11 @@ def test_all_that_is_offered_can_be_made_and_has_help():
 
 @pytest.mark.parametrize(
     ("name", "loaded"),
-    [("threshold", []), ("mask", ["changes", "mask"]), ("all+freshen", ["changes", "freshen", "motion"])],
+    [
+        ("threshold", []),
+        ("mask", ["change_detection", "motion_mask"]),
+        ("all+freshen", ["change_detection", "flow_warp", "optical_flow"]),
+    ],
 )
 def test_what_is_not_asked_for_is_not_imported(name, loaded):
     script = (
