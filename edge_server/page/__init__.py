@@ -1,7 +1,7 @@
-"""The live page: the scene as the field renders it for each visitor, the cameras, the figures, the controls.
+"""The live page: the field rendered for each visitor, the cameras, charts and controls.
 
-``start_page`` serves it on one port from threads of its own; it only reads what the loop published, and
-renders with immutable snapshots, so the field never waits for a visitor.
+``start_page`` serves it on one port from its own threads. It only reads what the loop published and renders
+immutable snapshots, so the field never waits for a visitor.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ __all__ = ["Page", "PageError", "start_page"]
 log = logging.getLogger(__name__)
 
 REFRESH_S = 0.5
-# Until then the field's points are shown with its rendering: they say more than a blur.
-YOUNG_UPDATES = 6
+# Number of first updates during which the field's points are shown: they say more than a blurred rendering.
+POINT_UPDATES = 6
 BRAND: tuple[int, int, int] = (0, 150, 115)
 
 
@@ -38,30 +38,29 @@ class PageError(RuntimeError):
 
 @dataclass
 class Page:
-    """A page being served. url: an address that can be opened on this machine (or through an SSH forward
-    of the port)."""
+    """A page being served. url: its address on this machine (or through an SSH forward of the port)."""
 
     url: str
     port: int
     _server: viser.ViserServer
-    _keeper: _Keeper
+    _refresher: _Refresher
     _renders: RenderLoop
 
     def stop(self) -> None:
         """Close the port and end the page's threads. May be called twice."""
-        self._keeper.stop()
+        self._refresher.stop()
         self._renders.stop()
         _quietly(self._server.stop)
 
 
 def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080) -> Page:
-    """Serve the page of ``state``. port 0 takes a free one. Raises PageError if the port cannot be had."""
+    """Serve the page of ``state``. Port 0 takes a free one. Raises PageError if the port is not available."""
     _check_port(host, port)
     server: viser.ViserServer = _quietly(lambda: viser.ViserServer(host, port, verbose=False))
-    if port and server.get_port() != port:  # taken between the check and now; viser moves on silently
+    if port and server.get_port() != port:  # taken since the check: viser silently takes the next one
         _quietly(server.stop)
         raise PageError(_taken(host, port))
-    # A visitor's browser must not be able to make this machine open a tunnel to the outside.
+    # A visitor must not be able to make this machine open a tunnel to the outside.
     server.request_share_url = _no_sharing  # type: ignore[method-assign]
     server.gui.configure_theme(
         dark_mode=True, show_logo=False, show_share_button=False, brand_color=BRAND, control_width="medium"
@@ -69,29 +68,29 @@ def start_page(state: EdgeState, host: str = "127.0.0.1", port: int = 8080) -> P
     scene = Scene(server, state)
     renders = RenderLoop(state, scene.show_points)
     panel = Panel(server, state)
-    keeper = _Keeper(server, state, scene, renders, panel)
+    refresher = _Refresher(server, state, scene, renders, panel)
 
     async def joined(client: viser.ClientHandle) -> None:
-        renders.join(client)
+        renders.add_client(client)
 
         async def moved(camera: Any) -> None:
-            renders.moved(client)
+            renders.camera_moved(client)
 
         client.camera.on_update(moved)
 
     async def left(client: viser.ClientHandle) -> None:
-        renders.leave(client)
-        scene.forget(client)
+        renders.remove_client(client)
+        scene.remove_client(client)
 
     server.on_client_connect(joined)
     server.on_client_disconnect(left)
     renders.start()
-    keeper.start()
-    return Page(page_url(host, server.get_port()), server.get_port(), server, keeper, renders)
+    refresher.start()
+    return Page(page_url(host, server.get_port()), server.get_port(), server, refresher, renders)
 
 
-class _Keeper:
-    """The thread that keeps scene, panel and history up to date, at a fixed and low rate."""
+class _Refresher:
+    """The thread that keeps scene, panel and history up to date, at a fixed low rate."""
 
     def __init__(
         self, server: viser.ViserServer, state: EdgeState, scene: Scene, renders: RenderLoop, panel: Panel
@@ -100,7 +99,7 @@ class _Keeper:
         self._scene, self._renders, self._panel = scene, renders, panel
         self._history = History()
         self._stopped = threading.Event()
-        self._complained = ""
+        self._last_error = ""
         self._wanted: tuple[Any, ...] = ()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
@@ -116,17 +115,17 @@ class _Keeper:
         while not self._stopped.is_set():
             began = perf_counter()
             try:
-                self._once()
-            except Exception as error:  # a page must never take the server with it
+                self._refresh()
+            except Exception as error:  # the page must never stop the server
                 text = f"{type(error).__name__}: {error}"
-                if text != self._complained:
-                    self._complained = text
+                if text != self._last_error:
+                    self._last_error = text
                     log.warning("page: refresh failed: %s", text, exc_info=error)
-            # A slow refresh (a starved machine) is followed by as long a rest.
+            # A slow refresh (a busy machine) is followed by an equally long pause.
             spent = perf_counter() - began
             self._stopped.wait(max(REFRESH_S - spent, spent))
 
-    def _once(self) -> None:
+    def _refresh(self) -> None:
         state = self._state
         cameras = state.cameras()
         channel = state.channel()
@@ -141,10 +140,11 @@ class _Keeper:
         self._choose_view(publications[-1].number + 1 if publications else 0)
 
     def _choose_view(self, updates: int) -> None:
-        """Tell the renderer what visitors want to see: points while the field is young, then images."""
+        """Tell the render loop what visitors want to see: points during the first updates, then images."""
         controls = self._panel.controls
         view = controls.view.value
-        points = view == "points" or (view == "automatic" and updates < controls.young_from + YOUNG_UPDATES)
+        early = updates < controls.updates_at_reset + POINT_UPDATES
+        points = view == "points" or (view == "automatic" and early)
         wanted = (points, view != "points", controls.occlude.value)
         if wanted != self._wanted:
             self._wanted = wanted
@@ -153,14 +153,14 @@ class _Keeper:
 
 
 def page_url(host: str, port: int) -> str:
-    """An address that can be opened: listening everywhere is reached as localhost."""
+    """An address that a browser can open: localhost if the page listens on every interface."""
     if host in ("", "0.0.0.0", "::", "*"):
         host = "localhost"
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def _check_port(host: str, port: int) -> None:
-    """Refuse a taken port or a foreign address now: viser would silently take the next port, or hang."""
+    """Refuse a taken port or an address of another machine: viser would take the next port, or hang."""
     if not 0 <= port <= 65535:
         raise PageError(f"page: {port} is not a port; give one from 1 to 65535, or 0 for a free one")
     try:
@@ -184,7 +184,7 @@ def _no_sharing(verbose: bool = True) -> None:
 
 
 def _quietly(action: Any) -> Any:
-    """Run what prints through rich's global console without its banners: the terminal is the caller's."""
+    """Call ``action`` without the banners that it prints through rich's global console."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:

@@ -1,7 +1,7 @@
-"""Ages as colors: one scale for frustums, tables and the legend, readable by color-blind people.
+"""The color scale of ages, for frustums, tables and the legend; readable by color-blind people.
 
-Bluish green, yellow, vermillion after Okabe and Ito's palette, on a logarithmic axis: a network's delays
-spread over decades, and what matters is whether an age is tens, hundreds or thousands of milliseconds.
+Bluish green, yellow and vermilion after Okabe and Ito's palette, on a logarithmic axis: network delays span
+decades, and what matters is whether an age is tens, hundreds or thousands of milliseconds.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ FRESH: RGB = (0, 190, 140)
 MIDDLE: RGB = (240, 228, 66)
 STALE: RGB = (210, 50, 10)
 UNKNOWN: RGB = (125, 131, 143)
-"""A camera without an age: it never reported."""
+"""A camera that never reported."""
 HELD_OUT: RGB = (158, 128, 255)
-"""The truth is not part of the age scale: it is never trained on. Violet, because sky blue is the same as the
-fresh green to a tritanope."""
+"""Held-out cameras are outside the age scale because they are never trained on. Violet, because a tritanope
+cannot tell sky blue from the fresh green."""
 FOR: RGB = (0, 114, 178)
 AGAINST: RGB = (213, 94, 0)
-"""What spoke for a decision and what against it: blue and vermillion, as in the figures."""
-# Frustums change color in steps, so that a page at rest sends next to nothing.
+"""Contributions for and against a decision: blue and vermilion, as in the figures."""
+# Frustums change color in steps, so that an idle page sends almost nothing.
 STEPS = 24
 
 
 def age_fraction(age_ms: float) -> float:
-    """Place of an age on the scale, 0 fresh to 1 stale; ages outside are clamped, NaN counts as stale."""
+    """Position of an age on the scale, 0 fresh to 1 stale, clamped; NaN counts as stale."""
     if math.isnan(age_ms):
         return 1.0
-    place = math.log(max(age_ms, FRESH_MS) / FRESH_MS) / math.log(STALE_MS / FRESH_MS)
-    return min(1.0, place)
+    fraction = math.log(max(age_ms, FRESH_MS) / FRESH_MS) / math.log(STALE_MS / FRESH_MS)
+    return min(1.0, fraction)
 
 
 def age_color(age_ms: float | None) -> RGB:

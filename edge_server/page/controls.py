@@ -1,6 +1,6 @@
 """What an operator may change: policy and its value, pause, reset, snapshot.
 
-Whatever is refused becomes a notification for who asked; what is in force is shown to everybody.
+A refused change becomes a notification for its sender. Everybody sees the values in force.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ VIEWS = ("automatic", "rendering", "points")
 
 
 class ControlPanel:
-    """Inputs in the present GUI container, kept equal to ``state.controls`` whoever changes it."""
+    """Inputs in the current GUI container, kept equal to ``state.controls``, which others may change too."""
 
     def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
         gui = server.gui
@@ -38,25 +38,25 @@ class ControlPanel:
         self.policy: Any = gui.add_dropdown(
             "policy", names, initial_value=current, hint="Which of the newest views an update uses."
         )
-        self.value: Any = gui.add_number("value", _shown(state.controls.value), min=0.0, step=1.0)
+        self.value: Any = gui.add_number("value", _finite_or_zero(state.controls.value), min=0.0, step=1.0)
         self.help = gui.add_html("")
         self.buttons = gui.add_button_group("field", ("pause", "reset", "snapshot"))
         self.view = gui.add_dropdown(
-            "view", VIEWS, hint="Automatic shows the field's points while it is young, then its rendering."
+            "view",
+            VIEWS,
+            hint="Automatic shows the field's points at first, then its rendering.",
         )
-        self.occlude = gui.add_checkbox(
-            "occlusion", False, hint="Hide cameras behind what the field takes for surfaces."
-        )
+        self.occlude = gui.add_checkbox("occlusion", False, hint="Hide cameras behind the field's surfaces.")
         self._paused: bool | None = None
-        self.young_from = 0
-        """Number of updates at the last reset from here: from there on the field is young again."""
+        self.updates_at_reset = 0
+        """Number of updates at the last reset from this page; the field starts again from there."""
         self.policy.on_update(lambda event: self._policy_chosen(event))
         self.value.on_update(lambda event: self._value_entered(event))
         self.buttons.on_click(self._pressed)
         self.refresh()
 
     def refresh(self) -> None:
-        """Show what is in force."""
+        """Show the values in force."""
         controls = self._state.controls
         with self._lock:
             if controls.policy in self.policy.options and self.policy.value != controls.policy:
@@ -64,38 +64,38 @@ class ControlPanel:
             parameter = self._parameter_of(controls.policy)
             self.value.visible = parameter is not None
             self.value.label = _label(parameter)
-            if self.value.value != _shown(controls.value):
-                self.value.value = _shown(controls.value)
+            if self.value.value != _finite_or_zero(controls.value):
+                self.value.value = _finite_or_zero(controls.value)
             learning = self._state.learning()
             self.help.content = _help(controls.policy) + (note(learning) if learning else "")
             if self._paused != controls.paused:
                 self._paused = controls.paused
                 self.buttons.options = ("resume" if controls.paused else "pause", "reset", "snapshot")
 
-    # --- what people do -------------------------------------------------------------------------
+    # --- callbacks ------------------------------------------------------------------------------
 
     def _policy_chosen(self, event: Any) -> None:
-        if event.client is None:  # the page itself, following a change made elsewhere
+        if event.client is None:  # set by refresh, not by a visitor
             return
         name = event.target.value
         self._attempt(event.client, f"policy {name}", lambda: self._state.set_policy(name, None))
 
     def _value_entered(self, event: Any) -> None:
         entered, name = event.target.value, self._state.controls.policy
-        if event.client is None or entered == _shown(self._state.controls.value):
+        if event.client is None or entered == _finite_or_zero(self._state.controls.value):
             return
-        # The browser decides what is sent: an emptied field must end as a notification too.
+        # The value comes from a browser: an empty input must end as a notification too.
         self._attempt(
             event.client, f"{name} with {entered}", lambda: self._state.set_policy(name, float(entered))
         )
 
     async def _pressed(self, event: Any) -> None:
-        # A coroutine runs before the next click is taken, so the group's value is still this click's.
+        # A coroutine runs before the next click is handled, so the group still holds this click's value.
         pressed, client, controls = event.target.value, event.client, self._state.controls
         if pressed == "reset":
             controls.reset_requested = True
-            self.young_from = next((p.number + 1 for p in reversed(self._state.publications())), 0)
-            _notify(client, "Reset", "The field forgets the scene and starts anew.")
+            self.updates_at_reset = next((p.number + 1 for p in reversed(self._state.publications())), 0)
+            _notify(client, "Reset", "The field forgets the scene and starts again.")
         elif pressed == "snapshot":
             save = partial(self._attempt, client, "snapshot", lambda: self._snapshot(client))
             threading.Thread(target=save, name="page-snapshot", daemon=True).start()
@@ -108,16 +108,16 @@ class ControlPanel:
         _notify(client, "Snapshot saved", str(path), seconds=30.0)
 
     def _attempt(self, client: Any, what: str, action: Any) -> None:
-        """Do it; if it cannot be done say why, and show what is still in force."""
+        """Call ``action``; if it fails, notify the client and show the values still in force."""
         try:
             action()
-        except Exception as error:  # whatever goes wrong is the operator's to know, never the page's end
+        except Exception as error:  # any failure is shown to the operator and never ends the page
             log.info("page: %s refused: %s", what, error)
             _notify(client, f"Not done: {what}", str(error) or type(error).__name__, bad=True)
         self.refresh()
 
     def _parameter_of(self, policy: str) -> str | None:
-        """Name of the policy's one value, None if it has none; policies unknown here may have one."""
+        """Name of the policy's value, None if it has none. A policy unknown here may have one."""
         if policy not in self._parameter:
             try:
                 self._parameter[policy] = make_policy(policy, None, np.random.default_rng(0)).parameter
@@ -126,12 +126,12 @@ class ControlPanel:
         return self._parameter[policy]
 
 
-def _shown(value: float | None) -> float:
+def _finite_or_zero(value: float | None) -> float:
     return float(value) if value is not None and math.isfinite(value) else 0.0
 
 
 def _label(parameter: str | None) -> str:
-    """``omega_ms`` as people write it: omega, ms."""
+    """``omega_ms`` for people: omega, ms."""
     if parameter is None:
         return "value"
     name, _, unit = parameter.partition("_")
@@ -139,7 +139,7 @@ def _label(parameter: str | None) -> str:
 
 
 def _help(policy: str) -> str:
-    """The scheduler's line on the policy, without what only readers of its source need."""
+    """The scheduler's line of help on the policy, without equation numbers and values."""
     return note(re.sub(r" \([\d.-]+\)", "", policy_help(policy).split("; value:")[0]))
 
 

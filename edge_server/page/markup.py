@@ -1,4 +1,4 @@
-"""The panel's HTML: pure functions from what the state says to text. Everything from outside is escaped."""
+"""The panel's HTML: pure functions from state to text. Everything from outside is escaped."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from edge_server.page.colors import (
     scale_color,
 )
 
-if TYPE_CHECKING:  # loaded only where a policy was learned
+if TYPE_CHECKING:  # loaded only with a learned policy
     from edge_server.scheduler.learned.explain import Explanation
 
-# Cameras that the explanation of a decision shows.
-CAMERAS_WHY = 6
+# Number of cameras in the explanation of a decision.
+EXPLAINED_CAMERAS = 6
 _DIM = "color:var(--mantine-color-dimmed)"
 _CARD = "background:rgba(128,140,160,.10);border-radius:6px"
 
@@ -38,7 +38,7 @@ INTRO = (
 
 @dataclass(frozen=True)
 class Summary:
-    """What the tiles show. None is drawn as a dash. condition: live, waiting or paused."""
+    """The values of the tiles; None is shown as a dash. condition: live, waiting or paused."""
 
     scenario: str
     field: str
@@ -91,7 +91,7 @@ def _tile(name: str, value: str, unit: str, age_ms: float | None = None) -> str:
 
 
 def legend() -> str:
-    """The age scale, the held-out camera's color."""
+    """The age scale and the color of held-out cameras."""
     stops = ",".join(css(scale_color(i / 8)) for i in range(9))
     middle = (FRESH_MS * STALE_MS) ** 0.5
     return (
@@ -100,13 +100,13 @@ def legend() -> str:
         f'<div style="display:flex;justify-content:space-between;{_DIM}">'
         f"<span>fresh, {FRESH_MS:g} ms</span><span>{_rounded(middle)} ms</span>"
         f"<span>stale, {STALE_MS / 1000:g} s</span></div>"
-        f'<div><span style="color:{css(HELD_OUT)}">&#9632;</span> held out: the truth, never trained on'
+        f'<div><span style="color:{css(HELD_OUT)}">&#9632;</span> held out: ground truth, never trained on'
         "</div></div>"
     )
 
 
 def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
-    """One row a camera: age, frames delivered and rejected; those of the last update are ticked."""
+    """One row for each camera: age, frames delivered and rejected. Cameras of the last update are ticked."""
     chosen = set(selected)
     rows = "".join(_row(c, c.camera in chosen) for c in cameras)
     cell = "padding:.1em .35em;font-weight:400;text-align:right"
@@ -136,36 +136,36 @@ def _row(camera: CameraView, used: bool) -> str:
     )
 
 
-def comparison_caption(camera: str, psnr_db: float | None, number_: int) -> str:
-    """Above the pair of images."""
+def comparison_caption(camera: str, psnr_db: float | None, update: int) -> str:
+    """The caption above the pair of images."""
     score = "" if psnr_db is None else f"{number(psnr_db, 1)} dB &middot; "
     return (
         f'<div style="padding:.4em .9em .25em;font-size:.78em"><b>{escape(camera)}</b>, '
-        f'<span style="{_DIM}">{score}update {number_}</span>'
+        f'<span style="{_DIM}">{score}update {update}</span>'
         f'<div style="display:grid;grid-template-columns:1fr 1fr;{_DIM};font-size:.95em">'
         "<span>truth at the present</span><span>what the field renders</span></div></div>"
     )
 
 
-def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], note_: str = "") -> str:
-    """A chart's title at the left, its lines' names in their colors at the right."""
+def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], remark: str = "") -> str:
+    """A chart's title on the left; on the right ``remark``, or the names of its lines in their colors."""
     names = " ".join(
         f'<span style="color:{css(color)};margin-left:.6em">&#9473; {escape(name)}</span>'
         for name, color in lines
     )
-    right = f'<span style="{_DIM}">{escape(note_)}</span>' if note_ else names
+    right = f'<span style="{_DIM}">{escape(remark)}</span>' if remark else names
     return (
         '<div style="padding:.35em .9em .1em;font-size:.78em;display:flex;justify-content:space-between">'
         f"<span>{escape(title)}</span><span>{right}</span></div>"
     )
 
 
-def why(e: Explanation) -> str:
-    """Why a learned policy decided as it did: bars of the parts of the state and of the strongest cameras."""
-    largest = sorted(zip(e.names, e.cameras.tolist()), key=lambda pair: -abs(pair[1]))[:CAMERAS_WHY]
+def decision_explanation(e: Explanation) -> str:
+    """A learned policy's decision: bars of the contributions of parts of the state and of cameras."""
+    largest = sorted(zip(e.names, e.cameras.tolist()), key=lambda pair: -abs(pair[1]))[:EXPLAINED_CAMERAS]
     widest = max((abs(share) for share in (*e.parts.values(), *(s for _, s in largest))), default=0.0)
-    bars = "".join(_share(name, share, widest) for name, share in e.parts.items())
-    bars += f'<div style="height:.4em"></div>{"".join(_share(n, s, widest) for n, s in largest)}'
+    bars = "".join(_bar(name, share, widest) for name, share in e.parts.items())
+    bars += f'<div style="height:.4em"></div>{"".join(_bar(n, s, widest) for n, s in largest)}'
     return (
         f'<div style="padding:.3em .9em;font-size:.78em"><div><b>{escape(e.action)}</b> '
         f'<span style="{_DIM}">logit {e.logit:+.2f}, of average cameras {e.baseline_logit:+.2f}</span></div>'
@@ -175,7 +175,7 @@ def why(e: Explanation) -> str:
     )
 
 
-def _share(name: str, share: float, widest: float) -> str:
+def _bar(name: str, share: float, widest: float) -> str:
     percent = 100.0 * abs(share) / widest if widest > 0 else 0.0
     bar = (
         f"width:{percent:.0f}%;height:.7em;border-radius:2px;background:{css(FOR if share >= 0 else AGAINST)}"
@@ -189,7 +189,7 @@ def _share(name: str, share: float, widest: float) -> str:
 
 
 def channel_line(channel: dict[str, Any]) -> str:
-    """What the emulator does, in one line; whatever it does not say is left out."""
+    """The emulator's status in one line; values that it does not report are left out."""
     counts = channel.get("counts")
     delay = channel.get("drawn_delay_ms")
     mean_ms = delay.get("mean") if isinstance(delay, dict) else None
@@ -209,7 +209,7 @@ def note(text: str) -> str:
 
 
 def number(value: float | None, digits: int = 0) -> str:
-    """A number for people: a dash for None and NaN, thousands as they are."""
+    """A number for people: a dash for None and NaN."""
     if value is None or value != value:
         return "&ndash;"
     if value in (float("inf"), float("-inf")):

@@ -1,4 +1,4 @@
-"""The mesh on the page: made of what was published last when somebody asks, beside everything else."""
+"""The mesh on the page: made on request from the newest publication, in the background."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ NOTICE_S = 10.0
 
 
 class MeshLayer:
-    """A button in the present GUI container that shows a mesh of the field, and hides it again.
+    """A button in the current GUI container that shows a mesh of the field, and hides it again.
 
-    The work is done by a thread of its own, one mesh at a time, from an immutable snapshot: neither the loop
-    nor other visitors wait for it. Nothing of it is imported before the first press.
+    A separate thread makes one mesh at a time from an immutable snapshot, so neither the loop nor other
+    visitors wait. Nothing for it is imported before the first press.
     """
 
     def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
@@ -31,14 +31,14 @@ class MeshLayer:
         self._node: Any = None
         self._thread: threading.Thread | None = None
         self.button: Any = server.gui.add_button(
-            "show mesh", hint="The surface of the field as it is now, from the depth that its cameras see."
+            "show mesh", hint="The surface of the field as it is now, from depth rendered at its cameras."
         )
         self.button.on_click(self._pressed)
 
     def _pressed(self, event: Any) -> None:
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
-                return  # it is being made
+                return  # still being made
             if self._node is not None:
                 self._node.remove()
                 self._node = None
@@ -53,9 +53,9 @@ class MeshLayer:
     def _make(self, client: Any) -> None:
         label = "show mesh"
         try:
-            self._node = self._shown()
+            self._node = self._add_mesh()
             label = "hide mesh"
-        except Exception as error:  # whatever goes wrong is the visitor's to know, never the page's end
+        except Exception as error:  # any failure is shown to the visitor and never ends the page
             log.info("page: no mesh: %s", error)
             if client is not None:
                 client.add_notification(
@@ -64,7 +64,7 @@ class MeshLayer:
         finally:
             self.button.label, self.button.disabled = label, False
 
-    def _shown(self) -> Any:
+    def _add_mesh(self) -> Any:
         import numpy as np
         import trimesh
 
@@ -76,7 +76,7 @@ class MeshLayer:
         views = getattr(renderer, "cameras", ())
         if renderer is None or not views:
             raise SurfaceError("the field has not been trained yet")
-        # The depth as the field has it: what moves is in no two pictures alike.
+        # No sharpening: it compares images, and moving parts differ between them.
         settings, pool = MeshSettings(sharpen=False, memory_mb=MEMORY_MB), shared_pool(nice=SERVER_NICE)
         maps = maps_of(renderer, views, settings, pool=pool)
         grid = grid_for(maps, settings)

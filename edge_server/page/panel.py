@@ -1,4 +1,4 @@
-"""The two side panels: what is going on and what one may change; the time lines and the cameras."""
+"""The two side panels: status and controls; timelines and cameras."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
 from edge_server.page import markup
 from edge_server.page.controls import ControlPanel
-from edge_server.page.decision_explanation import Why
+from edge_server.page.decision_explanation import DecisionExplanation
 from edge_server.page.mesh_layer import MeshLayer
 from edge_server.page.timelines import History, Timelines
 
 MAIN_WIDTH = 372
 SIDE_WIDTH = 356
-# Two images and the gap between them, as they stand in the panel.
+# Width of two images and the gap between them, in pixels.
 PAIR_WIDTH = 640
 GAP = 8
 PANEL_COLOR = (36, 36, 36)
 
 
 class Panel:
-    """Server-wide GUI. ``refresh`` is called by one thread, a few times a second."""
+    """GUI shared by all visitors. One thread calls ``refresh``, a few times a second."""
 
     def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
         self._state = state
@@ -37,15 +37,15 @@ class Panel:
         self._status = gui.add_html("")
         self._caption = gui.add_html(markup.note("Waiting for a held-out frame to compare with."))
         self._pair: Any = None
-        self._pair_of: int | None = None
-        self._turn = 0
+        self._compared_update: int | None = None
+        self._refreshes = 0
         self._folder = gui.add_folder("Controls")
         with self._folder:
             self.controls = ControlPanel(server, state)
             self.surface = MeshLayer(server, state)
-        self._why = Why(gui, state)
+        self._explanation = DecisionExplanation(gui, state)
         side = gui.add_panel()
-        with side.add_tab("Time lines"):
+        with side.add_tab("Timelines"):
             self._timelines = Timelines(gui)
             self._waiting = gui.add_html(markup.note("Curves appear with the first frames and updates."))
             self._channel = gui.add_html("", visible=False)
@@ -62,7 +62,7 @@ class Panel:
         publications: list[Publication],
         channel: dict[str, Any] | None,
     ) -> None:
-        """Show the present."""
+        """Show the current state."""
         last = publications[-1] if publications else None
         self._status.content = markup.status(summary(self._state, cameras, publications))
         self._table.content = markup.table(cameras, last.selected if last else ())
@@ -70,17 +70,17 @@ class Panel:
         if channel is not None:
             self._channel.content = markup.channel_line(channel)
             self._channel.visible = True
-        self._turn += 1
-        if self._turn % 2:  # curves need no more than one new point a second
+        self._refreshes += 1
+        if self._refreshes % 2:  # charts need only one new point a second
             self._timelines.refresh(history, publications)
         self.controls.refresh()
-        self._why.refresh()
+        self._explanation.refresh()
         comparison = self._state.comparison
-        if comparison is not None and comparison.number != self._pair_of:
-            self._compare(comparison, publications)
+        if comparison is not None and comparison.number != self._compared_update:
+            self._show_comparison(comparison, publications)
 
-    def _compare(self, comparison: Comparison, publications: list[Publication]) -> None:
-        self._pair_of = comparison.number
+    def _show_comparison(self, comparison: Comparison, publications: list[Publication]) -> None:
+        self._compared_update = comparison.number
         scored = next((p for p in reversed(publications) if p.number == comparison.number), None)
         self._caption.content = markup.comparison_caption(
             comparison.camera, scored.psnr_db if scored else None, comparison.number
@@ -94,7 +94,7 @@ class Panel:
 
 
 def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publication]) -> markup.Summary:
-    """The tiles' numbers: the latest score there is, ages of the training cameras now."""
+    """The numbers of the tiles: the latest score, the current ages of the training cameras."""
     ages = [c.age_ms for c in cameras if not c.held_out and c.age_ms is not None]
     last = publications[-1] if publications else None
     scored = next((p for p in reversed(publications) if p.psnr_db is not None), None)
@@ -116,14 +116,13 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
 
 
 def side_by_side(truth: NDArray[np.uint8], rendered: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Two images of any size as one (H, PAIR_WIDTH, 3), a gap in the panel's color between them."""
+    """Two images of any size as one (H, PAIR_WIDTH, 3), with a gap in the panel's color."""
     width = (PAIR_WIDTH - GAP) // 2
     height = max(1, round(width * truth.shape[0] / max(1, truth.shape[1])))
     out = np.empty((height, PAIR_WIDTH, 3), np.uint8)
     out[:] = PANEL_COLOR
     for image, left in ((truth, 0), (rendered, PAIR_WIDTH - width)):
-        small = np.ascontiguousarray(image[..., :3])
-        shrinks = small.shape[1] > width
-        how = cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST
-        out[:, left : left + width] = cv2.resize(small, (width, height), interpolation=how)
+        pixels = np.ascontiguousarray(image[..., :3])
+        how = cv2.INTER_AREA if pixels.shape[1] > width else cv2.INTER_NEAREST
+        out[:, left : left + width] = cv2.resize(pixels, (width, height), interpolation=how)
     return out

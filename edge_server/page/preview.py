@@ -1,9 +1,8 @@
 """A page without a deployment: ``python -m edge_server.page.preview [--port 8080]``.
 
-A ball circles over a floor. Cameras on an arc photograph it, a toy network delays the pictures, and the
-"field" is the analytic scene as it was at the mean capture time of the views that the policy selects: what
-a perfect field would show. Ages, policies and scores are computed, not invented, so the page shows true
-relations between them; only the learning is left out.
+A ball circles over a floor. Cameras on an arc capture it, a toy network delays the images, and the "field" is
+the analytic scene at the mean capture time of the views that the policy selects: what a perfect field would
+show. Ages, policies and scores are computed, so their relations are real; only the learning is left out.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _SUN = np.array([0.4, -0.5, 0.77])
 
 
 class BallScene:
-    """The scene at one instant: a Renderer that needs no field. Empty space is dark blue."""
+    """The scene at one instant, as a Renderer. Empty space is dark blue."""
 
     def __init__(self, t_s: float) -> None:
         angle = 2 * np.pi * t_s / PERIOD_S
@@ -98,10 +97,10 @@ class BallScene:
 
 
 class Preview:
-    """Cameras, network and updates of the toy deployment, as an EdgeState."""
+    """The cameras, network and updates of the toy deployment."""
 
     def __init__(self, folder: Path, cameras: int = CAMERAS, silent: int = 0, seed: int = 0) -> None:
-        """``silent`` of the cameras never report. Snapshots go to ``folder``. cameras: 3 or more."""
+        """folder: for snapshots. cameras: 3 or more. silent: how many of them never report."""
         if cameras < 3:
             raise ValueError(f"3 cameras or more are needed, not {cameras}: the middle one is held out")
         self._folder = folder
@@ -115,7 +114,7 @@ class Preview:
         self._held_out = self.names[cameras // 2]
         self._poses = {name: _arc(i, cameras) for i, name in enumerate(self.names)}
         self._newest: dict[str, Frame] = {}
-        self._on_the_way: list[tuple[int, Frame]] = []
+        self._in_flight: list[tuple[int, Frame]] = []
         self._delivered = dict.fromkeys(self.names, 0)
         self._congested = False
         self._policy: Policy = make_policy("threshold", 600.0, self._rng)
@@ -157,7 +156,7 @@ class Preview:
         return views
 
     def _channel(self) -> dict[str, Any]:
-        """As the emulator's status file says it."""
+        """The channel's status, as the emulator writes it."""
         state = "high" if self._congested else "low"
         forwarded = sum(self._delivered.values())
         return {"preset": "toy", "discipline": "parallel", "states": ["low", "high"], "state": state,
@@ -180,12 +179,12 @@ class Preview:
             frame = Frame(name, "preview", number, now_ns, Pose.from_matrix(self._poses[name]), LENS, "jpeg",
                           payload.encode(image), held_out=name == self._held_out)  # fmt: skip
             mean_ms = 0.0 if frame.held_out else (700.0 if self._congested else 90.0)
-            self._on_the_way.append((now_ns + round(1e6 * self._rng.exponential(mean_ms)), frame))
+            self._in_flight.append((now_ns + round(1e6 * self._rng.exponential(mean_ms)), frame))
 
     def _deliver(self) -> None:
         now_ns = self._clock.now_ns()
-        arrived = [item for item in self._on_the_way if item[0] <= now_ns]
-        self._on_the_way = [item for item in self._on_the_way if item[0] > now_ns]
+        arrived = [item for item in self._in_flight if item[0] <= now_ns]
+        self._in_flight = [item for item in self._in_flight if item[0] > now_ns]
         with self._lock:
             for _, frame in arrived:
                 known = self._newest.get(frame.camera)
@@ -247,7 +246,7 @@ class Preview:
 
 
 def _arc(i: int, count: int) -> NDArray[np.float64]:
-    """Camera i of an arc of 150 degrees around the floor's middle."""
+    """Pose of camera i on an arc of 150 degrees around the middle of the floor."""
     angle = np.deg2rad(-75.0 + 150.0 * i / max(1, count - 1))
     eye = (3.4 * np.cos(angle), 3.4 * np.sin(angle), 1.5 + 0.35 * (i % 2))
     return look_at(eye, (0.0, 0.0, 0.35))

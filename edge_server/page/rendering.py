@@ -1,9 +1,8 @@
-"""Renders the field for every visitor: coarse while they move, finer when they stop, never a queue.
+"""Renders the field for every visitor: coarse while they move, finer at rest, without a queue.
 
-One thread serves all visitors and is the only place of the page that renders, so the share of the machine
-that watching costs is bounded however many watch. A visitor is a slot that holds the newest viewpoint: what
-was asked for while the thread was busy is forgotten. Images are rendered in bands, and one that has been
-overtaken by a movement is given up between two bands.
+One thread renders for all visitors, so the share of the machine that they cost is bounded. Each visitor keeps
+only the newest viewpoint; viewpoints that changed while the thread was busy are skipped. Images are rendered
+in bands of rows, and an image whose visitor moves is abandoned between two bands.
 """
 
 from __future__ import annotations
@@ -20,70 +19,75 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Renderer, Rendering
 from edge_server.live.state import EdgeState
-from edge_server.page.viewpoint import band, visitor_camera
+from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Stage:
-    """How fine an image is. seconds: what it may take; share: of all time that may go into such images;
-    rows between least and most, adapted to what this machine's renderer turns out to need."""
+class DetailLevel:
+    """A level of detail. budget_s: time for one image. max_share: largest share of all time for such images.
+    min_rows, max_rows: bounds of the image rows, which adapt to the speed of the renderer."""
 
-    seconds: float
-    share: float
-    least: int
-    most: int
+    budget_s: float
+    max_share: float
+    min_rows: int
+    max_rows: int
 
 
-# While the visitor moves, at rest, and at rest with nothing new to show. Below the least rows an image says
-# too little to be worth its fixed cost, which is waiting for a training step of the field to end.
-STAGES = (Stage(0.08, 0.5, 64, 240), Stage(0.20, 0.2, 120, 480), Stage(1.2, 0.15, 200, 720))
+# While the visitor moves, at rest, and at rest with nothing new to show. An image below min_rows is not worth
+# its fixed cost, the wait for a training step of the field to end.
+LEVELS = (
+    DetailLevel(0.08, 0.5, 64, 240),
+    DetailLevel(0.20, 0.2, 120, 480),
+    DetailLevel(1.2, 0.15, 200, 720),
+)
 BAND_S = 0.1
-LEAST_GAP_S = 0.05
+MIN_GAP_S = 0.05
 SETTLE_S = 0.25
 POINTS = 8000
 POINTS_SHARE = 0.05
 POINTS_EVERY_S = 1.0
-# viser packs depth into 24 bits of 1e-5 m: this is the farthest it can say.
+# viser packs depth into 24 bits of 1e-5 m: the largest depth that fits.
 FAR_M = 167.0
-# Coarser depth has a constant low byte, which PNG packs five times better.
+# A multiple of 256 units has a constant low byte, which PNG compresses five times better.
 DEPTH_STEP_M = 256e-5
 DEPTH_ROWS = 180
 BACKDROP = np.array([18, 20, 24], np.float32) / 255
 
 
 @dataclass
-class Visitor:
-    """One connected browser. viewpoint: position (3,), wxyz (4,), vertical field of view, canvas size.
-    stage: finest of STAGES that was sent for this viewpoint and ``renderer``; -1 for none."""
+class ClientState:
+    """A connected browser. viewpoint: position (3,), wxyz (4,), vertical field of view, canvas size.
+    serial: number of viewpoints so far. level: the finest of LEVELS sent for this viewpoint and ``renderer``,
+    -1 for none. sent: number of images since the last blank background."""
 
     client: Any
     viewpoint: tuple[NDArray[np.float64], NDArray[np.float64], float, int, int] | None = None
     moved_at: float = 0.0
     serial: int = 0
     renderer: Renderer | None = None
-    stage: int = -1
+    level: int = -1
     sent: int = 0
 
 
 class RenderLoop:
-    """The thread. ``show_points(points, colors)`` is called with the field's own points while ``mode`` or
-    the field's youth asks for them, and with None when it no longer does."""
+    """The render thread. It calls ``show_points(points, colors)`` with the field's points while
+    ``want_points`` is set, and with (None, None) once it no longer is."""
 
     def __init__(self, state: EdgeState, show_points: Any) -> None:
         self._state = state
         self._show_points = show_points
-        self._visitors: dict[int, Visitor] = {}
+        self._visitors: dict[int, ClientState] = {}
         self._wake = threading.Condition()
         self._stopped = False
-        self._rows = [1.5 * stage.least for stage in STAGES]
-        self._not_before = [0.0] * len(STAGES)
+        self._rows = [1.5 * level.min_rows for level in LEVELS]
+        self._not_before = [0.0] * len(LEVELS)
         self._points_from: Renderer | None = None
         self._points_not_before = 0.0
         self._points_shown = False
-        self._complained = ""
+        self._last_error = ""
         self.want_points = False
         self.want_rendering = True
         self.occlude = False
@@ -98,19 +102,19 @@ class RenderLoop:
             self._wake.notify_all()
         self._thread.join(timeout=5.0)
 
-    # --- what visitors do (called from viser's threads) -----------------------------------------
+    # --- called from viser's threads --------------------------------------------------------------
 
-    def join(self, client: Any) -> None:
+    def add_client(self, client: Any) -> None:
         with self._wake:
-            self._visitors[client.client_id] = Visitor(client)
-        self.moved(client)
+            self._visitors[client.client_id] = ClientState(client)
+        self.camera_moved(client)
 
-    def leave(self, client: Any) -> None:
+    def remove_client(self, client: Any) -> None:
         with self._wake:
             self._visitors.pop(client.client_id, None)
 
-    def moved(self, client: Any) -> None:
-        """Take the client's viewpoint, replacing what it asked for before."""
+    def camera_moved(self, client: Any) -> None:
+        """Replace the viewpoint to render for the client."""
         camera = client.camera
         viewpoint = (
             np.array(camera.position, dtype=np.float64),
@@ -128,14 +132,14 @@ class RenderLoop:
             visitor.viewpoint = viewpoint
             visitor.moved_at = perf_counter()
             visitor.serial += 1
-            visitor.stage = -1
+            visitor.level = -1
             self._wake.notify_all()
 
     def refresh(self) -> None:
-        """Send everybody a new image, because what they want to see has changed."""
+        """Render again for every visitor, after a change of the view options."""
         with self._wake:
             for visitor in self._visitors.values():
-                visitor.stage = -1
+                visitor.level = -1
             self._points_from = None
             self._wake.notify_all()
 
@@ -148,8 +152,8 @@ class RenderLoop:
                     return
             try:
                 worked = self._step(perf_counter())
-            except Exception as error:  # a page must never take the server with it
-                self._complain(error)
+            except Exception as error:  # the page must never stop the server
+                self._log_error(error)
                 worked = False
             if not worked:
                 with self._wake:
@@ -157,59 +161,60 @@ class RenderLoop:
                         self._wake.wait(0.05 if self._visitors else 0.5)
 
     def _step(self, now: float) -> bool:
-        """Do the most urgent thing there is time for; False if there is none."""
+        """Do the most urgent work; False if nothing is due."""
         renderer = self._state.renderer
         with self._wake:
             visitors = [v for v in self._visitors.values() if v.viewpoint is not None]
         if not visitors:
             return False
-        if self._points(renderer, now):
+        if self._update_points(renderer, now):
             return True
         if renderer is None or not self.want_rendering:
             for visitor in visitors:
-                if visitor.stage < len(STAGES) and visitor.sent:
+                if visitor.level < len(LEVELS) and visitor.sent:
                     visitor.client.scene.set_background_image(None)
                     visitor.sent = 0
-                visitor.stage = -1
+                visitor.level = -1
             return False
-        due = [(stage, v.sent, v) for v in visitors if (stage := self._due(v, renderer, now)) is not None]
+        levels = [(self._next_level(visitor, renderer, now), visitor.sent, visitor) for visitor in visitors]
+        due = [(level, sent, visitor) for level, sent, visitor in levels if level is not None]
         if not due:
             return False
-        stage, _, visitor = min(due, key=lambda item: item[:2])
-        self._serve(visitor, renderer, stage)
+        level, _, visitor = min(due, key=lambda item: item[:2])
+        self._render_and_send(visitor, renderer, level)
         return True
 
-    def _due(self, visitor: Visitor, renderer: Renderer, now: float) -> int | None:
-        """The stage to render next for a visitor, None if it has what it can have or must wait."""
-        if visitor.stage < 0:
-            stage = 0
+    def _next_level(self, visitor: ClientState, renderer: Renderer, now: float) -> int | None:
+        """The level to render next for a visitor; None if it has the finest or must wait."""
+        if visitor.level < 0:
+            level = 0
         elif now - visitor.moved_at < SETTLE_S:
             return None
         elif visitor.renderer is not renderer:
-            stage = 1
+            level = 1
         else:
-            stage = visitor.stage + 1
-        if stage >= len(STAGES) or now < self._not_before[stage]:
+            level = visitor.level + 1
+        if level >= len(LEVELS) or now < self._not_before[level]:
             return None
-        return stage
+        return level
 
-    def _serve(self, visitor: Visitor, renderer: Renderer, stage: int) -> None:
+    def _render_and_send(self, visitor: ClientState, renderer: Renderer, level: int) -> None:
         with self._wake:
             viewpoint, serial = visitor.viewpoint, visitor.serial
         assert viewpoint is not None
-        pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[stage]))
+        pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[level]))
         began = perf_counter()
         try:
-            image = self._render(renderer, pose, camera, visitor, serial, stage)
+            image = self._render(renderer, pose, camera, visitor, serial, level)
         finally:
             spent = perf_counter() - began
-            # The second bound counts where rendering is cheap: the network and the browser have a share, too.
-            self._not_before[stage] = began + max(spent / STAGES[stage].share, LEAST_GAP_S)
+            # The second bound matters if rendering is cheap: it spares the network and the browser.
+            self._not_before[level] = began + max(spent / LEVELS[level].max_share, MIN_GAP_S)
         if image is None:
             return
-        self._adapt(stage, spent)
-        color, depth = presentable(image, camera)
-        if visitor.client.client_id not in self._visitors:  # gone meanwhile
+        self._adapt(level, spent)
+        color, depth = browser_images(image, camera)
+        if visitor.client.client_id not in self._visitors:  # has left meanwhile
             return
         visitor.client.scene.set_background_image(
             color, format="jpeg", jpeg_quality=85,
@@ -218,33 +223,39 @@ class RenderLoop:
         visitor.sent += 1
         with self._wake:
             if visitor.serial == serial:
-                visitor.stage, visitor.renderer = stage, renderer
+                visitor.level, visitor.renderer = level, renderer
 
-    def _adapt(self, stage: int, spent: float) -> None:
-        """Take more or fewer rows next time, so that an image takes about what its stage allows."""
-        plan = STAGES[stage]
-        change = np.clip(np.sqrt(plan.seconds / max(spent, 1e-4)), 0.7, 1.3)
-        self._rows[stage] = float(np.clip(self._rows[stage] * change, plan.least, plan.most))
+    def _adapt(self, number: int, spent: float) -> None:
+        """Change the rows of the next image so that it takes about the time budget of its level."""
+        level = LEVELS[number]
+        change = np.clip(np.sqrt(level.budget_s / max(spent, 1e-4)), 0.7, 1.3)
+        self._rows[number] = float(np.clip(self._rows[number] * change, level.min_rows, level.max_rows))
 
     def _render(
-        self, renderer: Renderer, pose: NDArray, camera: Pinhole, visitor: Visitor, serial: int, stage: int
+        self,
+        renderer: Renderer,
+        pose: NDArray,
+        camera: Pinhole,
+        visitor: ClientState,
+        serial: int,
+        level: int,
     ) -> Rendering | None:
-        """The image in bands; None if the visitor has moved on meanwhile."""
-        bands = max(1, round(STAGES[stage].seconds / BAND_S)) if stage else 1
+        """The image, rendered in bands; None if the visitor has moved meanwhile."""
+        bands = max(1, round(LEVELS[level].budget_s / BAND_S)) if level else 1
         edges = np.linspace(0, camera.height, min(bands, camera.height) + 1).astype(int)
         parts = []
         for top, bottom in pairwise(edges):
-            if stage and (visitor.serial != serial or self._stopped):
+            if level and (visitor.serial != serial or self._stopped):
                 return None
-            parts.append(renderer.render(pose, band(camera, int(top), int(bottom - top))))
+            parts.append(renderer.render(pose, row_band(camera, int(top), int(bottom - top))))
         return Rendering(
             np.concatenate([p.color for p in parts]),
             np.concatenate([p.depth for p in parts]),
             np.concatenate([p.opacity for p in parts]),
         )
 
-    def _points(self, renderer: Renderer | None, now: float) -> bool:
-        """Renew the point cloud if it is wanted and affordable, drop it if it no longer is."""
+    def _update_points(self, renderer: Renderer | None, now: float) -> bool:
+        """Update the point cloud if it is wanted and due; remove it if not wanted. True if updated."""
         if renderer is None or not self.want_points:
             if self._points_shown:
                 self._points_shown, self._points_from = False, None
@@ -263,21 +274,21 @@ class RenderLoop:
             self._show_points(points[good], np.clip(colors[good] * 255, 0, 255).astype(np.uint8))
         return True
 
-    def _complain(self, error: Exception) -> None:
-        """Log a failure once, not at every frame, and slow down."""
+    def _log_error(self, error: Exception) -> None:
+        """Log an error once, not at every frame, and pause for a second."""
         text = f"{type(error).__name__}: {error}"
-        if text != self._complained:
+        if text != self._last_error:
             log.warning("page: rendering for a visitor failed: %s", text, exc_info=error)
-            self._complained = text
+            self._last_error = text
         until = perf_counter() + 1.0
         self._not_before = [max(t, until) for t in self._not_before]
         self._points_not_before = max(self._points_not_before, until)
 
 
-def presentable(image: Rendering, camera: Pinhole) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """What a browser is sent: color uint8 (H, W, 3) and depth float32 (h, w) along the view axis, metres.
+def browser_images(image: Rendering, camera: Pinhole) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The images for a browser: color uint8 (H, W, 3) and depth float32 (h, w) along the view axis, metres.
 
-    Whatever the field rendered is safe to show: what is not a number becomes empty space.
+    Pixels that are not finite become empty space.
     """
     color = np.nan_to_num(image.color, nan=0.0, posinf=1.0, neginf=0.0).astype(np.float32)
     opacity = np.clip(np.nan_to_num(image.opacity, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)

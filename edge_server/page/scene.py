@@ -1,4 +1,4 @@
-"""What stands in the 3D scene: a frustum per camera, the field's points, and where visitors start."""
+"""The 3D scene: a frustum for each camera, the field's points, and the starting viewpoint of visitors."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ log = logging.getLogger(__name__)
 
 THUMBNAIL_WIDTH = 112
 THUMBNAIL_EVERY_S = 1.0
-# Decoding for pictures may take this long per refresh; cameras take turns.
+# Time for decoding thumbnails per refresh; cameras take turns.
 THUMBNAIL_BUDGET_S = 0.03
 FRUSTUM_OF_RADIUS = 0.06
-# The starting place follows the cameras that report late, for so long, and only for who has not moved.
+# For this long the starting viewpoint follows cameras that report late, for visitors who have not moved.
 SETTLE_S = 20.0
-# Cameras report one after the other: wait until no new one has for so long before choosing.
+# Cameras report one after the other: choose a viewpoint when no new one has reported for this long.
 QUIET_S = 0.7
 
 
 @dataclass
-class _Shown:
-    """A camera as it stands in the scene, and what of it was sent last."""
+class _CameraNode:
+    """A camera's frustum, and what was last sent of it."""
 
     handle: Any
     pose: Pose
@@ -44,24 +44,24 @@ class _Shown:
 
 
 class Scene:
-    """Server-wide scene nodes. ``refresh`` is called by one thread, a few times a second."""
+    """Scene nodes shared by all visitors. One thread calls ``refresh``, a few times a second."""
 
     def __init__(self, server: viser.ViserServer, state: EdgeState) -> None:
         self._server = server
         self._state = state
-        self._shown: dict[str, _Shown] = {}
+        self._nodes: dict[str, _CameraNode] = {}
         self._viewpoint: Viewpoint | None = None
         self._placed_for = 0
         self._first_seen: float | None = None
         self._seen = 0
         self._seen_at = 0.0
         self._placed: dict[int, NDArray[np.float64]] = {}
-        self._turn = 0
+        self._next_thumbnail = 0
         self._points: Any = None
         self._undecodable: set[str] = set()
 
     def refresh(self, cameras: list[CameraView], watched: bool) -> None:
-        """Bring the scene up to date, if somebody watches."""
+        """Bring the scene up to date if there are visitors (``watched``)."""
         self._place_visitors(cameras)
         if self._viewpoint is None or not watched:
             return
@@ -71,7 +71,7 @@ class Scene:
         self._thumbnails([c for c in cameras if c.newest is not None])
 
     def show_points(self, points: NDArray | None, colors: NDArray | None) -> None:
-        """Points (N, 3) and uint8 colors (N, 3), or None to show no points."""
+        """Show points (N, 3) with uint8 colors (N, 3), or none."""
         if points is None or colors is None:
             if self._points is not None:
                 self._points.remove()
@@ -87,19 +87,19 @@ class Scene:
 
     def _frustum(self, camera: CameraView, frame: Frame) -> None:
         color = HELD_OUT if camera.held_out else age_color(camera.age_ms)
-        shown = self._shown.get(camera.camera)
-        if shown is None:
-            self._shown[camera.camera] = self._add(camera, frame, color)
+        node = self._nodes.get(camera.camera)
+        if node is None:
+            self._nodes[camera.camera] = self._add(camera, frame, color)
             return
-        if frame.pose != shown.pose:
-            shown.pose = frame.pose
-            shown.handle.wxyz = frame.pose.quaternion
-            shown.handle.position = frame.pose.translation_m
-        if color != shown.color:
-            shown.color = color
-            shown.handle.color = color
+        if frame.pose != node.pose:
+            node.pose = frame.pose
+            node.handle.wxyz = frame.pose.quaternion
+            node.handle.position = frame.pose.translation_m
+        if color != node.color:
+            node.color = color
+            node.handle.color = color
 
-    def _add(self, camera: CameraView, frame: Frame, color: RGB) -> _Shown:
+    def _add(self, camera: CameraView, frame: Frame, color: RGB) -> _CameraNode:
         assert self._viewpoint is not None
         k, size = frame.intrinsics, self._viewpoint.radius_m * FRUSTUM_OF_RADIUS
         handle = self._server.scene.add_camera_frustum(
@@ -122,13 +122,13 @@ class Scene:
             _, height, depth = handle.compute_canonical_frustum_size()
             above = (0.0, -0.75 * height * size, depth * size)
             self._server.scene.add_label(
-                f"/cameras/{camera.camera}/label", "held out: the truth", anchor="bottom-center",
+                f"/cameras/{camera.camera}/label", "held out: ground truth", anchor="bottom-center",
                 position=above, font_screen_scale=0.85,
             )  # fmt: skip
-        return _Shown(handle, frame.pose, color)
+        return _CameraNode(handle, frame.pose, color)
 
     def _look_through(self, client: Any, camera: str) -> None:
-        """Stand where a camera stands, with its lens."""
+        """Move a visitor to a camera's pose and field of view."""
         found = next((c for c in self._state.cameras() if c.camera == camera), None)
         if found is None or found.newest is None or self._viewpoint is None:
             return
@@ -141,31 +141,31 @@ class Scene:
             client.camera.fov = float(2 * np.arctan(0.5 * frame.intrinsics.height / frame.intrinsics.fy))
 
     def _thumbnails(self, cameras: list[CameraView]) -> None:
-        """Renew pictures in turn, within the budget."""
+        """Update thumbnails in turn, within the time budget."""
         began = perf_counter()
         for i in range(len(cameras)):
-            camera = cameras[(self._turn + i) % len(cameras)]
-            frame, shown = camera.newest, self._shown[camera.camera]
+            camera = cameras[(self._next_thumbnail + i) % len(cameras)]
+            frame, node = camera.newest, self._nodes[camera.camera]
             assert frame is not None
             now = perf_counter()
             if now - began > THUMBNAIL_BUDGET_S:
-                self._turn = (self._turn + i) % len(cameras)
+                self._next_thumbnail = (self._next_thumbnail + i) % len(cameras)
                 return
             key = (frame.session, frame.sequence)
-            if key == shown.thumbnail_of or now - shown.thumbnail_at < THUMBNAIL_EVERY_S:
+            if key == node.thumbnail_of or now - node.thumbnail_at < THUMBNAIL_EVERY_S:
                 continue
-            shown.thumbnail_of, shown.thumbnail_at = key, now
-            picture = thumbnail(frame)
-            if picture is not None:
-                shown.handle.image = picture
+            node.thumbnail_of, node.thumbnail_at = key, now
+            image = thumbnail(frame)
+            if image is not None:
+                node.handle.image = image
             elif camera.camera not in self._undecodable:
                 self._undecodable.add(camera.camera)
                 log.warning("page: the newest frame of %s cannot be decoded", camera.camera)
 
-    # --- where visitors stand -------------------------------------------------------------------
+    # --- the starting viewpoint -----------------------------------------------------------------
 
     def _place_visitors(self, cameras: list[CameraView]) -> None:
-        """Choose the starting place once cameras have reported, and again while more of them do."""
+        """Choose the starting viewpoint when cameras have reported, and again while more of them do."""
         poses = [c.newest.pose.matrix() for c in cameras if c.newest is not None]
         now = perf_counter()
         if not poses:
@@ -183,13 +183,13 @@ class Scene:
             start.position, start.look_at, start.up = view.position, view.look_at, view.up
             start.fov = VERTICAL_FOV_RAD
             size = view.radius_m * FRUSTUM_OF_RADIUS
-            for shown in self._shown.values():
-                shown.handle.scale = size
+            for node in self._nodes.values():
+                node.handle.scale = size
         for number, client in self._server.get_clients().items():
             self._place(number, client)
 
     def _place(self, number: int, client: Any) -> None:
-        """Move a visitor to the starting place unless they have gone somewhere of their own choice."""
+        """Move a visitor to the starting viewpoint unless they have moved themselves."""
         assert self._viewpoint is not None
         wanted, last = self._viewpoint.position, self._placed.get(number)
         if last is not None and np.allclose(last, wanted):
@@ -204,7 +204,7 @@ class Scene:
             client.camera.up_direction = self._viewpoint.up
             client.camera.fov = VERTICAL_FOV_RAD
 
-    def forget(self, client: Any) -> None:
+    def remove_client(self, client: Any) -> None:
         self._placed.pop(client.client_id, None)
 
 

@@ -1,4 +1,4 @@
-"""The last minutes as curves: age and omega, fidelity, the channel's state."""
+"""Charts of the last minutes: age and omega, fidelity, the channel's state."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from edge_server.page.markup import chart_caption
 
 WINDOW_S = 120.0
 LINE_PX = 1.6
-# A line without a value in so many rows, such as omega of a policy that has none, is left out.
+# A line without a value in this many last rows, such as omega of a policy that has none, is left out.
 RECENT = 10
-# More points than the chart has pixels would only be sent, never seen.
+# More points than the chart has pixels would be sent but not seen.
 MAX_POINTS = 300
 HEIGHT = 104
 
 
 class History:
-    """Ages and the channel's state as sampled by the page, also while nobody watches. Bounded."""
+    """Ages and the channel's state, sampled by the page with or without visitors. Bounded."""
 
     def __init__(self, window_s: float = WINDOW_S, most: int = 1200) -> None:
         self._window_s = window_s
@@ -32,7 +32,7 @@ class History:
         self.state_names: list[str] = []
 
     def sample(self, t_s: float, cameras: Sequence[CameraView], channel: dict | None) -> None:
-        """Note the training cameras' mean and worst age and the channel's state at ``t_s``."""
+        """Record the training cameras' mean and worst age and the channel's state at ``t_s``."""
         ages = [c.age_ms for c in cameras if not c.held_out and c.age_ms is not None]
         mean, worst = (float(np.mean(ages)), float(np.max(ages))) if ages else (np.nan, np.nan)
         if self._samples and t_s <= self._samples[-1][0]:
@@ -47,18 +47,18 @@ class History:
         return data[:, 0], data[:, 1], data[:, 2], data[:, 3]
 
     def _state_number(self, channel: dict | None) -> float:
-        """The state's place in the emulator's list, or in the order in which states were seen; the mean
-        place where each camera has a chain of its own; NaN where the emulator does not say."""
+        """Index of the state in the emulator's list, or in the order in which states were seen; their mean if
+        each camera has its own chain; NaN if the emulator does not report it."""
         channel = channel or {}
         for name in _names(channel.get("states")):
-            self._place(name)
-        of_each = channel.get("by_camera")
-        lanes = of_each.values() if isinstance(of_each, dict) else ()
-        found = [channel.get("state"), *(lane.get("state") for lane in lanes if isinstance(lane, dict))]
-        places = [self._place(str(state)) for state in found if isinstance(state, str | int)]
-        return float(np.mean(places)) if places else float("nan")
+            self._index(name)
+        by_camera = channel.get("by_camera")
+        chains = by_camera.values() if isinstance(by_camera, dict) else ()
+        states = [channel.get("state"), *(chain.get("state") for chain in chains if isinstance(chain, dict))]
+        numbers = [self._index(str(state)) for state in states if isinstance(state, str | int)]
+        return float(np.mean(numbers)) if numbers else float("nan")
 
-    def _place(self, name: str) -> int:
+    def _index(self, name: str) -> int:
         if name not in self.state_names:
             self.state_names.append(name)
         return self.state_names.index(name)
@@ -69,7 +69,7 @@ def _names(states: Any) -> list[str]:
 
 
 class Timelines:
-    """Three charts in the present GUI container. ``refresh`` is called about once a second."""
+    """Three charts in the current GUI container. ``refresh`` is called about once a second."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._age = _Chart(gui, "Age of the newest frames, ms",
@@ -78,24 +78,24 @@ class Timelines:
         self._channel = _Chart(gui, "Channel", (("state", MIDDLE),), zero=True, stepped=True)
 
     def refresh(self, history: History, publications: Sequence[Publication]) -> None:
-        """Redraw the last WINDOW_S seconds of what there is."""
+        """Redraw the last WINDOW_S seconds."""
         t, mean, worst, state = history.columns()
         now = float(t[-1]) if len(t) else 0.0
         recent = [p for p in publications if p.t_s > now - WINDOW_S]
-        omega = _in_force(t, [(p.t_s, p.omega_ms) for p in recent])
+        omega = _latest_value(t, [(p.t_s, p.omega_ms) for p in recent])
         self._age.draw(t, mean, worst, omega)
         scored = [p for p in recent if p.psnr_db is not None]
         self._psnr.draw(_column(p.t_s for p in scored), _column(p.psnr_db for p in scored),
                         _column(p.psnr_moving_db for p in scored))  # fmt: skip
         names = ", ".join(f"{i} {name}" for i, name in enumerate(history.state_names))
-        self._channel.draw(t, state, note=names)
+        self._channel.draw(t, state, remark=names)
 
 
 class _Chart:
-    """A caption with the lines' colors, and the curves once there is something to connect.
+    """A caption with the lines' colors, and the chart once there are two points.
 
-    uPlot takes a NaN for a number and then finds no ends for its axis, so gaps are filled with what was
-    known before them, and a line that has no values is left out: the chart is made anew without it.
+    uPlot treats NaN as a number and then finds no range for its axis. So gaps are filled with the value
+    before them, and the chart is rebuilt without lines that have no values.
     """
 
     def __init__(
@@ -109,16 +109,16 @@ class _Chart:
         self._shown: tuple[int, ...] = ()
         self._chart: Any = None
 
-    def draw(self, t: NDArray, *curves: NDArray, note: str = "") -> None:
-        """Show curves (N,) over t (N,) seconds, which increase; data are where the first curve has them."""
+    def draw(self, t: NDArray, *curves: NDArray, remark: str = "") -> None:
+        """Show curves (N,) over increasing t (N,) seconds, where the first curve has values."""
         known = np.isfinite(curves[0])
         if known.sum() < 2:
             return
-        kept = _thin(t[known], *(c[known] for c in curves))
+        kept = _decimate(t[known], *(c[known] for c in curves))
         shown = tuple(i for i, c in enumerate(kept[1:]) if np.isfinite(c[-RECENT:]).any())
-        data = (kept[0], *(_filled(kept[1 + i]) for i in shown))
+        data = (kept[0], *(_forward_fill(kept[1 + i]) for i in shown))
         if self._stepped:
-            data = _steps(*data)
+            data = _stairs(*data)
         if shown != self._shown:
             self._shown = shown
             if self._chart is not None:
@@ -127,7 +127,7 @@ class _Chart:
                 self._chart = self._make([self._lines[i] for i in shown], data)
         else:
             self._chart.data = data
-        self._caption.content = chart_caption(self._title, [self._lines[i] for i in shown], note)
+        self._caption.content = chart_caption(self._title, [self._lines[i] for i in shown], remark)
         self._caption.visible = True
 
     def _make(self, lines: Sequence[tuple[str, RGB]], data: tuple[NDArray, ...]) -> Any:
@@ -151,27 +151,27 @@ def _column(values: Any) -> NDArray:
     return np.array([np.nan if v is None else float(v) for v in values], dtype=np.float64)
 
 
-def _thin(*columns: NDArray) -> tuple[NDArray, ...]:
+def _decimate(*columns: NDArray) -> tuple[NDArray, ...]:
     """At most MAX_POINTS rows, the last one kept."""
     step = max(1, -(-len(columns[0]) // MAX_POINTS))
     return tuple(np.ascontiguousarray(c[::-1][::step][::-1], dtype=np.float64) for c in columns)
 
 
-def _filled(values: NDArray) -> NDArray:
-    """Gaps take the value before them, a leading gap the first value. At least one must be finite."""
+def _forward_fill(values: NDArray) -> NDArray:
+    """Fill gaps with the value before them, a leading gap with the first value. One must be finite."""
     known = np.flatnonzero(np.isfinite(values))
     place = np.searchsorted(known, np.arange(len(values)), side="right") - 1
     return values[known[np.maximum(place, 0)]]
 
 
-def _in_force(t: NDArray, events: Sequence[tuple[float, float | None]]) -> NDArray:
-    """Value in force at each t: that of the latest event before it, NaN before the first."""
+def _latest_value(t: NDArray, events: Sequence[tuple[float, float | None]]) -> NDArray:
+    """The value of the latest event (t, value) before each t; NaN before the first."""
     if not events:
         return np.full(len(t), np.nan)
     values = np.concatenate([[np.nan], _column(v for _, v in events)])
     return values[np.searchsorted(_column(s for s, _ in events), t, side="right")]
 
 
-def _steps(t: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
-    """Corners of a staircase: each value holds until the next sample."""
+def _stairs(t: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
+    """Corners of a step function: each value holds until the next sample."""
     return np.repeat(t, 2)[1:], np.repeat(y, 2)[:-1]

@@ -1,4 +1,4 @@
-"""Where a visitor starts, which way is up, and the pinhole camera of a browser window."""
+"""The starting viewpoint, the world's up direction, and the pinhole camera of a browser window."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix
 Array = NDArray[np.float64]
 
 VERTICAL_FOV_RAD = float(np.deg2rad(60.0))
-# The visitor stands this much higher above the horizon than the rig, within bounds.
-ABOVE_RIG_DEG = 10.0
+# The visitor's elevation exceeds that of the cameras by this much, within bounds.
+ABOVE_CAMERAS_DEG = 10.0
 ELEVATION_DEG = (18.0, 55.0)
-# As far away as it takes to see so many of the cameras in a square window, in radii of the rig; no farther,
-# because a field knows little of the space behind the cameras, and hides the scene behind what it imagines.
+# The visitor stands at the nearest of DISTANCES (in multiples of the median camera distance) from which a
+# square window shows this share of the cameras. No farther: a field knows little of the space behind its
+# cameras, and artifacts there would hide the scene.
 SEEN_SHARE = 0.75
 MARGIN = 0.95
 DISTANCES = np.linspace(1.3, 2.2, 37)
-# Below this the mean of unit vectors says nothing: the rig surrounds the scene, or its cameras roll freely.
+# A shorter mean of unit vectors has no meaning: cameras surround the scene, or roll freely.
 _SCATTERED = 0.25
-# Smallest eigenvalue of the mean of I - d d^T at which axes are called parallel (about 3 degrees apart).
+# Axes are parallel if the mean of I - d d^T has a smaller eigenvalue (about 3 degrees apart).
 _PARALLEL = 1e-3
-# The same for the x axes of cameras that face nearly one way (about 10 degrees either side).
+# The same for x axes of cameras that face nearly the same way (about 10 degrees to either side).
 _FAN = 0.03
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where to stand, where to look and what is up: (3,) each, world metres. radius_m: typical distance
-    of the cameras from what they look at, the unit in which the scene is drawn."""
+    """position, look_at, up: (3,) each, world metres. radius_m: median distance of the cameras from the point
+    they look at, the unit of size in the scene."""
 
     position: Array
     look_at: Array
@@ -40,10 +41,10 @@ class Viewpoint:
 
 
 def world_up(poses: Array) -> Array:
-    """Unit vector (3,). poses: camera-to-world (N, 4, 4), N >= 1.
+    """The up direction, unit vector (3,). poses: camera-to-world (N, 4, 4), N >= 1.
 
-    Cameras are held level: up is what their x axes are all at right angles to. Where those are one line (a
-    single camera, a row of them), it is the mean of their -y axes, which leans with a rig that looks down.
+    Cameras are held level, so up is perpendicular to their x axes. If these are parallel (a single camera, a
+    row of cameras), it is the mean of the -y axes, which tilts with cameras that look down.
     """
     ups, sides = -poses[:, :3, 1], poses[:, :3, 0]
     mean = ups.mean(axis=0)
@@ -51,14 +52,14 @@ def world_up(poses: Array) -> Array:
         mean = ups[0]
     spread, directions = np.linalg.eigh(sides.T @ sides / len(sides))
     level = directions[:, 0] * (1.0 if directions[:, 0] @ mean >= 0 else -1.0)
-    # Level cameras that face different ways: sides fill a plane and nearly nothing is across it.
+    # Level cameras that face different ways: their x axes span a plane.
     if spread[1] > _FAN and spread[0] < 0.1 * spread[1] and level @ mean > _SCATTERED:
         return level
     return mean / np.linalg.norm(mean)
 
 
-def convergence(poses: Array) -> Array | None:
-    """Point (3,) nearest to all optical axes in the least-squares sense, None if they do not meet in
+def convergence_point(poses: Array) -> Array | None:
+    """Point (3,) nearest to all optical axes in the least-squares sense. None if the axes do not meet in
     front of most cameras (parallel, diverging, or a single one)."""
     eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -71,15 +72,15 @@ def convergence(poses: Array) -> Array | None:
 
 
 def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> Viewpoint:
-    """Behind and above the rig, looking at what its cameras look at.
+    """A viewpoint behind and above the cameras, looking at what they look at.
 
-    poses: camera-to-world (N, 4, 4), N >= 1. bounds: the field's box (2, 3), used where the optical axes
-    do not meet. Everything returned is finite.
+    poses: camera-to-world (N, 4, 4), N >= 1. bounds: the field's box (2, 3), used if the optical axes do not
+    meet. All values returned are finite.
     """
     poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
     up = world_up(poses)
-    center = convergence(poses)
+    center = convergence_point(poses)
     box = None if bounds is None else np.asarray(bounds, dtype=np.float64)
     if center is None and box is not None and np.all(np.isfinite(box)):
         center = box.mean(axis=0)
@@ -99,18 +100,18 @@ def initial_viewpoint(poses: ArrayLike, bounds: ArrayLike | None = None) -> View
 
 
 def _outward(offsets: Array, up: Array, radius: float) -> Array:
-    """Unit vector from the center to the visitor: above the middle of the rig. offsets: (N, 3) metres."""
+    """Unit vector from the center to the visitor, above the mean camera. offsets: (N, 3) metres."""
     flat = offsets - (offsets @ up)[:, None] * up
     behind = flat.mean(axis=0)
-    if np.linalg.norm(behind) < _SCATTERED * radius:  # a ring of cameras: stand behind the first
+    if np.linalg.norm(behind) < _SCATTERED * radius:  # a ring of cameras: behind the first
         behind = flat[0]
-    if np.linalg.norm(behind) < 1e-6 * radius:  # it looks straight down: any side will do
+    if np.linalg.norm(behind) < 1e-6 * radius:  # it looks straight down: any side
         least = np.zeros(3)
         least[np.argmin(np.abs(up))] = 1.0
         behind = np.cross(up, least)
     behind = behind / np.linalg.norm(behind)
     heights = offsets @ up / np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
-    elevation = np.rad2deg(np.arcsin(np.clip(np.mean(heights), -1, 1))) + ABOVE_RIG_DEG
+    elevation = np.rad2deg(np.arcsin(np.clip(np.mean(heights), -1, 1))) + ABOVE_CAMERAS_DEG
     elevation = np.deg2rad(np.clip(elevation, *ELEVATION_DEG))
     return behind * np.cos(elevation) + up * np.sin(elevation)
 
@@ -125,10 +126,10 @@ def _share_seen(eyes: Array, position: Array, center: Array, up: Array, tangent:
 def visitor_camera(
     position: ArrayLike, wxyz: ArrayLike, fov_rad: float, width: int, height: int, rows: int
 ) -> tuple[Array, Pinhole]:
-    """Camera-to-world (4, 4) and intrinsics of a browser's view at ``rows`` image rows.
+    """Camera-to-world (4, 4) and intrinsics of a browser's view with ``rows`` image rows.
 
-    width, height: canvas pixels; fov_rad: vertical. The image keeps the canvas's aspect, whatever rounding
-    does to its width.
+    position: (3,) metres. wxyz: rotation quaternion. fov_rad: vertical. width, height: canvas pixels. The
+    image has exactly the canvas's field of view although its width is rounded.
     """
     pose = np.eye(4)
     pose[:3, :3] = quaternion_to_matrix(wxyz)
@@ -136,11 +137,11 @@ def visitor_camera(
     rows = max(1, min(rows, height))
     columns = max(1, round(rows * width / max(1, height)))
     f = 0.5 * rows / np.tan(0.5 * fov_rad)
-    # fx differs from fy by that rounding: pixels are stretched over the canvas by the browser.
+    # fx differs from fy by the rounding: the browser stretches pixels over the canvas.
     fx = f * columns / (rows * width / max(1, height))
     return pose, Pinhole(columns, rows, float(fx), float(f), columns / 2.0, rows / 2.0)
 
 
-def band(camera: Pinhole, first_row: int, rows: int) -> Pinhole:
-    """The part of ``camera`` with image rows first_row .. first_row + rows - 1."""
+def row_band(camera: Pinhole, first_row: int, rows: int) -> Pinhole:
+    """The camera of the image rows first_row .. first_row + rows - 1 of ``camera``."""
     return Pinhole(camera.width, rows, camera.fx, camera.fy, camera.cx, camera.cy - first_row)

@@ -94,7 +94,7 @@ def test_policy_and_value_reach_the_server_and_mistakes_are_explained(shown):
 def test_reset_and_snapshot(shown):
     preview, _, browser = shown
     browser.click_text("reset")
-    browser.wait_for_text("starts anew")
+    browser.wait_for_text("starts again")
     browser.wait_for(lambda: not preview.state.controls.reset_requested, "the reset's execution")
     browser.close_notices()
     browser.click_text("snapshot")

@@ -18,7 +18,7 @@ from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, 
 from edge_server.page import Page, PageError, page_url, start_page
 from edge_server.page.panel import PAIR_WIDTH, side_by_side
 from edge_server.page.preview import BallScene, Preview
-from edge_server.page.rendering import DEPTH_ROWS, FAR_M, presentable
+from edge_server.page.rendering import DEPTH_ROWS, FAR_M, browser_images
 from edge_server.page.scene import thumbnail
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.page.visitor import Visitor
@@ -81,7 +81,7 @@ def publication(number: int) -> Publication:
 
 def test_an_image_is_safe_to_show_whatever_was_rendered():
     camera = Pinhole.from_fov(40, 400, 60)
-    color, depth = presentable(Broken().render(np.eye(4), camera), camera)
+    color, depth = browser_images(Broken().render(np.eye(4), camera), camera)
     assert color.dtype == np.uint8 and color.shape == (400, 40, 3)
     assert np.ptp(color.reshape(-1, 3), axis=0).max() == 0  # the backdrop, everywhere
     assert (depth >= FAR_M - 0.01).all() and depth.shape[0] <= DEPTH_ROWS
@@ -92,7 +92,7 @@ def test_depth_is_along_the_view_axis_not_along_the_ray():
     camera = Pinhole.from_fov(64, 64, 50)
     floor = BallScene(0.0).render(look_at((-1.2, 0, 1.0), (-1.2, 0, 0)), camera)
     assert floor.depth[0, 0] > 1.1
-    _, depth = presentable(floor, camera)
+    _, depth = browser_images(floor, camera)
     assert np.allclose(depth, 1.0, atol=0.003)
 
 

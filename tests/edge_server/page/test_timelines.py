@@ -1,11 +1,11 @@
-"""What the curves are drawn from: bounded, without gaps that a chart cannot draw."""
+"""The data of the charts: bounded, without gaps that a chart cannot draw."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from edge_server.live.state import CameraView
-from edge_server.page.timelines import MAX_POINTS, History, _filled, _in_force, _steps, _thin
+from edge_server.page.timelines import MAX_POINTS, History, _decimate, _forward_fill, _latest_value, _stairs
 
 
 def views(*ages: float | None) -> list[CameraView]:
@@ -43,31 +43,31 @@ def test_states_are_numbered_by_the_emulators_list_or_as_they_come():
 
 def test_chains_of_each_camera_are_averaged_and_odd_status_files_survived():
     history = History()
-    lanes = {"a": {"state": "low"}, "b": {"state": "high"}, "c": {}, "d": 3}
-    history.sample(0.0, views(), {"state": None, "states": ["low", "high"], "by_camera": lanes})
+    chains = {"a": {"state": "low"}, "b": {"state": "high"}, "c": {}, "d": 3}
+    history.sample(0.0, views(), {"state": None, "states": ["low", "high"], "by_camera": chains})
     history.sample(1.0, views(), {"states": 7, "by_camera": [1], "state": None})
     assert history.columns()[3][0] == 0.5 and np.isnan(history.columns()[3][1])
 
 
-def test_value_in_force():
+def test_value_latest_value():
     t = np.array([0.0, 1.0, 2.0, 3.0])
-    held = _in_force(t, [(0.5, 100.0), (2.0, None), (2.5, 50.0)])
+    held = _latest_value(t, [(0.5, 100.0), (2.0, None), (2.5, 50.0)])
     assert np.isnan(held[[0, 2]]).all() and held[1] == 100.0 and held[3] == 50.0
-    assert np.isnan(_in_force(t, [])).all()
+    assert np.isnan(_latest_value(t, [])).all()
 
 
 def test_thinning_keeps_the_newest_and_its_place():
     t = np.arange(1000.0)
-    thin_t, thin_y = _thin(t, 2 * t)
+    thin_t, thin_y = _decimate(t, 2 * t)
     assert len(thin_t) <= MAX_POINTS and thin_t[-1] == 999 and np.array_equal(thin_y, 2 * thin_t)
-    assert np.array_equal(_thin(t[:5])[0], t[:5])
+    assert np.array_equal(_decimate(t[:5])[0], t[:5])
 
 
 def test_gaps_are_filled_with_what_was_known():
     nan = np.nan
-    assert _filled(np.array([nan, 2.0, nan, nan, 5.0, nan])).tolist() == [2, 2, 2, 2, 5, 5]
+    assert _forward_fill(np.array([nan, 2.0, nan, nan, 5.0, nan])).tolist() == [2, 2, 2, 2, 5, 5]
 
 
 def test_a_staircase_holds_each_value():
-    t, y = _steps(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
+    t, y = _stairs(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]))
     assert t.tolist() == [0, 1, 1, 2, 2] and y.tolist() == [0, 0, 1, 1, 0]

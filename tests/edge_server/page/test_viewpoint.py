@@ -1,4 +1,4 @@
-"""Where visitors start, and whether their window's camera is the right one."""
+"""The starting viewpoint, and the camera of a visitor's window."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from edge_server.page.preview import BallScene
 from edge_server.page.viewpoint import (
     VERTICAL_FOV_RAD,
-    band,
-    convergence,
+    convergence_point,
     initial_viewpoint,
+    row_band,
     visitor_camera,
     world_up,
 )
@@ -32,18 +32,18 @@ def rig(count: int, spread_deg: float, elevation_deg: float = 20.0, radius_m: fl
 
 
 def test_axes_meet_where_the_cameras_look():
-    assert np.allclose(convergence(rig(7, 120)), TARGET, atol=1e-9)
+    assert np.allclose(convergence_point(rig(7, 120)), TARGET, atol=1e-9)
 
 
 def test_parallel_diverging_and_single_cameras_meet_nowhere():
     parallel = np.stack([np.eye(4)] * 5)
     parallel[:, 0, 3] = np.arange(5)
-    assert convergence(parallel) is None
-    assert convergence(rig(1, 0)) is None
+    assert convergence_point(parallel) is None
+    assert convergence_point(rig(1, 0)) is None
     outward = rig(6, 90)
     outward[:, :3, 0] *= -1  # turned half about their y axis: they look away from the center
     outward[:, :3, 2] *= -1
-    assert convergence(outward) is None
+    assert convergence_point(outward) is None
 
 
 @pytest.mark.parametrize("elevation_deg", [0, 35, 70])
@@ -159,6 +159,6 @@ def test_bands_are_the_image():
     _, camera = visitor_camera(pose[:3, 3], matrix_to_quaternion(pose[:3, :3]), 0.8, 160, 120, 61)
     scene = BallScene(0.7)
     whole = scene.render(pose, camera)
-    parts = [scene.render(pose, band(camera, a, b - a)) for a, b in ((0, 20), (20, 47), (47, 61))]
+    parts = [scene.render(pose, row_band(camera, a, b - a)) for a, b in ((0, 20), (20, 47), (47, 61))]
     assert np.allclose(np.concatenate([p.color for p in parts]), whole.color, atol=1e-6)
     assert np.allclose(np.concatenate([p.depth for p in parts]), whole.depth, atol=1e-4)
