@@ -82,6 +82,7 @@ bench: .venv/.ok-test  ## measure this machine, hours: docs/results/field.*, run
 	  --json $(if $(findstring --quick,$(BENCH)),runs/quick,docs/results)/field.json $(BENCH)
 	$(PY) -m channel_emu.cli bench --json | tee runs/bench-emulator.json
 	$(PY) -m camera_node.synthetic.effect_costs --json runs/bench-world.json
+	$(PY) docs/tables.py  # the tables of docs/ are made from these files
 
 proto: .venv/.ok-test  ## regenerate proto/freshfield/v1 from its .proto files
 	cd proto && ../$(PY) $(call PROTOC,.) freshfield/v1/*.proto

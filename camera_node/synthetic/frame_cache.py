@@ -40,7 +40,6 @@ _NAME = re.compile("[0-9a-f]{32}")  # of the folder of one camera's frames
 _TOOLS = (
     "frame_cache.py",
     "effect_costs.py",
-    "prerender.py",
     "preview.py",
     "source.py",
 )  # do not decide what a frame looks like

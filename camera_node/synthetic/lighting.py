@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.synthetic.placement import Placed
 from camera_node.synthetic.shapes import Array
 from camera_node.synthetic.textures import Colour
-
-if TYPE_CHECKING:
-    from camera_node.synthetic.render import Placed
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.synthetic import motion
-from camera_node.synthetic.render import Mover, Part
+from camera_node.synthetic.placement import Mover, Part
 from camera_node.synthetic.shapes import RoundCone, Sphere, capsule
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
 

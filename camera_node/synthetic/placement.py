@@ -1,11 +1,15 @@
-"""Where parts stand: world-from-local matrices (4, 4)."""
+"""Parts of a world and where they stand: world-from-local matrices (4, 4)."""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
-Array = NDArray[np.float64]
+import numpy as np
+
+from camera_node.synthetic.shapes import Array, Shape
+from camera_node.synthetic.textures import Texture
+
 Vector = tuple[float, float, float]
 
 
@@ -24,3 +28,58 @@ def facing(x_axis: Vector, y_axis: Vector, centre: Vector) -> Array:
     out[:3, 0], out[:3, 1], out[:3, 3] = x_axis, y_axis, centre
     out[:3, 2] = np.cross(x_axis, y_axis)
     return out
+
+
+@dataclass(frozen=True)
+class Part:
+    """A shape with its texture and, for a part that does not move, its world-from-local matrix (4, 4)."""
+
+    shape: Shape
+    texture: Texture
+    matrix: Array = field(default_factory=lambda: np.eye(4))
+    casts_shadow: bool = True
+    takes_contact: bool = False  # darkened beneath moving parts (floors, rugs)
+    glow: float = 0.0  # share of the albedo that shines of itself (lamps)
+
+
+@dataclass(frozen=True)
+class Mover:
+    """Parts that move together: ``matrices(t_s)`` gives their world-from-local matrices (M, 4, 4), which
+    may scale. ``contact`` lists the parts (index, radius in metres) that darken the floor beneath."""
+
+    parts: tuple[Part, ...]
+    matrices: Callable[[float], Array]
+    contact: tuple[tuple[int, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Parts where they are at one instant: world-from-local matrices (M, 4, 4), the inverses (M, 3, 3) of
+    their linear parts, and bounding spheres in world axes, centres (M, 3) and radii (M,)."""
+
+    parts: Sequence[Part]
+    matrices: Array
+    inverse: Array
+    centres: Array
+    radii: Array
+
+
+def place(parts: Sequence[Part], matrices: Array) -> Placed:
+    """Prepare ``parts`` at ``matrices`` (M, 4, 4) for casting."""
+    linear = matrices[:, :3, :3]
+    spheres = [p.shape.bounding_sphere() for p in parts]
+    centres = np.array([c for c, _ in spheres]).reshape(-1, 3, 1)
+    # The columns of rotation times scale are orthogonal, so the longest is the largest stretch.
+    stretch = np.sqrt((linear * linear).sum(axis=1).max(axis=1, initial=0.0))
+    return Placed(
+        parts,
+        matrices,
+        np.asarray(np.linalg.inv(linear), dtype=np.float64),
+        (linear @ centres)[:, :, 0] + matrices[:, :3, 3],
+        np.array([r for _, r in spheres]) * stretch,
+    )
+
+
+def place_still(parts: Sequence[Part]) -> Placed:
+    """Prepare parts that do not move."""
+    return place(parts, np.array([p.matrix for p in parts]).reshape(-1, 4, 4))

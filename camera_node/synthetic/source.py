@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+import pickle
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,12 +18,13 @@ from camera_node.sources.playback import rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, EffectError
 from camera_node.synthetic.frame_cache import FrameCache
-from camera_node.synthetic.prerender import fill_in_child
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
     from camera_node.synthetic.effects import Effects
+
+log = logging.getLogger("camera-node")
 
 Stopped = Callable[[], bool]
 
@@ -26,6 +32,7 @@ WORLD_FPS = 15.0
 # Casting takes some 350 bytes a ray at its peak. Beyond this many rays another process renders ahead, so
 # that this one stays small.
 _MAX_RAYS = 200_000
+_POLL_S = 0.1
 
 
 class WorldSource(Source):
@@ -126,3 +133,43 @@ def _names(scenario: Scenario, scene: Scene) -> dict[str, str]:
     if len(known) < len(scenario.cameras):
         raise ScenarioError(f"{scenario.path}: cameras: the scene has {len(known)}: {', '.join(known)}")
     return dict(zip(scenario.cameras, known))
+
+
+def fill_in_child(scenario: Scenario, config: WorldConfig, camera: str, stopped: Callable[[], bool]) -> None:
+    """Have one camera's frames rendered by a process of its own, which frees its memory when it ends: casting a
+    large image takes hundreds of megabytes. Returns when the frames are there, when ``stopped`` says so, or
+    when the child failed; frames that are missing then are rendered as they are needed."""
+    log.info("%s: rendering its frames ahead, once: they are kept for next time", camera)
+    begin = time.perf_counter()
+    child = subprocess.Popen([sys.executable, "-m", "camera_node.synthetic.source"], stdin=subprocess.PIPE)
+    try:
+        assert child.stdin is not None
+        try:
+            with child.stdin:
+                child.stdin.write(pickle.dumps((scenario, config, camera)))
+        except BrokenPipeError:
+            pass  # its exit status says the same
+        while child.poll() is None and not stopped():
+            time.sleep(_POLL_S)
+    finally:
+        child.terminate()
+        status = child.wait()
+    if status == 0:
+        log.info("%s: frames are ready after %.1f s", camera, time.perf_counter() - begin)
+    elif not stopped():
+        log.warning("%s: rendering ahead failed (exit %d): frames are rendered as they come", camera, status)
+
+
+def _child() -> None:
+    scenario, config, camera = pickle.load(sys.stdin.buffer)
+    from camera_node.sources.with_effects import camera_effects
+
+    effects = {camera: camera_effects(scenario, config, camera)}
+    frames = frame_caches(scenario, config, [camera], effects)[camera]
+    frames.fill(stop=lambda: frames.disk_error is not None)
+    if frames.disk_error is not None:
+        sys.exit(f"camera-node: {frames.disk_error}")
+
+
+if __name__ == "__main__":
+    _child()

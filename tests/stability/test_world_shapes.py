@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from camera_node.synthetic.render import CameraRenderer, Light, Part, World
+from camera_node.synthetic.placement import Part
+from camera_node.synthetic.render import CameraRenderer, Light, World
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
 from camera_node.synthetic.textures import Checker
 from freshfield.geometry import Pinhole, look_at

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from camera_node.synthetic.motion import TICK_S, bone_frames, phase_of
-from camera_node.synthetic.render import Mover, Part
+from camera_node.synthetic.placement import Mover, Part
 from camera_node.synthetic.shapes import Array, capsule
 from camera_node.synthetic.textures import Stripes
 

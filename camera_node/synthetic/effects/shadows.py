@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic.effects import check_ranges
 from camera_node.synthetic.lighting import Gloss, Light, Lit, direct
-from camera_node.synthetic.render import SHADOW_BIAS, Placed, cast, place
+from camera_node.synthetic.placement import Placed, place
+from camera_node.synthetic.render import SHADOW_BIAS, cast
 from camera_node.synthetic.shapes import Array
 
 if TYPE_CHECKING:

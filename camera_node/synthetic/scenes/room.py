@@ -13,9 +13,10 @@ import numpy as np
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.person import walk_at, walking_person
+from camera_node.synthetic.placement import Part
 from camera_node.synthetic.placement import at as _at
 from camera_node.synthetic.placement import facing as _facing
-from camera_node.synthetic.render import Light, Part, World
+from camera_node.synthetic.render import Light, World
 from camera_node.synthetic.scene import MovingParams, Scene, pinhole
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere
 

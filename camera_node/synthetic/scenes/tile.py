@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.motion import TICK_S
-from camera_node.synthetic.render import Light, Part, World
+from camera_node.synthetic.placement import Part
+from camera_node.synthetic.render import Light, World
 from camera_node.synthetic.scene import BaseParams, Scene, pinhole
 from camera_node.synthetic.shapes import Box, Cylinder, Sphere
 

@@ -15,8 +15,8 @@ import numpy as np
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.person import Walk, walk_at, walking_person
-from camera_node.synthetic.placement import at, facing
-from camera_node.synthetic.render import Light, Mover, Part, World
+from camera_node.synthetic.placement import Mover, Part, at, facing
+from camera_node.synthetic.render import Light, World
 from camera_node.synthetic.scene import MovingParams, Scene, pinhole
 from camera_node.synthetic.shapes import Array, Box, Cylinder, Quad, RoundCone, Sphere, capsule
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.camera_rig import on_sphere
-from camera_node.synthetic.render import Placed, cast, place_still, surfaces
+from camera_node.synthetic.placement import Placed, place_still
+from camera_node.synthetic.render import cast, surfaces
 from camera_node.synthetic.scene import Scene
 from edge_server.fields import View
 from edge_server.surface.metrics import STEEPEST_DEG, Truth, thinned

@@ -7,16 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from camera_node.synthetic.render import (
-    CameraRenderer,
-    Light,
-    Mover,
-    Part,
-    World,
-    cast,
-    place_still,
-    rays_within,
-)
+from camera_node.synthetic.placement import Mover, Part, place_still
+from camera_node.synthetic.render import CameraRenderer, Light, World, cast, rays_within
 from camera_node.synthetic.shapes import Box, Quad, Sphere, nearest_hit
 from camera_node.synthetic.textures import Checker, Noise, Plain
 from freshfield.geometry import Pinhole, look_at, se3_inverse, world_rays

@@ -14,7 +14,8 @@ from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, inverse, transform_of
 from camera_node.robot.calibration.targets import Grey, Target
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.render import CameraRenderer, Part, World
+from camera_node.synthetic.placement import Part
+from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.shapes import Quad
 from camera_node.synthetic.textures import Plain
 from freshfield.geometry import Pinhole, look_at, se3_inverse, so3_exp

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import on_sphere
 from camera_node.synthetic.person import walk_at, walking_person
-from camera_node.synthetic.placement import at
-from camera_node.synthetic.render import CameraRenderer, Mover, Part, World, cast, place, place_still
+from camera_node.synthetic.placement import Mover, Part, at, place, place_still
+from camera_node.synthetic.render import CameraRenderer, World, cast
 from camera_node.synthetic.scene import Scene, make_scene
 from camera_node.synthetic.shapes import Array, Cylinder, Quad, Shape, Sphere
 from freshfield.geometry import Pinhole, look_at, world_rays

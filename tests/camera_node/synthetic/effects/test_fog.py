@@ -10,7 +10,8 @@ import pytest
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects.fog import Fog, FogParameters
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.render import CameraRenderer, Mover, Part, World
+from camera_node.synthetic.placement import Mover, Part
+from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import Sphere
 from camera_node.synthetic.textures import Plain

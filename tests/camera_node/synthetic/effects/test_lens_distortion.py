@@ -10,7 +10,8 @@ from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import EffectError, load_effects
 from camera_node.synthetic.frame_cache import FrameCache
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.render import Part, World
+from camera_node.synthetic.placement import Part
+from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Sphere
 from camera_node.synthetic.textures import Plain
 from freshfield.geometry import Pinhole, se3_inverse

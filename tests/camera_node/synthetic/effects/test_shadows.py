@@ -11,7 +11,8 @@ from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import load_effects
 from camera_node.synthetic.effects.shadows import Shadows, ShadowsParameters
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.render import CameraRenderer, Mover, Part, World
+from camera_node.synthetic.placement import Mover, Part
+from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import Box, Quad, Sphere
 from camera_node.synthetic.textures import Checker, Plain

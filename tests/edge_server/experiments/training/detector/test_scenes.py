@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from camera_node.synthetic.placement import at
-from camera_node.synthetic.render import Light, Mover, Part, World
+from camera_node.synthetic.placement import Mover, Part, at
+from camera_node.synthetic.render import Light, World
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from camera_node.synthetic.textures import Plain
 from edge_server.experiments.training.detector.dataset import Pictures, render
