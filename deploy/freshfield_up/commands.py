@@ -76,52 +76,38 @@ def process_set(
     """
     edge_port, emulator_port = free_ports(2)
     edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
-    file = str(scenario.path)
     common = ["--out", str(out), *(["--seed", str(seed)] if seed is not None else [])]
-    one = _threads(_SINGLE_THREADED, 1)
     recorded = ["--data", str(data)] if data is not None else []
-    edge = Child(
-        "edge",
-        "the edge server",
-        [
-            *(program("edge-server"), "run", file, "--listen", edge_address),
-            *("--page-host", LOOPBACK, "--page-port", str(page_port)),
-            *(*common, *recorded, *edge_options),
-        ],
-        out / "log-edge.txt",
-        _threads(_EDGE_THREADS, _cores()),
-    )
-    emulator = Child(
-        "emulator",
-        "the channel emulator",
-        [
-            *(program("channel-emu"), "run", file),
-            *("--listen", emulator_address, "--to", edge_address, *common),
-        ],
-        out / "log-emulator.txt",
-        one,
-    )
-    groups = [[camera] for camera in scenario.cameras] if process_per_camera else [[]]
-    nodes = []
-    for cameras in groups:
-        which = ["--camera", ",".join(cameras)] if cameras else ["--all"]
-        name = f"node-{cameras[0]}" if cameras else "node"
-        role = f"the camera node of {', '.join(cameras)}" if cameras else "the camera node"
-        command = [program("camera-node"), "run", file, *which, "--to", emulator_address, *common, *recorded]
-        nodes.append(Child(name, role, command, out / f"log-{name}.txt", one))
+    single_threaded = _threads(_SINGLE_THREADED, 1)
+
+    def child(name: str, role: str, command: str, action: str, *arguments: str) -> Child:
+        words = [program(command), action, str(scenario.path), *arguments]
+        return Child(name, role, words, out / f"log-{name}.txt", single_threaded)
+
+    edge = child(
+        "edge", "the edge server", "edge-server", "run", "--listen", edge_address,
+        "--page-host", LOOPBACK, "--page-port", str(page_port), *common, *recorded, *edge_options,
+    )  # fmt: skip
+    edge.environment = _threads(_EDGE_THREADS, _cores())
+    emulator = child(
+        "emulator", "the channel emulator", "channel-emu", "run", "--listen", emulator_address,
+        "--to", edge_address, *common,
+    )  # fmt: skip
+
+    def node(name: str, role: str, *cameras: str) -> Child:
+        arguments = (*cameras, "--to", emulator_address, *common, *recorded)
+        return child(name, role, "camera-node", "run", *arguments)
+
+    if process_per_camera:
+        nodes = [node(f"node-{c}", f"the camera node of {c}", "--camera", c) for c in scenario.cameras]
+    else:
+        nodes = [node("node", "the camera node", "--all")]
     arm = scenario.source.get("arm")
     if not isinstance(arm, dict) or not arm.get("simulated"):
         return ProcessSet(edge, emulator, nodes, edge_address, emulator_address)
-    arms, drivers = [
-        [Child(name, role, [program("camera-node"), command, file], out / f"log-{name}.txt", one)]
-        for name, role, command in (
-            ("arm", "the simulated arm", "simulate-arm"),
-            ("driver", "the arm's driver", "drive-arm"),
-        )
-    ]
+    arms = [child("arm", "the simulated arm", "camera-node", "simulate-arm")]
+    drivers = [child("driver", "the arm's driver", "camera-node", "drive-arm")] if arm.get("path") else []
     arm_address = f"{arm.get('host')}:{_ARM_PORT}"
-    if not arm.get("path"):
-        drivers = []
     return ProcessSet(edge, emulator, nodes, edge_address, emulator_address, arms, arm_address, drivers)
 
 

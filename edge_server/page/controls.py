@@ -95,7 +95,7 @@ class ControlPanel:
         if pressed == "reset":
             controls.reset_requested = True
             self.updates_at_reset = next((p.number + 1 for p in reversed(self._state.publications())), 0)
-            _notify(client, "Reset", "The field forgets the scene and starts again.")
+            notify(client, "Reset", "The field forgets the scene and starts again.")
         elif pressed == "snapshot":
             save = partial(self._attempt, client, "snapshot", lambda: self._snapshot(client))
             threading.Thread(target=save, name="page-snapshot", daemon=True).start()
@@ -105,7 +105,7 @@ class ControlPanel:
 
     def _snapshot(self, client: Any) -> None:
         path = self._state.save_snapshot()
-        _notify(client, "Snapshot saved", str(path), seconds=30.0)
+        notify(client, "Snapshot saved", str(path), seconds=30.0)
 
     def _attempt(self, client: Any, what: str, action: Any) -> None:
         """Call ``action``; if it fails, notify the client and show the values still in force."""
@@ -113,7 +113,7 @@ class ControlPanel:
             action()
         except Exception as error:  # any failure is shown to the operator and never ends the page
             log.info("page: %s refused: %s", what, error)
-            _notify(client, f"Not done: {what}", str(error) or type(error).__name__, bad=True)
+            notify(client, f"Not done: {what}", str(error) or type(error).__name__, bad=True)
         self.refresh()
 
     def _parameter_of(self, policy: str) -> str | None:
@@ -143,6 +143,7 @@ def _help(policy: str) -> str:
     return note(re.sub(r" \([\d.-]+\)", "", policy_help(policy).split("; value:")[0]))
 
 
-def _notify(client: Any, title: str, body: str, bad: bool = False, seconds: float = NOTICE_S) -> None:
+def notify(client: Any, title: str, body: str, bad: bool = False, seconds: float = NOTICE_S) -> None:
+    """Show a notification to ``client``, if there is one."""
     if client is not None:
         client.add_notification(title, body, auto_close_seconds=seconds, color="red" if bad else None)

@@ -9,6 +9,7 @@ from typing import Any
 import viser
 
 from edge_server.live.state import EdgeState
+from edge_server.page.controls import notify
 
 log = logging.getLogger(__name__)
 
@@ -57,10 +58,7 @@ class MeshLayer:
             label = "hide mesh"
         except Exception as error:  # any failure is shown to the visitor and never ends the page
             log.info("page: no mesh: %s", error)
-            if client is not None:
-                client.add_notification(
-                    "No mesh", str(error) or type(error).__name__, auto_close_seconds=NOTICE_S, color="red"
-                )
+            notify(client, "No mesh", str(error) or type(error).__name__, bad=True, seconds=NOTICE_S)
         finally:
             self.button.label, self.button.disabled = label, False
 

@@ -1,4 +1,4 @@
-"""One look for all figures: quiet axes, readable sizes, colors that color-blind readers can tell apart."""
+"""The style of all figures: light axes, readable sizes, colors that color-blind readers can tell apart."""
 
 from __future__ import annotations
 
@@ -9,22 +9,15 @@ from typing import Any
 
 import matplotlib
 
-matplotlib.use("Agg")  # figures are files; no display is ever needed
+matplotlib.use("Agg")  # figures are files; no display is needed
 
 import matplotlib.pyplot as plt
 from cycler import cycler
 from matplotlib.axes import Axes
 
 # Okabe and Ito's palette, ordered so that neighbours differ in lightness too.
-BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, YELLOW = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#E69F00",
-    "#56B4E9",
-    "#CC79A7",
-    "#F0E442",
-)
+BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"
+ORANGE, SKY, PURPLE = "#E69F00", "#56B4E9", "#CC79A7"
 INK, GREY, PALE = "#222222", "#777777", "#E4E4E4"
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE)
 WIDTH_INCH = 8.4
@@ -73,14 +66,14 @@ def figure(
         )
         try:
             yield fig, axes
-            # No creation date inside: the same run draws the same bytes.
+            # Without a creation date, so that the same run draws the same bytes.
             fig.savefig(path, metadata={"Software": "freshfield"})
         finally:
             plt.close(fig)
 
 
 def label_lines(axes: Axes, y: str, x: str | None = None, title: str | None = None) -> None:
-    """Axis labels, title and, where there is something to tell apart, a legend beside the plot."""
+    """Axis labels, a title and, for more than one line, a legend beside the plot."""
     axes.set_ylabel(y)
     if x:
         axes.set_xlabel(x)

@@ -7,9 +7,7 @@ import os
 import re
 import shutil
 import subprocess
-import time
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,6 +15,7 @@ import yaml
 
 from freshfield.scenario import load
 from tests.conftest import ROOT
+from tests.waiting import wait_until
 
 FILE = ROOT / "deploy" / "compose.yaml"
 COMPOSE = yaml.safe_load(FILE.read_text())
@@ -116,9 +115,10 @@ def test_the_deployment_streams_and_accounts_for_every_frame(tmp_path: Path) -> 
         run(*compose, "build")
     try:
         run(*compose, "up", "-d")
-        wait_until(page_answers, 180.0)
+        wait_until(page_answers, "the page did not answer", 180.0)
         alone = [below, "run", "--rm", "-v", "deploy_runs:/runs", "localhost/freshfield-edge"]
-        wait_until(lambda: json.loads(run(*alone, "cat", "/runs/edge.json"))["updates"]["count"] >= 5, 300.0)
+        status = (*alone, "cat", "/runs/edge.json")
+        wait_until(lambda: json.loads(run(*status))["updates"]["count"] >= 5, "no five updates", 300.0)
         for group in (list(CAMERAS), ["emulator"], ["edge"]):
             run(*compose, "stop", *group)
         run(*alone, "edge-server", "report", "/runs")
@@ -129,13 +129,6 @@ def test_the_deployment_streams_and_accounts_for_every_frame(tmp_path: Path) -> 
     assert report["frames"]["delivered"] > 100
     assert set(report["age_ms"]["by_camera"]) >= set(CAMERAS) - {"cam00"}
     assert report["updates"]["count"] >= 5 and report["fidelity"]["final"]["psnr_db"] is not None
-
-
-def wait_until(what: Callable[[], bool], seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < deadline, f"it did not happen in {seconds:.0f} s"
-        time.sleep(1.0)
 
 
 def page_answers() -> bool:

@@ -47,12 +47,8 @@ def test_installing_the_oldest_allowed_protobuf_satisfies_the_generated_code() -
 
 
 def test_cameras_and_emulator_install_without_torch() -> None:
-    assert not {Requirement(r).name for r in PROJECT["dependencies"]} & {
-        "torch",
-        "viser",
-        "numba",
-        "matplotlib",
-    }
+    required = {Requirement(r).name for r in PROJECT["dependencies"]}
+    assert not required & {"torch", "viser", "numba", "matplotlib"}
 
 
 def dry_run(*arguments: str, **variables: str) -> str:

@@ -14,23 +14,17 @@ import pytest
 
 from freshfield_up import processes
 from freshfield_up.processes import Child
+from tests.waiting import wait_until
 
 
 def python(tmp_path: Path, code: str, name: str = "one") -> Child:
     return Child(name, f"process {name}", [sys.executable, "-c", code], tmp_path / f"log-{name}.txt")
 
 
-def wait_for(what, seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.02)
-
-
 def test_the_exit_summary_names_the_exit_code_and_the_last_lines(tmp_path: Path) -> None:
     child = python(tmp_path, "print('reading'); raise SystemExit('the lens cap is on')")
     child.start()
-    wait_for(lambda: not child.running)
+    wait_until(lambda: not child.running, "it did not end")
     text = child.exit_summary()
     assert "process one ended by itself with exit code 1" in text
     assert "| the lens cap is on" in text and "| reading" in text
@@ -41,7 +35,7 @@ def test_the_exit_summary_names_the_signal(tmp_path: Path) -> None:
     child = python(tmp_path, "import time; time.sleep(60)")
     child.start()
     os.kill(child.pid, signal.SIGKILL)
-    wait_for(lambda: not child.running)
+    wait_until(lambda: not child.running, "it did not end")
     assert "killed by SIGKILL" in child.exit_summary()
     assert "wrote nothing" in child.exit_summary()
 
@@ -55,7 +49,7 @@ def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path: Path) ->
                   "print('up')\ntime.sleep(60)", "stubborn")  # fmt: skip
     for child in (obedient, stubborn):
         child.start()
-        wait_for(lambda child=child: "\nup\n" in child.log.read_text())
+        wait_until(lambda child=child: "\nup\n" in child.log.read_text(), "it did not start")
     began = time.monotonic()
     processes.stop([obedient, stubborn], grace_s=1.0)
     assert time.monotonic() - began < 5.0
@@ -81,7 +75,7 @@ time.sleep(60)
         pid = int(parent.stdout.readline())
         assert Path(f"/proc/{pid}").exists()
         parent.kill()
-    wait_for(lambda: not _lives(pid))
+    wait_until(lambda: not _lives(pid), "the child outlived its parent")
 
 
 def _lives(pid: int) -> bool:

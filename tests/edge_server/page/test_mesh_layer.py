@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,16 +14,17 @@ from edge_server.fields import View
 from edge_server.page.mesh_layer import NODE, MeshLayer
 from tests.edge_server.page.test_page import bare_state, publication
 from tests.edge_server.surface.shapes import LENS, BallRenderer, around
+from tests.waiting import wait_until
 
 
 class Client:
-    """Keeps what it is told."""
+    """Records notifications."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[str, str]] = []
+        self.notifications: list[tuple[str, str]] = []
 
     def add_notification(self, title: str, body: str, **more) -> None:
-        self.told.append((title, body))
+        self.notifications.append((title, body))
 
 
 @pytest.fixture
@@ -36,10 +36,7 @@ def server():
 
 def press(layer: MeshLayer, client: Client) -> None:
     layer._pressed(SimpleNamespace(client=client))
-    end = time.monotonic() + 60
-    while layer.button.disabled:
-        assert time.monotonic() < end, "the mesh was not finished"
-        time.sleep(0.02)
+    wait_until(lambda: not layer.button.disabled, "the mesh was not finished", timeout_s=60.0)
 
 
 def test_a_mesh_comes_and_goes(server):
@@ -50,7 +47,7 @@ def test_a_mesh_comes_and_goes(server):
     state.publish(publication(0), BallRenderer(cameras))
     layer = MeshLayer(server, state)
     press(layer, client)
-    assert client.told == [] and layer.button.label == "hide mesh"
+    assert client.notifications == [] and layer.button.label == "hide mesh"
     assert layer._node is not None and layer._node.name == NODE
     press(layer, client)
     assert layer._node is None and layer.button.label == "show mesh"
@@ -60,11 +57,11 @@ def test_a_field_that_has_seen_nothing_has_no_mesh(server):
     client = Client()
     layer = MeshLayer(server, bare_state())
     press(layer, client)
-    assert client.told == [("No mesh", "the field has not been trained yet")]
+    assert client.notifications == [("No mesh", "the field has not been trained yet")]
     assert layer.button.label == "show mesh" and layer._node is None
 
 
-def test_nothing_of_it_is_loaded_before_it_is_asked_for():
+def test_nothing_for_it_is_loaded_before_the_first_press():
     code = (
         "import sys, edge_server.page, edge_server.live.server\n"
         "loaded = [m for m in sys.modules if m.startswith(('edge_server.surface', 'skimage'))"

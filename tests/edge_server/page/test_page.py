@@ -1,4 +1,4 @@
-"""The page as its visitors' machines see it: alive through anything, bounded in what it sends and costs."""
+"""The page as browsers receive it: it survives every failure, and bounds what it sends and costs."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from edge_server.page.rendering import DEPTH_ROWS, FAR_M, browser_images
 from edge_server.page.scene import thumbnail
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.page.visitor import Visitor
+from tests.waiting import wait_until
 
 
 @contextlib.contextmanager
@@ -79,7 +80,7 @@ def publication(number: int) -> Publication:
 # --- what is sent ------------------------------------------------------------------------------
 
 
-def test_an_image_is_safe_to_show_whatever_was_rendered():
+def test_an_image_is_valid_whatever_was_rendered():
     camera = Pinhole.from_fov(40, 400, 60)
     color, depth = browser_images(Broken().render(np.eye(4), camera), camera)
     assert color.dtype == np.uint8 and color.shape == (400, 40, 3)
@@ -98,8 +99,9 @@ def test_depth_is_along_the_view_axis_not_along_the_ray():
 
 def test_thumbnails_are_small_and_damaged_frames_have_none(tmp_path):
     preview = Preview(tmp_path)
-    with contextlib.closing(_Running(preview)):
-        _until(lambda: any(c.newest for c in preview.cameras()))
+    preview.start()
+    wait_until(lambda: any(c.newest for c in preview.cameras()), "no frame arrived")
+    preview.stop()
     frame = next(c.newest for c in preview.cameras() if c.newest)
     assert thumbnail(frame).shape == (84, 112, 3)
     assert thumbnail(replace(frame, payload=b"\xff\xd8 nothing")) is None
@@ -122,7 +124,7 @@ def test_the_address_can_be_opened():
     assert page_url("::1", 8080) == "http://[::1]:8080"
 
 
-def test_a_taken_port_is_said_not_silently_exchanged():
+def test_a_taken_port_is_reported():
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -154,7 +156,7 @@ def test_stop_frees_the_port_and_ends_the_threads(tmp_path, capfd):
 
 def test_a_visitor_is_sent_the_scene_from_where_they_stand(tmp_path):
     with preview_page(tmp_path) as (preview, page):
-        _until(lambda: preview.state.started)
+        wait_until(lambda: preview.state.started, "no update")
         preview.state.controls.paused = True
         with Visitor(page.port, (4.0, 0.0, 3.0)) as visitor:
             visitor.wait_for(lambda: visitor.images >= 2, "a coarse and a finer image")
@@ -171,7 +173,7 @@ def test_a_visitor_is_sent_the_scene_from_where_they_stand(tmp_path):
 
 def test_images_come_coarse_first_then_fine(tmp_path):
     with preview_page(tmp_path) as (preview, page):
-        _until(lambda: preview.state.started)
+        wait_until(lambda: preview.state.started, "no update")
         preview.state.controls.paused = True
         with Visitor(page.port) as visitor:
             visitor.wait_for(lambda: visitor.images >= 1, "an image")
@@ -202,10 +204,10 @@ def test_rates_are_bounded_however_fast_the_field_publishes(tmp_path):
         assert visitor.bytes / seconds < 3e6
 
 
-def test_a_visitor_who_does_not_read_costs_no_memory_and_holds_up_nobody(tmp_path):
+def test_a_visitor_who_does_not_read_costs_no_memory_and_delays_nobody(tmp_path):
     with (
         preview_page(tmp_path) as (_, page),
-        Visitor(page.port, reads=False) as deaf,
+        Visitor(page.port, reads=False) as stuck,
         Visitor(page.port, (0.0, 4.0, 3.0)) as visitor,
     ):
         visitor.wait_for(lambda: visitor.images > 2, "images for who does read")
@@ -216,7 +218,7 @@ def test_a_visitor_who_does_not_read_costs_no_memory_and_holds_up_nobody(tmp_pat
             handle.scene.set_background_image(noise)
             time.sleep(0.05)
         for i in range(40):
-            deaf.stand_at((4.0, 0.05 * i, 3.0))
+            stuck.stand_at((4.0, 0.05 * i, 3.0))
             time.sleep(0.05)
         # What is not read is replaced, not queued: at most one image and the starting place.
         assert 1 <= len(waiting) <= 12
@@ -224,7 +226,7 @@ def test_a_visitor_who_does_not_read_costs_no_memory_and_holds_up_nobody(tmp_pat
         visitor.wait_for(lambda: visitor.images > at, "an image for who does read")
 
 
-def test_nobody_watching_costs_no_rendering(tmp_path):
+def test_nothing_is_rendered_without_visitors(tmp_path):
     broken = Broken()
     state = bare_state()
     page = start_page(state, "127.0.0.1", 0)
@@ -252,7 +254,7 @@ def test_the_page_outlives_a_broken_field(tmp_path, field):
                 Publication(7, 7.0, 0, 5.0, ("never",), (1.0,), 1.0, 1.0, psnr_db=float("inf")),
                 Comparison("never", np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8), 7),
             )
-            _until(lambda: field.renders > 0)
+            wait_until(lambda: field.renders > 0, "nothing was rendered")
             state.publish(publication(8), BallScene(0.0))  # it has recovered
             visitor.wait_for(lambda: visitor.images and _decode(visitor).std() > 20, "the ball")
     finally:
@@ -279,7 +281,7 @@ def test_a_state_that_fails_to_answer_is_reported_once_and_survived(caplog):
     page = start_page(state, "127.0.0.1", 0)
     try:
         with Visitor(page.port) as visitor:
-            _until(lambda: "half started" in caplog.text)
+            wait_until(lambda: "half started" in caplog.text, "no log entry")
             time.sleep(1.2)
             assert caplog.text.count("page: refresh failed") == 1
             answers["fail"] = False
@@ -293,27 +295,11 @@ def test_no_visitor_can_open_a_public_tunnel(tmp_path, caplog):
     with preview_page(tmp_path) as (_, page), Visitor(page.port) as visitor:
         visitor.wait_for(lambda: visitor.counts["GuiHtmlMessage"] > 0, "the panel")
         visitor.send("ShareUrlRequest")
-        _until(lambda: "does not give one" in caplog.text)
+        wait_until(lambda: "does not give one" in caplog.text, "no log entry")
         assert page._server._share_tunnel is None
 
 
 # --- helpers -----------------------------------------------------------------------------------
-
-
-class _Running:
-    def __init__(self, preview: Preview) -> None:
-        self._preview = preview
-        preview.start()
-
-    def close(self) -> None:
-        self._preview.stop()
-
-
-def _until(wanted, timeout_s: float = 20.0) -> None:
-    end = time.monotonic() + timeout_s
-    while not wanted():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.02)
 
 
 def _decode(visitor: Visitor) -> np.ndarray:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import socket
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +16,8 @@ import numpy as np
 import viser
 import websocket
 import zstandard
+
+from tests.waiting import wait_until
 
 
 class Visitor:
@@ -73,10 +74,7 @@ class Visitor:
         self._socket.send_binary(data)
 
     def wait_for(self, wanted: Callable[[], bool], what: str, timeout_s: float = 30.0) -> None:
-        end = time.monotonic() + timeout_s
-        while not wanted():
-            assert time.monotonic() < end, f"{what} did not happen; received {dict(self.counts)}"
-            time.sleep(0.02)
+        wait_until(wanted, lambda: f"{what} did not happen; received {dict(self.counts)}", timeout_s)
 
     def _read(self) -> None:
         while not self._closing:
