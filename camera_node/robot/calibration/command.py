@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from camera_node.robot import stdout
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, WANT_MM, CalibrationError
 
 if TYPE_CHECKING:
     from camera_node.robot.calibration.hand_eye.calibrate import Calibration
@@ -43,16 +43,15 @@ from, one of:
 """
 
 
-MAX_GAP_MS, WANT_MM = 50.0, 0.5
 # Option -> what it goes with: said with anything else, it would be ignored.
-_GO_WITH = {
+_GOES_WITH = {
     "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
     **dict.fromkeys(
         ("camera", "data", "want_mm", "moving", "drive", "yes", "samples", "preview", "seconds", "tracks"),
         ("live",),
     ),
 }  # fmt: skip
-_SPELT = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
+_INPUT_NAMES = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -115,10 +114,10 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add("--lens", type=Path, metavar="FILE",
         help="calibration JSON or ViSP's XML (default: the folder's XML, the live camera's own)")
     add("--eye-to-hand", action="store_true", help="the camera stands, the hand holds the target")
-    add("--method", default="refined", metavar="NAME",
+    add("--method", default=DEFAULT_METHOD, metavar="NAME",
         help="whose answer is given: tsai, park, horaud, andreff, daniilidis or refined (default)")
     add("--max-gap-ms", type=float, metavar="MS",
-        help=f"of streams: what is farther from a hand pose is not used (default {MAX_GAP_MS:g})")
+        help=f"of streams: what is farther from a hand pose is not used (default {MAX_GAP_S * 1e3:g})")
     add("--json", action="store_true",
         help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
     add("--out", type=Path, metavar="FILE.yaml", help="for the node (source.trajectory.hand_eye)")
@@ -170,23 +169,23 @@ def _hand_eye(args: argparse.Namespace) -> int:
         raise CalibrationError(
             "expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO"
         )
-    for option, goes_with in _GO_WITH.items():
+    for option, goes_with in _GOES_WITH.items():
         if getattr(args, option) not in (None, False) and not given & set(goes_with):
-            places = " or ".join(_SPELT[each] for each in goes_with)
+            places = " or ".join(_INPUT_NAMES[each] for each in goes_with)
             raise CalibrationError(f"--{option.replace('_', '-')}: goes with {places}")
-    args.max_gap_ms = MAX_GAP_MS if args.max_gap_ms is None else args.max_gap_ms
+    args.max_gap_ms = MAX_GAP_S * 1e3 if args.max_gap_ms is None else args.max_gap_ms
     args.want_mm = WANT_MM if args.want_mm is None else args.want_mm
     from camera_node.robot.calibration.hand_eye import calibrate as handeye
     from camera_node.robot.calibration.hand_eye import report
 
     if args.method not in handeye.ALL_METHODS:
         raise CalibrationError(f"--method: expected one of {', '.join(handeye.ALL_METHODS)}")
-    found = _found(args)
+    found = _calibrate_from(args)
     if args.json:
         for warning in found.warnings:
             _say(f"note: {warning}")
     # First of all, or a file that cannot be written would take a session's answer with it.
-    print(json.dumps(found.answer()) if args.json else report.show(found), flush=True)
+    print(json.dumps(found.to_dict()) if args.json else report.show(found), flush=True)
     if args.out is not None:
         report.write_yaml(found, args.out)
     if args.plot is not None:
@@ -194,11 +193,11 @@ def _hand_eye(args: argparse.Namespace) -> int:
     return 0
 
 
-def _found(args: argparse.Namespace) -> Calibration:
+def _calibrate_from(args: argparse.Namespace) -> Calibration:
     from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
     from camera_node.robot.calibration import files as folder
     from camera_node.robot.calibration.hand_eye import calibrate as handeye
-    from camera_node.robot.calibration.targets import parse
+    from camera_node.robot.calibration.targets import parse_target
 
     setup = EYE_TO_HAND if args.eye_to_hand else EYE_IN_HAND
     if args.pairs is not None:
@@ -216,7 +215,7 @@ def _found(args: argparse.Namespace) -> Calibration:
         raise CalibrationError("--board SPEC: say what the target is")
     if args.live is not None and args.camera is None:
         raise CalibrationError("--camera ID: say which of the scenario's cameras")
-    board = parse(args.board)
+    board = parse_target(args.board)
     lens = None if args.lens is None else folder.read_lens(args.lens)
     if args.live is not None:
         from camera_node.robot.calibration.hand_eye.live import calibrate_live
@@ -229,9 +228,9 @@ def _found(args: argparse.Namespace) -> Calibration:
 
 
 def _intrinsics(args: argparse.Namespace) -> int:
-    from camera_node.robot.calibration.files import pictures
+    from camera_node.robot.calibration.files import list_images
     from camera_node.robot.calibration.lens.solve import calibrate_folder
-    from camera_node.robot.calibration.targets import parse
+    from camera_node.robot.calibration.targets import parse_target
     from freshfield import files
 
     if (args.folder is None) == (args.live is None):
@@ -239,12 +238,12 @@ def _intrinsics(args: argparse.Namespace) -> int:
     if args.folder is not None:
         for option in ("data", "moving", "preview", "seconds"):
             if getattr(args, option) not in (None, False):
-                raise CalibrationError(f"--{option}: goes with {_SPELT['live']}")
-        lens = calibrate_folder(pictures(args.folder), parse(args.board), _counting("pictures"))
+                raise CalibrationError(f"--{option}: goes with {_INPUT_NAMES['live']}")
+        lens = calibrate_folder(list_images(args.folder), parse_target(args.board), _counting("pictures"))
     else:
         from camera_node.robot.calibration.lens.live import calibrate_live
 
-        lens = calibrate_live(args, parse(args.board))
+        lens = calibrate_live(args, parse_target(args.board))
     data = lens.calibration(args.camera)
     if args.out is not None:
         try:
@@ -259,9 +258,9 @@ def _target(args: argparse.Namespace) -> int:
     import cv2
     import numpy as np
 
-    from camera_node.robot.calibration.targets import parse
+    from camera_node.robot.calibration.targets import parse_target
 
-    board = parse(args.board)
+    board = parse_target(args.board)
     width, height = (round(side_m / 0.0254 * args.dpi) for side_m in board.size_m)
     if not 64 <= width <= 32_000:
         raise CalibrationError(f"--dpi: makes a picture {width} pixels wide, expected 64 to 32000")
@@ -280,20 +279,20 @@ def _target(args: argparse.Namespace) -> int:
 
 
 def _accuracy(args: argparse.Namespace) -> int:
-    from camera_node.robot.calibration import accuracy_cost
+    from camera_node.robot.calibration import accuracy_study
 
     if args.seed < 0:
         raise CalibrationError("--seed: expected a whole number from 0")
     tables = {}
     try:
-        for name, rows in accuracy_cost.measure(args.quick, args.seed):
+        for name, rows in accuracy_study.run_tables(args.quick, args.seed):
             tables[name] = rows
             if not args.json:
-                print(accuracy_cost.show(name, rows), flush=True)
+                print(accuracy_study.format_table(name, rows), flush=True)
             if args.out is not None:
-                accuracy_cost.write(name, rows, args.out)
+                accuracy_study.write_csv(name, rows, args.out)
         if args.out is not None:
-            accuracy_cost.draw(tables, args.out / "accuracy.png")
+            accuracy_study.plot(tables, args.out / "accuracy.png")
     except OSError as error:
         raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
     if args.json:

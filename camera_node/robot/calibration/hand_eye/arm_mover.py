@@ -25,7 +25,7 @@ from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 
 
-class Mover:
+class ArmMover:
     """Brings the hand of a scenario's arm to poses. Asks first, as ``drive-arm`` does, unless ``agreed_to``
     or the arm is simulated; speed and floor are those of its ``path``. Raises ScenarioError, ArmError, and
     CalibrationError where the answer is no."""
@@ -51,7 +51,7 @@ class Mover:
             at, _ = self._stream.at(WallClock().now_ns(), 0.0)
             if self._stream.trouble:
                 raise ArmError(self._stream.trouble)
-            stops = self._way(at, hand)
+            stops = self._route(at, hand)
             control = connect_control(self._stream.host)
             try:
                 visit(control, self._stream, stops, self._pace, threading.Event())
@@ -66,7 +66,7 @@ class Mover:
     def close(self) -> None:
         self._stream.stop()
 
-    def _way(self, at: Array, hand: Array) -> list[Array]:
+    def _route(self, at: Array, hand: Array) -> list[Array]:
         there = [p.joints for p in self._model.inverse(hand, at) if not p.singular]
         places = [0] * len(there) + [1] * len(self._been)
         roadmap = Roadmap(self._model, self._base, [*there, *self._been], places, self._floor_m)

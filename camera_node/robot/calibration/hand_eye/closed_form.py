@@ -49,7 +49,7 @@ class Residuals:
 
 def solve(samples: Samples, method: str) -> Array:
     """X (4, 4) by one closed form. Raises CalibrationError where it finds none."""
-    few = samples.spread(MAX_CLOSED_FORM)
+    few = samples.subsample(MAX_CLOSED_FORM)
     moved, target = few.moved, few.target
     try:
         # By keyword: given by position, the method is taken for an output and Tsai-Lenz runs.
@@ -67,7 +67,7 @@ def solve(samples: Samples, method: str) -> Array:
     return found
 
 
-def still(samples: Samples, x: Array) -> Array:
+def target_at_rest(samples: Samples, x: Array) -> Array:
     """(N, 4, 4): where each sample puts the target in the frame in which it stands still, G_i X T_i."""
     return np.asarray(samples.moved @ x @ samples.target)
 
@@ -80,7 +80,7 @@ def mean_transform(transforms: Array) -> Array:
 
 def residuals(samples: Samples, x: Array) -> Residuals:
     """Of any X: distances of ``still`` from its mean."""
-    return residuals_from(still(samples, x), None)
+    return residuals_from(target_at_rest(samples, x), None)
 
 
 def residuals_from(places: Array, centre: Array | None) -> Residuals:
@@ -100,7 +100,7 @@ def predicted_hand(samples: Samples, x: Array, y: Array) -> Array:
 def robust_start(samples: Samples) -> tuple[Array, Array]:
     """X and Y (4, 4) to refine from: of the closed forms on everything and of Park's on small subsets, the
     one with the least median residual. The subsets are the same in every run. Raises CalibrationError."""
-    few = samples.spread(MAX_CLOSED_FORM)
+    few = samples.subsample(MAX_CLOSED_FORM)
     rng = np.random.default_rng(0)
     subsets = []
     if len(few) > _SUBSET_SIZE + 1:
@@ -112,7 +112,7 @@ def robust_start(samples: Samples) -> tuple[Array, Array]:
             x = solve(chosen, method)
         except CalibrationError:
             continue
-        places = still(few, x)
+        places = target_at_rest(few, x)
         y = _median_transform(places)
         off = residuals_from(places, y)
         # One degree counts as much as it moves a point at arm's length of a third of a metre.

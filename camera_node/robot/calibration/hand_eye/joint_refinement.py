@@ -26,28 +26,28 @@ from camera_node.robot.calibration.hand_eye.closed_form import predicted_hand, r
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, inverse, transform_of
 
 # Degrees of freedom of Student's t; what it costs where nothing is wrong, ``accuracy`` shows.
-_FREEDOM = 8.0
+_DEGREES_OF_FREEDOM = 8.0
 _ROUNDS, _INNER_ROUNDS = 12, 60
 # Radians, metres and seconds; a step below this changes nothing that anybody can measure.
-_SETTLED = 1e-8
+_CONVERGED = 1e-8
 # Nothing measures a pose better than this; perfect data would make the likelihood infinite.
-_LEAST_RAD, _LEAST_M = 1e-7, 1e-7
+_MIN_RAD, _MIN_M = 1e-7, 1e-7
 # A sample's weight is below this where the squares of its six whitened numbers add up to more than 32, as
 # those of one good sample in sixty thousand do.
 OUTLIER_WEIGHT = 0.35
 
 
 @dataclass(frozen=True)
-class Refined:
+class Refinement:
     """x, y: (4, 4). covariance: (6, 6) of x: rotation (radians, camera axes), translation (metres).
-    robot_rad, robot_m: the arm's noise found, or given. weights: (N,), about 1 where nothing is wrong.
+    arm_noise_rad, arm_noise_m: the arm's noise, estimated or given. weights: (N,), about 1 for a good sample.
     offset_s, offset_std_s: of the time offset, where velocities were given."""
 
     x: Array
     y: Array
     covariance: Array
-    robot_rad: float
-    robot_m: float
+    arm_noise_rad: float
+    arm_noise_m: float
     weights: Array
     offset_s: float = 0.0
     offset_std_s: float = 0.0
@@ -69,13 +69,13 @@ class Refined:
 def refine(
     samples: Samples,
     start: tuple[Array, Array] | None = None,
-    robot_noise: tuple[float, float] | None = None,
+    arm_noise: tuple[float, float] | None = None,
     velocity: Array | None = None,
     weights: Array | None = None,
-) -> Refined:
+) -> Refinement:
     """Refine from ``start`` (X, Y), or from ``robust_start``.
 
-    robot_noise: (radians, metres), given instead of estimated; nearly zero trusts the arm fully, which needs
+    arm_noise: (radians, metres), given instead of estimated; nearly zero trusts the arm fully, which needs
     a covariance of the target to make sense. velocity: (N, 6) of the hand in its own axes (rad/s, m/s): the
     time offset is refined with the rest. weights: (N,), given instead of found.
 
@@ -84,46 +84,48 @@ def refine(
     x, y = start if start is not None else robust_start(samples)
     offset_s = 0.0
     if start is None:
-        x, y = _settled(samples, x, y)
-    noise = np.array(robot_noise or _spread_of(_errors(samples, x, y)))
+        x, y = _converge_start(samples, x, y)
+    noise = np.array(arm_noise or _robust_scale(_residuals(samples, x, y)))
     for _ in range(_ROUNDS):
         # Everything but the errors and their slopes is found on the linear problem, which costs little.
-        e, jacobian = _errors(samples, x, y), _jacobian(samples, x, y, velocity)
+        e, jacobian = _residuals(samples, x, y), _jacobian(samples, x, y, velocity)
         if velocity is not None:
             e = e - velocity * offset_s
         seen = _target_covariance(samples, x, y)
-        step, noise, w = _linear(e, jacobian, seen, noise, weights, robot_noise is None)
-        x, y = _moved(x, step[:6]), _moved(y, step[6:12])
+        step, noise, w = _solve_linearized(e, jacobian, seen, noise, weights, arm_noise is None)
+        x, y = _retract(x, step[:6]), _retract(y, step[6:12])
         if velocity is not None:
             offset_s += step[12]
-        if np.abs(step).max() < _SETTLED:
+        if np.abs(step).max() < _CONVERGED:
             break
     root = _whitener(_covariances(seen, len(samples), noise))
     covariance: Array = np.asarray(np.linalg.pinv(_information(root @ jacobian, w), hermitian=True))
-    return Refined(
+    return Refinement(
         x, y, covariance[:6, :6], float(noise[0]), float(noise[1]), w, float(offset_s),
         float(np.sqrt(covariance[12, 12])) if velocity is not None else 0.0,
     )  # fmt: skip
 
 
-def bound(samples: Samples, x: Array, y: Array, robot_noise: tuple[float, float]) -> tuple[float, float]:
+def cramer_rao_bound(
+    samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]
+) -> tuple[float, float]:
     """Cramer-Rao bound of X at the truth: degrees and mm, each the root of the summed variances of three
     numbers. Y is unknown too and has its share taken off."""
-    covariance = np.linalg.inv(information_of(samples, x, y, robot_noise).sum(axis=0))
+    covariance = np.linalg.inv(sample_information(samples, x, y, arm_noise).sum(axis=0))
     return (
         float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
         float(np.sqrt(np.trace(covariance[3:6, 3:6])) * 1e3),
     )
 
 
-def information_of(samples: Samples, x: Array, y: Array, robot_noise: tuple[float, float]) -> Array:
+def sample_information(samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]) -> Array:
     """(N, 12, 12): what each sample says about X and Y (rotation, translation; rotation, translation)."""
-    covariances = _covariances(_target_covariance(samples, x, y), len(samples), np.array(robot_noise))
+    covariances = _covariances(_target_covariance(samples, x, y), len(samples), np.array(arm_noise))
     slopes = _whitener(covariances) @ _jacobian(samples, x, y, None)
     return np.asarray(np.swapaxes(slopes, 1, 2) @ slopes)
 
 
-def left_out(samples: Samples, found: Refined, groups: int = 30) -> tuple[float, float, int]:
+def jackknife(samples: Samples, found: Refinement, groups: int = 30) -> tuple[float, float, int]:
     """Spread of X when samples are left out in turn, one by one or in that many stretches of the recording:
     jackknife deviations in degrees and mm (roots of summed variances), and the number of groups."""
     parts = np.array_split(np.arange(len(samples)), min(groups, len(samples)))
@@ -131,7 +133,7 @@ def left_out(samples: Samples, found: Refined, groups: int = 30) -> tuple[float,
     for part in parts:
         kept = np.setdiff1d(np.arange(len(samples)), part)
         again = refine(
-            samples.take(kept), (found.x, found.y), (found.robot_rad, found.robot_m),
+            samples.take(kept), (found.x, found.y), (found.arm_noise_rad, found.arm_noise_m),
             weights=found.weights[kept],
         )  # fmt: skip
         turns.append(Rotation.from_matrix(found.x[:3, :3].T @ again.x[:3, :3]).as_rotvec())
@@ -141,12 +143,12 @@ def left_out(samples: Samples, found: Refined, groups: int = 30) -> tuple[float,
     return float(np.degrees(spread[0])), float(spread[1] * 1e3), len(parts)
 
 
-def _moved(transform: Array, step: Array) -> Array:
+def _retract(transform: Array, step: Array) -> Array:
     turn = np.asarray(Rotation.from_rotvec(step[:3]).as_matrix())
     return transform_of(transform[:3, :3] @ turn, transform[:3, 3] + step[3:])
 
 
-def _errors(samples: Samples, x: Array, y: Array) -> Array:
+def _residuals(samples: Samples, x: Array, y: Array) -> Array:
     """(N, 6): predicted minus reported hand, in the hand's axes."""
     off = inverse(samples.hand) @ predicted_hand(samples, x, y)
     turns = np.asarray(Rotation.from_matrix(off[:, :3, :3]).as_rotvec())
@@ -167,20 +169,20 @@ def _jacobian(samples: Samples, x: Array, y: Array, velocity: Array | None) -> A
     of_a = np.zeros((len(samples), 6, 6))
     of_b = np.zeros((len(samples), 6, 6))
     of_a[:, :3, :3] = np.swapaxes(m[:, :3, :3] @ b[:3, :3].T, 1, 2)
-    of_a[:, 3:, :3] = -a[:3, :3] @ _crosses(arm)
+    of_a[:, 3:, :3] = -a[:3, :3] @ _skew(arm)
     of_a[:, 3:, 3:] = np.eye(3)
     of_b[:, :3, :3] = -b[:3, :3]
-    of_b[:, 3:, :3] = -am @ _crosses(lever)
+    of_b[:, 3:, :3] = -am @ _skew(lever)
     of_b[:, 3:, 3:] = -am @ b[:3, :3].T
-    both = _in_the_hand(samples, x, y, np.concatenate([of_b, of_a] if held else [of_a, of_b], axis=2))
+    both = _to_hand_frame(samples, x, y, np.concatenate([of_b, of_a] if held else [of_a, of_b], axis=2))
     return both if velocity is None else np.concatenate([both, -velocity[:, :, None]], axis=2)
 
 
-def _in_the_hand(samples: Samples, x: Array, y: Array, slopes: Array) -> Array:
+def _to_hand_frame(samples: Samples, x: Array, y: Array, slopes: Array) -> Array:
     """Slopes (N, 6, P) of the predicted hand (its turn about its own axes, its place in the base) as slopes
     of the errors, which are rotation vectors and places in the reported hand."""
-    turns = _errors(samples, x, y)[:, :3]
-    k = _crosses(turns)
+    turns = _residuals(samples, x, y)[:, :3]
+    k = _skew(turns)
     out = np.empty_like(slopes)
     # The inverse right Jacobian of SO(3), to second order in the error.
     out[:, :3] = (np.eye(3) + k / 2 + k @ k / 12) @ slopes[:, :3]
@@ -188,7 +190,7 @@ def _in_the_hand(samples: Samples, x: Array, y: Array, slopes: Array) -> Array:
     return out
 
 
-def _crosses(v: Array) -> Array:
+def _skew(v: Array) -> Array:
     """(..., 3, 3): matrices of the cross products with vectors (..., 3)."""
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
@@ -206,13 +208,13 @@ def _target_covariance(samples: Samples, x: Array, y: Array) -> Array | None:
     if samples.setup == EYE_IN_HAND:  # Y T^-1 X^-1
         lever = back @ (shift + (x[:3, :3].T @ x[:3, 3])[:, None])
         slopes[:, :3, :3] = -x[:3, :3] @ turn
-        slopes[:, 3:, :3] = -y[:3, :3] @ _crosses(lever[..., 0])
+        slopes[:, 3:, :3] = -y[:3, :3] @ _skew(lever[..., 0])
         slopes[:, 3:, 3:] = -y[:3, :3] @ back
     else:  # X T Y^-1
         slopes[:, :3, :3] = y[:3, :3]
-        slopes[:, 3:, :3] = x[:3, :3] @ turn @ _crosses(y[:3, :3].T @ y[:3, 3])
+        slopes[:, 3:, :3] = x[:3, :3] @ turn @ _skew(y[:3, :3].T @ y[:3, 3])
         slopes[:, 3:, 3:] = x[:3, :3]
-    slopes = _in_the_hand(samples, x, y, slopes)
+    slopes = _to_hand_frame(samples, x, y, slopes)
     return np.asarray(slopes @ samples.covariance @ np.swapaxes(slopes, 1, 2))
 
 
@@ -232,24 +234,24 @@ def _information(whitened: Array, w: Array) -> Array:
     return np.asarray(flat.T @ (np.repeat(w, whitened.shape[1])[:, None] * flat))
 
 
-def _settled(samples: Samples, x: Array, y: Array) -> tuple[Array, Array]:
+def _converge_start(samples: Samples, x: Array, y: Array) -> tuple[Array, Array]:
     """X and Y near enough for the linear rounds, from however poor a start: damped least squares, robust in
     each number."""
-    scale = np.repeat(_spread_of(_errors(samples, x, y)), 3)
+    scale = np.repeat(_robust_scale(_residuals(samples, x, y)), 3)
 
     def whitened(step: Array) -> Array:
-        return (_errors(samples, _moved(x, step[:6]), _moved(y, step[6:])) / scale).ravel()
+        return (_residuals(samples, _retract(x, step[:6]), _retract(y, step[6:])) / scale).ravel()
 
     def slopes(step: Array) -> Array:
         # By a further step instead of by this one: the same while the turns are small.
-        found = _jacobian(samples, _moved(x, step[:6]), _moved(y, step[6:]), None)
+        found = _jacobian(samples, _retract(x, step[:6]), _retract(y, step[6:]), None)
         return np.asarray((found / scale[:, None]).reshape(-1, 12))
 
     step = least_squares(whitened, np.zeros(12), slopes, loss="soft_l1", x_scale=0.1, max_nfev=20).x
-    return _moved(x, step[:6]), _moved(y, step[6:])
+    return _retract(x, step[:6]), _retract(y, step[6:])
 
 
-def _linear(
+def _solve_linearized(
     e: Array, jacobian: Array, seen: Array | None, noise: Array, weights: Array | None, estimate: bool
 ) -> tuple[Array, Array, Array]:
     """Step (12 or 13,), noise (2,) and weights (N,) that belong together where errors are e + J step."""
@@ -260,13 +262,13 @@ def _linear(
         root = _whitener(covariances)
         now = np.einsum("nij,nj->ni", root, e + jacobian @ step)
         if weights is None:
-            w = (_FREEDOM + 6.0) / (_FREEDOM + (now**2).sum(axis=1))
+            w = (_DEGREES_OF_FREEDOM + 6.0) / (_DEGREES_OF_FREEDOM + (now**2).sum(axis=1))
         slopes = root @ jacobian
         inverse_information: Array = np.asarray(np.linalg.pinv(_information(slopes, w), hermitian=True))
         before = step
         step = step - inverse_information @ np.einsum("n,nki,nk->i", w, slopes, now)
         if not estimate:
-            if np.abs(step - before).max() < _SETTLED / 10:
+            if np.abs(step - before).max() < _CONVERGED / 10:
                 break
             continue
         left = np.einsum("nij,nj->ni", root, e + jacobian @ step)
@@ -290,10 +292,10 @@ def _noise(root: Array, slopes: Array, left: Array, w: Array, inverse: Array, no
         taken = _information(carried[:, part], w)
         freedom = float(precision[:, part].sum() - (inverse * taken).sum())
         out[k] = noise[k] * np.sqrt(np.sqrt(found / max(freedom, 1e-12)))
-    return np.maximum(out, [_LEAST_RAD, _LEAST_M])
+    return np.maximum(out, [_MIN_RAD, _MIN_M])
 
 
-def _spread_of(e: Array) -> tuple[float, float]:
+def _robust_scale(e: Array) -> tuple[float, float]:
     """First guess of the arm's noise (rad, m) that a few outliers do not move."""
     turn, shift = (1.4826 * float(np.median(np.abs(part))) for part in (e[:, :3], e[:, 3:]))
-    return max(turn, _LEAST_RAD), max(shift, _LEAST_M)
+    return max(turn, _MIN_RAD), max(shift, _MIN_M)

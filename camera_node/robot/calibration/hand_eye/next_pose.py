@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.robot.calibration.hand_eye.closed_form import predicted_hand
-from camera_node.robot.calibration.hand_eye.joint_refinement import information_of
+from camera_node.robot.calibration.hand_eye.joint_refinement import sample_information
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples, angles, inverse, transform_of
 from freshfield.geometry import so3_exp
 
@@ -35,7 +35,7 @@ class Proposal:
     std_mm: float
 
 
-def propose(
+def propose_pose(
     samples: Samples,
     x: Array,
     y: Array,
@@ -47,7 +47,7 @@ def propose(
     """The best of 120 random places for the target: as far away as it has been seen, tilted by up to 50
     degrees, turned anyhow, but the hand turned by at least ``new_deg`` from where it has been and not much
     farther out than it has been. noise: the arm's (radians, metres). middle: (3,) of the target, its axes."""
-    targets = _imagined(samples, middle, rng)
+    targets = _candidate_targets(samples, middle, rng)
     hands = predicted_hand(Samples(targets, targets, samples.setup), x, y)
     reach = np.linalg.norm(samples.hand[:, :3, 3], axis=1).max() * 1.05
     between = np.swapaxes(samples.hand[:, None, :3, :3], 2, 3) @ hands[None, :, :3, :3]
@@ -55,15 +55,15 @@ def propose(
     good = (np.linalg.norm(hands[:, :3, 3], axis=1) <= reach) & (turned_deg >= new_deg)
     if good.any():
         hands, targets = hands[good], targets[good]
-    before = information_of(replace(samples, covariance=None), x, y, noise).sum(axis=0)
-    added = information_of(Samples(hands, targets, samples.setup), x, y, noise)
+    before = sample_information(replace(samples, covariance=None), x, y, noise).sum(axis=0)
+    added = sample_information(Samples(hands, targets, samples.setup), x, y, noise)
     variances = np.linalg.inv(before + added)[:, :6, :6].diagonal(axis1=1, axis2=2)
     cost = variances[:, 3:].sum(axis=1) + _LEVER_M**2 * variances[:, :3].sum(axis=1)
     best = int(np.argmin(cost))
     return Proposal(hands[best], targets[best], float(np.sqrt(variances[best, 3:].sum()) * 1e3))
 
 
-def first_turns(start: Array, taken: int) -> Array:
+def initial_pose(start: Array, taken: int) -> Array:
     """(4, 4): hand poses to begin with, while nothing is known of X: where the first sample was taken, turned
     by 15 degrees about x, y and z in turn and back, so that the target hardly leaves the picture."""
     turn = np.zeros(3)
@@ -73,7 +73,7 @@ def first_turns(start: Array, taken: int) -> Array:
     return out
 
 
-def in_words(now: Array, wanted: Array) -> str:
+def describe_motion(now: Array, wanted: Array) -> str:
     """How to get from a hand pose (4, 4) to another, in the hand's own axes, to a person's precision."""
     step = inverse(now) @ wanted
     chord = step[:3, :3]
@@ -86,7 +86,7 @@ def in_words(now: Array, wanted: Array) -> str:
     return f"turn by about {turn:.0f} degrees, mostly about its {sign}{'xyz'[axis]}{move}"
 
 
-def _imagined(samples: Samples, middle: Array, rng: np.random.Generator) -> Array:
+def _candidate_targets(samples: Samples, middle: Array, rng: np.random.Generator) -> Array:
     """(N, 4, 4) targets whose middle (3,) is near the middle of the picture, as far away as it has been."""
     depths = (samples.target @ np.append(middle, 1.0))[:, 2]
     out = []

@@ -10,8 +10,8 @@ import yaml
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, MAX_OFFSET_S
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.calibrate import Calibration, Row
-from camera_node.robot.calibration.hand_eye.closed_form import still
+from camera_node.robot.calibration.hand_eye.calibrate import Calibration, MethodResult
+from camera_node.robot.calibration.hand_eye.closed_form import target_at_rest
 from camera_node.robot.calibration.hand_eye.samples import Rotation, rotation_vectors
 from freshfield import files
 
@@ -23,8 +23,8 @@ def show(found: Calibration) -> str:
     what = "camera in hand" if found.samples.setup == EYE_IN_HAND else "camera in base"
     spread = found.diversity
     lines = [
-        f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} "
-        f"degrees, axes spread by {spread.spread_deg:.0f} degrees (35 where they point everywhere alike)",
+        f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} degrees, "
+        f"axes spread by {spread.axis_spread_deg:.0f} degrees (35 where they point everywhere alike)",
         "",
         f"{'method':12} {'residual mm':>12} {'degrees':>9}   {'from refined mm':>16} {'degrees':>9}",
         *(_row(row) for row in found.rows),
@@ -34,8 +34,8 @@ def show(found: Calibration) -> str:
         f"turned {_turn(found)}",
         f"  standard deviation {found.refined.std_mm:.3f} mm, {found.refined.std_deg:.4f} degrees; "
         f"leaving out one of {found.groups}: {found.left_out_mm:.3f} mm, {found.left_out_deg:.4f} degrees",
-        f"  the arm's noise, estimated: {found.refined.robot_m * 1e3:.3f} mm, "
-        f"{np.degrees(found.refined.robot_rad):.4f} degrees an axis",
+        f"  the arm's noise, estimated: {found.refined.arm_noise_m * 1e3:.3f} mm, "
+        f"{np.degrees(found.refined.arm_noise_rad):.4f} degrees an axis",
     ]
     if found.exact_arm is not None and found.exact_arm.transform is not None:
         lines.append(
@@ -53,7 +53,7 @@ def show(found: Calibration) -> str:
 
 def to_yaml(found: Calibration) -> str:
     """What ``camera_node.robot.arm.hand_eye_mount.read_hand_eye`` reads, and how it was found."""
-    answer = found.answer()
+    answer = found.to_dict()
     warnings = answer.pop("warnings")
     data = {
         "setup": found.samples.setup,
@@ -62,8 +62,8 @@ def to_yaml(found: Calibration) -> str:
         "poses": len(found.samples),
         "leave_out_mm": found.left_out_mm,
         "leave_out_deg": found.left_out_deg,
-        "arm_noise_mm": found.refined.robot_m * 1e3,
-        "arm_noise_deg": float(np.degrees(found.refined.robot_rad)),
+        "arm_noise_mm": found.refined.arm_noise_m * 1e3,
+        "arm_noise_deg": float(np.degrees(found.refined.arm_noise_rad)),
         "warnings": warnings,
     }
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
@@ -101,7 +101,7 @@ def plot(found: Calibration, path: Path) -> None:
     right.plot(count, found.residuals.deg, ".", color="black")
     right.set_ylabel("residual (degrees, dots)")
 
-    rotation = found.samples.spread(40).moved[:, :3, :3]
+    rotation = found.samples.subsample(40).moved[:, :3, :3]
     pairs = list(itertools.combinations(range(len(rotation)), 2))
     turns = rotation_vectors(np.array([rotation[i].T @ rotation[j] for i, j in pairs]))
     angle = np.linalg.norm(turns, axis=1)
@@ -113,7 +113,7 @@ def plot(found: Calibration, path: Path) -> None:
              title="axes of the turns, seen along z")  # fmt: skip
     figure.colorbar(drawn, ax=ball, label="turn (degrees)")
 
-    put = still(found.samples, found.transform)[:, :3, 3]
+    put = target_at_rest(found.samples, found.transform)[:, :3, 3]
     put = (put - put.mean(axis=0)) * 1e3
     drawn = places.scatter(put[:, 0], put[:, 1], c=put[:, 2], s=25)
     places.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", title="where each pose puts the target")
@@ -126,7 +126,7 @@ def plot(found: Calibration, path: Path) -> None:
         plt.close(figure)
 
 
-def _row(row: Row) -> str:
+def _row(row: MethodResult) -> str:
     if row.residuals is None:
         return f"{row.method:12} {row.error}"
     return (

@@ -71,7 +71,7 @@ class Samples:
             names=tuple(self.names[i] for i in at) if self.names else (),
         )
 
-    def spread(self, most: int) -> Samples:
+    def subsample(self, most: int) -> Samples:
         """At most so many of them, evenly over the recording."""
         if len(self) <= most:
             return self
@@ -81,7 +81,7 @@ class Samples:
 @dataclass(frozen=True)
 class Diversity:
     """What the motions between the samples are good for. motions: all pairs; usable: those that turn by
-    neither too little nor nearly half a turn. largest_turn_deg; spread_deg: how far the axes of usable
+    neither too little nor nearly half a turn. largest_turn_deg; axis_spread_deg: how far the axes of usable
     motions stand from being parallel (35 where they point everywhere alike). reason: why nothing can be
     calibrated from them, or None. missing: the axis (3,), in the hand's or the base's axes, about which the
     hand has turned least."""
@@ -90,7 +90,7 @@ class Diversity:
     usable: int
     half_turns: int
     largest_turn_deg: float
-    spread_deg: float
+    axis_spread_deg: float
     reason: str | None
     missing: Array
 
@@ -128,7 +128,7 @@ def angles(rotations: Array) -> Array:
 
 def diversity(samples: Samples) -> Diversity:
     """Judge the motions between all pairs of samples (at most 80 of these)."""
-    chosen = samples.spread(_MAX_SAMPLES)
+    chosen = samples.subsample(_MAX_SAMPLES)
     nothing = np.array([0.0, 0.0, 1.0])
     if len(chosen) < 2:
         return Diversity(0, 0, 0, 0.0, 0.0, _too_few(len(samples)), nothing)
@@ -142,14 +142,16 @@ def diversity(samples: Samples) -> Diversity:
     # Axes u and -u are one: the mean of u u^T knows that. Its second eigenvalue is sin^2 of the half angle
     # of the fan in which the axes lie, and 1/3 where they point everywhere alike.
     values, vectors = np.linalg.eigh(axes.T @ axes / max(1, len(axes)))
-    spread_deg = float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0))))) if len(axes) else 0.0
+    axis_spread_deg = (
+        float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0))))) if len(axes) else 0.0
+    )
     if len(samples) < MIN_POSES:
         reason: str | None = _too_few(len(samples))
-    elif usable.sum() >= 2 and spread_deg >= MIN_SPREAD_DEG:
+    elif usable.sum() >= 2 and axis_spread_deg >= MIN_SPREAD_DEG:
         reason = None
     elif usable.sum() >= 2:
         reason = (
-            f"the hand has turned about parallel axes only (they spread by {spread_deg:.1f} degrees, at "
+            f"the hand has turned about parallel axes only (they spread by {axis_spread_deg:.1f} degrees, at "
             f"least {MIN_SPREAD_DEG:g} are needed): the translation along them stays unknown; tilt the "
             "hand about another axis too"
         )
@@ -164,12 +166,12 @@ def diversity(samples: Samples) -> Diversity:
             "needed): moving without turning says nothing about the translation; turn it by 20 to 90 degrees"
         )
     return Diversity(
-        len(angles_deg), int(usable.sum()), int(half.sum()), float(angles_deg.max()), spread_deg, reason,
+        len(angles_deg), int(usable.sum()), int(half.sum()), float(angles_deg.max()), axis_spread_deg, reason,
         vectors[:, 0] if len(axes) else nothing,
     )  # fmt: skip
 
 
-def refuse_degenerate(samples: Samples) -> Diversity:
+def require_diversity(samples: Samples) -> Diversity:
     """Their diversity. Raises CalibrationError where no calibration can come from the samples."""
     found = diversity(samples)
     if found.reason is not None:
@@ -177,7 +179,7 @@ def refuse_degenerate(samples: Samples) -> Diversity:
     return found
 
 
-def mismatch_deg(samples: Samples) -> Array:
+def rotation_mismatch_deg(samples: Samples) -> Array:
     """(N,): median over the other samples of | angle of A_ij - angle of B_ij |. The two are equal whatever X
     is (4.6), so what is large here was detected or paired wrongly."""
     chosen = np.arange(len(samples))

@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, inverse, transform_of
-from camera_node.robot.calibration.targets import Grey, Target
+from camera_node.robot.calibration.targets import GrayImage, Target
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.render import CameraRenderer, Part, World
 from camera_node.synthetic.shapes import Quad
@@ -57,12 +57,12 @@ def _camera(azimuth: float, slope: float, distance_m: float, roll: float) -> Arr
     return out
 
 
-def seen_targets(hands: Array) -> Array:
+def observed_targets(hands: Array) -> Array:
     """(N, 4, 4) target in camera, exact."""
     return np.asarray(inverse(CAMERA_IN_HAND) @ inverse(hands) @ TARGET_IN_BASE)
 
 
-def disturbed(poses: Array, rng: np.random.Generator, rad: float, metres: float) -> Array:
+def add_noise(poses: Array, rng: np.random.Generator, rad: float, metres: float) -> Array:
     """Poses with Gaussian noise: a rotation vector about the body's own axes, and a translation."""
     turns = Rotation.from_rotvec(rng.normal(0.0, rad, (len(poses), 3))).as_matrix()
     shifts = rng.normal(0.0, metres, (len(poses), 3))
@@ -79,10 +79,10 @@ def samples(
     """Samples with the noise on the arm's side. For eye-to-hand, hand and camera change places: X is the
     same (4, 4), the camera in the base."""
     hands = random_hands(count, rng)
-    targets = seen_targets(hands)
+    targets = observed_targets(hands)
     if setup != EYE_IN_HAND:
         hands = inverse(hands)
-    return Samples(disturbed(hands, rng, rad, metres), targets, setup)
+    return Samples(add_noise(hands, rng, rad, metres), targets, setup)
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Sweep:
         return np.array([_camera(*row) for row in zip(azimuth, slope, distance_m, roll)]).reshape(-1, 4, 4)
 
 
-def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> Grey:
+def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> GrayImage:
     """The picture (H, W) of the target on a white plate, on a table, by the project's own ray caster."""
     width, height = target.size_m
     picture = target.draw(max(256, round(width / 0.0002)))
@@ -141,9 +141,9 @@ def camera_in_target(hand: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Picture:
-    """A grey picture on a rectangle, linear between its pixels."""
+    """A gray picture on a rectangle, linear between its pixels."""
 
-    pixels: Grey
+    pixels: GrayImage
     width_m: float
     height_m: float
 
@@ -151,5 +151,5 @@ class _Picture:
         rows, columns = self.pixels.shape
         x = (uv[0] / self.width_m + 0.5) * columns - 0.5
         y = (0.5 - uv[1] / self.height_m) * rows - 0.5
-        grey = map_coordinates(self.pixels.astype(np.float32), [y, x], order=1, mode="nearest")
-        return np.repeat(grey[None] / 255.0, 3, axis=0)
+        gray = map_coordinates(self.pixels.astype(np.float32), [y, x], order=1, mode="nearest")
+        return np.repeat(gray[None] / 255.0, 3, axis=0)

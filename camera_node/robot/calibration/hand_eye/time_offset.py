@@ -13,38 +13,37 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import correlate
 
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import MAX_GAP_S, CalibrationError
 from camera_node.robot.calibration.files import Track
-from camera_node.robot.calibration.hand_eye.joint_refinement import Refined, refine
+from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
     Rotation,
     Samples,
-    refuse_degenerate,
+    require_diversity,
     transform_of,
 )
 
-MAX_GAP_S = 0.05
 # Samples that the refinement uses: more are neighbours that say the same.
 MAX_SAMPLES = 400
 _STEP_S = 0.01
 # Angular speed over so long: shorter, and it is the noise of two poses; longer, and the motion is flat.
 _WINDOW_S = 0.25
-_LEAST_CORRELATION, _RIVAL = 0.5, 0.97
-_LEAST_OVERLAP_S = 2.0
+_MIN_CORRELATION, _RIVAL = 0.5, 0.97
+_MIN_OVERLAP_S = 2.0
 # Half of what the velocity of the hand is taken over.
 _HALF_S = 0.02
 _ROUNDS, _SETTLED_S = 10, 1e-6
 
 
 @dataclass(frozen=True)
-class Timed:
+class StreamCalibration:
     """samples: paired at the offset found. refined: X, Y and how sure they are. offset_s: hand's stamp minus
     camera's of an instant. std_s: as the likelihood has it. correlation: of the angular speeds at the coarse
     offset. unpaired: target poses with no hand pose near enough."""
 
     samples: Samples
-    refined: Refined
+    refined: Refinement
     offset_s: float
     std_s: float
     coarse_s: float
@@ -52,13 +51,15 @@ class Timed:
     unpaired: int
 
 
-def calibrate_streams(hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S) -> Timed:
+def calibrate_streams(
+    hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S
+) -> StreamCalibration:
     """Time offset and hand-eye calibration from two streams. Raises CalibrationError with the reason."""
     coarse_s, correlation = coarse_offset(hand, target)
     offset_s, start = coarse_s, None
     for _ in range(_ROUNDS):
         samples, velocity, unpaired = paired(hand, target, offset_s, setup, max_gap_s)
-        refuse_degenerate(samples)
+        require_diversity(samples)
         found = refine(samples, start, velocity=velocity)
         start = (found.x, found.y)
         offset_s += found.offset_s
@@ -69,7 +70,7 @@ def calibrate_streams(hand: Track, target: Track, setup: str, max_gap_s: float =
             )
         if abs(found.offset_s) < _SETTLED_S:
             break
-    return Timed(samples, found, offset_s, found.offset_std_s, coarse_s, correlation, unpaired)
+    return StreamCalibration(samples, found, offset_s, found.offset_std_s, coarse_s, correlation, unpaired)
 
 
 def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
@@ -78,10 +79,10 @@ def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
     a, b = _angular_speed(hand), _angular_speed(target)
     for name, speed in (("hand", a), ("target", b)):
         seen = speed[~np.isnan(speed)]
-        if seen.size * _STEP_S < _LEAST_OVERLAP_S:
+        if seen.size * _STEP_S < _MIN_OVERLAP_S:
             raise CalibrationError(
                 f"the {name}'s stream has {seen.size * _STEP_S:.1f} s without gaps, at least "
-                f"{_LEAST_OVERLAP_S:g} s are needed to find the time offset"
+                f"{_MIN_OVERLAP_S:g} s are needed to find the time offset"
             )
         if seen.max() < np.deg2rad(1.0):
             raise CalibrationError(
@@ -89,10 +90,10 @@ def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
                 "offset cannot be found from its motion"
             )
     score, count = _masked_correlation(a, b)
-    enough = count * _STEP_S >= max(_LEAST_OVERLAP_S, 0.5 * _STEP_S * min(len(a), len(b)))
+    enough = count * _STEP_S >= max(_MIN_OVERLAP_S, 0.5 * _STEP_S * min(len(a), len(b)))
     score[~enough] = -1.0
     best = int(np.argmax(score))
-    if score[best] < _LEAST_CORRELATION:
+    if score[best] < _MIN_CORRELATION:
         raise CalibrationError(
             f"hand and target do not turn alike at any time offset (correlation {score[best]:.2f} at best): "
             "they are not of one motion, or it is too even to tell"

@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.session import KEPT, drawn
-from camera_node.robot.calibration.lens.solve import MIN_CORNERS, MIN_VIEWS, Lens, calibrate
-from camera_node.robot.calibration.targets import Corners, Target, grey
+from camera_node.robot.calibration.hand_eye.session import KEPT, draw_corners
+from camera_node.robot.calibration.lens.solve import (
+    MIN_CORNERS,
+    MIN_VIEWS,
+    LensCalibration,
+    calibrate,
+    coverage_grid,
+)
+from camera_node.robot.calibration.targets import Corners, Target, to_gray
 
 GOOD_PICTURES, GOOD_COVERED, GOOD_TILT_DEG, GOOD_F = 10, 0.8, 30.0, 0.003
 # Of the picture's width: what corners may move by between two pictures, and must to say something new.
@@ -29,7 +35,7 @@ class LensStep:
     outcome: str
     count: int
     covered: float
-    lens: Lens | None
+    lens: LensCalibration | None
     enough: bool
     advice: str
 
@@ -57,13 +63,13 @@ class LensSession:
         self._target, self._moving = target, moving
         self._kept: dict[str, Corners] = {}
         self._size = (0, 0)
-        self._lens: Lens | None = None
+        self._lens: LensCalibration | None = None
         self._why = ""
         self._cells = np.zeros((6, 6), dtype=np.bool_)
         self.corners: Corners | None = None
         """Found in the last picture."""
 
-    def lens(self) -> Lens:
+    def lens(self) -> LensCalibration:
         """From all that is kept. Raises CalibrationError."""
         return calibrate(self._kept, self._size, {})
 
@@ -76,7 +82,7 @@ class LensSession:
             raise CalibrationError(f"a picture is {size[0]} x {size[1]}, those before were {was}")
         self._size = size
         last = self.corners
-        self.corners = self._target.find(grey(image))
+        self.corners = self._target.find(to_gray(image))
         if self.corners is None:
             return self._step("target not found", "bring all of it into the picture, well lit")
         if len(self.corners.points) < MIN_CORNERS:
@@ -87,8 +93,7 @@ class LensSession:
         if alike:
             return self._step(f"like {alike[0]}", self._advice())
         self._kept[f"picture {len(self._kept) + 1}"] = self.corners
-        at = np.clip(self.corners.pixels / size * 6, 0, 5).astype(int)
-        self._cells[at[:, 1], at[:, 0]] = True
+        self._cells = coverage_grid(self._kept.values(), size)
         try:
             self._lens, self._why = self.lens(), ""
         except CalibrationError as error:
@@ -99,11 +104,11 @@ class LensSession:
         """The picture (H + 40, W, 3) RGB with the corners that were found in it, dots where some were found
         before, and the step below."""
         said = f"{step.count} pictures, {100 * step.covered:.0f} % covered", f"{step.outcome}: {step.advice}"
-        shown = grey(image).copy()
+        shown = to_gray(image).copy()
         for kept in self._kept.values():
             for x, y in kept.pixels:
                 cv2.circle(shown, (round(x - 0.5), round(y - 0.5)), 2, 255, -1)
-        return drawn(shown, self.corners, said, step.outcome == KEPT)
+        return draw_corners(shown, self.corners, said, step.outcome == KEPT)
 
     @property
     def _enough(self) -> bool:

@@ -35,15 +35,15 @@ from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, REFINED, angle_deg, distance_mm
 from camera_node.robot.calibration.hand_eye.closed_form import solve
-from camera_node.robot.calibration.hand_eye.joint_refinement import bound, refine
-from camera_node.robot.calibration.hand_eye.next_pose import propose
+from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
+from camera_node.robot.calibration.hand_eye.next_pose import propose_pose
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse
 from camera_node.robot.calibration.hand_eye.time_offset import calibrate_streams
 from freshfield.geometry import Pose
 
 Rows = list[dict[str, Any]]
 
-MIXES: dict[str, Interpolate[Pose] | None] = {
+INTERPOLATIONS: dict[str, Interpolate[Pose] | None] = {
     "nearest": None,
     "line": interpolate_linear,
     "screw": interpolate_screw,
@@ -58,7 +58,7 @@ _FRAMES_PER_S = 30.0
 _SEEN_RAD, _SEEN_M = 0.0005, 0.0003
 
 
-def measure(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]:
+def run_tables(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]:
     """The three tables, each when it is there. quick: fewer frames and trials, for seconds instead of two
     minutes."""
     periods_ms, speeds = (PERIODS_MS[::2], SPEEDS_M_PER_S[1::2]) if quick else (PERIODS_MS, SPEEDS_M_PER_S)
@@ -80,7 +80,7 @@ def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, 
         for period_ms in periods_ms:
             times_s = np.arange(0.0, seconds + 2.0, period_ms / 1e3)
             hands = [Pose.from_matrix(h) for h in sweep.hands(times_s)]
-            for name, mix in MIXES.items():
+            for name, mix in INTERPOLATIONS.items():
                 hand = PoseBuffer(mix, max_gap_ns=10**9, keep_ns=10**12)
                 for t_s, pose in zip(times_s, hands):
                     hand.add(round(t_s * 1e9), pose)
@@ -115,10 +115,13 @@ def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
         spent = dict.fromkeys(methods, 0.0)
         for trial in range(trials):
             rng = np.random.default_rng([seed, 2, count, trial])
-            of = {"random": _seen(simulated.random_hands(count, rng), rng), "planned": _planned(count, rng)}
+            of = {
+                "random": _seen(simulated.random_hands(count, rng), rng),
+                "planned": _proposed_hands(count, rng),
+            }
             for name, method in methods.items():
                 exact, samples = of["planned" if name == PLANNED else "random"]
-                bounds[name].append(bound(exact, x, y, _NOISE))
+                bounds[name].append(cramer_rao_bound(exact, x, y, _NOISE))
                 begun = time.process_time()
                 try:
                     found = method(samples)
@@ -154,17 +157,17 @@ def rms(errors: Array) -> tuple[Array, Array]:
 
 def _seen(hands: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:
     """Exact samples, and those with the arm's noise."""
-    targets = simulated.seen_targets(hands)
-    return Samples(hands, targets), Samples(simulated.disturbed(hands, rng, *_NOISE), targets)
+    targets = simulated.observed_targets(hands)
+    return Samples(hands, targets), Samples(simulated.add_noise(hands, rng, *_NOISE), targets)
 
 
-def _planned(count: int, rng: np.random.Generator) -> tuple[Samples, Samples]:
+def _proposed_hands(count: int, rng: np.random.Generator) -> tuple[Samples, Samples]:
     """The same for hands that go, after the first four, where they are proposed."""
     hands = simulated.random_hands(min(count, 4), rng)
     middle = (inverse(simulated.TARGET_IN_BASE) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
     while len(hands) < count:
-        so_far = Samples(hands, simulated.seen_targets(hands))
-        next_hand = propose(
+        so_far = Samples(hands, simulated.observed_targets(hands))
+        next_hand = propose_pose(
             so_far, simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE, _NOISE, middle, rng
         ).hand
         hands = np.concatenate([hands, next_hand[None]])
@@ -209,9 +212,9 @@ def streams(
     on both sides' own."""
     hand_s = np.arange(0.0, seconds, 1 / 125.0)
     seen_s = np.arange(0.1, seconds - 0.1, 1 / 15.0) + float(rng.uniform(0.0, 0.05))
-    hands = simulated.disturbed(sweep.hands(hand_s), rng, simulated.ARM_RAD * noise, simulated.ARM_M * noise)
+    hands = simulated.add_noise(sweep.hands(hand_s), rng, simulated.ARM_RAD * noise, simulated.ARM_M * noise)
     targets = inverse(simulated.CAMERA_IN_HAND) @ inverse(sweep.hands(seen_s)) @ simulated.TARGET_IN_BASE
-    targets = simulated.disturbed(targets, rng, _SEEN_RAD * noise, _SEEN_M * noise)
+    targets = simulated.add_noise(targets, rng, _SEEN_RAD * noise, _SEEN_M * noise)
     return (
         Track(
             np.round((hand_s + offset_s) * 1e9).astype(np.int64), hands, PairingCounts(samples=len(hand_s))
@@ -220,7 +223,7 @@ def streams(
     )
 
 
-def show(name: str, rows: Rows) -> str:
+def format_table(name: str, rows: Rows) -> str:
     """A table as text."""
     keys = list(rows[0])
     width = {k: max(len(k), *(len(_cell(row[k])) for row in rows)) for k in keys}
@@ -229,7 +232,7 @@ def show(name: str, rows: Rows) -> str:
     return "\n".join([name, *lines, ""])
 
 
-def write(name: str, rows: Rows, folder: Path) -> None:
+def write_csv(name: str, rows: Rows, folder: Path) -> None:
     """A table as CSV. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / f"{name}.csv").open("w", newline="") as file:
@@ -238,7 +241,7 @@ def write(name: str, rows: Rows, folder: Path) -> None:
         table.writerows(rows)
 
 
-def draw(tables: dict[str, Rows], path: Path) -> None:
+def plot(tables: dict[str, Rows], path: Path) -> None:
     """Pairing and number of poses as a picture, where matplotlib is there. Raises OSError."""
     try:
         import matplotlib
@@ -250,7 +253,7 @@ def draw(tables: dict[str, Rows], path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     rows = tables["pairing"]
     speed = sorted({r["speed_m_per_s"] for r in rows})[len({r["speed_m_per_s"] for r in rows}) // 2]
-    for name in MIXES:
+    for name in INTERPOLATIONS:
         chosen = [r for r in rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
         left.loglog([r["arm_period_ms"] for r in chosen], [r["mm_p95"] for r in chosen], "o-", label=name)
     left.set(xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s")
