@@ -29,21 +29,21 @@ EXAMPLES = """examples:
 """
 
 HAND_EYE = """Estimates where a camera sits on a hand (or in the base of the arm, --eye-to-hand), T_EE^C of
-the thesis (4.2), by Tsai-Lenz and four other closed forms and by a joint refinement that takes the arm for as
-inexact as it turns out to be. Motions that do not determine it are refused with the reason.
+the thesis (4.2), by Tsai-Lenz, four other closed forms, and a joint refinement that estimates the arm's noise
+too. Motions that do not determine it are refused with the reason.
 
 from, one of:
   FOLDER         pictures NAME-3.png with NAME_3.yaml, the hand's pose (rows: 6, cols: 1, data: [tx ty tz and
                  theta u], metres and radians)
   --pairs FILE   JSON list of [end-effector in base, target in camera], 4 x 4 each
   --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, metres); the time offset is estimated too
-  --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when it is
-                 enough; with --drive the arm moves by itself. The hand's poses are those that the camera's
-                 source gives (without hand_eye), or --hand CSV of them, by seconds since the first frame
+  --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when there is
+                 enough; with --drive the arm moves by itself. Hand poses come from the camera's source
+                 (without hand_eye), or from --hand CSV, by seconds since the first frame
 """
 
 
-# Option -> what it goes with: said with anything else, it would be ignored.
+# Option -> the inputs that use it; with any other input it is an error, not ignored.
 _GOES_WITH = {
     "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
     **dict.fromkeys(
@@ -142,7 +142,7 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry a command out. Raises CalibrationError (exit code 2: it says what to change)."""
+    """Run a calibrate command. Raises CalibrationError, which ends it with exit code 2."""
     if args.what == "target":
         return _target(args)
     try:
@@ -175,16 +175,16 @@ def _hand_eye(args: argparse.Namespace) -> int:
             raise CalibrationError(f"--{option.replace('_', '-')}: goes with {places}")
     args.max_gap_ms = MAX_GAP_S * 1e3 if args.max_gap_ms is None else args.max_gap_ms
     args.want_mm = WANT_MM if args.want_mm is None else args.want_mm
-    from camera_node.robot.calibration.hand_eye import calibrate as handeye
+    from camera_node.robot.calibration.hand_eye import calibrate as hand_eye
     from camera_node.robot.calibration.hand_eye import report
 
-    if args.method not in handeye.ALL_METHODS:
-        raise CalibrationError(f"--method: expected one of {', '.join(handeye.ALL_METHODS)}")
-    found = _calibrate_from(args)
+    if args.method not in hand_eye.ALL_METHODS:
+        raise CalibrationError(f"--method: expected one of {', '.join(hand_eye.ALL_METHODS)}")
+    found = _calibrate(args)
     if args.json:
         for warning in found.warnings:
-            _say(f"note: {warning}")
-    # First of all, or a file that cannot be written would take a session's answer with it.
+            _note(f"note: {warning}")
+    # Print first, so that a file that cannot be written does not lose the session's answer.
     print(json.dumps(found.to_dict()) if args.json else report.show(found), flush=True)
     if args.out is not None:
         report.write_yaml(found, args.out)
@@ -193,38 +193,38 @@ def _hand_eye(args: argparse.Namespace) -> int:
     return 0
 
 
-def _calibrate_from(args: argparse.Namespace) -> Calibration:
+def _calibrate(args: argparse.Namespace) -> Calibration:
     from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
-    from camera_node.robot.calibration import files as folder
-    from camera_node.robot.calibration.hand_eye import calibrate as handeye
+    from camera_node.robot.calibration import files
+    from camera_node.robot.calibration.hand_eye import calibrate as hand_eye
     from camera_node.robot.calibration.targets import parse_target
 
     setup = EYE_TO_HAND if args.eye_to_hand else EYE_IN_HAND
     if args.pairs is not None:
-        return handeye.calibrate(folder.read_pairs(args.pairs, setup), args.method)
+        return hand_eye.calibrate(files.read_pairs(args.pairs, setup), args.method)
     if not args.max_gap_ms > 0:
         raise CalibrationError("--max-gap-ms: expected a positive number")
     if args.live is None and args.hand is not None:
-        hand, target = folder.read_track(args.hand), folder.read_track(args.target)
+        hand, target = files.read_track(args.hand), files.read_track(args.target)
         for name, track in (("hand", hand), ("target", target)):
             if track.counts.duplicates or track.counts.reordered:
-                _say(f"{name}: {track.counts.duplicates} stamps came twice (the first is used), "
+                _note(f"{name}: {track.counts.duplicates} stamps came twice (the first is used), "
                      f"{track.counts.reordered} out of order (sorted)")  # fmt: skip
-        return handeye.calibrate_tracks(hand, target, setup, args.method, args.max_gap_ms / 1e3)
+        return hand_eye.calibrate_tracks(hand, target, setup, args.method, args.max_gap_ms / 1e3)
     if args.board is None:
         raise CalibrationError("--board SPEC: say what the target is")
     if args.live is not None and args.camera is None:
         raise CalibrationError("--camera ID: say which of the scenario's cameras")
     board = parse_target(args.board)
-    lens = None if args.lens is None else folder.read_lens(args.lens)
+    lens = None if args.lens is None else files.read_lens(args.lens)
     if args.live is not None:
         from camera_node.robot.calibration.hand_eye.live import calibrate_live
 
         return calibrate_live(args, board, lens, setup)
-    samples, measured = folder.read_visp_folder(args.folder, board, lens, setup, _counting("pictures"))
+    samples, measured = files.read_visp_folder(args.folder, board, lens, setup, _print_progress)
     for name, why in measured.unused.items():
-        _say(f"{name}: {why}")
-    return handeye.calibrate(samples, args.method)
+        _note(f"{name}: {why}")
+    return hand_eye.calibrate(samples, args.method)
 
 
 def _intrinsics(args: argparse.Namespace) -> int:
@@ -239,7 +239,7 @@ def _intrinsics(args: argparse.Namespace) -> int:
         for option in ("data", "moving", "preview", "seconds"):
             if getattr(args, option) not in (None, False):
                 raise CalibrationError(f"--{option}: goes with {_INPUT_NAMES['live']}")
-        lens = calibrate_folder(list_images(args.folder), parse_target(args.board), _counting("pictures"))
+        lens = calibrate_folder(list_images(args.folder), parse_target(args.board), _print_progress)
     else:
         from camera_node.robot.calibration.lens.live import calibrate_live
 
@@ -264,10 +264,10 @@ def _target(args: argparse.Namespace) -> int:
     width, height = (round(side_m / 0.0254 * args.dpi) for side_m in board.size_m)
     if not 64 <= width <= 32_000:
         raise CalibrationError(f"--dpi: makes a picture {width} pixels wide, expected 64 to 32000")
-    # Drawn finer, in whole pixels a module, and brought to size: rounding each module would add up over them.
+    # Draw finer, in whole pixels a module, then scale: rounding errors of the modules would add up.
     fine = board.draw(board.modules * math.ceil(2 * width / board.modules))
     picture = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
-    # Detectors need white around what they look for.
+    # Detectors need a white border.
     border = max(8, width // 10)
     if not cv2.imwrite(str(args.out), np.pad(picture, border, constant_values=255)):
         raise CalibrationError(f"--out: {args.out} cannot be written (does its folder exist? .png?)")
@@ -300,13 +300,10 @@ def _accuracy(args: argparse.Namespace) -> int:
     return 0
 
 
-def _counting(what: str):  # type: ignore[no-untyped-def]
-    def progress(done: int) -> None:
-        if sys.stderr.isatty():
-            print(f"\r{done} {what} ", end="", file=sys.stderr, flush=True)
-
-    return progress
+def _print_progress(done: int) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{done} pictures ", end="", file=sys.stderr, flush=True)
 
 
-def _say(line: str) -> None:
+def _note(line: str) -> None:
     print(line, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What calibrations are made from, as files: ViSP's folders, pairs as JSON, time-stamped poses as CSV."""
+"""Read calibration input: ViSP's folders, pose pairs as JSON, time-stamped poses as CSV."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import GeometryError, Pinhole, Pose, so3_exp
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-# A corner is never better than this; perfect pictures would otherwise make it exact.
+# Lower bound in pixels, so that perfect (rendered) images do not make a corner exact.
 _MIN_PIXEL_NOISE = 0.02
 
 
 @dataclass(frozen=True)
 class Track:
-    """A stream of poses: times_ns (N,) increasing, poses (N, 4, 4), and what was put right in it."""
+    """A stream of poses. times_ns: (N,) increasing. poses: (N, 4, 4). counts: stamps sorted or dropped."""
 
     times_ns: NDArray[np.int64]
     poses: Array
@@ -61,13 +61,13 @@ def read_pairs(file: Path, setup: str) -> Samples:
 
 
 def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
-    """What ``read_pairs`` reads."""
+    """The JSON that ``read_pairs`` reads."""
     return [[h.tolist(), t.tolist()] for h, t in zip(samples.hand, samples.target)]
 
 
 def read_track(file: Path) -> Track:
-    """Poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), a header allowed; put in order where their stamps are
-    not. Raises CalibrationError."""
+    """Poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), header optional, sorted by stamp where
+    needed. Raises CalibrationError."""
     try:
         times, poses = read_samples(file)
     except TrajectoryError as error:
@@ -96,7 +96,7 @@ def read_visp_pose(file: Path) -> Array:
 
 
 def read_lens(file: Path) -> Pinhole:
-    """A lens from a calibration JSON (``camera-node calibrate intrinsics``; of one camera) or ViSP's camera
+    """A lens from a calibration JSON of one camera (``camera-node calibrate intrinsics``) or ViSP's camera
     XML. Raises CalibrationError."""
     if file.suffix.lower() != ".xml":
         try:
@@ -130,7 +130,7 @@ def read_lens(file: Path) -> Pinhole:
 
 @dataclass(frozen=True)
 class Detections:
-    """Pictures in which the target was found, by name, and why the others are not used."""
+    """seen: target poses by image name. unused: the reason, by name, for every other image."""
 
     seen: dict[str, TargetPose]
     unused: dict[str, str]
@@ -145,7 +145,7 @@ def read_gray_image(file: Path) -> np.ndarray:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Picture files, in the order of the numbers in their names. Raises CalibrationError for none."""
+    """Image files in the order of the numbers in their names. Raises CalibrationError if there are none."""
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: no such folder")
     found = [f for f in folder.iterdir() if f.suffix.lower() in PICTURES]
@@ -157,7 +157,7 @@ def list_images(folder: Path) -> list[Path]:
 def detect_target(
     files: Sequence[Path], target: Target, lens: Pinhole, progress: Callable[[int], None] = lambda done: None
 ) -> Detections:
-    """Find the target in pictures taken through ``lens``. Raises CalibrationError for one of another size."""
+    """Find the target in images taken through ``lens``. Raises CalibrationError if a size differs from it."""
     seen: dict[str, TargetPose] = {}
     unused: dict[str, str] = {}
     for k, file in enumerate(files):
@@ -180,8 +180,8 @@ def detect_target(
 
 
 def pixel_noise(seen: Sequence[TargetPose]) -> float:
-    """Standard deviation of a corner's coordinate, from all reprojections together, their six numbers each
-    accounted for."""
+    """Standard deviation (pixels) of a corner coordinate from all reprojections, less six degrees of freedom
+    an image."""
     squares = sum(s.error_px**2 * len(s.corners.points) for s in seen)
     freedom = sum(2 * len(s.corners.points) - 6 for s in seen)
     return max(float(np.sqrt(squares / max(freedom, 1))), _MIN_PIXEL_NOISE)
@@ -190,7 +190,7 @@ def pixel_noise(seen: Sequence[TargetPose]) -> float:
 def to_samples(
     seen: Sequence[TargetPose], hands: Sequence[Array], names: Sequence[str], setup: str
 ) -> Samples:
-    """Samples with the target's covariance as its corners have it."""
+    """Samples with the target's covariance from its corners' noise."""
     noise = pixel_noise(seen)
     return Samples(
         _stacked(list(hands)), _stacked([s.pose for s in seen]), setup,
@@ -205,8 +205,8 @@ def read_visp_folder(
     setup: str,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[Samples, Detections]:
-    """Pictures ``*-N.png`` with poses ``*_N.yaml`` of the hand, matched by number; the lens from the folder's
-    XML where none is given. Raises CalibrationError."""
+    """Pictures ``*-N.png`` with poses ``*_N.yaml`` of the hand, matched by number; without ``lens``,
+    the folder's XML is read. Raises CalibrationError."""
     if lens is None:
         lenses = sorted(folder.glob("*.xml"))
         if len(lenses) != 1:

@@ -1,9 +1,9 @@
-"""Corners of a dark square on white from its sides.
+"""Refine the corners of a dark square on white by fitting lines to its sides.
 
-Corner refinement that looks at gradients around a point is made for saddle points, as a chessboard has them.
-On the outer corner of a square it comes out a quarter to half a pixel inside, which makes a tag of 80 mm 1 mm
-farther away at 20 cm. Here each side is a line through the places where gray passes half way from dark to
-light, and the corners are where the sides meet: within a tenth of a pixel on rendered tags.
+Gradient-based corner refinement is made for saddle points such as those of a chessboard. At the outer corner
+of a square it ends a quarter to half a pixel inside, which puts a tag of 80 mm 1 mm farther away at 20 cm.
+Here each side is a line through the points where gray is half way between dark and light, and the corners are
+the intersections: within a tenth of a pixel on rendered tags.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _STEP_PX = 0.25
 
 
 def square_corners(picture: NDArray[np.uint8], corners: Array) -> Array:
-    """Corners (4, 2), pixel centres at whole numbers, made better; those given where a side cannot be seen.
-    Of a side that is dark in places only, as a QR code's is, those places count."""
+    """Refined corners (4, 2), pixel centers at whole numbers; ``corners`` unchanged if a side cannot be seen.
+    Where a side is dark in part only, as in a QR code, those parts are used."""
     better = corners
     for _ in range(_ROUNDS):
         lines = [_side(picture, better, k) for k in range(4)]
@@ -35,7 +35,7 @@ def square_corners(picture: NDArray[np.uint8], corners: Array) -> Array:
             return corners
         better = np.array(meets)
     reach = _reach(corners)
-    # A side that was mistaken for another line leads away from where the detector saw a corner.
+    # Far from the detector's corners, a side was mistaken for another line.
     return better if np.abs(better - corners).max() <= 2 * reach else corners
 
 
@@ -82,6 +82,6 @@ def _intersection(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array | Non
 
 
 def _reach(corners: Array) -> float:
-    """Pixels to each side of an edge that are looked at: less than a module of the coarsest code."""
+    """Half width (pixels) of the search across an edge: less than a module of the coarsest code."""
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     return float(np.clip(sides.min() / 40, 2.0, 5.0))

@@ -1,4 +1,4 @@
-"""Hand-eye calibration from samples or streams to a result: every method, and what the answer is worth."""
+"""Hand-eye calibration of samples or streams by every method, with uncertainty and warnings."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from camera_node.robot.calibration.hand_eye.time_offset import StreamCalibration
 
 REFINED = DEFAULT_METHOD
 ALL_METHODS = (*METHODS, REFINED)
-# With fewer, the spread between methods is as large as what they disagree about.
+# With fewer poses, each method's own scatter is as large as the differences between methods.
 _GOOD_POSES = 10
 _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
 _MISMATCH_DEG = 1.0
-# Beyond these it is no calibration: poses the wrong way round, in millimetres, or of something else.
+# Beyond these the input is wrong: inverted poses, millimetres, or poses of something else.
 _WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
 _ADVICE = (
     "are the poses hand in base and target in camera, not their inverses, in metres, and is the set-up right?"
 )
-# As good as exact beside any camera.
+# Practically exact beside any camera.
 EXACT_ARM = (1e-6, 1e-6)
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method's answer. transform: None where it found none, with the error. from_refined_deg, _mm: how
-    far it is from the refinement's."""
+    """One method's result. transform: None with ``error`` if there is no solution. from_refined_deg, _mm:
+    distance from the refinement's."""
 
     method: str
     transform: Array | None
@@ -55,7 +55,7 @@ class MethodResult:
 class Calibration:
     """transform: X (4, 4) of the method asked for. rows: every method's. left_out_deg, left_out_mm: deviation
     over leaving out samples in turn (``groups`` of them). exact_arm: the refinement with the arm taken as
-    exact, where the target's own uncertainty is known. timed: of two streams. warnings: one line each."""
+    exact, if the target's covariance is known. timed: of two streams. warnings: one line each."""
 
     samples: Samples
     method: str
@@ -76,8 +76,7 @@ class Calibration:
         return 0.0 if self.timed is None else self.timed.offset_s
 
     def to_dict(self) -> dict[str, Any]:
-        """For scripts: {transform, time_offset_s, residual_mm, residual_deg, method}, and what the answer is
-        worth: {std_mm, std_deg, warnings}."""
+        """The JSON for scripts: the result, its residuals, standard deviations and warnings."""
         return {
             "transform": self.transform.tolist(),
             "time_offset_s": self.time_offset_s,
@@ -91,7 +90,7 @@ class Calibration:
 
 
 def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
-    """Raises CalibrationError with the reason where the samples do not determine X."""
+    """Calibrate with every method. Raises CalibrationError if the samples do not determine X."""
     spread = require_diversity(samples)
     return _calibration(samples, method, refine(samples), spread, None)
 
@@ -99,7 +98,7 @@ def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
 def calibrate_tracks(
     hand: Track, target: Track, setup: str, method: str = REFINED, max_gap_s: float = MAX_GAP_S
 ) -> Calibration:
-    """From two streams with an unknown time offset. Raises CalibrationError."""
+    """Calibrate from two streams with an unknown time offset. Raises CalibrationError."""
     timed = calibrate_streams(hand, target, setup, max_gap_s)
     return _calibration(timed.samples, method, timed.refined, require_diversity(timed.samples), timed)
 
@@ -142,8 +141,8 @@ def _calibration(
 
 
 def _require_plausible(transform: Array, off: Residuals) -> None:
-    """Raises CalibrationError for what a script must not take for an answer. Medians: a few wild samples
-    among good ones do no harm."""
+    """Raises CalibrationError for a result that cannot be right. Judged by medians, so that a few wild
+    samples among good ones do no harm."""
     median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
     away_m = float(np.linalg.norm(transform[:3, 3]))
     if median_mm > _WORST_MM or median_deg > _WORST_DEG:
@@ -171,9 +170,9 @@ def _warnings(
         out.append(
             f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
         )
-    strange = rotation_mismatch_deg(samples)
-    threshold = max(_MISMATCH_DEG, 5 * float(np.median(strange)))
-    for i in sorted({*refined.outliers, *map(int, np.flatnonzero(strange > threshold))})[:5]:
+    mismatch = rotation_mismatch_deg(samples)
+    threshold = max(_MISMATCH_DEG, 5 * float(np.median(mismatch)))
+    for i in sorted({*refined.outliers, *map(int, np.flatnonzero(mismatch > threshold))})[:5]:
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
             f"degrees) and counts for {min(1.0, refined.weights[i]):.2f}"

@@ -1,4 +1,4 @@
-"""``camera-node calibrate hand-eye --live``: a scenario's camera and a session, at the camera's pace."""
+"""``camera-node calibrate hand-eye --live``: a guided session with a scenario's camera."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
             "(without --hand, --moving and --eye-to-hand: what a hand holds is not known to be kept clear of)"
         )
     if args.tracks is not None:
-        _make(args.tracks)
+        _create_writable(args.tracks)
     source = open_source(loaded, config, args)
     before = None
     if args.samples is not None and args.samples.exists():
@@ -115,8 +115,9 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     return calibrate_tracks(tracks.hand(), tracks.target(), setup, args.method, args.max_gap_ms / 1e3)
 
 
-def _make(folder: Path) -> None:
-    """Of ``--tracks``, before the session that would be lost without it. Raises CalibrationError."""
+def _create_writable(folder: Path) -> None:
+    """Create the folder of ``--tracks`` before the session, whose data would be lost without it. Raises
+    CalibrationError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -132,7 +133,8 @@ def _follow(loaded: scenario.Scenario, arm: ArmConfig, tracks: StreamRecorder) -
 
 
 def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> ArmMover:
-    """Whatever ends this process from now on ends a move first. Raises CalibrationError, ScenarioError."""
+    """Connect to the arm; from now on a termination signal stops a move first. Raises CalibrationError,
+    ScenarioError."""
     from camera_node.robot.arm.joint_states import ArmError
     from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 
@@ -147,7 +149,7 @@ def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> Arm
 
 
 def _to_base(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
-    """Base-from-world (4, 4): an arm's poses come in the world, and a calibration is asked for in its base.
+    """Base-from-world (4, 4): the arm reports poses in the world, the calibration needs them in its base.
     Raises CalibrationError, ScenarioError."""
     from camera_node.robot.arm.camera_poses import base_matrix
 
@@ -172,12 +174,15 @@ def guide(
     tracks: StreamRecorder | None = None,
     first: int = 0,
 ) -> HandEyeStep | None:
-    """Offer the source's shots to the session until there is enough, ``pace`` says that time is over, or a
-    recording has been seen once. lens: instead of the source's own. hands: poses of the hand by time since
-    the first shot; None: the shots' own poses are the hand's. move: brings the hand to a pose (4, 4), or
-    refuses by ValueError; None: an operator does. to_base: base-from-world (4, 4), where the shots' poses are
-    in the world. tracks: keeps where the target was seen, and decides when it is enough. first: the source's
-    tick to begin with. Returns the last step."""
+    """Offer the source's shots to the session until it has enough, ``pace`` ends it, or a recording has been
+    seen once. Returns the last step.
+
+    lens: replaces the source's own.
+    hands: hand poses by time since the first shot; None: the shots' poses are the hand's.
+    move: brings the hand to a pose (4, 4), ValueError if it cannot; None: an operator moves it.
+    to_base: base-from-world (4, 4), if the hand's poses are in the world.
+    tracks: records the target poses and decides when there is enough.
+    first: first tick of the source."""
     step, begin_ns = None, None
     for tick, shot, image in read_shots(source, codec, pace, first):
         t_ns = shot.captured_ns

@@ -1,4 +1,4 @@
-"""A calibration for people: a table, a YAML that the node loads, a picture."""
+"""Output of a hand-eye calibration: a table, the YAML that the node loads, a plot."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ _BLUE, _RED, _GREY = "#0072B2", "#D55E00", "#999999"
 
 
 def show(found: Calibration) -> str:
-    """Every method's figures, the answer, what it is worth, warnings."""
+    """Format all methods' residuals, the result, its uncertainty and the warnings."""
     what = "camera in hand" if found.samples.setup == EYE_IN_HAND else "camera in base"
     spread = found.diversity
     lines = [
-        f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} degrees, "
-        f"axes spread by {spread.axis_spread_deg:.0f} degrees (35 where they point everywhere alike)",
+        f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} "
+        f"degrees, axes spread by {spread.axis_spread_deg:.0f} degrees "
+        "(35 where they point everywhere alike)",
         "",
         f"{'method':12} {'residual mm':>12} {'degrees':>9}   {'from refined mm':>16} {'degrees':>9}",
         *(_row(row) for row in found.rows),
@@ -52,7 +53,7 @@ def show(found: Calibration) -> str:
 
 
 def to_yaml(found: Calibration) -> str:
-    """What ``camera_node.robot.arm.hand_eye_mount.read_hand_eye`` reads, and how it was found."""
+    """The YAML that ``hand_eye_mount.read_hand_eye`` reads, with details of the calibration."""
     answer = found.to_dict()
     warnings = answer.pop("warnings")
     data = {
@@ -70,7 +71,7 @@ def to_yaml(found: Calibration) -> str:
 
 
 def write_yaml(found: Calibration, path: Path) -> None:
-    """Raises CalibrationError, also for what the node would refuse."""
+    """Write ``to_yaml``. Raises CalibrationError, also for an offset that the node would refuse."""
     if abs(found.time_offset_s) >= MAX_OFFSET_S:
         raise CalibrationError(
             f"--out: {path} is not written: the node would refuse a time offset of "
@@ -83,7 +84,7 @@ def write_yaml(found: Calibration, path: Path) -> None:
 
 
 def plot(found: Calibration, path: Path) -> None:
-    """Each pose's residual, the axes about which the hand turned, and where each pose puts the target."""
+    """Plot residuals, motion axes and each pose's target position. Raises CalibrationError."""
     try:
         import matplotlib
     except ImportError:

@@ -1,5 +1,5 @@
-"""A guided hand-eye calibration: pictures and hand poses come in, and it says what to do next and when to
-stop. It knows no camera, no arm and no clock: whoever runs it brings them."""
+"""A guided hand-eye calibration: takes images and hand poses, and says what to do next and when to stop. The
+caller provides camera, arm and clock."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from camera_node.robot.calibration.targets import Corners, Target, TargetPose, e
 from freshfield.geometry import Pinhole
 
 MIN_POSES, GOOD_SPREAD_DEG = 10, 15.0
-# A pose that turns by less from one that is kept says little that is new.
+# A pose rotated by less from a kept one adds little information.
 NEW_DEG = 8.0
-# Between two frames; beyond, stamps that are a few milliseconds wrong would count.
+# Largest motion between two frames: above it, errors of a few milliseconds in the stamps would matter.
 STILL_MM, STILL_DEG = 0.5, 0.1
 _MIN_TO_SOLVE = 4
 KEPT, MOVING = "kept", "hand moving"
@@ -30,8 +30,8 @@ KEPT, MOVING = "kept", "hand moving"
 
 @dataclass(frozen=True)
 class HandEyeStep:
-    """What came of a picture. outcome: ``kept``, or why not. count: samples kept. std_mm, std_deg: of the
-    answer so far, None while there is none. enough: stop here. advice: what to do next."""
+    """Result of one image. outcome: ``kept``, or why not. count: samples kept. std_mm, std_deg: of the
+    calibration so far, None while there is none. enough: whether to stop. advice: what to do next."""
 
     outcome: str
     count: int
@@ -49,10 +49,10 @@ class HandEyeStep:
 
 
 class HandEyeSession:
-    """Collects samples until the answer is sure to ``want_mm``.
+    """Collects samples until the standard deviation of the translation is at most ``want_mm``.
 
-    moving: take pictures while the hand moves (its poses are exact in time), else only when it holds still.
-    before: samples of an earlier session to go on with. kept: called with all samples after each new one.
+    moving: take images while the hand moves (its poses must be exact in time), else only at rest.
+    before: samples of an earlier session to continue. kept: called with all samples after each new one.
     """
 
     def __init__(
@@ -74,13 +74,13 @@ class HandEyeSession:
         self._rejected = 0
         self._diversity = diversity(self.samples())
         self.corners: Corners | None = None
-        """Found in the last picture."""
+        """Found in the last image."""
         self.seen: TargetPose | None = None
-        """The target in the last picture, where its pose could be told."""
+        """The target in the last image, if its pose could be estimated."""
         self._solve()
 
     def samples(self) -> Samples:
-        """All that is kept; with the target's covariance unless some are of an earlier session."""
+        """All kept samples, with the target's covariance unless some are from an earlier session."""
         names = [f"pose {k + 1}" for k in range(len(self._seen))]
         new = to_samples(self._seen, self._hands, names, self._setup)
         if self._before is None:
@@ -90,10 +90,10 @@ class HandEyeSession:
         return Samples(hand, target, self._setup)
 
     def offer(self, image: NDArray[np.uint8], lens: Pinhole, hand: Array) -> HandEyeStep:
-        """Look at a picture taken with the hand at ``hand`` (4, 4), in base."""
+        """Process an image (H, W, 3) taken with the hand at ``hand`` (4, 4), in base."""
         last, self._last = self._last, hand
         self.corners = self.seen = None
-        if not self._moving and (last is None or _apart(last, hand) > 1.0):
+        if not self._moving and (last is None or _motion(last, hand) > 1.0):
             return self._step(MOVING, "hold still")
         self.corners = self._target.find(to_gray(image))
         if self.corners is None:
@@ -113,9 +113,9 @@ class HandEyeSession:
         return self._step(KEPT, self._advice())
 
     def next_hand_pose(self) -> Array | None:
-        """Where the hand (4, 4) should be for the next sample, the same until one is kept: at first turned a
-        little about each axis, then where it makes the answer surest. None while the target was never seen.
-        Nothing is known here of what the arm can reach or would hit."""
+        """Hand pose (4, 4) for the next sample, the same until one is kept or rejected: first rotated a
+        little about each axis, then where the variance falls most. None until the target has been seen.
+        Reach and collisions are not considered."""
         if not self._seen:
             return None
         if self._wanted is None:
@@ -131,13 +131,13 @@ class HandEyeSession:
         return self._wanted
 
     def reject_pose(self) -> None:
-        """The pose wanted cannot be reached, or was no good: want another."""
+        """Propose another pose: this one cannot be reached, or gave no sample."""
         self._rejected += 1
         self._wanted = None
 
     @property
     def pixel_noise(self) -> float | None:
-        """Standard deviation of the corners in pixels, as far as known."""
+        """Standard deviation of the corners in pixels, None before the first sample."""
         return pixel_noise(self._seen) if self._seen else None
 
     def _solve(self) -> None:
@@ -180,7 +180,7 @@ class HandEyeSession:
 
 
 def preview(image: NDArray[np.uint8], corners: Corners | None, step: HandEyeStep) -> NDArray[np.uint8]:
-    """The picture (H + 40, W, 3) RGB with the corners that were found, and the step below it."""
+    """The image (H + 40, W, 3) RGB with the corners that were found, and the step below it."""
     said = f"{step.count} poses", f"{step.outcome}: {step.advice}"
     return draw_corners(to_gray(image), corners, said, step.outcome == KEPT)
 
@@ -201,6 +201,6 @@ def draw_corners(
     return out
 
 
-def _apart(a: Array, b: Array) -> float:
+def _motion(a: Array, b: Array) -> float:
     """Distance of two hand poses in units of the largest that counts as standing still."""
     return max(distance_mm(a, b) / STILL_MM, angle_deg(a, b) / STILL_DEG)

@@ -1,5 +1,5 @@
-"""A hand with a camera that moves over a target, with the truth known: what calibration and pairing are
-measured on. The place is that of a UR3e's table: everything is within half a metre of its base."""
+"""A simulated camera on a hand over a target, with known truth, to measure calibration and pairing.
+Everything is within half a metre of the base, as on the table of a UR3e."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def samples(
     metres: float = ARM_M,
     setup: str = EYE_IN_HAND,
 ) -> Samples:
-    """Samples with the noise on the arm's side. For eye-to-hand, hand and camera change places: X is the
-    same (4, 4), the camera in the base."""
+    """Samples with arm noise. For eye-to-hand, hand and base change places: X is the same (4, 4), then the
+    camera in the base."""
     hands = random_hands(count, rng)
     targets = observed_targets(hands)
     if setup != EYE_IN_HAND:
@@ -87,14 +87,14 @@ def samples(
 
 @dataclass(frozen=True)
 class Sweep:
-    """A hand that sweeps over the target along incommensurate sines, so that no stretch is like another.
+    """A hand that sweeps over the target along incommensurate sines, so that the motion never repeats.
 
     speed_m_per_s: mean speed of the camera. The path is the same at every speed.
     """
 
     speed_m_per_s: float = 0.1
 
-    # Metres of path a second at rate 1, measured over ten minutes of it.
+    # Mean speed at rate 1, measured over ten minutes.
     _NATURAL_M_PER_S = 0.1036
 
     def hands(self, t_s: NDArray[np.float64]) -> Array:
@@ -113,14 +113,14 @@ class Sweep:
 
 
 def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> GrayImage:
-    """The picture (H, W) of the target on a white plate, on a table, by the project's own ray caster."""
+    """Render (H, W) the target on a white plate on a table, by the project's ray caster."""
     width, height = target.size_m
     picture = target.draw(max(256, round(width / 0.0002)))
     # The caster's rectangle is seen from +z and has y up; a target's z goes into the paper and its y down.
     flip = _rigid((np.pi, 0.0, 0.0), (width / 2, height / 2, 0.0))
     parts = []
     for depth_m, margin_m, texture in (
-        (0.0, 0.0, _Picture(picture, width, height)),
+        (0.0, 0.0, _ImageTexture(picture, width, height)),
         (0.0005, _PLATE_MARGIN_M, Plain((0.95, 0.95, 0.95))),
         (0.001, 0.6, Plain((0.45, 0.42, 0.40))),
     ):
@@ -140,8 +140,8 @@ def camera_in_target(hand: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Picture:
-    """A gray picture on a rectangle, linear between its pixels."""
+class _ImageTexture:
+    """Texture of a gray image on a rectangle, with linear interpolation."""
 
     pixels: GrayImage
     width_m: float

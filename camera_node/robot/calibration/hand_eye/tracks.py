@@ -1,7 +1,7 @@
-"""Two streams of a guided calibration, for the time offset: the hand's poses, and the target's as seen.
+"""Records the two streams of a guided calibration for the time offset: hand poses and detected target poses.
 
-Each keeps its own stamps: what lies between them (the camera's own delay, the way of the joint states) is
-what ``calibrate.offset`` estimates from the motion. The files are as ``--hand`` and ``--target`` read them.
+Each keeps its own stamps: ``time_offset`` estimates the offset between them (camera delay, transport of the
+joint states) from the motion. The files are those that ``--hand`` and ``--target`` read.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from freshfield.scenario import Scenario
 
 HAND_FILE, TARGET_FILE = "hand.csv", "target.csv"
-# Of motion with the target in sight: the offset's deviation falls with its square root.
+# Motion with the target in sight: the offset's deviation falls with the square root of its duration.
 MIN_SECONDS = 10.0
-_GAP_NS = 125_000_000  # between two sightings; beyond, the motion between them is not known
+_GAP_NS = 125_000_000  # largest gap between two detections: the motion in a longer one is unknown
 _HEADER = "t,x,y,z,qx,qy,qz,qw"
 
 
@@ -57,8 +57,8 @@ class StreamRecorder:
         return self._seen_ns / 1e9
 
     def with_stream_advice(self, step: HandEyeStep) -> HandEyeStep:
-        """The step, by what streams need: ``std_mm`` has no part in it, because an offset that is not known
-        yet counts as noise there."""
+        """The step with advice for recording streams. ``std_mm`` is not used: the unknown offset counts as
+        noise in it."""
         varied = step.count >= MIN_POSES and step.diversity.axis_spread_deg >= GOOD_SPREAD_DEG
         if not varied:
             return step
@@ -86,8 +86,8 @@ class StreamRecorder:
 
 
 def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) -> ArmStream:
-    """Joint states of the scenario's arm into ``tracks``, as poses of the hand in its base, until the stream
-    is stopped. Raises ScenarioError, ArmError."""
+    """Record the scenario's arm into ``tracks``, as hand poses in its base, until the stream is stopped.
+    Raises ScenarioError, ArmError."""
     from camera_node.robot.arm.camera_poses import arm_model
     from camera_node.robot.arm.joint_states import ArmStream
     from freshfield.clock import WallClock

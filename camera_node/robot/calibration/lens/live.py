@@ -1,4 +1,4 @@
-"""``camera-node calibrate intrinsics --live``: a scenario's camera and a session, at the camera's pace."""
+"""``camera-node calibrate intrinsics --live``: a guided session with a scenario's camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera's lens from pictures of a target (Zhang's method, OpenCV's solver), with how sure it is."""
+"""A camera's lens and its uncertainty from images of a target (Zhang's method, OpenCV's solver)."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from camera_node.robot.calibration.targets import Corners, Target, opencv_lens
 from freshfield.geometry import Pinhole
 
 MIN_VIEWS = 4
-# All of the views flat against the sensor leave focal length and distance one unknown.
+# With all views parallel to the sensor, focal length and distance cannot be told apart.
 MIN_TILT_DEG = 10.0
 MIN_CORNERS = 6
 _OUTLIER = 4.0
-# Focal lengths over the picture's longer side: 136 and 7 degrees of view. Pictures that determine nothing let
-# the solver run away beyond.
+# Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver runs away beyond them if
+# the images do not determine a lens.
 _SHORTEST, _LONGEST = 0.2, 8.0
 
 
 @dataclass(frozen=True)
 class LensCalibration:
     """pinhole: this project's (corner origin). std: deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2.
-    error_px: root mean square of the reprojection. views: by picture, its own. tilt_deg: how differently the
-    target was tilted, largest angle between two views. covered: share of a 6 x 6 raster over the picture in
-    which corners were seen. unused: pictures and why not."""
+    error_px: root mean square of the reprojection. views: by picture, its own. tilt_deg: largest angle
+    between the target's tilts in two views. covered: share of a 6 x 6 grid over the image in which corners
+    were seen. unused: reason by image."""
 
     pinhole: Pinhole
     std: tuple[float, ...]
@@ -77,7 +77,7 @@ class LensCalibration:
 def calibrate_folder(
     files: Sequence[Path], target: Target, progress: Callable[[int], None] = lambda done: None
 ) -> LensCalibration:
-    """From picture files. Raises CalibrationError."""
+    """Calibrate from image files. Raises CalibrationError."""
     found: dict[str, Corners] = {}
     unused: dict[str, str] = {}
     size: tuple[int, int] | None = None
@@ -101,7 +101,7 @@ def calibrate_folder(
 def calibrate(
     views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]
 ) -> LensCalibration:
-    """From corners by picture name. Raises CalibrationError where they do not determine a lens."""
+    """Calibrate from corners by image name. Raises CalibrationError if they do not determine a lens."""
     usable = {n: c for n, c in views.items() if len(c.points) >= MIN_CORNERS}
     dropped = {n: f"only {len(c.points)} corners" for n, c in views.items() if n not in usable}
     unused = {**unused, **dropped}

@@ -10,8 +10,7 @@ import pytest
 
 from camera_node.cli import main
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import list_images
-from camera_node.robot.calibration.files import read_lens
+from camera_node.robot.calibration.files import list_images, read_lens
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.lens.solve import calibrate, calibrate_folder
 from camera_node.robot.calibration.targets import Corners, parse_target
