@@ -14,23 +14,12 @@ from camera_node.config import ArmConfig, source_config
 from camera_node.pose.pairing import sort_samples
 from camera_node.pose.providers import PoseProvider, Trajectory, TrajectoryError, read_samples
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
-from camera_node.robot.calibration import ArmStopped, CalibrationError
+from camera_node.robot.calibration import ArmStopped, CalibrationError, live_camera
 from camera_node.robot.calibration.files import pairs_json, read_pairs
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, calibrate, calibrate_tracks
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.hand_eye.session import KEPT, MOVING, HandEyeSession, HandEyeStep, preview
 from camera_node.robot.calibration.hand_eye.tracks import StreamRecorder, follow_arm
-from camera_node.robot.calibration.live_camera import (
-    Image,
-    Pace,
-    first_tick,
-    load_scenario,
-    open_source,
-    read_shots,
-    report_skipped,
-    report_step,
-    write_image,
-)
 from camera_node.robot.calibration.targets import Target
 from camera_node.sources.base import Source
 from freshfield import files, scenario
@@ -46,7 +35,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     ScenarioError."""
     if not args.want_mm > 0 or (args.seconds is not None and not args.seconds > 0):
         raise CalibrationError("--want-mm, --seconds: expected positive numbers")
-    loaded = load_scenario(args)
+    loaded = live_camera.load_scenario(args)
     config = source_config(loaded)
     arm: ArmConfig | None = getattr(config, "arm", None)
     to_base = None if arm is None or args.hand is not None else _to_base(loaded, arm, args.camera)
@@ -61,7 +50,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         )
     if args.tracks is not None:
         _create_writable(args.tracks)
-    source = open_source(loaded, config, args)
+    source = live_camera.open_source(loaded, config, args)
     before = None
     if args.samples is not None and args.samples.exists():
         before = read_pairs(args.samples, setup)
@@ -71,10 +60,10 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         if args.samples is not None:
             files.write_json(args.samples, pairs_json(samples))
 
-    def show(image: Image, step: HandEyeStep, session: HandEyeSession) -> None:
-        report_step(step.outcome, step.line)
+    def show(image: live_camera.Image, step: HandEyeStep, session: HandEyeSession) -> None:
+        live_camera.report_step(step.outcome, step.line)
         if args.preview is not None:
-            write_image(args.preview, preview(image, session.corners, step))
+            live_camera.write_image(args.preview, preview(image, session.corners, step))
 
     hands = None
     if args.hand is not None:
@@ -84,7 +73,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         except TrajectoryError as error:
             raise CalibrationError(str(error)) from None
     session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep)
-    pace = Pace(float(source.fps), args.seconds)
+    pace = live_camera.Pace(float(source.fps), args.seconds)
     tracks = StreamRecorder() if args.moving and to_base is not None else None
     stream = mover = None
     try:
@@ -94,7 +83,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
             stream = _follow(loaded, arm, tracks)
         guide(
             source, config.codec, lens, session, pace, show, hands,
-            move=mover, to_base=to_base, tracks=tracks, first=first_tick(source),
+            move=mover, to_base=to_base, tracks=tracks, first=live_camera.first_tick(source),
         )  # fmt: skip
     except KeyboardInterrupt:
         print("\nstopped; what there is:", file=sys.stderr)
@@ -167,7 +156,7 @@ def guide(
     lens: Pinhole | None,
     session: HandEyeSession,
     pace: Callable[[int], bool],
-    show: Callable[[Image, HandEyeStep, HandEyeSession], None],
+    show: Callable[[live_camera.Image, HandEyeStep, HandEyeSession], None],
     hands: PoseProvider | None = None,
     move: Callable[[Array], None] | None = None,
     to_base: Array | None = None,
@@ -184,7 +173,7 @@ def guide(
     tracks: records the target poses and decides when there is enough.
     first: first tick of the source."""
     step, begin_ns = None, None
-    for tick, shot, image in read_shots(source, codec, pace, first):
+    for tick, shot, image in live_camera.read_shots(source, codec, pace, first):
         t_ns = shot.captured_ns
         if begin_ns is None:
             begin_ns = round(first * 10**9 / source.fps) if t_ns is None else t_ns
@@ -193,7 +182,7 @@ def guide(
         try:
             hand = shot.pose if hands is None else hands.at(t_ns - begin_ns).pose
         except ValueError as error:
-            report_skipped(error)
+            live_camera.report_skipped(error)
             continue
         matrix = hand.matrix() if to_base is None else to_base @ hand.matrix()
         step = session.offer(image, lens or shot.intrinsics, matrix)
@@ -218,4 +207,4 @@ def _move_to_next_pose(session: HandEyeSession, step: HandEyeStep, move: Callabl
     try:
         move(wanted)
     except ValueError as error:  # the hand stays, so the next image is rejected and another pose proposed
-        report_skipped(error)
+        live_camera.report_skipped(error)

@@ -22,6 +22,7 @@ def show(found: Calibration) -> str:
     """Format all methods' residuals, the result, its uncertainty and the warnings."""
     what = "camera in hand" if found.samples.setup == EYE_IN_HAND else "camera in base"
     spread = found.diversity
+    x, y, z = found.transform[:3, 3]
     lines = [
         f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} "
         f"degrees, axes spread by {spread.axis_spread_deg:.0f} degrees "
@@ -30,9 +31,7 @@ def show(found: Calibration) -> str:
         f"{'method':12} {'residual mm':>12} {'degrees':>9}   {'from refined mm':>16} {'degrees':>9}",
         *(_row(row) for row in found.rows),
         "",
-        f"{what} ({found.method}): "
-        f"x {_metres(found, 0)}  y {_metres(found, 1)}  z {_metres(found, 2)} m, "
-        f"turned {_turn(found)}",
+        f"{what} ({found.method}): x {x:.5f}  y {y:.5f}  z {z:.5f} m, turned {_turn(found)}",
         f"  standard deviation {found.refined.std_mm:.3f} mm, {found.refined.std_deg:.4f} degrees; "
         f"leaving out one of {found.groups}: {found.left_out_mm:.3f} mm, {found.left_out_deg:.4f} degrees",
         f"  the arm's noise, estimated: {found.refined.arm_noise_m * 1e3:.3f} mm, "
@@ -134,10 +133,6 @@ def _row(row: MethodResult) -> str:
         f"{row.method:12} {row.residuals.rms_mm:12.3f} {row.residuals.rms_deg:9.4f}   "
         f"{row.from_refined_mm:16.3f} {row.from_refined_deg:9.4f}"
     )
-
-
-def _metres(found: Calibration, axis: int) -> str:
-    return f"{found.transform[axis, 3]:.5f}"
 
 
 def _turn(found: Calibration) -> str:

@@ -9,19 +9,9 @@ import sys
 from collections.abc import Generator
 
 from camera_node.config import LiveConfig, SourceConfig, source_config
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import CalibrationError, live_camera
 from camera_node.robot.calibration.lens.session import LensSession
 from camera_node.robot.calibration.lens.solve import LensCalibration
-from camera_node.robot.calibration.live_camera import (
-    Image,
-    Pace,
-    first_tick,
-    load_scenario,
-    open_source,
-    read_shots,
-    report_step,
-    write_image,
-)
 from camera_node.robot.calibration.targets import Target
 from camera_node.sources.devices.feed import as_camera_error
 from camera_node.sources.devices.live import DEFAULT_FPS, open_feed
@@ -37,15 +27,15 @@ def calibrate_live(args: argparse.Namespace, board: Target) -> LensCalibration:
     ScenarioError."""
     if args.seconds is not None and not args.seconds > 0:
         raise CalibrationError("--seconds: expected a positive number")
-    loaded = load_scenario(args)
+    loaded = live_camera.load_scenario(args)
     session = LensSession(board, args.moving)
     try:
         with contextlib.closing(_images(loaded, source_config(loaded), args)) as images:
             for image in images:
                 step = session.offer(image)
-                report_step(step.outcome, step.line)
+                live_camera.report_step(step.outcome, step.line)
                 if args.preview is not None:
-                    write_image(args.preview, session.preview(image, step))
+                    live_camera.write_image(args.preview, session.preview(image, step))
                 if step.enough:
                     break
     except KeyboardInterrupt:
@@ -55,28 +45,30 @@ def calibrate_live(args: argparse.Namespace, board: Target) -> LensCalibration:
     return session.lens()
 
 
-def _images(loaded: Scenario, config: SourceConfig, args: argparse.Namespace) -> Generator[Image, None, None]:
+def _images(
+    loaded: Scenario, config: SourceConfig, args: argparse.Namespace
+) -> Generator[live_camera.Image, None, None]:
     """Images (H, W, 3) uint8 RGB, until time is over or a recording has been seen once."""
     if isinstance(config, LiveConfig):
         yield from _camera_images(config, args)
         return
-    source = open_source(loaded, config, args)
+    source = live_camera.open_source(loaded, config, args)
     try:
-        pace = Pace(float(source.fps), args.seconds)
-        for _, _, image in read_shots(source, config.codec, pace, first_tick(source)):
+        pace = live_camera.Pace(float(source.fps), args.seconds)
+        for _, _, image in live_camera.read_shots(source, config.codec, pace, live_camera.first_tick(source)):
             yield image
     finally:
         source.release()
 
 
-def _camera_images(config: LiveConfig, args: argparse.Namespace) -> Generator[Image, None, None]:
+def _camera_images(config: LiveConfig, args: argparse.Namespace) -> Generator[live_camera.Image, None, None]:
     """From the camera's feed: a source would require the lens, which is not known yet."""
     fps = rate(config.fps or DEFAULT_FPS)
     try:
         feed = open_feed(args.camera, config, fps, WallClock())
     except ValueError as error:
         raise CalibrationError(str(error)) from None
-    pace = Pace(float(fps), args.seconds)
+    pace = live_camera.Pace(float(fps), args.seconds)
     try:
         for tick in itertools.count():
             if not pace(tick):

@@ -343,12 +343,7 @@ def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkey
             moving.wait()
     assert found["time_offset_s"] == pytest.approx(-0.060, abs=0.006)  # joint states take their time too
     assert distance_mm(np.array(found["transform"]), X) < 2.0
-    words = [
-        "--hand",
-        str(tmp_path / tracks / HAND_FILE),
-        "--target",
-        str(tmp_path / tracks / TARGET_FILE),
-    ]
+    words = ["--hand", str(tmp_path / tracks / HAND_FILE), "--target", str(tmp_path / tracks / TARGET_FILE)]
     assert main(["calibrate", "hand-eye", *words, "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["time_offset_s"] == pytest.approx(found["time_offset_s"], abs=1e-5)

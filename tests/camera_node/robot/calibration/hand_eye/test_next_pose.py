@@ -58,11 +58,7 @@ def test_same_seed_same_proposal():
 @pytest.mark.parametrize(
     ("turn", "shift", "words"),
     [
-        (
-            (0.5, 0.1, 0),
-            (0.1, 0, -0.03),
-            "by about 29 degrees, mostly about its +x, move +10 cm x, -3 cm z",
-        ),
+        ((0.5, 0.1, 0), (0.1, 0, -0.03), "by about 29 degrees, mostly about its +x, move +10 cm x, -3 cm z"),
         ((0, -1.0, 0), (0, 0, 0.001), "by about 57 degrees, mostly about its -y"),
     ],
 )
