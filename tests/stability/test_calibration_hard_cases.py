@@ -28,10 +28,10 @@ def of_turns(turns, setup=EYE_IN_HAND, noise=(0.002, 0.0005)) -> Samples:
     for hand, turn in zip(hands, turns):
         hand[:3, :3] = hand[:3, :3] @ so3_exp(turn)
         hand[:3, 3] += rng.normal(0, 0.05, 3)
-    targets = simulated.seen_targets(hands)
+    targets = simulated.observed_targets(hands)
     if setup == EYE_TO_HAND:
         hands = inverse(hands)
-    return Samples(simulated.disturbed(hands, rng, *noise), targets, setup)
+    return Samples(simulated.add_noise(hands, rng, *noise), targets, setup)
 
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -130,7 +130,7 @@ def test_wrong_samples_up_to_three_in_ten(share):
     rng = np.random.default_rng(7)
     bad = rng.choice(30, int(30 * share), replace=False)
     target = good.target.copy()
-    target[bad] = simulated.disturbed(target[bad], rng, 0.5, 0.1)
+    target[bad] = simulated.add_noise(target[bad], rng, 0.5, 0.1)
     found = refine(Samples(good.hand, target))
     assert set(bad) == set(found.outliers)
     assert distance_mm(found.x, X) < 1.5

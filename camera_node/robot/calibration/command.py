@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from camera_node.robot import stdout
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, WANT_MM, CalibrationError
 
 if TYPE_CHECKING:
     from camera_node.robot.calibration.hand_eye.calibrate import Calibration
@@ -29,30 +29,29 @@ EXAMPLES = """examples:
 """
 
 HAND_EYE = """Estimates where a camera sits on a hand (or in the base of the arm, --eye-to-hand), T_EE^C of
-the thesis (4.2), by Tsai-Lenz and four other closed forms and by a joint refinement that takes the arm for as
-inexact as it turns out to be. Motions that do not determine it are refused with the reason.
+the thesis (4.2), by Tsai-Lenz, four other closed forms, and a joint refinement that estimates the arm's noise
+too. Motions that do not determine it are refused with the reason.
 
 from, one of:
   FOLDER         pictures NAME-3.png with NAME_3.yaml, the hand's pose (rows: 6, cols: 1, data: [tx ty tz and
                  theta u], metres and radians)
   --pairs FILE   JSON list of [end-effector in base, target in camera], 4 x 4 each
   --hand CSV --target CSV   lines t,x,y,z,qx,qy,qz,qw (seconds, metres); the time offset is estimated too
-  --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when it is
-                 enough; with --drive the arm moves by itself. The hand's poses are those that the camera's
-                 source gives (without hand_eye), or --hand CSV of them, by seconds since the first frame
+  --live SCENARIO --camera ID   guided: move the hand, hold still; it says what is missing and when there is
+                 enough; with --drive the arm moves by itself. Hand poses come from the camera's source
+                 (without hand_eye), or from --hand CSV, by seconds since the first frame
 """
 
 
-MAX_GAP_MS, WANT_MM = 50.0, 0.5
-# Option -> what it goes with: said with anything else, it would be ignored.
-_GO_WITH = {
+# Option -> the inputs that use it; with any other input it is an error, not ignored.
+_GOES_WITH = {
     "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
     **dict.fromkeys(
         ("camera", "data", "want_mm", "moving", "drive", "yes", "samples", "preview", "seconds", "tracks"),
         ("live",),
     ),
 }  # fmt: skip
-_SPELT = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
+_INPUT_NAMES = {"folder": "FOLDER", "hand": "--hand CSV", "live": "--live SCENARIO"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -115,10 +114,10 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     add("--lens", type=Path, metavar="FILE",
         help="calibration JSON or ViSP's XML (default: the folder's XML, the live camera's own)")
     add("--eye-to-hand", action="store_true", help="the camera stands, the hand holds the target")
-    add("--method", default="refined", metavar="NAME",
+    add("--method", default=DEFAULT_METHOD, metavar="NAME",
         help="whose answer is given: tsai, park, horaud, andreff, daniilidis or refined (default)")
     add("--max-gap-ms", type=float, metavar="MS",
-        help=f"of streams: what is farther from a hand pose is not used (default {MAX_GAP_MS:g})")
+        help=f"of streams: what is farther from a hand pose is not used (default {MAX_GAP_S * 1e3:g})")
     add("--json", action="store_true",
         help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
     add("--out", type=Path, metavar="FILE.yaml", help="for the node (source.trajectory.hand_eye)")
@@ -143,7 +142,7 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry a command out. Raises CalibrationError (exit code 2: it says what to change)."""
+    """Run a calibrate command. Raises CalibrationError, which ends it with exit code 2."""
     if args.what == "target":
         return _target(args)
     try:
@@ -170,23 +169,23 @@ def _hand_eye(args: argparse.Namespace) -> int:
         raise CalibrationError(
             "expected one of FOLDER, --pairs FILE, --hand CSV --target CSV, --live SCENARIO"
         )
-    for option, goes_with in _GO_WITH.items():
+    for option, goes_with in _GOES_WITH.items():
         if getattr(args, option) not in (None, False) and not given & set(goes_with):
-            places = " or ".join(_SPELT[each] for each in goes_with)
+            places = " or ".join(_INPUT_NAMES[each] for each in goes_with)
             raise CalibrationError(f"--{option.replace('_', '-')}: goes with {places}")
-    args.max_gap_ms = MAX_GAP_MS if args.max_gap_ms is None else args.max_gap_ms
+    args.max_gap_ms = MAX_GAP_S * 1e3 if args.max_gap_ms is None else args.max_gap_ms
     args.want_mm = WANT_MM if args.want_mm is None else args.want_mm
-    from camera_node.robot.calibration.hand_eye import calibrate as handeye
+    from camera_node.robot.calibration.hand_eye import calibrate as hand_eye
     from camera_node.robot.calibration.hand_eye import report
 
-    if args.method not in handeye.ALL_METHODS:
-        raise CalibrationError(f"--method: expected one of {', '.join(handeye.ALL_METHODS)}")
-    found = _found(args)
+    if args.method not in hand_eye.ALL_METHODS:
+        raise CalibrationError(f"--method: expected one of {', '.join(hand_eye.ALL_METHODS)}")
+    found = _calibrate(args)
     if args.json:
         for warning in found.warnings:
-            _say(f"note: {warning}")
-    # First of all, or a file that cannot be written would take a session's answer with it.
-    print(json.dumps(found.answer()) if args.json else report.show(found), flush=True)
+            _note(f"note: {warning}")
+    # Print first, so that a file that cannot be written does not lose the session's answer.
+    print(json.dumps(found.to_dict()) if args.json else report.show(found), flush=True)
     if args.out is not None:
         report.write_yaml(found, args.out)
     if args.plot is not None:
@@ -194,44 +193,44 @@ def _hand_eye(args: argparse.Namespace) -> int:
     return 0
 
 
-def _found(args: argparse.Namespace) -> Calibration:
+def _calibrate(args: argparse.Namespace) -> Calibration:
     from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
-    from camera_node.robot.calibration import files as folder
-    from camera_node.robot.calibration.hand_eye import calibrate as handeye
-    from camera_node.robot.calibration.targets import parse
+    from camera_node.robot.calibration import files
+    from camera_node.robot.calibration.hand_eye import calibrate as hand_eye
+    from camera_node.robot.calibration.targets import parse_target
 
     setup = EYE_TO_HAND if args.eye_to_hand else EYE_IN_HAND
     if args.pairs is not None:
-        return handeye.calibrate(folder.read_pairs(args.pairs, setup), args.method)
+        return hand_eye.calibrate(files.read_pairs(args.pairs, setup), args.method)
     if not args.max_gap_ms > 0:
         raise CalibrationError("--max-gap-ms: expected a positive number")
     if args.live is None and args.hand is not None:
-        hand, target = folder.read_track(args.hand), folder.read_track(args.target)
+        hand, target = files.read_track(args.hand), files.read_track(args.target)
         for name, track in (("hand", hand), ("target", target)):
             if track.counts.duplicates or track.counts.reordered:
-                _say(f"{name}: {track.counts.duplicates} stamps came twice (the first is used), "
+                _note(f"{name}: {track.counts.duplicates} stamps came twice (the first is used), "
                      f"{track.counts.reordered} out of order (sorted)")  # fmt: skip
-        return handeye.calibrate_tracks(hand, target, setup, args.method, args.max_gap_ms / 1e3)
+        return hand_eye.calibrate_tracks(hand, target, setup, args.method, args.max_gap_ms / 1e3)
     if args.board is None:
         raise CalibrationError("--board SPEC: say what the target is")
     if args.live is not None and args.camera is None:
         raise CalibrationError("--camera ID: say which of the scenario's cameras")
-    board = parse(args.board)
-    lens = None if args.lens is None else folder.read_lens(args.lens)
+    board = parse_target(args.board)
+    lens = None if args.lens is None else files.read_lens(args.lens)
     if args.live is not None:
         from camera_node.robot.calibration.hand_eye.live import calibrate_live
 
         return calibrate_live(args, board, lens, setup)
-    samples, measured = folder.read_visp_folder(args.folder, board, lens, setup, _counting("pictures"))
+    samples, measured = files.read_visp_folder(args.folder, board, lens, setup, _print_progress)
     for name, why in measured.unused.items():
-        _say(f"{name}: {why}")
-    return handeye.calibrate(samples, args.method)
+        _note(f"{name}: {why}")
+    return hand_eye.calibrate(samples, args.method)
 
 
 def _intrinsics(args: argparse.Namespace) -> int:
-    from camera_node.robot.calibration.files import pictures
+    from camera_node.robot.calibration.files import list_images
     from camera_node.robot.calibration.lens.solve import calibrate_folder
-    from camera_node.robot.calibration.targets import parse
+    from camera_node.robot.calibration.targets import parse_target
     from freshfield import files
 
     if (args.folder is None) == (args.live is None):
@@ -239,12 +238,12 @@ def _intrinsics(args: argparse.Namespace) -> int:
     if args.folder is not None:
         for option in ("data", "moving", "preview", "seconds"):
             if getattr(args, option) not in (None, False):
-                raise CalibrationError(f"--{option}: goes with {_SPELT['live']}")
-        lens = calibrate_folder(pictures(args.folder), parse(args.board), _counting("pictures"))
+                raise CalibrationError(f"--{option}: goes with {_INPUT_NAMES['live']}")
+        lens = calibrate_folder(list_images(args.folder), parse_target(args.board), _print_progress)
     else:
         from camera_node.robot.calibration.lens.live import calibrate_live
 
-        lens = calibrate_live(args, parse(args.board))
+        lens = calibrate_live(args, parse_target(args.board))
     data = lens.calibration(args.camera)
     if args.out is not None:
         try:
@@ -259,16 +258,16 @@ def _target(args: argparse.Namespace) -> int:
     import cv2
     import numpy as np
 
-    from camera_node.robot.calibration.targets import parse
+    from camera_node.robot.calibration.targets import parse_target
 
-    board = parse(args.board)
+    board = parse_target(args.board)
     width, height = (round(side_m / 0.0254 * args.dpi) for side_m in board.size_m)
     if not 64 <= width <= 32_000:
         raise CalibrationError(f"--dpi: makes a picture {width} pixels wide, expected 64 to 32000")
-    # Drawn finer, in whole pixels a module, and brought to size: rounding each module would add up over them.
+    # Draw finer, in whole pixels a module, then scale: rounding errors of the modules would add up.
     fine = board.draw(board.modules * math.ceil(2 * width / board.modules))
     picture = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
-    # Detectors need white around what they look for.
+    # Detectors need a white border.
     border = max(8, width // 10)
     if not cv2.imwrite(str(args.out), np.pad(picture, border, constant_values=255)):
         raise CalibrationError(f"--out: {args.out} cannot be written (does its folder exist? .png?)")
@@ -280,20 +279,20 @@ def _target(args: argparse.Namespace) -> int:
 
 
 def _accuracy(args: argparse.Namespace) -> int:
-    from camera_node.robot.calibration import accuracy_cost
+    from camera_node.robot.calibration import accuracy_study
 
     if args.seed < 0:
         raise CalibrationError("--seed: expected a whole number from 0")
     tables = {}
     try:
-        for name, rows in accuracy_cost.measure(args.quick, args.seed):
+        for name, rows in accuracy_study.run_tables(args.quick, args.seed):
             tables[name] = rows
             if not args.json:
-                print(accuracy_cost.show(name, rows), flush=True)
+                print(accuracy_study.format_table(name, rows), flush=True)
             if args.out is not None:
-                accuracy_cost.write(name, rows, args.out)
+                accuracy_study.write_csv(name, rows, args.out)
         if args.out is not None:
-            accuracy_cost.draw(tables, args.out / "accuracy.png")
+            accuracy_study.plot(tables, args.out / "accuracy.png")
     except OSError as error:
         raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
     if args.json:
@@ -301,13 +300,10 @@ def _accuracy(args: argparse.Namespace) -> int:
     return 0
 
 
-def _counting(what: str):  # type: ignore[no-untyped-def]
-    def progress(done: int) -> None:
-        if sys.stderr.isatty():
-            print(f"\r{done} {what} ", end="", file=sys.stderr, flush=True)
-
-    return progress
+def _print_progress(done: int) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{done} pictures ", end="", file=sys.stderr, flush=True)
 
 
-def _say(line: str) -> None:
+def _note(line: str) -> None:
     print(line, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What calibrations are made from, as files: ViSP's folders, pairs as JSON, time-stamped poses as CSV."""
+"""Read calibration input: ViSP's folders, pose pairs as JSON, time-stamped poses as CSV."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from camera_node.pose.pairing import PairingCounts, sort_samples
 from camera_node.pose.providers import TrajectoryError, read_samples
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
-from camera_node.robot.calibration.targets import Seen, Target, grey, locate
+from camera_node.robot.calibration.targets import Target, TargetPose, estimate_pose, to_gray
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import GeometryError, Pinhole, Pose, so3_exp
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-# A corner is never better than this; perfect pictures would otherwise make it exact.
-_LEAST_PIXEL_NOISE = 0.02
+# Lower bound in pixels, so that perfect (rendered) images do not make a corner exact.
+_MIN_PIXEL_NOISE = 0.02
 
 
 @dataclass(frozen=True)
 class Track:
-    """A stream of poses: times_ns (N,) increasing, poses (N, 4, 4), and what was put right in it."""
+    """A stream of poses. times_ns: (N,) increasing. poses: (N, 4, 4). counts: stamps sorted or dropped."""
 
     times_ns: NDArray[np.int64]
     poses: Array
@@ -61,13 +61,13 @@ def read_pairs(file: Path, setup: str) -> Samples:
 
 
 def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
-    """What ``read_pairs`` reads."""
+    """The JSON that ``read_pairs`` reads."""
     return [[h.tolist(), t.tolist()] for h, t in zip(samples.hand, samples.target)]
 
 
 def read_track(file: Path) -> Track:
-    """Poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), a header allowed; put in order where their stamps are
-    not. Raises CalibrationError."""
+    """Poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), header optional, sorted by stamp where
+    needed. Raises CalibrationError."""
     try:
         times, poses = read_samples(file)
     except TrajectoryError as error:
@@ -96,7 +96,7 @@ def read_visp_pose(file: Path) -> Array:
 
 
 def read_lens(file: Path) -> Pinhole:
-    """A lens from a calibration JSON (``camera-node calibrate intrinsics``; of one camera) or ViSP's camera
+    """A lens from a calibration JSON of one camera (``camera-node calibrate intrinsics``) or ViSP's camera
     XML. Raises CalibrationError."""
     if file.suffix.lower() != ".xml":
         try:
@@ -129,23 +129,23 @@ def read_lens(file: Path) -> Pinhole:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """Pictures in which the target was found, by name, and why the others are not used."""
+class Detections:
+    """seen: target poses by image name. unused: the reason, by name, for every other image."""
 
-    seen: dict[str, Seen]
+    seen: dict[str, TargetPose]
     unused: dict[str, str]
 
 
-def read_picture(file: Path) -> np.ndarray:
-    """Grey (H, W). Raises CalibrationError."""
+def read_gray_image(file: Path) -> np.ndarray:
+    """Gray (H, W). Raises CalibrationError."""
     picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CalibrationError(f"{file}: cannot be read as a picture")
     return np.asarray(picture, dtype=np.uint8)
 
 
-def pictures(folder: Path) -> list[Path]:
-    """Picture files, in the order of the numbers in their names. Raises CalibrationError for none."""
+def list_images(folder: Path) -> list[Path]:
+    """Image files in the order of the numbers in their names. Raises CalibrationError if there are none."""
     if not folder.is_dir():
         raise CalibrationError(f"{folder}: no such folder")
     found = [f for f in folder.iterdir() if f.suffix.lower() in PICTURES]
@@ -154,14 +154,14 @@ def pictures(folder: Path) -> list[Path]:
     return sorted(found, key=lambda f: (_number(f) is None, _number(f) or 0, f.name))
 
 
-def measure(
+def detect_target(
     files: Sequence[Path], target: Target, lens: Pinhole, progress: Callable[[int], None] = lambda done: None
-) -> Measured:
-    """Find the target in pictures taken through ``lens``. Raises CalibrationError for one of another size."""
-    seen: dict[str, Seen] = {}
+) -> Detections:
+    """Find the target in images taken through ``lens``. Raises CalibrationError if a size differs from it."""
+    seen: dict[str, TargetPose] = {}
     unused: dict[str, str] = {}
     for k, file in enumerate(files):
-        picture = grey(read_picture(file))
+        picture = to_gray(read_gray_image(file))
         if picture.shape != (lens.height, lens.width):
             raise CalibrationError(
                 f"{file}: is {picture.shape[1]} x {picture.shape[0]}, the lens was calibrated at "
@@ -172,27 +172,29 @@ def measure(
             unused[file.name] = f"{target.name} not found"
         else:
             try:
-                seen[file.name] = locate(corners, lens)
+                seen[file.name] = estimate_pose(corners, lens)
             except CalibrationError as error:
                 unused[file.name] = str(error)
         progress(k + 1)
-    return Measured(seen, unused)
+    return Detections(seen, unused)
 
 
-def pixel_noise(seen: Sequence[Seen]) -> float:
-    """Standard deviation of a corner's coordinate, from all reprojections together, their six numbers each
-    accounted for."""
+def pixel_noise(seen: Sequence[TargetPose]) -> float:
+    """Standard deviation (pixels) of a corner coordinate from all reprojections, less six degrees of freedom
+    an image."""
     squares = sum(s.error_px**2 * len(s.corners.points) for s in seen)
     freedom = sum(2 * len(s.corners.points) - 6 for s in seen)
-    return max(float(np.sqrt(squares / max(freedom, 1))), _LEAST_PIXEL_NOISE)
+    return max(float(np.sqrt(squares / max(freedom, 1))), _MIN_PIXEL_NOISE)
 
 
-def samples_of(seen: Sequence[Seen], hands: Sequence[Array], names: Sequence[str], setup: str) -> Samples:
-    """Samples with the target's covariance as its corners have it."""
+def to_samples(
+    seen: Sequence[TargetPose], hands: Sequence[Array], names: Sequence[str], setup: str
+) -> Samples:
+    """Samples with the target's covariance from its corners' noise."""
     noise = pixel_noise(seen)
     return Samples(
         _stacked(list(hands)), _stacked([s.pose for s in seen]), setup,
-        np.array([s.per_pixel * noise**2 for s in seen]).reshape(-1, 6, 6), tuple(names),
+        np.array([s.unit_covariance * noise**2 for s in seen]).reshape(-1, 6, 6), tuple(names),
     )  # fmt: skip
 
 
@@ -202,9 +204,9 @@ def read_visp_folder(
     lens: Pinhole | None,
     setup: str,
     progress: Callable[[int], None] = lambda done: None,
-) -> tuple[Samples, Measured]:
-    """Pictures ``*-N.png`` with poses ``*_N.yaml`` of the hand, matched by number; the lens from the folder's
-    XML where none is given. Raises CalibrationError."""
+) -> tuple[Samples, Detections]:
+    """Pictures ``*-N.png`` with poses ``*_N.yaml`` of the hand, matched by number; without ``lens``,
+    the folder's XML is read. Raises CalibrationError."""
     if lens is None:
         lenses = sorted(folder.glob("*.xml"))
         if len(lenses) != 1:
@@ -212,20 +214,20 @@ def read_visp_folder(
                 f"{folder}: has {len(lenses)} camera XML files; name the lens: --lens FILE"
             )
         lens = read_lens(lenses[0])
-    files = pictures(folder)
+    files = list_images(folder)
     poses = {_number(f): f for f in folder.glob("*.yaml") if _number(f) is not None}
     paired = [f for f in files if _number(f) in poses]
     if not paired:
         raise CalibrationError(
             f"{folder}: no picture has a pose file of its number (NAME_3.yaml, NAME-3.png)"
         )
-    found = measure(paired, target, lens, progress)
+    found = detect_target(paired, target, lens, progress)
     unused = {f.name: "no pose file of its number" for f in files if _number(f) not in poses}
-    found = Measured(found.seen, {**found.unused, **unused})
+    found = Detections(found.seen, {**found.unused, **unused})
     used = [f for f in paired if f.name in found.seen]
     hands = [read_visp_pose(poses[_number(f)]) for f in used]
     names = [f.name for f in used]
-    return samples_of([found.seen[n] for n in names], hands, names, setup), found
+    return to_samples([found.seen[n] for n in names], hands, names, setup), found
 
 
 def _number(file: Path) -> int | None:

@@ -1,9 +1,9 @@
-"""Corners of a dark square on white from its sides.
+"""Refine the corners of a dark square on white by fitting lines to its sides.
 
-Corner refinement that looks at gradients around a point is made for saddle points, as a chessboard has them.
-On the outer corner of a square it comes out a quarter to half a pixel inside, which makes a tag of 80 mm 1 mm
-farther away at 20 cm. Here each side is a line through the places where grey passes half way from dark to
-light, and the corners are where the sides meet: within a tenth of a pixel on rendered tags.
+Gradient-based corner refinement is made for saddle points such as those of a chessboard. At the outer corner
+of a square it ends a quarter to half a pixel inside, which puts a tag of 80 mm 1 mm farther away at 20 cm.
+Here each side is a line through the points where gray is half way between dark and light, and the corners are
+the intersections: within a tenth of a pixel on rendered tags.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ Array = NDArray[np.float64]
 
 # Along a side, as shares of its length: the ends belong to the corners.
 _SHARES = np.linspace(0.06, 0.94, 64)
-_LEAST_SAMPLES = 10
+_MIN_SAMPLES = 10
 _ROUNDS = 2
 # Across a side, in pixels.
 _STEP_PX = 0.25
 
 
 def square_corners(picture: NDArray[np.uint8], corners: Array) -> Array:
-    """Corners (4, 2), pixel centres at whole numbers, made better; those given where a side cannot be seen.
-    Of a side that is dark in places only, as a QR code's is, those places count."""
+    """Refined corners (4, 2), pixel centers at whole numbers; ``corners`` unchanged if a side cannot be seen.
+    Where a side is dark in part only, as in a QR code, those parts are used."""
     better = corners
     for _ in range(_ROUNDS):
         lines = [_side(picture, better, k) for k in range(4)]
         if any(line is None for line in lines):
             return corners
-        meets = [_meet(lines[k - 1], lines[k]) for k in range(4)]  # type: ignore[arg-type]
+        meets = [_intersection(lines[k - 1], lines[k]) for k in range(4)]  # type: ignore[arg-type]
         if any(m is None for m in meets):
             return corners
         better = np.array(meets)
     reach = _reach(corners)
-    # A side that was mistaken for another line leads away from where the detector saw a corner.
+    # Far from the detector's corners, a side was mistaken for another line.
     return better if np.abs(better - corners).max() <= 2 * reach else corners
 
 
@@ -49,32 +49,32 @@ def _side(picture: NDArray[np.uint8], corners: Array, k: int) -> tuple[Array, Ar
     reach = _reach(corners)
     depth = np.arange(-reach, reach + _STEP_PX / 2, _STEP_PX)
     at = start + _SHARES[:, None, None] * along + depth[:, None] * across
-    grey = cv2.remap(
+    gray = cv2.remap(
         picture, at[..., 0].astype(np.float32), at[..., 1].astype(np.float32), cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     ).astype(np.float64)  # fmt: skip
     ends = max(2, len(depth) // 6)
-    inside, outside = grey[:, :ends].mean(axis=1), grey[:, -ends:].mean(axis=1)
+    inside, outside = gray[:, :ends].mean(axis=1), gray[:, -ends:].mean(axis=1)
     contrast = outside - inside
     seen = contrast > 0.6 * np.quantile(contrast, 0.9)
-    if seen.sum() < _LEAST_SAMPLES or np.quantile(contrast, 0.9) < 10:
+    if seen.sum() < _MIN_SAMPLES or np.quantile(contrast, 0.9) < 10:
         return None
     half = (inside + outside) / 2
-    light = grey >= half[:, None]
+    light = gray >= half[:, None]
     # The last dark place on the way out.
     last = len(depth) - 1 - np.argmax(~light[:, ::-1], axis=1)
     seen &= (last < len(depth) - 1) & ~light[:, 0]
     rows = np.flatnonzero(seen)
-    if len(rows) < _LEAST_SAMPLES:
+    if len(rows) < _MIN_SAMPLES:
         return None
-    before, after = grey[rows, last[rows]], grey[rows, last[rows] + 1]
+    before, after = gray[rows, last[rows]], gray[rows, last[rows] + 1]
     share = (half[rows] - before) / np.maximum(after - before, 1e-9)
     edge = start + _SHARES[rows, None] * along + ((depth[last[rows]] + share * _STEP_PX)[:, None] * across)
     vx, vy, x, y = cv2.fitLine(edge.astype(np.float32), cv2.DIST_HUBER, 0, 0.01, 0.01).ravel()
     return np.array([x, y], dtype=np.float64), np.array([vx, vy], dtype=np.float64)
 
 
-def _meet(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array | None:
+def _intersection(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array | None:
     directions = np.stack([a[1], -b[1]], axis=1)
     if abs(np.linalg.det(directions)) < 1e-3:
         return None
@@ -82,6 +82,6 @@ def _meet(a: tuple[Array, Array], b: tuple[Array, Array]) -> Array | None:
 
 
 def _reach(corners: Array) -> float:
-    """Pixels to each side of an edge that are looked at: less than a module of the coarsest code."""
+    """Half width (pixels) of the search across an edge: less than a module of the coarsest code."""
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     return float(np.clip(sides.min() / 40, 2.0, 5.0))

@@ -1,12 +1,12 @@
-"""Targets that a camera can measure itself against, by name, and their pose from one picture.
+"""Calibration targets by name, and a target's pose from one image.
 
     charuco:7x5:30mm:22mm[:4X4_50]     squares across x down, their side, the markers' side, dictionary
     chessboard:9x6:23.6mm              inner corners across x down, side of a square
-    apriltag:36h11:0:80mm              family (16h5, 25h9, 36h10, 36h11), number, side of the black square
-    qr:60mm[:TEXT]                     side of the code; what it must say, else any
+    apriltag:36h11:0:80mm              family (16h5, 25h9, 36h10, 36h11), tag id, side of the black square
+    qr:60mm[:TEXT]                     side of the code; its text (default: any)
 
-A target's axes: origin at the top left corner of its picture (of a chessboard: the first inner corner), x to
-the right, y down, z away from the viewer, metres.
+Target axes: origin at the top left corner of the printed pattern (of a chessboard: the first inner corner),
+x to the right, y down, z away from the viewer, metres.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from camera_node.robot.calibration.square_corners import square_corners
 from freshfield.geometry import Pinhole
 
 Array = NDArray[np.float64]
-Grey = NDArray[np.uint8]
+GrayImage = NDArray[np.uint8]
 
 SPELLINGS = "charuco:7x5:30mm:22mm, chessboard:9x6:23.6mm, apriltag:36h11:0:80mm or qr:60mm"
-# Fewer corners than this of a board say too little about where it is turned.
+# With fewer corners of a board, its orientation is too uncertain.
 _MIN_CORNERS = 6
-# Of the two poses that explain a flat target, the second must be this much worse, or either may be true.
+# Ratio of reprojection errors above which the second of the two poses of a flat target is ruled out.
 _AMBIGUOUS = 1.5
 _FAMILIES = ("16h5", "25h9", "36h10", "36h11")
 _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
@@ -43,33 +43,33 @@ class Corners:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """pose: (4, 4) target in camera. error_px: root mean square of the reprojection. per_pixel: (6, 6), the
-    covariance of rotation (about the target's axes) and translation (camera axes) that one pixel of noise in
-    each coordinate makes. corners: what it rests on."""
+class TargetPose:
+    """pose: (4, 4) target in camera. error_px: rms of the reprojection. unit_covariance: (6, 6) of rotation
+    (radians, target axes) and translation (metres, camera axes) for one pixel of noise in each coordinate of
+    a corner. corners: those it was estimated from."""
 
     pose: Array
     error_px: float
-    per_pixel: Array
+    unit_covariance: Array
     corners: Corners
 
 
 @dataclass(frozen=True)
 class Target:
-    """name: as it was spelled. size_m: of the picture, width and height. find: corners in a grey picture, or
-    None. draw: the picture, so many pixels wide; exact in multiples of ``modules``, of which it is so many
-    wide. pattern_m: what is not white of it, width and height."""
+    """name: as the user spelled it. size_m: width and height of the drawing. find: corners in a gray image,
+    or None. draw: drawing of a given width in pixels, exact at multiples of ``modules`` (its width in
+    modules). pattern_m: width and height without the white border."""
 
     name: str
     size_m: tuple[float, float]
-    find: Callable[[Grey], Corners | None]
-    draw: Callable[[int], Grey]
+    find: Callable[[GrayImage], Corners | None]
+    draw: Callable[[int], GrayImage]
     modules: int
     pattern_m: tuple[float, float]
 
 
-def parse(spelling: str) -> Target:
-    """Raises CalibrationError saying how targets are spelled."""
+def parse_target(spelling: str) -> Target:
+    """The target of a SPEC such as those above. Raises CalibrationError with examples."""
     kind, *rest = spelling.split(":")
     makers: dict[str, Callable[..., Target]] = {
         "charuco": _charuco,
@@ -86,11 +86,11 @@ def parse(spelling: str) -> Target:
         raise CalibrationError(f"target {spelling!r}: expected for example {SPELLINGS}{why}") from None
 
 
-def locate(corners: Corners, lens: Pinhole) -> Seen:
-    """Pose of a flat target from its corners. Raises CalibrationError where either of two poses may be true
-    (a small target seen straight on) or none is found."""
+def estimate_pose(corners: Corners, lens: Pinhole) -> TargetPose:
+    """Pose of a flat target from its corners. Raises CalibrationError if none is found or two are equally
+    likely (a small target seen straight on)."""
     matrix, distortion = opencv_lens(lens)
-    # OpenCV counts from the centre of the first pixel.
+    # OpenCV's origin is the center of the first pixel.
     pixels = np.ascontiguousarray(corners.pixels - 0.5)
     count, turns, shifts, errors = cv2.solvePnPGeneric(
         corners.points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
@@ -105,31 +105,31 @@ def locate(corners: Corners, lens: Pinhole) -> Seen:
     off = again.reshape(-1, 2) - pixels
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    # OpenCV's slopes are by the rotation vector; a turn about the target's own axes is wanted.
+    # OpenCV differentiates by the rotation vector; convert to rotations about the target's own axes.
     slopes = np.concatenate(
-        [slopes[:, :3] @ _by_own_turns(np.ravel(turn).astype(np.float64)), slopes[:, 3:6]], axis=1
+        [slopes[:, :3] @ _inverse_right_jacobian(np.ravel(turn).astype(np.float64)), slopes[:, 3:6]], axis=1
     )
     error_px = float(np.sqrt(np.mean((off**2).sum(axis=1))))
-    return Seen(pose, error_px, np.linalg.pinv(slopes.T @ slopes, hermitian=True), corners)
+    return TargetPose(pose, error_px, np.linalg.pinv(slopes.T @ slopes, hermitian=True), corners)
 
 
 def opencv_lens(lens: Pinhole) -> tuple[Array, Array]:
-    """Matrix (3, 3) and (k1, k2, p1, p2) as OpenCV wants them: its pixel centres are whole numbers."""
+    """Matrix (3, 3) and (k1, k2, p1, p2) for OpenCV, whose pixel centers are whole numbers."""
     matrix = np.array([[lens.fx, 0, lens.cx - 0.5], [0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
     return matrix, np.array(lens.distortion)
 
 
-def grey(image: NDArray[np.uint8]) -> Grey:
-    """(H, W) of a grey, RGB or RGBA picture."""
+def to_gray(image: NDArray[np.uint8]) -> GrayImage:
+    """(H, W) of a gray, RGB or RGBA picture."""
     if image.ndim == 2:
         return image
     code = cv2.COLOR_RGBA2GRAY if image.shape[2] == 4 else cv2.COLOR_RGB2GRAY
     return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
 
 
-def _by_own_turns(vector: Array) -> Array:
-    """(3, 3): derivative of a rotation vector by turns of the body about its own axes, the inverse right
-    Jacobian of SO(3); the half angle's tangent keeps it exact at half a turn, where targets often are."""
+def _inverse_right_jacobian(vector: Array) -> Array:
+    """(3, 3): inverse right Jacobian of SO(3), the derivative of a rotation vector by rotations about the
+    body's own axes. The tangent of the half angle keeps it exact at half a turn, where targets often are."""
     angle = float(np.linalg.norm(vector))
     k = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]])
     factor = 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2)) if angle > 1e-4 else 1 / 12
@@ -147,7 +147,7 @@ def _charuco(
     detector = cv2.aruco.CharucoDetector(board)
     places = np.asarray(board.getChessboardCorners(), dtype=np.float64)
 
-    def find(picture: Grey) -> Corners | None:
+    def find(picture: GrayImage) -> Corners | None:
         pixels, numbers, _, _ = detector.detectBoard(picture)
         if numbers is None or len(numbers) < _MIN_CORNERS:
             return None
@@ -156,7 +156,7 @@ def _charuco(
             return None  # all on one line
         return Corners(pixels.reshape(-1, 2).astype(np.float64) + 0.5, points)
 
-    def draw(width: int) -> Grey:
+    def draw(width: int) -> GrayImage:
         return np.asarray(board.generateImage((width, round(width * down / across))), dtype=np.uint8)
 
     size = across * side, down * side
@@ -172,25 +172,25 @@ def _chessboard(name: str, corners: str, square: str) -> Target:
     points = np.stack([x, y, np.zeros_like(x)], axis=1)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 
-    def find(picture: Grey) -> Corners | None:
+    def find(picture: GrayImage) -> Corners | None:
         found, pixels = cv2.findChessboardCorners(picture, (across, down), flags=flags)
         if not found:
             return None
         pixels = pixels.reshape(down, across, 2)
-        # A third of the distance to the nearest neighbour, so that no other corner is in the window.
+        # A third of the distance to the nearest neighbor, so that the window holds no other corner.
         steps = [np.linalg.norm(np.diff(pixels, axis=k), axis=2).min() for k in (0, 1)]
         window = int(np.clip(min(steps) / 3, 2, 11))
         pixels = cv2.cornerSubPix(picture, pixels.reshape(-1, 1, 2), (window, window), (-1, -1), _SUBPIX)
         pixels = pixels.reshape(down, across, 2).astype(np.float64)
-        # Found either way round: the square beside the first corner is the darker one of the two.
+        # The detector may start at either end: of the two end squares, the one at the first corner is darker.
         first = pixels[:2, :2].mean(axis=(0, 1))
         last = pixels[-2:, -2:].mean(axis=(0, 1))
-        if _level(picture, first) > _level(picture, last):
+        if _mean_level(picture, first) > _mean_level(picture, last):
             pixels = pixels[::-1, ::-1]
         return Corners(np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64), points)
 
-    def draw(width: int) -> Grey:
-        # White around the outer squares, which the detector needs.
+    def draw(width: int) -> GrayImage:
+        # The detector needs white around the outer squares.
         cell = max(1, width // (across + 3))
         board = (np.indices((down + 1, across + 1)).sum(axis=0) % 2 * 255).astype(np.uint8)
         return np.pad(np.kron(board, np.ones((cell, cell), np.uint8)), cell, constant_values=255)
@@ -208,15 +208,15 @@ def _apriltag(name: str, family: str, number: str, size: str) -> Target:
         raise ValueError(f"family {family} has numbers 0 to {len(dictionary.bytesList) - 1}")
     detector = cv2.aruco.ArucoDetector(dictionary)
 
-    def find(picture: Grey) -> Corners | None:
+    def find(picture: GrayImage) -> Corners | None:
         pixels, numbers, _ = detector.detectMarkers(picture)
         at = [] if numbers is None else np.flatnonzero(numbers.ravel() == wanted)
-        if len(at) != 1:  # the same tag twice: which one is meant?
+        if len(at) != 1:  # absent, or ambiguous because the tag appears twice
             return None
         corners = pixels[int(at[0])].reshape(4, 2).astype(np.float64)
         return Corners(square_corners(picture, corners) + 0.5, _square(side))
 
-    def draw(width: int) -> Grey:
+    def draw(width: int) -> GrayImage:
         return np.asarray(cv2.aruco.generateImageMarker(dictionary, wanted, width), dtype=np.uint8)
 
     return Target(name, (side, side), find, draw, dictionary.markerSize + 2, (side, side))
@@ -226,7 +226,7 @@ def _qr(name: str, size: str, *text: str) -> Target:
     side, wanted = _metres(size), ":".join(text)
     detector = cv2.QRCodeDetector()
 
-    def find(picture: Grey) -> Corners | None:
+    def find(picture: GrayImage) -> Corners | None:
         said, pixels, _ = detector.detectAndDecode(picture)
         if not said or pixels is None or (wanted and said != wanted):
             return None
@@ -234,11 +234,11 @@ def _qr(name: str, size: str, *text: str) -> Target:
         return Corners(square_corners(picture, corners) + 0.5, _square(side))
 
     code = cv2.QRCodeEncoder.create().encode(wanted or "freshfield")
-    # The encoder's own quiet zone is two modules wide, of which none belongs to the code's size.
+    # Remove the encoder's quiet zone of two modules: it does not belong to the code's size.
     dark = np.flatnonzero((code == 0).any(axis=0))
     code = code[dark[0] : dark[-1] + 1, dark[0] : dark[-1] + 1]
 
-    def draw(width: int) -> Grey:
+    def draw(width: int) -> GrayImage:
         return np.asarray(cv2.resize(code, (width, width), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
     return Target(name, (side, side), find, draw, len(code), (side, side))
@@ -248,7 +248,7 @@ def _square(side: float) -> Array:
     return np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], dtype=np.float64)
 
 
-def _level(picture: Grey, at: Array) -> float:
+def _mean_level(picture: GrayImage, at: Array) -> float:
     x, y = np.rint(at).astype(int)
     return float(picture[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].mean())
 

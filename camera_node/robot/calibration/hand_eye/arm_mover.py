@@ -1,8 +1,8 @@
-"""``camera-node calibrate hand-eye --live --drive``: the arm goes by itself where the session wants the hand.
+"""``camera-node calibrate hand-eye --live --drive``: the arm moves to the poses that the session proposes.
 
-Between two moves nobody holds the arm's controls: whoever stands by may bring the hand elsewhere with the
-pendant. Ways are tested as ``drive-arm`` tests them (``robot.arm.roadmap``): arm, camera and floor
-are known, the target, the cable and whatever else stands there are not.
+Between two moves the arm's control is released, so an operator may move the hand with the pendant. Paths are
+checked as by ``drive-arm`` (``robot.arm.roadmap``): against arm, camera and floor, but not against the
+target, the cable and other objects, which are unknown.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 
 
-class Mover:
+class ArmMover:
     """Brings the hand of a scenario's arm to poses. Asks first, as ``drive-arm`` does, unless ``agreed_to``
     or the arm is simulated; speed and floor are those of its ``path``. Raises ScenarioError, ArmError, and
     CalibrationError where the answer is no."""
@@ -34,7 +34,7 @@ class Mover:
         path = config.path or PathConfig()
         self._model, self._base = arm_model(scenario, config), base_matrix(config)
         self._floor_m, self._pace = path.floor_m, Pace.of(config, path)
-        self._been: list[Array] = []
+        self._visited: list[Array] = []
         self._stream = watch(config)
         try:
             self._stream.start()
@@ -45,31 +45,31 @@ class Mover:
             raise
 
     def __call__(self, hand: Array) -> None:
-        """Go where the hand is at ``hand`` (4, 4), in base, and come to rest there. Raises PathError for a
-        pose that cannot be had, and ArmStopped."""
+        """Bring the hand to ``hand`` (4, 4) in base, at rest. Raises PathError for a pose that cannot be
+        reached, and ArmStopped."""
         try:
             at, _ = self._stream.at(WallClock().now_ns(), 0.0)
             if self._stream.trouble:
                 raise ArmError(self._stream.trouble)
-            stops = self._way(at, hand)
+            stops = self._route(at, hand)
             control = connect_control(self._stream.host)
             try:
                 visit(control, self._stream, stops, self._pace, threading.Event())
             except ArmError:
-                # The library's destructor would wait for an arm that may be gone: it is never called.
+                # Keep the library's object: its destructor would wait for an arm that may be gone.
                 ctypes.pythonapi.Py_IncRef(ctypes.py_object(control))
                 raise
         except (ArmError, PoseGapError) as error:
             raise ArmStopped(str(error)) from None
-        self._been += [at, *stops]
+        self._visited += [at, *stops]
 
     def close(self) -> None:
         self._stream.stop()
 
-    def _way(self, at: Array, hand: Array) -> list[Array]:
+    def _route(self, at: Array, hand: Array) -> list[Array]:
         there = [p.joints for p in self._model.inverse(hand, at) if not p.singular]
-        places = [0] * len(there) + [1] * len(self._been)
-        roadmap = Roadmap(self._model, self._base, [*there, *self._been], places, self._floor_m)
+        places = [0] * len(there) + [1] * len(self._visited)
+        roadmap = Roadmap(self._model, self._base, [*there, *self._visited], places, self._floor_m)
         way = roadmap.way(np.asarray(at), {0})
         if way is None:
             why = "without coming near itself or the floor" if there else "at all"

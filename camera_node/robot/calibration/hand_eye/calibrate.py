@@ -1,4 +1,4 @@
-"""Hand-eye calibration from samples or streams to a result: every method, and what the answer is worth."""
+"""Hand-eye calibration of samples or streams by every method, with uncertainty and warnings."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.arm.hand_eye_mount import MAX_OFFSET_S
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, CalibrationError
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, residuals, solve
-from camera_node.robot.calibration.hand_eye.joint_refinement import Refined, left_out, refine
+from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, jackknife, refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
     Diversity,
     Samples,
     angles,
-    mismatch_deg,
-    refuse_degenerate,
+    require_diversity,
+    rotation_mismatch_deg,
 )
-from camera_node.robot.calibration.hand_eye.time_offset import Timed, calibrate_streams
+from camera_node.robot.calibration.hand_eye.time_offset import StreamCalibration, calibrate_streams
 
-REFINED = "refined"
+REFINED = DEFAULT_METHOD
 ALL_METHODS = (*METHODS, REFINED)
-# With fewer, the spread between methods is as large as what they disagree about.
+# With fewer poses, each method's own scatter is as large as the differences between methods.
 _GOOD_POSES = 10
 _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
-_STRANGE_DEG = 1.0
-# Beyond these it is no calibration: poses the wrong way round, in millimetres, or of something else.
+_MISMATCH_DEG = 1.0
+# Beyond these the input is wrong: inverted poses, millimetres, or poses of something else.
 _WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
 _ADVICE = (
     "are the poses hand in base and target in camera, not their inverses, in metres, and is the set-up right?"
 )
-# As good as exact beside any camera.
+# Practically exact beside any camera.
 EXACT_ARM = (1e-6, 1e-6)
 
 
 @dataclass(frozen=True)
-class Row:
-    """One method's answer. transform: None where it found none, with the error. from_refined_deg, _mm: how
-    far it is from the refinement's."""
+class MethodResult:
+    """One method's result. transform: None with ``error`` if there is no solution. from_refined_deg, _mm:
+    distance from the refinement's."""
 
     method: str
     transform: Array | None
@@ -55,29 +55,28 @@ class Row:
 class Calibration:
     """transform: X (4, 4) of the method asked for. rows: every method's. left_out_deg, left_out_mm: deviation
     over leaving out samples in turn (``groups`` of them). exact_arm: the refinement with the arm taken as
-    exact, where the target's own uncertainty is known. timed: of two streams. warnings: one line each."""
+    exact, if the target's covariance is known. timed: of two streams. warnings: one line each."""
 
     samples: Samples
     method: str
     transform: Array
     residuals: Residuals
-    rows: tuple[Row, ...]
-    refined: Refined
+    rows: tuple[MethodResult, ...]
+    refined: Refinement
     left_out_deg: float
     left_out_mm: float
     groups: int
     diversity: Diversity
-    exact_arm: Row | None = None
-    timed: Timed | None = None
+    exact_arm: MethodResult | None = None
+    timed: StreamCalibration | None = None
     warnings: tuple[str, ...] = field(default=())
 
     @property
     def time_offset_s(self) -> float:
         return 0.0 if self.timed is None else self.timed.offset_s
 
-    def answer(self) -> dict[str, Any]:
-        """For scripts: {transform, time_offset_s, residual_mm, residual_deg, method}, and what the answer is
-        worth: {std_mm, std_deg, warnings}."""
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON for scripts: the result, its residuals, standard deviations and warnings."""
         return {
             "transform": self.transform.tolist(),
             "time_offset_s": self.time_offset_s,
@@ -91,17 +90,17 @@ class Calibration:
 
 
 def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
-    """Raises CalibrationError with the reason where the samples do not determine X."""
-    spread = refuse_degenerate(samples)
+    """Calibrate with every method. Raises CalibrationError if the samples do not determine X."""
+    spread = require_diversity(samples)
     return _calibration(samples, method, refine(samples), spread, None)
 
 
 def calibrate_tracks(
-    hand: Track, target: Track, setup: str, method: str = REFINED, max_gap_s: float | None = None
+    hand: Track, target: Track, setup: str, method: str = REFINED, max_gap_s: float = MAX_GAP_S
 ) -> Calibration:
-    """From two streams with an unknown time offset. Raises CalibrationError."""
-    timed = calibrate_streams(hand, target, setup, **({} if max_gap_s is None else {"max_gap_s": max_gap_s}))
-    return _calibration(timed.samples, method, timed.refined, refuse_degenerate(timed.samples), timed)
+    """Calibrate from two streams with an unknown time offset. Raises CalibrationError."""
+    timed = calibrate_streams(hand, target, setup, max_gap_s)
+    return _calibration(timed.samples, method, timed.refined, require_diversity(timed.samples), timed)
 
 
 def angle_deg(a: Array, b: Array) -> float:
@@ -114,36 +113,36 @@ def distance_mm(a: Array, b: Array) -> float:
 
 
 def _calibration(
-    samples: Samples, method: str, refined: Refined, spread: Diversity, timed: Timed | None
+    samples: Samples, method: str, refined: Refinement, spread: Diversity, timed: StreamCalibration | None
 ) -> Calibration:
-    def row(name: str, find: Callable[[], Array]) -> Row:
+    def row(name: str, find: Callable[[], Array]) -> MethodResult:
         try:
             x = find()
         except CalibrationError as error:
-            return Row(name, None, None, error=str(error))
+            return MethodResult(name, None, None, error=str(error))
         away = angle_deg(refined.x, x), distance_mm(refined.x, x)
-        return Row(name, x, residuals(samples, x), *away)
+        return MethodResult(name, x, residuals(samples, x), *away)
 
     rows = [row(name, lambda name=name: solve(samples, name)) for name in METHODS]  # type: ignore[misc]
     rows.append(row(REFINED, lambda: refined.x))
     chosen = next(r for r in rows if r.method == method)
     if chosen.transform is None or chosen.residuals is None:
         raise CalibrationError(chosen.error)
-    _refuse_nonsense(chosen.transform, chosen.residuals)
+    _require_plausible(chosen.transform, chosen.residuals)
     exact = None
     if samples.covariance is not None:
         start = (refined.x, refined.y)
-        exact = row("exact arm", lambda: refine(samples, start, robot_noise=EXACT_ARM).x)
-    left_deg, left_mm, groups = left_out(samples, refined)
+        exact = row("exact arm", lambda: refine(samples, start, arm_noise=EXACT_ARM).x)
+    left_deg, left_mm, groups = jackknife(samples, refined)
     return Calibration(
         samples, method, chosen.transform, chosen.residuals, tuple(rows), refined, left_deg, left_mm, groups,
         spread, exact, timed, tuple(_warnings(samples, refined, chosen.residuals, spread, timed)),
     )  # fmt: skip
 
 
-def _refuse_nonsense(transform: Array, off: Residuals) -> None:
-    """Raises CalibrationError for what a script must not take for an answer. Medians: a few wild samples
-    among good ones do no harm."""
+def _require_plausible(transform: Array, off: Residuals) -> None:
+    """Raises CalibrationError for a result that cannot be right. Judged by medians, so that a few wild
+    samples among good ones do no harm."""
     median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
     away_m = float(np.linalg.norm(transform[:3, 3]))
     if median_mm > _WORST_MM or median_deg > _WORST_DEG:
@@ -156,7 +155,7 @@ def _refuse_nonsense(transform: Array, off: Residuals) -> None:
 
 
 def _warnings(
-    samples: Samples, refined: Refined, off: Residuals, spread: Diversity, timed: Timed | None
+    samples: Samples, refined: Refinement, off: Residuals, spread: Diversity, timed: StreamCalibration | None
 ) -> list[str]:
     out = []
     if len(samples) < _GOOD_POSES:
@@ -171,9 +170,9 @@ def _warnings(
         out.append(
             f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
         )
-    strange = mismatch_deg(samples)
-    threshold = max(_STRANGE_DEG, 5 * float(np.median(strange)))
-    for i in sorted({*refined.outliers, *map(int, np.flatnonzero(strange > threshold))})[:5]:
+    mismatch = rotation_mismatch_deg(samples)
+    threshold = max(_MISMATCH_DEG, 5 * float(np.median(mismatch)))
+    for i in sorted({*refined.outliers, *map(int, np.flatnonzero(mismatch > threshold))})[:5]:
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
             f"degrees) and counts for {min(1.0, refined.weights[i]):.2f}"

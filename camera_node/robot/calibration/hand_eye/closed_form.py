@@ -25,15 +25,15 @@ METHODS = {
     "andreff": cv2.CALIB_HAND_EYE_ANDREFF,
     "daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
 }
-# OpenCV pairs every sample with every other: beyond this it takes seconds and gains nothing.
+# OpenCV pairs every sample with every other: more samples take seconds and gain nothing.
 MAX_CLOSED_FORM = 60
-# Random subsets that the start of the refinement may come from, so that a few wrong samples do not spoil it.
+# Random subsets to start the refinement from, so that a few wrong samples do not spoil the start.
 _SUBSETS, _SUBSET_SIZE = 24, 5
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """How far each sample's target is from the mean of all, where it does not move: (N,) each."""
+    """Distance of each sample's target from the mean of all, in the frame where it is at rest: (N,) each."""
 
     mm: Array
     deg: Array
@@ -48,11 +48,11 @@ class Residuals:
 
 
 def solve(samples: Samples, method: str) -> Array:
-    """X (4, 4) by one closed form. Raises CalibrationError where it finds none."""
-    few = samples.spread(MAX_CLOSED_FORM)
+    """X (4, 4) by one closed form. Raises CalibrationError if it finds no solution."""
+    few = samples.subsample(MAX_CLOSED_FORM)
     moved, target = few.moved, few.target
     try:
-        # By keyword: given by position, the method is taken for an output and Tsai-Lenz runs.
+        # By keyword: by position, OpenCV would take the method for an output and run Tsai-Lenz.
         rotation, translation = cv2.calibrateHandEye(
             list(moved[:, :3, :3]), list(moved[:, :3, 3]), list(target[:, :3, :3]), list(target[:, :3, 3]),
             method=METHODS[method],
@@ -67,8 +67,8 @@ def solve(samples: Samples, method: str) -> Array:
     return found
 
 
-def still(samples: Samples, x: Array) -> Array:
-    """(N, 4, 4): where each sample puts the target in the frame in which it stands still, G_i X T_i."""
+def target_at_rest(samples: Samples, x: Array) -> Array:
+    """(N, 4, 4): each sample's target pose in the frame where it is at rest, G_i X T_i."""
     return np.asarray(samples.moved @ x @ samples.target)
 
 
@@ -80,18 +80,18 @@ def mean_transform(transforms: Array) -> Array:
 
 def residuals(samples: Samples, x: Array) -> Residuals:
     """Of any X: distances of ``still`` from its mean."""
-    return residuals_from(still(samples, x), None)
+    return residuals_from(target_at_rest(samples, x), None)
 
 
-def residuals_from(places: Array, centre: Array | None) -> Residuals:
-    y = mean_transform(places) if centre is None else centre
+def residuals_from(places: Array, center: Array | None) -> Residuals:
+    y = mean_transform(places) if center is None else center
     turned = angles(y[:3, :3].T @ places[:, :3, :3])
     off = np.linalg.norm(places[:, :3, 3] - y[:3, 3], axis=1)
     return Residuals(off * 1e3, np.degrees(turned))
 
 
 def predicted_hand(samples: Samples, x: Array, y: Array) -> Array:
-    """(N, 4, 4): where the hand must be for the camera to see what it sees."""
+    """(N, 4, 4): hand poses in base that X, Y and the target poses imply."""
     if samples.setup == EYE_IN_HAND:
         return np.asarray(y @ inverse(samples.target) @ inverse(x))
     return np.asarray(x @ samples.target @ inverse(y))
@@ -100,7 +100,7 @@ def predicted_hand(samples: Samples, x: Array, y: Array) -> Array:
 def robust_start(samples: Samples) -> tuple[Array, Array]:
     """X and Y (4, 4) to refine from: of the closed forms on everything and of Park's on small subsets, the
     one with the least median residual. The subsets are the same in every run. Raises CalibrationError."""
-    few = samples.spread(MAX_CLOSED_FORM)
+    few = samples.subsample(MAX_CLOSED_FORM)
     rng = np.random.default_rng(0)
     subsets = []
     if len(few) > _SUBSET_SIZE + 1:
@@ -112,10 +112,10 @@ def robust_start(samples: Samples) -> tuple[Array, Array]:
             x = solve(chosen, method)
         except CalibrationError:
             continue
-        places = still(few, x)
+        places = target_at_rest(few, x)
         y = _median_transform(places)
         off = residuals_from(places, y)
-        # One degree counts as much as it moves a point at arm's length of a third of a metre.
+        # One degree counts as the motion of a point at a third of a metre.
         score = float(np.median(off.mm + np.deg2rad(off.deg) * 330.0))
         if best is None or score < best[0]:
             best = score, x, y
@@ -125,6 +125,6 @@ def robust_start(samples: Samples) -> tuple[Array, Array]:
 
 
 def _median_transform(places: Array) -> Array:
-    """The sample that is nearest to all others: a centre that outliers do not move."""
+    """The transform nearest to all others: a center that outliers do not move."""
     distance = np.linalg.norm(places[:, None, :3, :] - places[None, :, :3, :], axis=(2, 3))
     return places[int(np.argmin(np.median(distance, axis=1)))]

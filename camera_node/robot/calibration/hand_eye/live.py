@@ -1,46 +1,33 @@
-"""``camera-node calibrate hand-eye --live``: a scenario's camera and a session, at the camera's pace."""
+"""``camera-node calibrate hand-eye --live``: a guided session with a scenario's camera."""
 
 from __future__ import annotations
 
 import argparse
-import itertools
-import os
-import secrets
-import shutil
 import signal
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import cv2
-import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.config import ArmConfig, source_config
 from camera_node.pose.pairing import sort_samples
 from camera_node.pose.providers import PoseProvider, Trajectory, TrajectoryError, read_samples
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
-from camera_node.robot.calibration import ArmStopped, CalibrationError
+from camera_node.robot.calibration import ArmStopped, CalibrationError, live_camera
 from camera_node.robot.calibration.files import pairs_json, read_pairs
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, calibrate, calibrate_tracks
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
-from camera_node.robot.calibration.hand_eye.session import KEPT, MOVING, Session, Step, preview
-from camera_node.robot.calibration.hand_eye.tracks import Tracks, follow_arm
+from camera_node.robot.calibration.hand_eye.session import KEPT, MOVING, HandEyeSession, HandEyeStep, preview
+from camera_node.robot.calibration.hand_eye.tracks import StreamRecorder, follow_arm
 from camera_node.robot.calibration.targets import Target
 from camera_node.sources.base import Source
-from camera_node.sources.registry import open_sources
-from freshfield import files, payload, scenario
-from freshfield.clock import WallClock
+from freshfield import files, scenario
 from freshfield.geometry import Pinhole, se3_inverse
 
 if TYPE_CHECKING:
     from camera_node.robot.arm.joint_states import ArmStream
-    from camera_node.robot.calibration.hand_eye.arm_mover import Mover
-
-Image = NDArray[np.uint8]
+    from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 
 
 def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None, setup: str) -> Calibration:
@@ -48,12 +35,10 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     ScenarioError."""
     if not args.want_mm > 0 or (args.seconds is not None and not args.seconds > 0):
         raise CalibrationError("--want-mm, --seconds: expected positive numbers")
-    plan = scenario.load(args.live)
-    if args.camera not in plan.cameras:
-        raise CalibrationError(f"--camera: {plan.path} has {', '.join(plan.cameras)}, got {args.camera}")
-    config = source_config(plan)
+    loaded = live_camera.load_scenario(args)
+    config = source_config(loaded)
     arm: ArmConfig | None = getattr(config, "arm", None)
-    to_base = None if arm is None or args.hand is not None else _to_base(plan, arm, args.camera)
+    to_base = None if arm is None or args.hand is not None else _to_base(loaded, arm, args.camera)
     if args.tracks is not None and not (args.moving and to_base is not None):
         raise CalibrationError("--tracks: goes with --moving and the poses of a scenario's arm")
     if args.yes and not args.drive:
@@ -64,11 +49,8 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
             "(without --hand, --moving and --eye-to-hand: what a hand holds is not known to be kept clear of)"
         )
     if args.tracks is not None:
-        _make(args.tracks)
-    try:
-        source = open_sources(plan, config, [args.camera], args.data)[args.camera]
-    except (ValueError, OSError) as error:
-        raise CalibrationError(str(error)) from None
+        _create_writable(args.tracks)
+    source = live_camera.open_source(loaded, config, args)
     before = None
     if args.samples is not None and args.samples.exists():
         before = read_pairs(args.samples, setup)
@@ -78,10 +60,10 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         if args.samples is not None:
             files.write_json(args.samples, pairs_json(samples))
 
-    def show(image: Image, step: Step, session: Session) -> None:
-        say(step.outcome, step.line)
+    def show(image: live_camera.Image, step: HandEyeStep, session: HandEyeSession) -> None:
+        live_camera.report_step(step.outcome, step.line)
         if args.preview is not None:
-            write_picture(args.preview, preview(image, session.corners, step))
+            live_camera.write_image(args.preview, preview(image, session.corners, step))
 
     hands = None
     if args.hand is not None:
@@ -90,20 +72,18 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
             hands = Trajectory(times, poses, max_gap_ns=round(args.max_gap_ms * 1e6))
         except TrajectoryError as error:
             raise CalibrationError(str(error)) from None
-    session = Session(board, setup, args.want_mm, args.moving, before, keep)
-    pace = Pace(float(source.fps), args.seconds)
-    tracks = Tracks() if args.moving and to_base is not None else None
+    session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep)
+    pace = live_camera.Pace(float(source.fps), args.seconds)
+    tracks = StreamRecorder() if args.moving and to_base is not None else None
     stream = mover = None
     try:
         if args.drive and arm is not None:
-            mover = _take_arm(plan, arm, args.yes)
+            mover = _open_arm(loaded, arm, args.yes)
         if tracks is not None and arm is not None:
-            stream = _follow(plan, arm, tracks)
-        # What never repeats goes by the time of day, as a node's ticks do.
-        first = round(WallClock().now_ns() * source.fps / 10**9) if source.contents is None else 0
+            stream = _follow(loaded, arm, tracks)
         guide(
             source, config.codec, lens, session, pace, show, hands,
-            move=mover, to_base=to_base, tracks=tracks, first=first,
+            move=mover, to_base=to_base, tracks=tracks, first=live_camera.first_tick(source),
         )  # fmt: skip
     except KeyboardInterrupt:
         print("\nstopped; what there is:", file=sys.stderr)
@@ -124,8 +104,9 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     return calibrate_tracks(tracks.hand(), tracks.target(), setup, args.method, args.max_gap_ms / 1e3)
 
 
-def _make(folder: Path) -> None:
-    """Of ``--tracks``, before the session that would be lost without it. Raises CalibrationError."""
+def _create_writable(folder: Path) -> None:
+    """Create the folder of ``--tracks`` before the session, whose data would be lost without it. Raises
+    CalibrationError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -133,20 +114,21 @@ def _make(folder: Path) -> None:
         raise CalibrationError(f"--tracks: {folder}: {error.strerror}") from None
 
 
-def _follow(plan: scenario.Scenario, arm: ArmConfig, tracks: Tracks) -> ArmStream:
+def _follow(loaded: scenario.Scenario, arm: ArmConfig, tracks: StreamRecorder) -> ArmStream:
     try:
-        return follow_arm(plan, arm, tracks)
+        return follow_arm(loaded, arm, tracks)
     except ValueError as error:
         raise CalibrationError(str(error)) from None
 
 
-def _take_arm(plan: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> Mover:
-    """Whatever ends this process from now on ends a move first. Raises CalibrationError, ScenarioError."""
+def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> ArmMover:
+    """Connect to the arm; from now on a termination signal stops a move first. Raises CalibrationError,
+    ScenarioError."""
     from camera_node.robot.arm.joint_states import ArmError
-    from camera_node.robot.calibration.hand_eye.arm_mover import Mover
+    from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 
     try:
-        mover = Mover(plan, arm, agreed_to)
+        mover = ArmMover(loaded, arm, agreed_to)
     except ArmError as error:
         raise CalibrationError(str(error)) from None
     for number in (signal.SIGTERM, signal.SIGHUP):
@@ -155,14 +137,14 @@ def _take_arm(plan: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> Mover
     return mover
 
 
-def _to_base(plan: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
-    """Base-from-world (4, 4): an arm's poses come in the world, and a calibration is asked for in its base.
+def _to_base(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
+    """Base-from-world (4, 4): the arm reports poses in the world, the calibration needs them in its base.
     Raises CalibrationError, ScenarioError."""
     from camera_node.robot.arm.camera_poses import base_matrix
 
     if camera not in arm.cameras or arm.cameras[camera] is not None:
         raise CalibrationError(
-            f"{plan.path}: source.arm.cameras: set {camera}: null for the calibration (also for a camera "
+            f"{loaded.path}: source.arm.cameras: set {camera}: null for the calibration (also for a camera "
             "that stands): its poses are then the hand's"
         )
     return se3_inverse(base_matrix(arm))
@@ -172,94 +154,57 @@ def guide(
     source: Source,
     codec: str,
     lens: Pinhole | None,
-    session: Session,
+    session: HandEyeSession,
     pace: Callable[[int], bool],
-    show: Callable[[Image, Step, Session], None],
+    show: Callable[[live_camera.Image, HandEyeStep, HandEyeSession], None],
     hands: PoseProvider | None = None,
     move: Callable[[Array], None] | None = None,
     to_base: Array | None = None,
-    tracks: Tracks | None = None,
+    tracks: StreamRecorder | None = None,
     first: int = 0,
-) -> Step | None:
-    """Offer the source's shots to the session until there is enough, ``pace`` says that time is over, or a
-    recording has been seen once. lens: instead of the source's own. hands: poses of the hand by time since
-    the first shot; None: the shots' own poses are the hand's. move: brings the hand to a pose (4, 4), or
-    refuses by ValueError; None: an operator does. to_base: base-from-world (4, 4), where the shots' poses are
-    in the world. tracks: keeps where the target was seen, and decides when it is enough. first: the source's
-    tick to begin with. Returns the last step."""
+) -> HandEyeStep | None:
+    """Offer the source's shots to the session until it has enough, ``pace`` ends it, or a recording has been
+    seen once. Returns the last step.
+
+    lens: replaces the source's own.
+    hands: hand poses by time since the first shot; None: the shots' poses are the hand's.
+    move: brings the hand to a pose (4, 4), ValueError if it cannot; None: an operator moves it.
+    to_base: base-from-world (4, 4), if the hand's poses are in the world.
+    tracks: records the target poses and decides when there is enough.
+    first: first tick of the source."""
     step, begin_ns = None, None
-    for tick in itertools.count():
-        if (source.contents is not None and tick >= source.contents) or not pace(tick):
-            return step
+    for tick, shot, image in live_camera.read_shots(source, codec, pace, first):
+        t_ns = shot.captured_ns
+        if begin_ns is None:
+            begin_ns = round(first * 10**9 / source.fps) if t_ns is None else t_ns
+        if t_ns is None:
+            t_ns = round(tick * 10**9 / source.fps)
         try:
-            shot = source.read(source.content(first + tick))
-            t_ns = shot.captured_ns
-            if begin_ns is None:
-                begin_ns = round(first * 10**9 / source.fps) if t_ns is None else t_ns
-            if t_ns is None:
-                t_ns = round((first + tick) * 10**9 / source.fps)
             hand = shot.pose if hands is None else hands.at(t_ns - begin_ns).pose
-        except ValueError as error:  # one shot that cannot be had; later ones may
-            print(f"\n{error}", file=sys.stderr)
+        except ValueError as error:
+            live_camera.report_skipped(error)
             continue
-        image = shot.image
-        if isinstance(image, bytes):
-            image = payload.decode(image, codec, shot.intrinsics.width, shot.intrinsics.height)
         matrix = hand.matrix() if to_base is None else to_base @ hand.matrix()
         step = session.offer(image, lens or shot.intrinsics, matrix)
         if tracks is not None:
             if session.seen is not None:
                 tracks.add_target(t_ns, session.seen.pose)
-            step = tracks.judged(step)
+            step = tracks.with_stream_advice(step)
         show(image, step, session)
         if step.enough:
             return step
         if move is not None and step.outcome != MOVING:
-            _go_on(session, step, move)
+            _move_to_next_pose(session, step, move)
     return step
 
 
-def _go_on(session: Session, step: Step, move: Callable[[Array], None]) -> None:
+def _move_to_next_pose(session: HandEyeSession, step: HandEyeStep, move: Callable[[Array], None]) -> None:
     if step.outcome != KEPT:
-        session.turn_down()
-    wanted = session.wanted()
+        session.reject_pose()
+    wanted = session.next_hand_pose()
     if wanted is None:
         return
     try:
         move(wanted)
-    except ValueError as error:  # the next picture is like this one, and another pose will be wanted
-        print(f"\n{error}", file=sys.stderr)
-
-
-class Pace:
-    """Waits for a tick's instant; ticks that are late are not waited for."""
-
-    def __init__(self, fps: float, seconds: float | None) -> None:
-        self._fps, self._seconds = fps, seconds
-        self._start = time.monotonic()
-
-    def __call__(self, tick: int) -> bool:
-        at_s = tick / self._fps
-        if self._seconds is not None and at_s > self._seconds:
-            return False
-        time.sleep(max(0.0, self._start + at_s - time.monotonic()))
-        return True
-
-
-def say(outcome: str, line: str) -> None:
-    """A step: on a terminal in place, else only what was kept."""
-    if sys.stderr.isatty():
-        width = shutil.get_terminal_size().columns - 1
-        print(f"\r{line[:width]:{width}}", end="\n" if outcome == KEPT else "", file=sys.stderr)
-    elif outcome == KEPT:
-        print(line, file=sys.stderr)
-
-
-def write_picture(path: Path, picture: Image) -> None:
-    """Whole whenever somebody looks. Raises OSError."""
-    done, data = cv2.imencode(path.suffix or ".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    if not done:
-        raise OSError(f"{path}: not a kind of picture")
-    part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
-    part.write_bytes(data.tobytes())
-    os.replace(part, path)
+    except ValueError as error:  # the hand stays, so the next image is rejected and another pose proposed
+        live_camera.report_skipped(error)

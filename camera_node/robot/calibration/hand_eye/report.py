@@ -1,4 +1,4 @@
-"""A calibration for people: a table, a YAML that the node loads, a picture."""
+"""Output of a hand-eye calibration: a table, the YAML that the node loads, a plot."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import yaml
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, MAX_OFFSET_S
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.calibrate import Calibration, Row
-from camera_node.robot.calibration.hand_eye.closed_form import still
+from camera_node.robot.calibration.hand_eye.calibrate import Calibration, MethodResult
+from camera_node.robot.calibration.hand_eye.closed_form import target_at_rest
 from camera_node.robot.calibration.hand_eye.samples import Rotation, rotation_vectors
 from freshfield import files
 
@@ -19,23 +19,23 @@ _BLUE, _RED, _GREY = "#0072B2", "#D55E00", "#999999"
 
 
 def show(found: Calibration) -> str:
-    """Every method's figures, the answer, what it is worth, warnings."""
+    """Format all methods' residuals, the result, its uncertainty and the warnings."""
     what = "camera in hand" if found.samples.setup == EYE_IN_HAND else "camera in base"
     spread = found.diversity
+    x, y, z = found.transform[:3, 3]
     lines = [
         f"{len(found.samples)} poses, {found.samples.setup}; turns up to {spread.largest_turn_deg:.0f} "
-        f"degrees, axes spread by {spread.spread_deg:.0f} degrees (35 where they point everywhere alike)",
+        f"degrees, axes spread by {spread.axis_spread_deg:.0f} degrees "
+        "(35 where they point everywhere alike)",
         "",
         f"{'method':12} {'residual mm':>12} {'degrees':>9}   {'from refined mm':>16} {'degrees':>9}",
         *(_row(row) for row in found.rows),
         "",
-        f"{what} ({found.method}): "
-        f"x {_metres(found, 0)}  y {_metres(found, 1)}  z {_metres(found, 2)} m, "
-        f"turned {_turn(found)}",
+        f"{what} ({found.method}): x {x:.5f}  y {y:.5f}  z {z:.5f} m, turned {_turn(found)}",
         f"  standard deviation {found.refined.std_mm:.3f} mm, {found.refined.std_deg:.4f} degrees; "
         f"leaving out one of {found.groups}: {found.left_out_mm:.3f} mm, {found.left_out_deg:.4f} degrees",
-        f"  the arm's noise, estimated: {found.refined.robot_m * 1e3:.3f} mm, "
-        f"{np.degrees(found.refined.robot_rad):.4f} degrees an axis",
+        f"  the arm's noise, estimated: {found.refined.arm_noise_m * 1e3:.3f} mm, "
+        f"{np.degrees(found.refined.arm_noise_rad):.4f} degrees an axis",
     ]
     if found.exact_arm is not None and found.exact_arm.transform is not None:
         lines.append(
@@ -52,8 +52,8 @@ def show(found: Calibration) -> str:
 
 
 def to_yaml(found: Calibration) -> str:
-    """What ``camera_node.robot.arm.hand_eye_mount.read_hand_eye`` reads, and how it was found."""
-    answer = found.answer()
+    """The YAML that ``hand_eye_mount.read_hand_eye`` reads, with details of the calibration."""
+    answer = found.to_dict()
     warnings = answer.pop("warnings")
     data = {
         "setup": found.samples.setup,
@@ -62,15 +62,15 @@ def to_yaml(found: Calibration) -> str:
         "poses": len(found.samples),
         "leave_out_mm": found.left_out_mm,
         "leave_out_deg": found.left_out_deg,
-        "arm_noise_mm": found.refined.robot_m * 1e3,
-        "arm_noise_deg": float(np.degrees(found.refined.robot_rad)),
+        "arm_noise_mm": found.refined.arm_noise_m * 1e3,
+        "arm_noise_deg": float(np.degrees(found.refined.arm_noise_rad)),
         "warnings": warnings,
     }
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
 
 
 def write_yaml(found: Calibration, path: Path) -> None:
-    """Raises CalibrationError, also for what the node would refuse."""
+    """Write ``to_yaml``. Raises CalibrationError, also for an offset that the node would refuse."""
     if abs(found.time_offset_s) >= MAX_OFFSET_S:
         raise CalibrationError(
             f"--out: {path} is not written: the node would refuse a time offset of "
@@ -83,7 +83,7 @@ def write_yaml(found: Calibration, path: Path) -> None:
 
 
 def plot(found: Calibration, path: Path) -> None:
-    """Each pose's residual, the axes about which the hand turned, and where each pose puts the target."""
+    """Plot residuals, motion axes and each pose's target position. Raises CalibrationError."""
     try:
         import matplotlib
     except ImportError:
@@ -101,7 +101,7 @@ def plot(found: Calibration, path: Path) -> None:
     right.plot(count, found.residuals.deg, ".", color="black")
     right.set_ylabel("residual (degrees, dots)")
 
-    rotation = found.samples.spread(40).moved[:, :3, :3]
+    rotation = found.samples.subsample(40).moved[:, :3, :3]
     pairs = list(itertools.combinations(range(len(rotation)), 2))
     turns = rotation_vectors(np.array([rotation[i].T @ rotation[j] for i, j in pairs]))
     angle = np.linalg.norm(turns, axis=1)
@@ -113,7 +113,7 @@ def plot(found: Calibration, path: Path) -> None:
              title="axes of the turns, seen along z")  # fmt: skip
     figure.colorbar(drawn, ax=ball, label="turn (degrees)")
 
-    put = still(found.samples, found.transform)[:, :3, 3]
+    put = target_at_rest(found.samples, found.transform)[:, :3, 3]
     put = (put - put.mean(axis=0)) * 1e3
     drawn = places.scatter(put[:, 0], put[:, 1], c=put[:, 2], s=25)
     places.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", title="where each pose puts the target")
@@ -126,17 +126,13 @@ def plot(found: Calibration, path: Path) -> None:
         plt.close(figure)
 
 
-def _row(row: Row) -> str:
+def _row(row: MethodResult) -> str:
     if row.residuals is None:
         return f"{row.method:12} {row.error}"
     return (
         f"{row.method:12} {row.residuals.rms_mm:12.3f} {row.residuals.rms_deg:9.4f}   "
         f"{row.from_refined_mm:16.3f} {row.from_refined_deg:9.4f}"
     )
-
-
-def _metres(found: Calibration, axis: int) -> str:
-    return f"{found.transform[axis, 3]:.5f}"
 
 
 def _turn(found: Calibration) -> str:

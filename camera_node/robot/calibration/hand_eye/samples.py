@@ -1,4 +1,4 @@
-"""Samples of a hand-eye calibration, their relative motions (4.4), (4.5), and whether they determine it.
+"""Samples of a hand-eye calibration, their relative motions (4.4), (4.5), and whether they suffice.
 
 Both setups are one problem, G_i X T_i = Y, with T_i the target in the camera: for eye-in-hand G_i = H_i (hand
 in base), X = camera in hand, Y = target in base; for eye-to-hand G_i = H_i^-1, X = camera in base, Y = target
@@ -21,11 +21,11 @@ from camera_node.robot.calibration import CalibrationError
 Array = NDArray[np.float64]
 
 MIN_POSES = 3
-# A turn smaller than this has an axis made of noise; one nearer than this to half a turn has two.
+# The axis of a smaller rotation is mostly noise; one nearer than the margin to half a turn has two axes.
 MIN_TURN_DEG, HALF_TURN_MARGIN_DEG = 5.0, 10.0
-# Axes that lie within a cone of about this half angle leave a translation along them undetermined.
+# Axes within a cone of about this half angle leave the translation along them undetermined.
 MIN_SPREAD_DEG = 8.0
-# Pairs of samples looked at: all of 80 samples' are 3160.
+# Samples whose pairs are examined: 80 have 3160 pairs.
 _MAX_SAMPLES = 80
 
 
@@ -71,8 +71,8 @@ class Samples:
             names=tuple(self.names[i] for i in at) if self.names else (),
         )
 
-    def spread(self, most: int) -> Samples:
-        """At most so many of them, evenly over the recording."""
+    def subsample(self, most: int) -> Samples:
+        """At most that many samples, evenly spaced over the recording."""
         if len(self) <= most:
             return self
         return self.take(np.linspace(0, len(self) - 1, most).round().astype(np.intp))
@@ -80,17 +80,16 @@ class Samples:
 
 @dataclass(frozen=True)
 class Diversity:
-    """What the motions between the samples are good for. motions: all pairs; usable: those that turn by
-    neither too little nor nearly half a turn. largest_turn_deg; spread_deg: how far the axes of usable
-    motions stand from being parallel (35 where they point everywhere alike). reason: why nothing can be
-    calibrated from them, or None. missing: the axis (3,), in the hand's or the base's axes, about which the
-    hand has turned least."""
+    """Whether the motions between the samples determine X. motions: all pairs. usable: those with neither
+    too small a rotation nor nearly half a turn. axis_spread_deg: angle of the usable motions' axes from
+    parallel (35 if uniform). reason: why no calibration is possible, or None. missing: the axis (3,), in the
+    hand's or the base's axes, with the least rotation about it."""
 
     motions: int
     usable: int
     half_turns: int
     largest_turn_deg: float
-    spread_deg: float
+    axis_spread_deg: float
     reason: str | None
     missing: Array
 
@@ -120,15 +119,15 @@ def rotation_vectors(rotations: Array) -> Array:
 
 
 def angles(rotations: Array) -> Array:
-    """Angles (N,) in radians of rotation matrices (N, 3, 3); from the chord, which costs less than a
-    rotation vector and keeps small angles exact (near half a turn it loses half of the digits)."""
+    """Angles (N,) in radians of rotation matrices (N, 3, 3), from the chord: cheaper than a rotation vector
+    and exact for small angles (near half a turn it loses half of the digits)."""
     chord = np.linalg.norm(rotations - np.eye(3), axis=(-2, -1)) / np.sqrt(8.0)
     return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
 
 
 def diversity(samples: Samples) -> Diversity:
-    """Judge the motions between all pairs of samples (at most 80 of these)."""
-    chosen = samples.spread(_MAX_SAMPLES)
+    """Examine the motions between all pairs of samples (of at most 80)."""
+    chosen = samples.subsample(_MAX_SAMPLES)
     nothing = np.array([0.0, 0.0, 1.0])
     if len(chosen) < 2:
         return Diversity(0, 0, 0, 0.0, 0.0, _too_few(len(samples)), nothing)
@@ -139,17 +138,19 @@ def diversity(samples: Samples) -> Diversity:
     small, half = angles_deg < MIN_TURN_DEG, angles_deg > 180.0 - HALF_TURN_MARGIN_DEG
     usable = ~small & ~half
     axes = turns[usable] / np.linalg.norm(turns[usable], axis=1, keepdims=True)
-    # Axes u and -u are one: the mean of u u^T knows that. Its second eigenvalue is sin^2 of the half angle
-    # of the fan in which the axes lie, and 1/3 where they point everywhere alike.
+    # The mean of u u^T treats axes u and -u as one. Its second eigenvalue is sin^2 of the half angle of the
+    # fan in which the axes lie, and 1/3 if they are uniform.
     values, vectors = np.linalg.eigh(axes.T @ axes / max(1, len(axes)))
-    spread_deg = float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0))))) if len(axes) else 0.0
+    axis_spread_deg = (
+        float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0))))) if len(axes) else 0.0
+    )
     if len(samples) < MIN_POSES:
         reason: str | None = _too_few(len(samples))
-    elif usable.sum() >= 2 and spread_deg >= MIN_SPREAD_DEG:
+    elif usable.sum() >= 2 and axis_spread_deg >= MIN_SPREAD_DEG:
         reason = None
     elif usable.sum() >= 2:
         reason = (
-            f"the hand has turned about parallel axes only (they spread by {spread_deg:.1f} degrees, at "
+            f"the hand has turned about parallel axes only (they spread by {axis_spread_deg:.1f} degrees, at "
             f"least {MIN_SPREAD_DEG:g} are needed): the translation along them stays unknown; tilt the "
             "hand about another axis too"
         )
@@ -164,22 +165,22 @@ def diversity(samples: Samples) -> Diversity:
             "needed): moving without turning says nothing about the translation; turn it by 20 to 90 degrees"
         )
     return Diversity(
-        len(angles_deg), int(usable.sum()), int(half.sum()), float(angles_deg.max()), spread_deg, reason,
+        len(angles_deg), int(usable.sum()), int(half.sum()), float(angles_deg.max()), axis_spread_deg, reason,
         vectors[:, 0] if len(axes) else nothing,
     )  # fmt: skip
 
 
-def refuse_degenerate(samples: Samples) -> Diversity:
-    """Their diversity. Raises CalibrationError where no calibration can come from the samples."""
+def require_diversity(samples: Samples) -> Diversity:
+    """The samples' diversity. Raises CalibrationError if they do not determine X."""
     found = diversity(samples)
     if found.reason is not None:
         raise CalibrationError(found.reason)
     return found
 
 
-def mismatch_deg(samples: Samples) -> Array:
-    """(N,): median over the other samples of | angle of A_ij - angle of B_ij |. The two are equal whatever X
-    is (4.6), so what is large here was detected or paired wrongly."""
+def rotation_mismatch_deg(samples: Samples) -> Array:
+    """(N,): median over the other samples of | angle of A_ij - angle of B_ij |. Both angles are equal for
+    any X (4.6), so a large value means a wrong detection or pairing."""
     chosen = np.arange(len(samples))
     if len(chosen) > _MAX_SAMPLES:
         chosen = np.linspace(0, len(samples) - 1, _MAX_SAMPLES).round().astype(np.intp)

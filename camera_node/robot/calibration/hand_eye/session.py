@@ -1,5 +1,5 @@
-"""A guided hand-eye calibration: pictures and hand poses come in, and it says what to do next and when to
-stop. It knows no camera, no arm and no clock: whoever runs it brings them."""
+"""A guided hand-eye calibration: takes images and hand poses, and says what to do next and when to stop. The
+caller provides camera, arm and clock."""
 
 from __future__ import annotations
 
@@ -10,27 +10,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import pixel_noise, samples_of
-from camera_node.robot.calibration.hand_eye.joint_refinement import Refined, refine
-from camera_node.robot.calibration.hand_eye.next_pose import first_turns, in_words, propose
+from camera_node.robot.calibration import WANT_MM, CalibrationError
+from camera_node.robot.calibration.files import pixel_noise, to_samples
+from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance_mm
+from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
+from camera_node.robot.calibration.hand_eye.next_pose import describe_motion, initial_pose, propose_pose
 from camera_node.robot.calibration.hand_eye.samples import Array, Diversity, Samples, angles, diversity
-from camera_node.robot.calibration.targets import Corners, Seen, Target, grey, locate
+from camera_node.robot.calibration.targets import Corners, Target, TargetPose, estimate_pose, to_gray
 from freshfield.geometry import Pinhole
 
 MIN_POSES, GOOD_SPREAD_DEG = 10, 15.0
-# A pose that turns by less from one that is kept says little that is new.
+# A pose rotated by less from a kept one adds little information.
 NEW_DEG = 8.0
-# Between two frames; beyond, stamps that are a few milliseconds wrong would count.
+# Largest motion between two frames: above it, errors of a few milliseconds in the stamps would matter.
 STILL_MM, STILL_DEG = 0.5, 0.1
-_LEAST_TO_SOLVE = 4
+_MIN_TO_SOLVE = 4
 KEPT, MOVING = "kept", "hand moving"
 
 
 @dataclass(frozen=True)
-class Step:
-    """What came of a picture. outcome: ``kept``, or why not. count: samples kept. std_mm, std_deg: of the
-    answer so far, None while there is none. enough: stop here. advice: what to do next."""
+class HandEyeStep:
+    """Result of one image. outcome: ``kept``, or why not. count: samples kept. std_mm, std_deg: of the
+    calibration so far, None while there is none. enough: whether to stop. advice: what to do next."""
 
     outcome: str
     count: int
@@ -43,65 +44,65 @@ class Step:
     @property
     def line(self) -> str:
         sure = "" if self.std_mm is None else f", sure to {self.std_mm:.2f} mm {self.std_deg:.3f} degrees"
-        spread = f"axes spread by {self.diversity.spread_deg:.0f} degrees"
+        spread = f"axes spread by {self.diversity.axis_spread_deg:.0f} degrees"
         return f"{self.count} poses, {spread}{sure}; {self.outcome}: {self.advice}"
 
 
-class Session:
-    """Collects samples until the answer is sure to ``want_mm``.
+class HandEyeSession:
+    """Collects samples until the standard deviation of the translation is at most ``want_mm``.
 
-    moving: take pictures while the hand moves (its poses are exact in time), else only when it holds still.
-    before: samples of an earlier session to go on with. kept: called with all samples after each new one.
+    moving: take images while the hand moves (its poses must be exact in time), else only at rest.
+    before: samples of an earlier session to continue. kept: called with all samples after each new one.
     """
 
     def __init__(
         self,
         target: Target,
         setup: str,
-        want_mm: float = 0.5,
+        want_mm: float = WANT_MM,
         moving: bool = False,
         before: Samples | None = None,
         kept: Callable[[Samples], None] = lambda samples: None,
     ) -> None:
         self._target, self._setup, self._want_mm, self._moving = target, setup, want_mm, moving
         self._before, self._kept = before, kept
-        self._seen: list[Seen] = []
+        self._seen: list[TargetPose] = []
         self._hands: list[Array] = []
         self._last: Array | None = None
-        self._refined: Refined | None = None
+        self._refined: Refinement | None = None
         self._wanted: Array | None = None
-        self._turned_down = 0
+        self._rejected = 0
         self._diversity = diversity(self.samples())
         self.corners: Corners | None = None
-        """Found in the last picture."""
-        self.seen: Seen | None = None
-        """The target in the last picture, where its pose could be told."""
+        """Found in the last image."""
+        self.seen: TargetPose | None = None
+        """The target in the last image, if its pose could be estimated."""
         self._solve()
 
     def samples(self) -> Samples:
-        """All that is kept; with the target's covariance unless some are of an earlier session."""
+        """All kept samples, with the target's covariance unless some are from an earlier session."""
         names = [f"pose {k + 1}" for k in range(len(self._seen))]
-        new = samples_of(self._seen, self._hands, names, self._setup)
+        new = to_samples(self._seen, self._hands, names, self._setup)
         if self._before is None:
             return new
         hand, target = (np.concatenate(p) for p in ((self._before.hand, new.hand),
                                                     (self._before.target, new.target)))  # fmt: skip
         return Samples(hand, target, self._setup)
 
-    def offer(self, image: NDArray[np.uint8], lens: Pinhole, hand: Array) -> Step:
-        """Look at a picture taken with the hand at ``hand`` (4, 4), in base."""
+    def offer(self, image: NDArray[np.uint8], lens: Pinhole, hand: Array) -> HandEyeStep:
+        """Process an image (H, W, 3) taken with the hand at ``hand`` (4, 4), in base."""
         last, self._last = self._last, hand
         self.corners = self.seen = None
-        if not self._moving and (last is None or _apart(last, hand) > 1.0):
+        if not self._moving and (last is None or _motion(last, hand) > 1.0):
             return self._step(MOVING, "hold still")
-        self.corners = self._target.find(grey(image))
+        self.corners = self._target.find(to_gray(image))
         if self.corners is None:
             return self._step("target not found", "bring all of it into the picture, well lit")
         try:
-            self.seen = seen = locate(self.corners, lens)
+            self.seen = seen = estimate_pose(self.corners, lens)
         except CalibrationError as error:
             return self._step("target unclear", str(error))
-        like = self._most_alike(hand)
+        like = self._nearest_kept(hand)
         if like is not None:
             return self._step(f"like pose {like + 1}", self._advice())
         self._seen.append(seen)
@@ -111,41 +112,41 @@ class Session:
         self._kept(self.samples())
         return self._step(KEPT, self._advice())
 
-    def wanted(self) -> Array | None:
-        """Where the hand (4, 4) should be for the next sample, the same until one is kept: at first turned a
-        little about each axis, then where it makes the answer surest. None while the target was never seen.
-        Nothing is known here of what the arm can reach or would hit."""
+    def next_hand_pose(self) -> Array | None:
+        """Hand pose (4, 4) for the next sample, the same until one is kept or rejected: first rotated a
+        little about each axis, then where the variance falls most. None until the target has been seen.
+        Reach and collisions are not considered."""
         if not self._seen:
             return None
         if self._wanted is None:
             found = self._refined
             if found is None:
-                self._wanted = first_turns(self._hands[0], len(self._hands) - 1 + self._turned_down)
+                self._wanted = initial_pose(self._hands[0], len(self._hands) - 1 + self._rejected)
             else:
-                self._wanted = propose(
-                    self.samples(), found.x, found.y, (found.robot_rad, found.robot_m),
+                self._wanted = propose_pose(
+                    self.samples(), found.x, found.y, (found.arm_noise_rad, found.arm_noise_m),
                     self._seen[0].corners.points.mean(axis=0),
-                    np.random.default_rng([len(self._seen), self._turned_down]), NEW_DEG,
+                    np.random.default_rng([len(self._seen), self._rejected]), NEW_DEG,
                 ).hand  # fmt: skip
         return self._wanted
 
-    def turn_down(self) -> None:
-        """The pose wanted cannot be reached, or was no good: want another."""
-        self._turned_down += 1
+    def reject_pose(self) -> None:
+        """Propose another pose: this one cannot be reached, or gave no sample."""
+        self._rejected += 1
         self._wanted = None
 
     @property
     def pixel_noise(self) -> float | None:
-        """Standard deviation of the corners in pixels, as far as known."""
+        """Standard deviation of the corners in pixels, None before the first sample."""
         return pixel_noise(self._seen) if self._seen else None
 
     def _solve(self) -> None:
         samples = self.samples()
         self._refined, self._wanted = None, None
-        if self._diversity.reason is None and len(samples) >= _LEAST_TO_SOLVE:
+        if self._diversity.reason is None and len(samples) >= _MIN_TO_SOLVE:
             self._refined = refine(samples)
 
-    def _most_alike(self, hand: Array) -> int | None:
+    def _nearest_kept(self, hand: Array) -> int | None:
         hands = self.samples().hand
         if not len(hands):
             return None
@@ -158,50 +159,48 @@ class Session:
         return (
             self._refined is not None
             and len(self._hands) + (0 if self._before is None else len(self._before)) >= MIN_POSES
-            and self._diversity.spread_deg >= GOOD_SPREAD_DEG
+            and self._diversity.axis_spread_deg >= GOOD_SPREAD_DEG
             and self._refined.std_mm <= self._want_mm
         )
 
     def _advice(self) -> str:
         if self._enough:
             return "enough"
-        wanted = self.wanted()
+        wanted = self.next_hand_pose()
         if wanted is None or self._last is None:
             return "bring the target into the picture"
-        return in_words(self._last, wanted)
+        return describe_motion(self._last, wanted)
 
-    def _step(self, outcome: str, advice: str) -> Step:
+    def _step(self, outcome: str, advice: str) -> HandEyeStep:
         found = self._refined
-        return Step(
+        return HandEyeStep(
             outcome, len(self.samples()), self._diversity, None if found is None else found.std_mm,
             None if found is None else found.std_deg, self._enough, advice,
         )  # fmt: skip
 
 
-def preview(image: NDArray[np.uint8], corners: Corners | None, step: Step) -> NDArray[np.uint8]:
-    """The picture (H + 40, W, 3) RGB with the corners that were found, and the step below it."""
+def preview(image: NDArray[np.uint8], corners: Corners | None, step: HandEyeStep) -> NDArray[np.uint8]:
+    """The image (H + 40, W, 3) RGB with the corners that were found, and the step below it."""
     said = f"{step.count} poses", f"{step.outcome}: {step.advice}"
-    return drawn(grey(image), corners, said, step.outcome == KEPT)
+    return draw_corners(to_gray(image), corners, said, step.outcome == KEPT)
 
 
-def drawn(
+def draw_corners(
     plain: NDArray[np.uint8], corners: Corners | None, said: tuple[str, str], kept: bool
 ) -> NDArray[np.uint8]:
-    """A grey picture as (H + 40, W, 3) RGB, its corners circled, two lines below it."""
+    """A gray picture as (H + 40, W, 3) RGB, its corners circled, two lines below it."""
     out = np.zeros((plain.shape[0] + 40, max(plain.shape[1], 320), 3), dtype=np.uint8)
     out[: plain.shape[0], : plain.shape[1]] = plain[..., None]
     if corners is not None:
         for x, y in corners.pixels:
             cv2.circle(out, (round(x - 0.5), round(y - 0.5)), 4, (0, 158, 115), 1, cv2.LINE_AA)
-    colour = (0, 158, 115) if kept else (213, 94, 0)
+    color = (0, 158, 115) if kept else (213, 94, 0)
     for line, text in enumerate(said):
         at = (6, plain.shape[0] + 15 + 17 * line)
-        cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+        cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
     return out
 
 
-def _apart(a: Array, b: Array) -> float:
-    """How far two hand poses are apart, 1 where that is just still."""
-    moved_mm = float(np.linalg.norm(a[:3, 3] - b[:3, 3])) * 1e3
-    turned_deg = float(np.degrees(angles(a[:3, :3].T @ b[:3, :3])))
-    return max(moved_mm / STILL_MM, turned_deg / STILL_DEG)
+def _motion(a: Array, b: Array) -> float:
+    """Distance of two hand poses in units of the largest that counts as standing still."""
+    return max(distance_mm(a, b) / STILL_MM, angle_deg(a, b) / STILL_DEG)

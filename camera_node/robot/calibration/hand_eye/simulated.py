@@ -1,5 +1,5 @@
-"""A hand with a camera that moves over a target, with the truth known: what calibration and pairing are
-measured on. The place is that of a UR3e's table: everything is within half a metre of its base."""
+"""A simulated camera on a hand over a target, with known truth, to measure calibration and pairing.
+Everything is within half a metre of the base, as on the table of a UR3e."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, inverse, transform_of
-from camera_node.robot.calibration.targets import Grey, Target
+from camera_node.robot.calibration.targets import GrayImage, Target
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import CameraRenderer, World
@@ -58,12 +58,12 @@ def _camera(azimuth: float, slope: float, distance_m: float, roll: float) -> Arr
     return out
 
 
-def seen_targets(hands: Array) -> Array:
+def observed_targets(hands: Array) -> Array:
     """(N, 4, 4) target in camera, exact."""
     return np.asarray(inverse(CAMERA_IN_HAND) @ inverse(hands) @ TARGET_IN_BASE)
 
 
-def disturbed(poses: Array, rng: np.random.Generator, rad: float, metres: float) -> Array:
+def add_noise(poses: Array, rng: np.random.Generator, rad: float, metres: float) -> Array:
     """Poses with Gaussian noise: a rotation vector about the body's own axes, and a translation."""
     turns = Rotation.from_rotvec(rng.normal(0.0, rad, (len(poses), 3))).as_matrix()
     shifts = rng.normal(0.0, metres, (len(poses), 3))
@@ -77,25 +77,25 @@ def samples(
     metres: float = ARM_M,
     setup: str = EYE_IN_HAND,
 ) -> Samples:
-    """Samples with the noise on the arm's side. For eye-to-hand, hand and camera change places: X is the
-    same (4, 4), the camera in the base."""
+    """Samples with arm noise. For eye-to-hand, hand and base change places: X is the same (4, 4), then the
+    camera in the base."""
     hands = random_hands(count, rng)
-    targets = seen_targets(hands)
+    targets = observed_targets(hands)
     if setup != EYE_IN_HAND:
         hands = inverse(hands)
-    return Samples(disturbed(hands, rng, rad, metres), targets, setup)
+    return Samples(add_noise(hands, rng, rad, metres), targets, setup)
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A hand that sweeps over the target along incommensurate sines, so that no stretch is like another.
+    """A hand that sweeps over the target along incommensurate sines, so that the motion never repeats.
 
     speed_m_per_s: mean speed of the camera. The path is the same at every speed.
     """
 
     speed_m_per_s: float = 0.1
 
-    # Metres of path a second at rate 1, measured over ten minutes of it.
+    # Mean speed at rate 1, measured over ten minutes.
     _NATURAL_M_PER_S = 0.1036
 
     def hands(self, t_s: NDArray[np.float64]) -> Array:
@@ -113,15 +113,15 @@ class Sweep:
         return np.array([_camera(*row) for row in zip(azimuth, slope, distance_m, roll)]).reshape(-1, 4, 4)
 
 
-def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> Grey:
-    """The picture (H, W) of the target on a white plate, on a table, by the project's own ray caster."""
+def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> GrayImage:
+    """Render (H, W) the target on a white plate on a table, by the project's ray caster."""
     width, height = target.size_m
     picture = target.draw(max(256, round(width / 0.0002)))
     # The caster's rectangle is seen from +z and has y up; a target's z goes into the paper and its y down.
     flip = _rigid((np.pi, 0.0, 0.0), (width / 2, height / 2, 0.0))
     parts = []
     for depth_m, margin_m, texture in (
-        (0.0, 0.0, _Picture(picture, width, height)),
+        (0.0, 0.0, _ImageTexture(picture, width, height)),
         (0.0005, _PLATE_MARGIN_M, Plain((0.95, 0.95, 0.95))),
         (0.001, 0.6, Plain((0.45, 0.42, 0.40))),
     ):
@@ -141,10 +141,10 @@ def camera_in_target(hand: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Picture:
-    """A grey picture on a rectangle, linear between its pixels."""
+class _ImageTexture:
+    """Texture of a gray image on a rectangle, with linear interpolation."""
 
-    pixels: Grey
+    pixels: GrayImage
     width_m: float
     height_m: float
 
@@ -152,5 +152,5 @@ class _Picture:
         rows, columns = self.pixels.shape
         x = (uv[0] / self.width_m + 0.5) * columns - 0.5
         y = (0.5 - uv[1] / self.height_m) * rows - 0.5
-        grey = map_coordinates(self.pixels.astype(np.float32), [y, x], order=1, mode="nearest")
-        return np.repeat(grey[None] / 255.0, 3, axis=0)
+        gray = map_coordinates(self.pixels.astype(np.float32), [y, x], order=1, mode="nearest")
+        return np.repeat(gray[None] / 255.0, 3, axis=0)

@@ -1,8 +1,8 @@
-"""The time offset between an arm's clock and a camera's, from how both saw the same motion.
+"""The time offset between an arm's clock and a camera's, estimated from their motion.
 
-Whatever X is, hand and target turn by the same angles (4.6), so their angular speeds are one signal on two
-clocks. Their cross-correlation finds the offset to a fraction of a sample, over any range of offsets; then it
-is refined with X and Y in one likelihood (``refine``), where it counts by how fast the hand moved.
+For any X, hand and target rotate by the same angles (4.6), so their angular speeds are one signal on two
+clocks. Their cross-correlation gives the offset to a fraction of a sample, over any range of offsets. The
+offset is then refined with X and Y in one likelihood (``refine``), by means of the hand's velocity.
 """
 
 from __future__ import annotations
@@ -13,38 +13,37 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import correlate
 
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import MAX_GAP_S, CalibrationError
 from camera_node.robot.calibration.files import Track
-from camera_node.robot.calibration.hand_eye.joint_refinement import Refined, refine
+from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
     Rotation,
     Samples,
-    refuse_degenerate,
+    require_diversity,
     transform_of,
 )
 
-MAX_GAP_S = 0.05
-# Samples that the refinement uses: more are neighbours that say the same.
+# Most samples to refine with: neighboring ones add little information.
 MAX_SAMPLES = 400
 _STEP_S = 0.01
-# Angular speed over so long: shorter, and it is the noise of two poses; longer, and the motion is flat.
+# Window of the angular speed: a shorter one shows pose noise, a longer one smooths the motion away.
 _WINDOW_S = 0.25
-_LEAST_CORRELATION, _RIVAL = 0.5, 0.97
-_LEAST_OVERLAP_S = 2.0
-# Half of what the velocity of the hand is taken over.
+_MIN_CORRELATION, _RIVAL = 0.5, 0.97
+_MIN_OVERLAP_S = 2.0
+# Half the window of the hand's velocity.
 _HALF_S = 0.02
 _ROUNDS, _SETTLED_S = 10, 1e-6
 
 
 @dataclass(frozen=True)
-class Timed:
-    """samples: paired at the offset found. refined: X, Y and how sure they are. offset_s: hand's stamp minus
-    camera's of an instant. std_s: as the likelihood has it. correlation: of the angular speeds at the coarse
-    offset. unpaired: target poses with no hand pose near enough."""
+class StreamCalibration:
+    """samples: paired at the estimated offset. refined: X, Y and their uncertainty. offset_s: hand's stamp
+    minus camera's of one instant. std_s: from the likelihood. correlation: of the angular speeds at the
+    coarse offset. unpaired: target poses without a hand pose near enough in time."""
 
     samples: Samples
-    refined: Refined
+    refined: Refinement
     offset_s: float
     std_s: float
     coarse_s: float
@@ -52,13 +51,15 @@ class Timed:
     unpaired: int
 
 
-def calibrate_streams(hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S) -> Timed:
+def calibrate_streams(
+    hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S
+) -> StreamCalibration:
     """Time offset and hand-eye calibration from two streams. Raises CalibrationError with the reason."""
     coarse_s, correlation = coarse_offset(hand, target)
     offset_s, start = coarse_s, None
     for _ in range(_ROUNDS):
         samples, velocity, unpaired = paired(hand, target, offset_s, setup, max_gap_s)
-        refuse_degenerate(samples)
+        require_diversity(samples)
         found = refine(samples, start, velocity=velocity)
         start = (found.x, found.y)
         offset_s += found.offset_s
@@ -69,19 +70,19 @@ def calibrate_streams(hand: Track, target: Track, setup: str, max_gap_s: float =
             )
         if abs(found.offset_s) < _SETTLED_S:
             break
-    return Timed(samples, found, offset_s, found.offset_std_s, coarse_s, correlation, unpaired)
+    return StreamCalibration(samples, found, offset_s, found.offset_std_s, coarse_s, correlation, unpaired)
 
 
 def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
-    """Offset in seconds and the correlation there. Raises CalibrationError where the streams do not overlap,
-    the motion does not vary, or two offsets fit alike."""
+    """Offset in seconds and the correlation there. Raises CalibrationError if the streams do not overlap, the
+    motion does not vary, or two offsets fit equally well."""
     a, b = _angular_speed(hand), _angular_speed(target)
     for name, speed in (("hand", a), ("target", b)):
         seen = speed[~np.isnan(speed)]
-        if seen.size * _STEP_S < _LEAST_OVERLAP_S:
+        if seen.size * _STEP_S < _MIN_OVERLAP_S:
             raise CalibrationError(
                 f"the {name}'s stream has {seen.size * _STEP_S:.1f} s without gaps, at least "
-                f"{_LEAST_OVERLAP_S:g} s are needed to find the time offset"
+                f"{_MIN_OVERLAP_S:g} s are needed to find the time offset"
             )
         if seen.max() < np.deg2rad(1.0):
             raise CalibrationError(
@@ -89,10 +90,10 @@ def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
                 "offset cannot be found from its motion"
             )
     score, count = _masked_correlation(a, b)
-    enough = count * _STEP_S >= max(_LEAST_OVERLAP_S, 0.5 * _STEP_S * min(len(a), len(b)))
+    enough = count * _STEP_S >= max(_MIN_OVERLAP_S, 0.5 * _STEP_S * min(len(a), len(b)))
     score[~enough] = -1.0
     best = int(np.argmax(score))
-    if score[best] < _LEAST_CORRELATION:
+    if score[best] < _MIN_CORRELATION:
         raise CalibrationError(
             f"hand and target do not turn alike at any time offset (correlation {score[best]:.2f} at best): "
             "they are not of one motion, or it is too even to tell"
@@ -161,7 +162,7 @@ def _angular_speed(track: Track) -> Array:
         )
     at = start + np.arange(count, dtype=np.int64) * round(_STEP_S * 1e9)
     half = round(_WINDOW_S / 2 * 1e9)
-    # Within a gap the speed would be its mean: as long as the window, and no longer, that changes little.
+    # In a gap no longer than the window, the speed's mean over the gap is near enough.
     (a, there), (b, too) = (interpolated(track, at + d, _WINDOW_S / 2) for d in (-half, half))
     turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).magnitude()
     return np.where(there & too, turns / _WINDOW_S, np.nan)
@@ -182,6 +183,6 @@ def _masked_correlation(a: Array, b: Array) -> tuple[Array, Array]:
     sum_a, sum_b = cross(a, mb), cross(ma, b)
     top = cross(a, b) - sum_a * sum_b / n
     below = (cross(a * a, mb) - sum_a**2 / n) * (cross(ma, b * b) - sum_b**2 / n)
-    # Rounding of the transforms leaves crumbs where nothing varies.
+    # Where nothing varies, rounding of the transforms leaves values just above zero.
     level = 1e-9 * max(float((a * a).sum() * (b * b).sum()), 1e-300)
     return np.where(below > level, top / np.sqrt(np.maximum(below, level)), -1.0), count

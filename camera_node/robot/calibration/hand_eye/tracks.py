@@ -1,7 +1,7 @@
-"""Two streams of a guided calibration, for the time offset: the hand's poses, and the target's as seen.
+"""Records the two streams of a guided calibration for the time offset: hand poses and detected target poses.
 
-Each keeps its own stamps: what lies between them (the camera's own delay, the way of the joint states) is
-what ``calibrate.offset`` estimates from the motion. The files are as ``--hand`` and ``--target`` read them.
+Each keeps its own stamps: ``time_offset`` estimates the offset between them (camera delay, transport of the
+joint states) from the motion. The files are those that ``--hand`` and ``--target`` read.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from camera_node.pose.pairing import sort_samples
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye.samples import Array
-from camera_node.robot.calibration.hand_eye.session import GOOD_SPREAD_DEG, MIN_POSES, Step
+from camera_node.robot.calibration.hand_eye.session import GOOD_SPREAD_DEG, MIN_POSES, HandEyeStep
 from freshfield import files
 from freshfield.geometry import Pose
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from freshfield.scenario import Scenario
 
 HAND_FILE, TARGET_FILE = "hand.csv", "target.csv"
-# Of motion with the target in sight: the offset's deviation falls with its square root.
-LEAST_S = 10.0
-_GAP_NS = 125_000_000  # between two sightings; beyond, the motion between them is not known
+# Motion with the target in sight: the offset's deviation falls with the square root of its duration.
+MIN_SECONDS = 10.0
+_GAP_NS = 125_000_000  # largest gap between two detections: the motion in a longer one is unknown
 _HEADER = "t,x,y,z,qx,qy,qz,qw"
 
 
-class Tracks:
+class StreamRecorder:
     """Poses (4, 4) by stamp (ns). One thread may add hands, another targets."""
 
     def __init__(self) -> None:
@@ -56,15 +56,15 @@ class Tracks:
         """Seconds with the target in sight."""
         return self._seen_ns / 1e9
 
-    def judged(self, step: Step) -> Step:
-        """The step, by what streams need: ``std_mm`` has no part in it, because an offset that is not known
-        yet counts as noise there."""
-        varied = step.count >= MIN_POSES and step.diversity.spread_deg >= GOOD_SPREAD_DEG
+    def with_stream_advice(self, step: HandEyeStep) -> HandEyeStep:
+        """The step with advice for recording streams. ``std_mm`` is not used: the unknown offset counts as
+        noise in it."""
+        varied = step.count >= MIN_POSES and step.diversity.axis_spread_deg >= GOOD_SPREAD_DEG
         if not varied:
             return step
-        if self.seen_s >= LEAST_S:
+        if self.seen_s >= MIN_SECONDS:
             return replace(step, enough=True, advice="enough")
-        left = f"keep moving, irregularly, the target in sight: {LEAST_S - self.seen_s:.0f} s more"
+        left = f"keep moving, irregularly, the target in sight: {MIN_SECONDS - self.seen_s:.0f} s more"
         return replace(step, enough=False, advice=left)
 
     def hand(self) -> Track:
@@ -85,9 +85,9 @@ class Tracks:
             raise CalibrationError(f"--tracks: {folder}: {error.strerror}") from None
 
 
-def follow_arm(scenario: Scenario, config: ArmConfig, tracks: Tracks) -> ArmStream:
-    """Joint states of the scenario's arm into ``tracks``, as poses of the hand in its base, until the stream
-    is stopped. Raises ScenarioError, ArmError."""
+def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) -> ArmStream:
+    """Record the scenario's arm into ``tracks``, as hand poses in its base, until the stream is stopped.
+    Raises ScenarioError, ArmError."""
     from camera_node.robot.arm.camera_poses import arm_model
     from camera_node.robot.arm.joint_states import ArmStream
     from freshfield.clock import WallClock

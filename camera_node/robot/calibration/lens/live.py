@@ -1,4 +1,4 @@
-"""``camera-node calibrate intrinsics --live``: a scenario's camera and a session, at the camera's pace."""
+"""``camera-node calibrate intrinsics --live``: a guided session with a scenario's camera."""
 
 from __future__ import annotations
 
@@ -8,43 +8,34 @@ import itertools
 import sys
 from collections.abc import Generator
 
-import numpy as np
-from numpy.typing import NDArray
-
 from camera_node.config import LiveConfig, SourceConfig, source_config
-from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.live import Pace, say, write_picture
+from camera_node.robot.calibration import CalibrationError, live_camera
 from camera_node.robot.calibration.lens.session import LensSession
-from camera_node.robot.calibration.lens.solve import Lens
+from camera_node.robot.calibration.lens.solve import LensCalibration
 from camera_node.robot.calibration.targets import Target
 from camera_node.sources.devices.feed import as_camera_error
 from camera_node.sources.devices.live import DEFAULT_FPS, open_feed
 from camera_node.sources.playback import rate
-from camera_node.sources.registry import open_sources
-from freshfield import payload, scenario
 from freshfield.clock import WallClock
-
-Image = NDArray[np.uint8]
+from freshfield.scenario import Scenario
 
 _GRAB_S = 1.0
 
 
-def calibrate_live(args: argparse.Namespace, board: Target) -> Lens:
+def calibrate_live(args: argparse.Namespace, board: Target) -> LensCalibration:
     """Run a session with a scenario's camera. Ctrl-C ends it with what there is. Raises CalibrationError,
     ScenarioError."""
     if args.seconds is not None and not args.seconds > 0:
         raise CalibrationError("--seconds: expected a positive number")
-    plan = scenario.load(args.live)
-    if args.camera not in plan.cameras:
-        raise CalibrationError(f"--camera: {plan.path} has {', '.join(plan.cameras)}, got {args.camera}")
+    loaded = live_camera.load_scenario(args)
     session = LensSession(board, args.moving)
     try:
-        with contextlib.closing(_pictures(plan, source_config(plan), args)) as pictures:
-            for image in pictures:
+        with contextlib.closing(_images(loaded, source_config(loaded), args)) as images:
+            for image in images:
                 step = session.offer(image)
-                say(step.outcome, step.line)
+                live_camera.report_step(step.outcome, step.line)
                 if args.preview is not None:
-                    write_picture(args.preview, session.preview(image, step))
+                    live_camera.write_image(args.preview, session.preview(image, step))
                 if step.enough:
                     break
     except KeyboardInterrupt:
@@ -54,25 +45,30 @@ def calibrate_live(args: argparse.Namespace, board: Target) -> Lens:
     return session.lens()
 
 
-def _pictures(
-    plan: scenario.Scenario, config: SourceConfig, args: argparse.Namespace
-) -> Generator[Image, None, None]:
-    """uint8 RGB, until time is over or a recording has been seen once."""
+def _images(
+    loaded: Scenario, config: SourceConfig, args: argparse.Namespace
+) -> Generator[live_camera.Image, None, None]:
+    """Images (H, W, 3) uint8 RGB, until time is over or a recording has been seen once."""
     if isinstance(config, LiveConfig):
-        return _taken(plan, config, args)
-    return _recorded(plan, config, args)
+        yield from _camera_images(config, args)
+        return
+    source = live_camera.open_source(loaded, config, args)
+    try:
+        pace = live_camera.Pace(float(source.fps), args.seconds)
+        for _, _, image in live_camera.read_shots(source, config.codec, pace, live_camera.first_tick(source)):
+            yield image
+    finally:
+        source.release()
 
 
-def _taken(
-    plan: scenario.Scenario, config: LiveConfig, args: argparse.Namespace
-) -> Generator[Image, None, None]:
-    """Of the camera itself: a source would ask for the lens that is to be found."""
+def _camera_images(config: LiveConfig, args: argparse.Namespace) -> Generator[live_camera.Image, None, None]:
+    """From the camera's feed: a source would require the lens, which is not known yet."""
     fps = rate(config.fps or DEFAULT_FPS)
     try:
         feed = open_feed(args.camera, config, fps, WallClock())
     except ValueError as error:
         raise CalibrationError(str(error)) from None
-    pace = Pace(float(fps), args.seconds)
+    pace = live_camera.Pace(float(fps), args.seconds)
     try:
         for tick in itertools.count():
             if not pace(tick):
@@ -86,29 +82,3 @@ def _taken(
                 yield taken[1]
     finally:
         feed.close()
-
-
-def _recorded(
-    plan: scenario.Scenario, config: SourceConfig, args: argparse.Namespace
-) -> Generator[Image, None, None]:
-    try:
-        source = open_sources(plan, config, [args.camera], args.data)[args.camera]
-    except (ValueError, OSError) as error:
-        raise CalibrationError(str(error)) from None
-    pace = Pace(float(source.fps), args.seconds)
-    first = 0 if source.contents is not None else round(WallClock().now_ns() * source.fps / 10**9)
-    try:
-        for tick in itertools.count():
-            if (source.contents is not None and tick >= source.contents) or not pace(tick):
-                return
-            try:
-                shot = source.read(source.content(first + tick))
-            except ValueError as error:  # one shot that cannot be had; later ones may
-                print(f"\n{error}", file=sys.stderr)
-                continue
-            image = shot.image
-            if isinstance(image, bytes):
-                image = payload.decode(image, config.codec, shot.intrinsics.width, shot.intrinsics.height)
-            yield image
-    finally:
-        source.release()

@@ -1,5 +1,5 @@
-"""A guided calibration of a lens: pictures come in, and it says where the target should be shown next and
-when there is enough. It knows no camera and no clock: whoever runs it brings them."""
+"""A guided calibration of a lens: takes images, and says where to show the target next and when there is
+enough. The caller provides camera and clock."""
 
 from __future__ import annotations
 
@@ -10,26 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.session import KEPT, drawn
-from camera_node.robot.calibration.lens.solve import MIN_CORNERS, MIN_VIEWS, Lens, calibrate
-from camera_node.robot.calibration.targets import Corners, Target, grey
+from camera_node.robot.calibration.hand_eye.session import KEPT, draw_corners
+from camera_node.robot.calibration.lens.solve import (
+    MIN_CORNERS,
+    MIN_VIEWS,
+    LensCalibration,
+    calibrate,
+    coverage_grid,
+)
+from camera_node.robot.calibration.targets import Corners, Target, to_gray
 
 GOOD_PICTURES, GOOD_COVERED, GOOD_TILT_DEG, GOOD_F = 10, 0.8, 30.0, 0.003
-# Of the picture's width: what corners may move by between two pictures, and must to say something new.
+# Shares of the image's width: corner motion that still counts as at rest, and that makes an image new.
 STILL, NEW = 0.003, 0.06
 _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("left", "middle", "right")
 
 
 @dataclass(frozen=True)
 class LensStep:
-    """What came of a picture. outcome: ``kept``, or why not. count: pictures kept. covered: share of the
-    picture in which corners were seen. lens: so far, None while there is none. enough: stop here. advice:
-    what to do next."""
+    """Result of one image. outcome: ``kept``, or why not. count: images kept. covered: share of the image
+    area in which corners were seen. lens: so far, or None. enough: whether to stop. advice: what to do
+    next."""
 
     outcome: str
     count: int
     covered: float
-    lens: Lens | None
+    lens: LensCalibration | None
     enough: bool
     advice: str
 
@@ -49,46 +55,45 @@ class LensStep:
 
 
 class LensSession:
-    """Collects pictures until the focal length is known to .3 %, from at least 10 that cover .8 of the
-    picture, the target tilted by 30 degrees between them. moving: take pictures while the target or the
-    camera moves too, else only when both hold still."""
+    """Collects images until the focal length is known to .3 %, from at least 10 that cover .8 of the image
+    area, with the target tilted by 30 degrees between them. moving: take images during motion too, else only
+    when target and camera are at rest."""
 
     def __init__(self, target: Target, moving: bool = False) -> None:
         self._target, self._moving = target, moving
         self._kept: dict[str, Corners] = {}
         self._size = (0, 0)
-        self._lens: Lens | None = None
+        self._lens: LensCalibration | None = None
         self._why = ""
         self._cells = np.zeros((6, 6), dtype=np.bool_)
         self.corners: Corners | None = None
-        """Found in the last picture."""
+        """Found in the last image."""
 
-    def lens(self) -> Lens:
+    def lens(self) -> LensCalibration:
         """From all that is kept. Raises CalibrationError."""
         return calibrate(self._kept, self._size, {})
 
     def offer(self, image: NDArray[np.uint8]) -> LensStep:
-        """Look at a picture (H, W) or (H, W, 3). Raises CalibrationError where its size is another than those
-        before."""
+        """Process an image (H, W) or (H, W, 3). Raises CalibrationError if its size differs from earlier
+        ones."""
         size = image.shape[1], image.shape[0]
         if self._size not in ((0, 0), size):
             was = f"{self._size[0]} x {self._size[1]}"
             raise CalibrationError(f"a picture is {size[0]} x {size[1]}, those before were {was}")
         self._size = size
         last = self.corners
-        self.corners = self._target.find(grey(image))
+        self.corners = self._target.find(to_gray(image))
         if self.corners is None:
             return self._step("target not found", "bring all of it into the picture, well lit")
         if len(self.corners.points) < MIN_CORNERS:
             return self._step("target unclear", "show more of it")
-        if not self._moving and (last is None or _apart(last, self.corners) > STILL * size[0]):
+        if not self._moving and (last is None or _distance(last, self.corners) > STILL * size[0]):
             return self._step("moving", "hold still")
-        alike = [name for name, kept in self._kept.items() if _apart(kept, self.corners) < NEW * size[0]]
+        alike = [name for name, kept in self._kept.items() if _distance(kept, self.corners) < NEW * size[0]]
         if alike:
             return self._step(f"like {alike[0]}", self._advice())
         self._kept[f"picture {len(self._kept) + 1}"] = self.corners
-        at = np.clip(self.corners.pixels / size * 6, 0, 5).astype(int)
-        self._cells[at[:, 1], at[:, 0]] = True
+        self._cells = coverage_grid(self._kept.values(), size)
         try:
             self._lens, self._why = self.lens(), ""
         except CalibrationError as error:
@@ -96,14 +101,13 @@ class LensSession:
         return self._step(KEPT, self._advice())
 
     def preview(self, image: NDArray[np.uint8], step: LensStep) -> NDArray[np.uint8]:
-        """The picture (H + 40, W, 3) RGB with the corners that were found in it, dots where some were found
-        before, and the step below."""
+        """The image (H + 40, W, 3) RGB with its corners, dots at earlier corners, and the step below it."""
         said = f"{step.count} pictures, {100 * step.covered:.0f} % covered", f"{step.outcome}: {step.advice}"
-        shown = grey(image).copy()
+        shown = to_gray(image).copy()
         for kept in self._kept.values():
             for x, y in kept.pixels:
                 cv2.circle(shown, (round(x - 0.5), round(y - 0.5)), 2, 255, -1)
-        return drawn(shown, self.corners, said, step.outcome == KEPT)
+        return draw_corners(shown, self.corners, said, step.outcome == KEPT)
 
     @property
     def _enough(self) -> bool:
@@ -139,7 +143,7 @@ class LensSession:
         return LensStep(outcome, len(self._kept), self._covered, self._lens, self._enough, advice)
 
 
-def _apart(a: Corners, b: Corners) -> float:
+def _distance(a: Corners, b: Corners) -> float:
     """Mean distance (pixels) of the corners that both have; infinite where these are less than half."""
     at = dict(zip(map(tuple, a.points.tolist()), a.pixels))
     pairs = [(at[key], pixel) for key, pixel in zip(map(tuple, b.points.tolist()), b.pixels) if key in at]

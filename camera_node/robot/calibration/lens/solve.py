@@ -1,37 +1,38 @@
-"""A camera's lens from pictures of a target (Zhang's method, OpenCV's solver), with how sure it is."""
+"""A camera's lens and its uncertainty from images of a target (Zhang's method, OpenCV's solver)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import read_picture
+from camera_node.robot.calibration.files import read_gray_image
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.targets import Corners, Target, opencv_lens
 from freshfield.geometry import Pinhole
 
 MIN_VIEWS = 4
-# All of the views flat against the sensor leave focal length and distance one unknown.
+# With all views parallel to the sensor, focal length and distance cannot be told apart.
 MIN_TILT_DEG = 10.0
 MIN_CORNERS = 6
 _OUTLIER = 4.0
-# Focal lengths over the picture's longer side: 136 and 7 degrees of view. Pictures that determine nothing let
-# the solver run away beyond.
+# Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver runs away beyond them if
+# the images do not determine a lens.
 _SHORTEST, _LONGEST = 0.2, 8.0
 
 
 @dataclass(frozen=True)
-class Lens:
+class LensCalibration:
     """pinhole: this project's (corner origin). std: deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2.
-    error_px: root mean square of the reprojection. views: by picture, its own. tilt_deg: how differently the
-    target was tilted, largest angle between two views. covered: share of a 6 x 6 raster over the picture in
-    which corners were seen. unused: pictures and why not."""
+    error_px: root mean square of the reprojection. views: by picture, its own. tilt_deg: largest angle
+    between the target's tilts in two views. covered: share of a 6 x 6 grid over the image in which corners
+    were seen. unused: reason by image."""
 
     pinhole: Pinhole
     std: tuple[float, ...]
@@ -75,13 +76,13 @@ class Lens:
 
 def calibrate_folder(
     files: Sequence[Path], target: Target, progress: Callable[[int], None] = lambda done: None
-) -> Lens:
-    """From picture files. Raises CalibrationError."""
+) -> LensCalibration:
+    """Calibrate from image files. Raises CalibrationError."""
     found: dict[str, Corners] = {}
     unused: dict[str, str] = {}
     size: tuple[int, int] | None = None
     for k, file in enumerate(files):
-        picture = read_picture(file)
+        picture = read_gray_image(file)
         this = picture.shape[1], picture.shape[0]
         if size is not None and this != size:
             raise CalibrationError(f"{file}: is {this[0]} x {this[1]}, the others {size[0]} x {size[1]}")
@@ -97,8 +98,10 @@ def calibrate_folder(
     return calibrate(found, size, unused)
 
 
-def calibrate(views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]) -> Lens:
-    """From corners by picture name. Raises CalibrationError where they do not determine a lens."""
+def calibrate(
+    views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]
+) -> LensCalibration:
+    """Calibrate from corners by image name. Raises CalibrationError if they do not determine a lens."""
     usable = {n: c for n, c in views.items() if len(c.points) >= MIN_CORNERS}
     dropped = {n: f"only {len(c.points)} corners" for n, c in views.items() if n not in usable}
     unused = {**unused, **dropped}
@@ -129,7 +132,8 @@ def calibrate(views: Mapping[str, Corners], size: tuple[int, int], unused: Mappi
         )
     weights = [len(c.points) for c in usable.values()]
     error_px = float(np.sqrt(np.average(np.square(errors), weights=weights)))
-    return Lens(lens, std, error_px, dict(zip(usable, errors)), tilt_deg, _covered(usable, size), unused)
+    covered = float(coverage_grid(usable.values(), size).mean())
+    return LensCalibration(lens, std, error_px, dict(zip(usable, errors)), tilt_deg, covered, unused)
 
 
 def _solve(
@@ -152,9 +156,10 @@ def _solve(
     return lens, tuple(map(float, std.ravel()[:8])), vectors, [float(e) for e in errors.ravel()]
 
 
-def _covered(views: Mapping[str, Corners], size: tuple[int, int]) -> float:
-    cells = np.zeros((6, 6), dtype=bool)
-    for corners in views.values():
+def coverage_grid(views: Iterable[Corners], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(6, 6) cells of the image, rows first: those in which corners were seen."""
+    cells = np.zeros((6, 6), dtype=np.bool_)
+    for corners in views:
         at = np.clip(corners.pixels / size * 6, 0, 5).astype(int)
         cells[at[:, 1], at[:, 0]] = True
-    return float(cells.mean())
+    return cells

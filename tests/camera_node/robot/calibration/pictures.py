@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration.hand_eye import simulated
-from camera_node.robot.calibration.targets import parse
+from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
 
 BOARD = "charuco:7x5:24mm:18mm"
@@ -22,13 +22,13 @@ LENS = Pinhole.from_fov(320, 240, 65.0)
 
 @lru_cache(maxsize=1)
 def taken(count: int = 12) -> tuple[list[np.ndarray], np.ndarray]:
-    """Grey pictures, and the hand's true poses (N, 4, 4)."""
+    """Gray pictures, and the hand's true poses (N, 4, 4)."""
     hands = simulated.random_hands(count, np.random.default_rng(3))
-    board = parse(BOARD)
+    board = parse_target(BOARD)
     return [simulated.render(board, LENS, simulated.camera_in_target(h), 2) for h in hands], hands
 
 
-def as_scenario(
+def write_scenario(
     folder: Path, lens: Pinhole, pictures: Sequence[NDArray[np.uint8]], poses: Sequence[NDArray[np.float64]]
 ) -> Path:
     """A scenario in ``folder`` whose one camera, eye, plays pictures with their poses (4, 4)."""

@@ -12,12 +12,12 @@ import pytest
 
 from camera_node.cli import main
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND, read_hand_eye
-from camera_node.robot.calibration.accuracy_cost import streams
+from camera_node.robot.calibration.accuracy_study import streams
 from camera_node.robot.calibration.files import Track, pairs_json, read_visp_pose
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance_mm
 from camera_node.robot.calibration.hand_eye.samples import inverse
-from camera_node.robot.calibration.targets import parse
+from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import Pose
 from tests.conftest import data_dir
 
@@ -197,7 +197,7 @@ def test_a_printed_target_is_one(spelling, tmp_path, capsys):
     assert main(["calibrate", "target", spelling, "--out", str(file), "--dpi", "200"]) == 0
     assert "must measure" in capsys.readouterr().out
     picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    corners = parse(spelling).find(picture)
+    corners = parse_target(spelling).find(picture)
     # Metres a pixel, over the whole target: what --dpi says.
     pixels = np.ptp(corners.pixels[:, 0]) / np.ptp(corners.points[:, 0])
     assert pixels == pytest.approx(200 / 0.0254, rel=0.02)
@@ -212,7 +212,7 @@ def test_a_printed_chessboard_measures_what_is_said(tmp_path, capsys):
     dark = np.argwhere(picture < 128)
     measured_mm = (np.ptp(dark, axis=0) + 1)[::-1] / 300 * 25.4
     assert measured_mm == pytest.approx((100.0, 70.0), abs=0.1)
-    corners = parse("chessboard:9x6:10mm").find(picture)
+    corners = parse_target("chessboard:9x6:10mm").find(picture)
     assert np.ptp(corners.pixels[:, 0]) / 300 * 25.4 == pytest.approx(80.0, abs=0.05)
 
 
@@ -250,12 +250,12 @@ def test_visps_poses_are_rotation_vectors(tmp_path):
 
 
 def test_the_study_prints_its_tables(tmp_path, capsys):
-    from camera_node.robot.calibration import accuracy_cost
+    from camera_node.robot.calibration import accuracy_study
 
     tables = {
-        "pairing": accuracy_cost.pairing(1.0, (8.0, 100.0), (0.25,)),
-        "poses": accuracy_cost.poses((6, 15), 2),
-        "offset": accuracy_cost.offset(1, (5.0,)),
+        "pairing": accuracy_study.pairing(1.0, (8.0, 100.0), (0.25,)),
+        "poses": accuracy_study.poses((6, 15), 2),
+        "offset": accuracy_study.offset(1, (5.0,)),
     }
     of = {(r["arm_period_ms"], r["pairing"]): r for r in tables["pairing"]}
     for period_ms in (8.0, 100.0):
@@ -267,15 +267,15 @@ def test_the_study_prints_its_tables(tmp_path, capsys):
     assert all(r["trials"] == 2 and r["rms_mm_std"] > 0 and r["rms_deg_std"] > 0 for r in tables["poses"])
     assert all(r["error_ms"] < 1.0 and not r["failed"] for r in tables["offset"])
     for name, rows in tables.items():
-        accuracy_cost.write(name, rows, tmp_path / "out")
-        assert accuracy_cost.show(name, rows).count("\n") == len(rows) + 2
-    accuracy_cost.draw(tables, tmp_path / "out" / "accuracy.png")
+        accuracy_study.write_csv(name, rows, tmp_path / "out")
+        assert accuracy_study.format_table(name, rows).count("\n") == len(rows) + 2
+    accuracy_study.plot(tables, tmp_path / "out" / "accuracy.png")
     assert (tmp_path / "out" / "pairing.csv").read_text().count("\n") == 7
     assert cv2.imread(str(tmp_path / "out" / "accuracy.png")) is not None
 
 
 def test_the_deviation_of_an_rms_is_what_it_deviates_by():
-    from camera_node.robot.calibration.accuracy_cost import rms
+    from camera_node.robot.calibration.accuracy_study import rms
 
     rng = np.random.default_rng(4)
     errors = np.linalg.norm(rng.normal(size=(500, 20, 2, 3)), axis=-1) * [1.0, 5.0]

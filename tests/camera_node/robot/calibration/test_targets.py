@@ -10,7 +10,7 @@ from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg
 from camera_node.robot.calibration.hand_eye.samples import inverse
-from camera_node.robot.calibration.targets import Corners, locate, parse
+from camera_node.robot.calibration.targets import Corners, estimate_pose, parse_target
 from freshfield.geometry import Pinhole, look_at, so3_exp
 
 LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001))
@@ -39,12 +39,12 @@ def cameras(target) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(("spelling", "deg", "mm"), KINDS)
 def test_a_rendered_target_is_found_where_it_is(spelling, deg, mm):
-    target = parse(spelling)
+    target = parse_target(spelling)
     for camera in cameras(target):
         picture = simulated.render(target, LENS, camera, 2)
         corners = target.find(picture)
         assert corners is not None
-        found = locate(corners, LENS)
+        found = estimate_pose(corners, LENS)
         truth = inverse(camera)
         truth[:3, 3] += truth[:3, :3] @ ([ORIGIN.get(spelling.split(":")[0], 0.0)] * 2 + [0.0])
         assert angle_deg(found.pose, truth) < deg
@@ -56,18 +56,21 @@ def test_a_rendered_target_is_found_where_it_is(spelling, deg, mm):
 def test_nothing_is_found_where_nothing_is(spelling, deg, mm):
     noise = np.random.default_rng(0).integers(0, 256, (120, 160)).astype(np.uint8)
     for picture in (np.zeros((120, 160), np.uint8), np.full((120, 160), 255, np.uint8), noise):
-        assert parse(spelling).find(picture) is None
+        assert parse_target(spelling).find(picture) is None
 
 
 def test_the_wrong_tag_and_the_wrong_text_are_not_taken():
-    printed = np.pad(parse("apriltag:36h11:3:80mm").draw(200), 40, constant_values=255)
-    assert parse("apriltag:36h11:3:80mm").find(printed) is not None
-    assert parse("apriltag:36h11:4:80mm").find(printed) is None
+    printed = np.pad(parse_target("apriltag:36h11:3:80mm").draw(200), 40, constant_values=255)
+    assert parse_target("apriltag:36h11:3:80mm").find(printed) is not None
+    assert parse_target("apriltag:36h11:4:80mm").find(printed) is None
     twice = np.hstack([printed, printed])
-    assert parse("apriltag:36h11:3:80mm").find(twice) is None
-    printed = np.pad(parse("qr:80mm:here").draw(400), 60, constant_values=255)
-    assert parse("qr:80mm:here").find(printed) is not None and parse("qr:80mm").find(printed) is not None
-    assert parse("qr:80mm:there").find(printed) is None
+    assert parse_target("apriltag:36h11:3:80mm").find(twice) is None
+    printed = np.pad(parse_target("qr:80mm:here").draw(400), 60, constant_values=255)
+    assert (
+        parse_target("qr:80mm:here").find(printed) is not None
+        and parse_target("qr:80mm").find(printed) is not None
+    )
+    assert parse_target("qr:80mm:there").find(printed) is None
 
 
 @pytest.mark.parametrize(
@@ -75,7 +78,7 @@ def test_the_wrong_tag_and_the_wrong_text_are_not_taken():
 )
 def test_a_chessboard_is_the_same_way_up_however_it_is_held(turn):
     """Its first corner stays the first: the picture is turned and the corners with it."""
-    target = parse("chessboard:7x4:20mm")
+    target = parse_target("chessboard:7x4:20mm")
     straight = cv2.GaussianBlur(target.draw(600), (0, 0), 1.0)
     first = target.find(straight).pixels[0]
     height, width = straight.shape
@@ -95,17 +98,19 @@ def test_a_chessboard_is_the_same_way_up_however_it_is_held(turn):
 @pytest.mark.parametrize("roll", [0.0, np.pi])
 def test_the_covariance_is_what_noisy_corners_scatter_by(roll):
     """Also for a target turned by half a turn, where rotation vectors are at their worst."""
-    target = parse("charuco:7x5:24mm:18mm")
+    target = parse_target("charuco:7x5:24mm:18mm")
     camera = cameras(target)[0]
     camera[:3, :3] = camera[:3, :3] @ so3_exp([0, 0, roll - 0.4])
     points = np.array([[x, y, 0] for y in (0, 0.03, 0.06) for x in (0, 0.04, 0.08, 0.12)])
     truth = inverse(camera)
     exact = LENS.project(points @ truth[:3, :3].T + truth[:3, 3])
     rng = np.random.default_rng(1)
-    poses = [locate(Corners(exact + rng.normal(0, 0.1, exact.shape), points), LENS).pose for _ in range(400)]
+    poses = [
+        estimate_pose(Corners(exact + rng.normal(0, 0.1, exact.shape), points), LENS).pose for _ in range(400)
+    ]
     turns = np.array([cv2.Rodrigues(truth[:3, :3].T @ p[:3, :3])[0].ravel() for p in poses])
     off = np.concatenate([turns, np.array(poses)[:, :3, 3] - truth[:3, 3]], axis=1)
-    said = locate(Corners(exact, points), LENS).per_pixel * 0.1**2
+    said = estimate_pose(Corners(exact, points), LENS).unit_covariance * 0.1**2
     scatter = np.cov(off.T)
     np.testing.assert_allclose(np.sqrt(np.diag(scatter)), np.sqrt(np.diag(said)), rtol=0.15)
     # Whitened by what was said, the scatter is round.
@@ -118,7 +123,7 @@ def test_a_small_tag_seen_straight_on_may_be_tilted_either_way():
     pixels = LENS.project(points - [0.01, 0.01, -0.8])
     wobble = np.random.default_rng(0).normal(0, 0.05, pixels.shape)
     with pytest.raises(CalibrationError, match="tilted either way"):
-        locate(Corners(pixels + wobble, points), LENS)
+        estimate_pose(Corners(pixels + wobble, points), LENS)
 
 
 @pytest.mark.parametrize(
@@ -139,5 +144,5 @@ def test_a_small_tag_seen_straight_on_may_be_tilted_either_way():
 )
 def test_spellings_that_are_none_say_what_is_one(spelling, why):
     with pytest.raises(CalibrationError, match=why) as error:
-        parse(spelling)
+        parse_target(spelling)
     assert "charuco:7x5:30mm:22mm" in str(error.value)

@@ -13,9 +13,9 @@ from camera_node.robot.calibration.files import pairs_json, read_pairs, read_vis
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, angle_deg, calibrate, distance_mm
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, residuals, solve
-from camera_node.robot.calibration.hand_eye.joint_refinement import bound, refine
-from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, inverse, mismatch_deg
-from camera_node.robot.calibration.targets import parse
+from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
+from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, inverse, rotation_mismatch_deg
+from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import so3_exp
 from tests.conftest import data_dir
 
@@ -45,9 +45,9 @@ def errors(trials: int, count: int, find) -> tuple[np.ndarray, np.ndarray]:
     for trial in range(trials):
         rng = np.random.default_rng([7, trial])
         hands = simulated.random_hands(count, rng)
-        targets = simulated.seen_targets(hands)
-        least.append(bound(Samples(hands, targets), X, Y, (0.002, 0.0005)))
-        x = find(Samples(simulated.disturbed(hands, rng, 0.002, 0.0005), targets))
+        targets = simulated.observed_targets(hands)
+        least.append(cramer_rao_bound(Samples(hands, targets), X, Y, (0.002, 0.0005)))
+        x = find(Samples(simulated.add_noise(hands, rng, 0.002, 0.0005), targets))
         found.append((angle_deg(x, X), distance_mm(x, X)))
     return tuple(np.sqrt(np.mean(np.square(v), axis=0)) for v in (found, least))
 
@@ -79,21 +79,21 @@ def test_the_said_deviation_is_the_real_one():
 
 def test_the_arms_noise_is_found():
     found = [refine(simulated.samples(30, np.random.default_rng([3, k]))) for k in range(6)]
-    assert np.mean([f.robot_m for f in found]) == pytest.approx(0.0005, rel=0.1)
-    assert np.mean([f.robot_rad for f in found]) == pytest.approx(0.002, rel=0.1)
+    assert np.mean([f.arm_noise_m for f in found]) == pytest.approx(0.0005, rel=0.1)
+    assert np.mean([f.arm_noise_rad for f in found]) == pytest.approx(0.002, rel=0.1)
 
 
 @pytest.mark.parametrize("setup", SETUPS)
 def test_a_few_wrong_samples_are_found_and_hardly_count(setup):
     good = simulated.samples(20, np.random.default_rng(5), setup=setup)
     bad = good.target.copy()
-    bad[[3, 11, 17]] = simulated.disturbed(bad[[3, 11, 17]], np.random.default_rng(6), 0.3, 0.08)
+    bad[[3, 11, 17]] = simulated.add_noise(bad[[3, 11, 17]], np.random.default_rng(6), 0.3, 0.08)
     spoilt = Samples(good.hand, bad, setup)
     found = calibrate(spoilt)
     assert found.refined.outliers == [3, 11, 17]
     assert distance_mm(found.transform, X) < 1.0 < distance_mm(solve(spoilt, "park"), X)
     assert sum("does not fit the others" in w for w in found.warnings) == 3
-    assert set(np.argsort(mismatch_deg(spoilt))[-3:]) == {3, 11, 17}
+    assert set(np.argsort(rotation_mismatch_deg(spoilt))[-3:]) == {3, 11, 17}
 
 
 def test_same_samples_same_answer_bit_for_bit():
@@ -110,11 +110,11 @@ def test_the_targets_uncertainty_counts_where_it_is_known():
         variance = np.tile([1e-8] * 3 + [1e-8] * 3, (16, 1))
         variance[::2] = [1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 25e-6]
         noise = rng.normal(0, np.sqrt(variance))
-        targets = simulated.seen_targets(hands)
+        targets = simulated.observed_targets(hands)
         for t, n in zip(targets, noise):
             t[:3, :3] = t[:3, :3] @ simulated.so3_exp(n[:3])
             t[:3, 3] += n[3:]
-        hands = simulated.disturbed(hands, rng, 1e-4, 1e-4)
+        hands = simulated.add_noise(hands, rng, 1e-4, 1e-4)
         covariance = np.array([np.diag(v) for v in variance])
         knowing = refine(Samples(hands, targets, covariance=covariance)).x
         wins.append((distance_mm(knowing, X), distance_mm(refine(Samples(hands, targets)).x, X)))
@@ -171,7 +171,7 @@ def test_half_turns_alone_are_called_what_they_are():
 @pytest.fixture(scope="module")
 def franka():
     folder = data_dir("handeye_visp_franka")
-    samples, measured = read_visp_folder(folder, parse("chessboard:9x6:23.6mm"), None, EYE_IN_HAND)
+    samples, measured = read_visp_folder(folder, parse_target("chessboard:9x6:23.6mm"), None, EYE_IN_HAND)
     return samples, measured, np.loadtxt(folder / "expected_eMc.txt")
 
 
@@ -190,7 +190,7 @@ def test_the_refinement_takes_the_arm_for_what_it_is(franka):
     found = calibrate(samples)
     assert angle_deg(found.transform, published) < 0.2 and distance_mm(found.transform, published) < 1.0
     # This arm is off by millimetres: whoever believes it exactly lands degrees away.
-    assert 1e-3 < found.refined.robot_m < 1e-2
+    assert 1e-3 < found.refined.arm_noise_m < 1e-2
     assert found.exact_arm is not None and found.exact_arm.from_refined_deg > 1.0
     assert {row.method for row in found.rows} == set(ALL_METHODS)
     assert diversity(samples).reason is None

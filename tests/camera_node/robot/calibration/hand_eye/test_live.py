@@ -24,17 +24,17 @@ from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.arm.roadmap import clear
 from camera_node.robot.arm.viewpoint_tour import PathError
-from camera_node.robot.calibration import ArmStopped
-from camera_node.robot.calibration.accuracy_cost import streams
+from camera_node.robot.calibration import ArmStopped, live_camera
+from camera_node.robot.calibration.accuracy_study import streams
 from camera_node.robot.calibration.files import read_track
 from camera_node.robot.calibration.hand_eye import live
 from camera_node.robot.calibration.hand_eye import simulated as simulate
-from camera_node.robot.calibration.hand_eye.arm_mover import Mover
+from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, calibrate_tracks, distance_mm
 from camera_node.robot.calibration.hand_eye.samples import inverse
-from camera_node.robot.calibration.hand_eye.session import Session
-from camera_node.robot.calibration.hand_eye.tracks import HAND_FILE, LEAST_S, TARGET_FILE, Tracks
-from camera_node.robot.calibration.targets import parse
+from camera_node.robot.calibration.hand_eye.session import HandEyeSession
+from camera_node.robot.calibration.hand_eye.tracks import HAND_FILE, MIN_SECONDS, TARGET_FILE, StreamRecorder
+from camera_node.robot.calibration.targets import parse_target
 from camera_node.robot.hand_camera import Truth
 from camera_node.sources.base import Shot
 from freshfield.clock import WallClock
@@ -91,7 +91,7 @@ def test_what_it_saves_is_what_the_node_takes_it_for(setup, tmp_path, monkeypatc
     config = source_config(plan).arm
     base = base_matrix(config)
     recording = Replay(base @ hands_of(setup), each=2)  # each place twice: the hand holds still
-    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": recording})
+    monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": recording})
     held = ["--eye-to-hand"] if setup == EYE_TO_HAND else []
     arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out)]
     assert main(["calibrate", "hand-eye", *arguments, *held, "--json"]) == 0
@@ -120,26 +120,26 @@ def test_tracks_need_an_arm_and_motion(tmp_path, capsys):
 
 def test_the_cameras_own_stamps_are_kept_with_what_was_seen():
     stamps = [10**18 + 70_000_001 * k for k in range(6)]
-    hands, tracks = hands_of(EYE_IN_HAND)[:6], Tracks()
-    session = Session(parse(BOARD), EYE_IN_HAND, moving=True)
+    hands, tracks = hands_of(EYE_IN_HAND)[:6], StreamRecorder()
+    session = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, moving=True)
     step = live.guide(
         Replay(hands, stamps), "png", None, session, lambda tick: True, lambda *_: None, tracks=tracks
     )
     seen = tracks.target()
     assert seen.times_ns.tolist() == stamps
-    expected = simulate.seen_targets(hands)
+    expected = simulate.observed_targets(hands)
     assert max(distance_mm(a, b) for a, b in zip(seen.poses, expected)) < 2.0
     assert tracks.seen_s == pytest.approx(0.35, abs=1e-3) and not step.enough
 
 
 def test_streams_give_the_time_offset_also_when_read_from_their_files(tmp_path):
-    hand, target = streams(simulate.Sweep(0.15), LEAST_S + 3, 0.0371, np.random.default_rng(1))
+    hand, target = streams(simulate.Sweep(0.15), MIN_SECONDS + 3, 0.0371, np.random.default_rng(1))
     epoch_ns = 1_790_000_000 * 10**9
-    tracks = Tracks()
+    tracks = StreamRecorder()
     for stream, add in ((hand, tracks.add_hand), (target, tracks.add_target)):
         for t_ns, pose in zip(stream.times_ns, stream.poses):
             add(int(t_ns) + epoch_ns, pose)
-    assert LEAST_S < tracks.seen_s < LEAST_S + 3.1
+    assert MIN_SECONDS < tracks.seen_s < MIN_SECONDS + 3.1
     tracks.write(tmp_path)
     for a, b in ((tracks.hand(), tracks.target()),
                  (read_track(tmp_path / HAND_FILE), read_track(tmp_path / TARGET_FILE))):  # fmt: skip
@@ -150,15 +150,15 @@ def test_streams_give_the_time_offset_also_when_read_from_their_files(tmp_path):
 
 def test_it_is_not_enough_before_there_is_motion_to_tell_the_offset_from():
     pictures, hands = taken()
-    session, tracks = Session(parse(BOARD), EYE_IN_HAND, moving=True), Tracks()
+    session, tracks = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, moving=True), StreamRecorder()
     for picture, hand in zip(pictures, hands):
         step = session.offer(picture, LENS, hand)
     assert step.enough
-    waiting = tracks.judged(step)
+    waiting = tracks.with_stream_advice(step)
     assert not waiting.enough and "10 s more" in waiting.advice
-    for k in range(round(LEAST_S * 15) + 2):
+    for k in range(round(MIN_SECONDS * 15) + 2):
         tracks.add_target(k * 10**9 // 15, session.seen.pose)
-    assert tracks.judged(step).enough
+    assert tracks.with_stream_advice(step).enough
 
 
 MOVES = """
@@ -192,7 +192,7 @@ class OnArm:
     def read(self, content):
         t_ns = self._clock.now_ns()
         hand = UR3E.forward(self._truth.joints(t_ns))
-        picture = simulate.render(parse(BOARD), LENS, simulate.camera_in_target(hand), 1)
+        picture = simulate.render(parse_target(BOARD), LENS, simulate.camera_in_target(hand), 1)
         image = cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB)
         return Shot(image, Pose.from_matrix(hand), LENS, 0, t_ns + self._late_ns)
 
@@ -224,7 +224,7 @@ def test_the_arm_goes_by_itself_where_it_is_wanted(tmp_path, monkeypatch, capsys
     host = own_address()
     path = {"speed_rad_s": 3.0, "acceleration_rad_s2": 20.0, "floor_m": 0.02}
     file = bench(tmp_path, host, path=path)
-    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
+    monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
     samples = tmp_path / "samples.json"
     with simulated_arm(host, looking()[1]):
         arguments = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--drive", "--json"]
@@ -243,7 +243,7 @@ def test_a_pose_that_the_arm_cannot_have_is_refused_and_an_arm_that_is_lost_ends
     plan = load(str(bench(tmp_path, host, path={"speed_rad_s": 3.0, "floor_m": 0.02})))
     begin, joints = looking()
     with simulated_arm(host, joints) as process:
-        mover = Mover(plan, source_config(plan).arm, agreed_to=False)
+        mover = ArmMover(plan, source_config(plan).arm, agreed_to=False)
         try:
             hand = UR3E.forward(begin)
             for down_m, why in ((2.0, "at all"), (hand[2, 3] - 0.01, "the floor")):
@@ -267,7 +267,7 @@ def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path):
     goal = begin + np.array([0.8, 0, 0, 0, 0, 0])  # four seconds away
     with simulated_arm(host, joints):
         truth, clock = Truth(host), WallClock()
-        mover = Mover(plan, source_config(plan).arm, agreed_to=False)
+        mover = ArmMover(plan, source_config(plan).arm, agreed_to=False)
 
         def press() -> None:
             watched = Truth(host)
@@ -294,7 +294,7 @@ def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, c
     require_ur_rtde()
     host = own_address()
     file = bench(tmp_path, host, simulated=False)
-    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
+    monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 0)})
     begin, joints = looking()
     words = ["calibrate", "hand-eye", "--live", str(file), "--camera", "eye", "--board", BOARD, "--drive"]
     with simulated_arm(host, joints):
@@ -325,7 +325,7 @@ def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkey
     require_ur_rtde()
     host = own_address()
     file = bench(tmp_path, host)
-    monkeypatch.setattr(live, "open_sources", lambda *_: {"eye": OnArm(host, 60_000_000)})
+    monkeypatch.setattr(live_camera, "open_sources", lambda *_: {"eye": OnArm(host, 60_000_000)})
     begin, joints = looking()
     with simulated_arm(host, joints):
         moving = subprocess.Popen([sys.executable, "-c", MOVES, host, str(begin.tolist())])
@@ -343,12 +343,7 @@ def test_the_time_offset_is_found_on_a_moving_arm_as_on_a_bench(tmp_path, monkey
             moving.wait()
     assert found["time_offset_s"] == pytest.approx(-0.060, abs=0.006)  # joint states take their time too
     assert distance_mm(np.array(found["transform"]), X) < 2.0
-    words = [
-        "--hand",
-        str(tmp_path / tracks / HAND_FILE),
-        "--target",
-        str(tmp_path / tracks / TARGET_FILE),
-    ]
+    words = ["--hand", str(tmp_path / tracks / HAND_FILE), "--target", str(tmp_path / tracks / TARGET_FILE)]
     assert main(["calibrate", "hand-eye", *words, "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["time_offset_s"] == pytest.approx(found["time_offset_s"], abs=1e-5)

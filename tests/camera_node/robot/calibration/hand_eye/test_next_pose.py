@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
-from camera_node.robot.calibration.accuracy_cost import _planned
+from camera_node.robot.calibration.accuracy_study import _proposed_hands
 from camera_node.robot.calibration.hand_eye import simulated
-from camera_node.robot.calibration.hand_eye.joint_refinement import bound
-from camera_node.robot.calibration.hand_eye.next_pose import MAX_TILT_DEG, in_words, propose
+from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound
+from camera_node.robot.calibration.hand_eye.next_pose import MAX_TILT_DEG, describe_motion, propose_pose
 from camera_node.robot.calibration.hand_eye.samples import Samples, inverse
 from freshfield.geometry import so3_exp
 
@@ -20,7 +20,7 @@ MIDDLE = (inverse(Y) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
 
 def known(count: int, seed: int, setup: str = EYE_IN_HAND) -> Samples:
     hands = simulated.random_hands(count, np.random.default_rng(seed))
-    targets = simulated.seen_targets(hands)
+    targets = simulated.observed_targets(hands)
     return Samples(hands if setup == EYE_IN_HAND else inverse(hands), targets, setup)
 
 
@@ -28,7 +28,7 @@ def known(count: int, seed: int, setup: str = EYE_IN_HAND) -> Samples:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_target_is_seen_and_the_promise_is_kept(seed, setup):
     samples = known(5, seed, setup)
-    found = propose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(seed))
+    found = propose_pose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(seed))
     # What the camera will see follows from where the hand will be, and the other way round.
     moved = found.hand if setup == EYE_IN_HAND else inverse(found.hand)
     np.testing.assert_allclose(moved @ X @ found.target, Y, atol=1e-9)
@@ -37,30 +37,28 @@ def test_the_target_is_seen_and_the_promise_is_kept(seed, setup):
     assert found.target[2, 2] > np.cos(np.deg2rad(MAX_TILT_DEG)) - 1e-9  # faces the camera
     hands, targets = np.append(samples.hand, [found.hand], 0), np.append(samples.target, [found.target], 0)
     with_it = Samples(hands, targets, setup)
-    assert bound(with_it, X, Y, NOISE)[1] == pytest.approx(found.std_mm, rel=1e-6)
-    assert found.std_mm < 0.85 * bound(samples, X, Y, NOISE)[1]
+    assert cramer_rao_bound(with_it, X, Y, NOISE)[1] == pytest.approx(found.std_mm, rel=1e-6)
+    assert found.std_mm < 0.85 * cramer_rao_bound(samples, X, Y, NOISE)[1]
 
 
 def test_eight_planned_poses_are_worth_fifteen_of_chance():
-    planned = [bound(_planned(8, np.random.default_rng(k))[0], X, Y, NOISE) for k in range(8)]
-    chance = [bound(known(15, k), X, Y, NOISE) for k in range(8)]
+    planned = [
+        cramer_rao_bound(_proposed_hands(8, np.random.default_rng(k))[0], X, Y, NOISE) for k in range(8)
+    ]
+    chance = [cramer_rao_bound(known(15, k), X, Y, NOISE) for k in range(8)]
     assert np.mean(planned, axis=0)[1] < 1.05 * np.mean(chance, axis=0)[1]
 
 
 def test_same_seed_same_proposal():
     samples = known(5, 1)
-    a, b = (propose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(3)) for _ in range(2))
+    a, b = (propose_pose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(a.hand, b.hand)
 
 
 @pytest.mark.parametrize(
     ("turn", "shift", "words"),
     [
-        (
-            (0.5, 0.1, 0),
-            (0.1, 0, -0.03),
-            "by about 29 degrees, mostly about its +x, move +10 cm x, -3 cm z",
-        ),
+        ((0.5, 0.1, 0), (0.1, 0, -0.03), "by about 29 degrees, mostly about its +x, move +10 cm x, -3 cm z"),
         ((0, -1.0, 0), (0, 0, 0.001), "by about 57 degrees, mostly about its -y"),
     ],
 )
@@ -68,4 +66,4 @@ def test_a_way_in_words(turn, shift, words):
     now = simulated.random_hands(1, np.random.default_rng(0))[0]
     step = np.eye(4)
     step[:3, :3], step[:3, 3] = so3_exp(turn), shift
-    assert in_words(now, now @ step) == f"turn {words}"
+    assert describe_motion(now, now @ step) == f"turn {words}"

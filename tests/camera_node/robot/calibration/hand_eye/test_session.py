@@ -16,11 +16,11 @@ from camera_node.robot.calibration.files import read_lens, read_pairs, read_visp
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, calibrate, distance_mm
 from camera_node.robot.calibration.hand_eye.live import guide
-from camera_node.robot.calibration.hand_eye.session import Session, preview
-from camera_node.robot.calibration.targets import parse
+from camera_node.robot.calibration.hand_eye.session import HandEyeSession, preview
+from camera_node.robot.calibration.targets import parse_target
 from camera_node.sources.base import Shot
 from freshfield.geometry import Pose
-from tests.camera_node.robot.calibration.pictures import BOARD, LENS, as_scenario, taken
+from tests.camera_node.robot.calibration.pictures import BOARD, LENS, taken, write_scenario
 from tests.conftest import data_dir
 
 X = simulated.CAMERA_IN_HAND
@@ -28,8 +28,8 @@ X = simulated.CAMERA_IN_HAND
 
 def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough():
     pictures, hands = taken()
-    hands = simulated.disturbed(hands, np.random.default_rng(0), 1e-4, 2e-4)
-    session = Session(parse(BOARD), EYE_IN_HAND, want_mm=0.5)
+    hands = simulated.add_noise(hands, np.random.default_rng(0), 1e-4, 2e-4)
+    session = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, want_mm=0.5)
     steps = []
     for picture, hand in zip(pictures, hands):
         assert session.offer(picture, LENS, hand).outcome == "hand moving"
@@ -51,7 +51,7 @@ def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough(
 
 def test_a_picture_without_the_target_is_not_kept():
     _, hands = taken()
-    session = Session(parse(BOARD), EYE_IN_HAND, moving=True)
+    session = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, moving=True)
     step = session.offer(np.zeros((240, 320, 3), np.uint8), LENS, hands[0])
     assert (step.outcome, step.count, step.enough) == ("target not found", 0, False)
     with pytest.raises(CalibrationError, match="too few poses: 0"):
@@ -61,10 +61,10 @@ def test_a_picture_without_the_target_is_not_kept():
 def test_an_earlier_session_is_gone_on_with():
     pictures, hands = taken()
     kept = []
-    first = Session(parse(BOARD), EYE_IN_HAND, moving=True, kept=kept.append)
+    first = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, moving=True, kept=kept.append)
     for picture, hand in zip(pictures[:6], hands):
         first.offer(picture, LENS, hand)
-    second = Session(parse(BOARD), EYE_IN_HAND, moving=True, before=kept[-1])
+    second = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, moving=True, before=kept[-1])
     assert second.offer(pictures[2], LENS, hands[2]).outcome == "like pose 3"
     step = second.offer(pictures[6], LENS, hands[6])
     assert (step.outcome, step.count) == ("kept", 7)
@@ -75,7 +75,7 @@ def test_real_pictures_replayed():
     """The Franka's eight pictures as an operator would have taken them."""
     folder = data_dir("handeye_visp_franka")
     lens = read_lens(folder / "franka_camera.xml")
-    session = Session(parse("chessboard:9x6:23.6mm"), EYE_IN_HAND, want_mm=3.0, moving=True)
+    session = HandEyeSession(parse_target("chessboard:9x6:23.6mm"), EYE_IN_HAND, want_mm=3.0, moving=True)
     for k in range(1, 9):
         hand = read_visp_pose(folder / f"franka_pose_rPe_{k}.yaml")
         step = session.offer(cv2.imread(str(folder / f"franka_image-{k}.png")), lens, hand)
@@ -101,8 +101,8 @@ class Cell:
 
     def read(self, content: int) -> Shot:
         if self._seen is None or self._seen[0] != self.hand.tobytes():
-            picture = simulated.render(parse(BOARD), LENS, simulated.camera_in_target(self.hand), 2)
-            noisy = simulated.disturbed(self.hand[None], np.random.default_rng(content), 1e-4, 2e-4)[0]
+            picture = simulated.render(parse_target(BOARD), LENS, simulated.camera_in_target(self.hand), 2)
+            noisy = simulated.add_noise(self.hand[None], np.random.default_rng(content), 1e-4, 2e-4)[0]
             shot = Shot(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB), Pose.from_matrix(noisy), LENS)
             self._seen = self.hand.tobytes(), shot
         return self._seen[1]
@@ -118,7 +118,7 @@ class Cell:
 def test_it_moves_a_hand_by_itself_from_one_look_at_the_target(reach_m):
     """Also an arm that refuses some of the places: others are proposed."""
     cell = Cell(taken()[1][0], reach_m)
-    session = Session(parse(BOARD), EYE_IN_HAND, want_mm=0.4)
+    session = HandEyeSession(parse_target(BOARD), EYE_IN_HAND, want_mm=0.4)
     outcomes = []
     last = guide(
         cell, "png", None, session, lambda tick: tick < 100,
@@ -135,7 +135,7 @@ def test_it_moves_a_hand_by_itself_from_one_look_at_the_target(reach_m):
 @pytest.fixture
 def scenario(tmp_path):
     """A recorded camera whose poses are the hand's: photos with transforms.json."""
-    return as_scenario(tmp_path, LENS, *taken())
+    return write_scenario(tmp_path, LENS, *taken())
 
 
 def test_live_from_the_command_line(scenario, tmp_path, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from camera_node.robot.calibration.hand_eye import simulated
-from camera_node.robot.calibration.hand_eye.closed_form import still
+from camera_node.robot.calibration.hand_eye.closed_form import target_at_rest
 from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, inverse
 
 
@@ -21,9 +21,9 @@ def test_the_sweep_keeps_its_speed_and_within_reach(speed):
 
 def test_the_target_stands_still_and_the_camera_looks_at_it():
     hands = simulated.random_hands(20, np.random.default_rng(0))
-    exact = Samples(hands, simulated.seen_targets(hands))
+    exact = Samples(hands, simulated.observed_targets(hands))
     np.testing.assert_allclose(
-        still(exact, simulated.CAMERA_IN_HAND), [simulated.TARGET_IN_BASE] * 20, atol=1e-12
+        target_at_rest(exact, simulated.CAMERA_IN_HAND), [simulated.TARGET_IN_BASE] * 20, atol=1e-12
     )
     middle = np.array([*simulated.TARGET_MIDDLE, 1.0])
     seen = inverse(hands @ simulated.CAMERA_IN_HAND) @ middle
@@ -33,6 +33,6 @@ def test_the_target_stands_still_and_the_camera_looks_at_it():
 
 def test_noise_has_the_size_that_is_said():
     poses = simulated.random_hands(500, np.random.default_rng(1))
-    off = inverse(poses) @ simulated.disturbed(poses, np.random.default_rng(2), 0.002, 0.0005)
+    off = inverse(poses) @ simulated.add_noise(poses, np.random.default_rng(2), 0.002, 0.0005)
     assert off[:, :3, 3].std() == pytest.approx(0.0005, rel=0.1)
     assert off[:, [2, 0, 1], [1, 2, 0]].std() == pytest.approx(0.002, rel=0.1)

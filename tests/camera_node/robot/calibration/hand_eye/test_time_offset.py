@@ -8,7 +8,7 @@ import pytest
 from camera_node.pose.pairing import PairingCounts
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.accuracy_cost import streams
+from camera_node.robot.calibration.accuracy_study import streams
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import calibrate_tracks, distance_mm
@@ -77,7 +77,7 @@ def test_streams_of_different_bodies_are_refused():
     hand, _ = streams(simulated.Sweep(0.15), 20.0, 0.0, np.random.default_rng(4))
     still = simulated.Sweep(0.05)
     t_s = (hand.times_ns / 1e9)[::8]
-    other = Track(hand.times_ns[::8], simulated.seen_targets(still.hands(t_s + 300.0)), PairingCounts())
+    other = Track(hand.times_ns[::8], simulated.observed_targets(still.hands(t_s + 300.0)), PairingCounts())
     with pytest.raises(CalibrationError, match=r"turn alike|does not settle|repeats"):
         calibrate_streams(hand, other, EYE_IN_HAND)
 

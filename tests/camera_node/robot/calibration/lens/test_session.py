@@ -11,11 +11,11 @@ from camera_node.cli import main
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.simulated import render
 from camera_node.robot.calibration.lens.session import GOOD_COVERED, GOOD_F, GOOD_PICTURES, LensSession
-from camera_node.robot.calibration.targets import parse
+from camera_node.robot.calibration.targets import parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, so3_exp
-from tests.camera_node.robot.calibration.pictures import BOARD, as_scenario
+from tests.camera_node.robot.calibration.pictures import BOARD, write_scenario
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 
 LENS = Pinhole.from_fov(640, 480, 65.0)
@@ -25,7 +25,7 @@ EVERYWHERE = [(x, y) for y in (-0.45, 0.0, 0.45) for x in (-0.5, 0.0, 0.5)] * 2
 @pytest.fixture(scope="module")
 def board():
     """(pictures, cameras in target): a board that is held into every part of the picture, tilted."""
-    target, rng = parse(BOARD), np.random.default_rng(8)
+    target, rng = parse_target(BOARD), np.random.default_rng(8)
     middle = np.array([*np.array(target.size_m) / 2, 0.0])
     pictures, poses = [], []
     for k, (x, y) in enumerate(EVERYWHERE):
@@ -40,7 +40,7 @@ def board():
 
 
 def test_it_asks_for_what_is_missing_until_the_lens_is_known(board):
-    session = LensSession(parse(BOARD), moving=True)
+    session = LensSession(parse_target(BOARD), moving=True)
     steps = []
     for picture in board[0]:
         steps.append(session.offer(picture))
@@ -60,7 +60,7 @@ def test_it_asks_for_what_is_missing_until_the_lens_is_known(board):
 
 
 def test_what_moves_and_what_was_shown_before_is_not_kept(board):
-    session, pictures = LensSession(parse(BOARD)), board[0]
+    session, pictures = LensSession(parse_target(BOARD)), board[0]
     outcomes = [session.offer(pictures[k]).outcome for k in (0, 0, 0, 4, 4)]
     assert outcomes == ["moving", "kept", "like picture 1", "moving", "kept"]
     assert session.offer(np.zeros_like(pictures[0])).outcome == "target not found"
@@ -72,7 +72,7 @@ def test_what_moves_and_what_was_shown_before_is_not_kept(board):
 
 
 def test_live_from_the_command_line(board, tmp_path, capsys):
-    file, out, seen = as_scenario(tmp_path, LENS, *board), tmp_path / "lens.json", tmp_path / "seen.png"
+    file, out, seen = write_scenario(tmp_path, LENS, *board), tmp_path / "lens.json", tmp_path / "seen.png"
     words = ["calibrate", "intrinsics", "--board", BOARD, "--camera", "eye"]
     live = ["--live", str(file), "--moving", "--preview", str(seen), "--out", str(out)]
     assert main([*words, *live]) == 0

@@ -10,11 +10,10 @@ import pytest
 
 from camera_node.cli import main
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import pictures as picture_files
-from camera_node.robot.calibration.files import read_lens
+from camera_node.robot.calibration.files import list_images, read_lens
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.lens.solve import calibrate, calibrate_folder
-from camera_node.robot.calibration.targets import Corners, parse
+from camera_node.robot.calibration.targets import Corners, parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, so3_exp
 from tests.camera_node.robot.calibration import pictures
@@ -29,7 +28,7 @@ def views(count: int = 14):
     points = np.array([[x, y, 0.0] for y in np.arange(6) * 0.03 for x in np.arange(9) * 0.03])
     out = {}
     for k, hand in enumerate(simulated.random_hands(count, rng)):
-        seen = simulated.seen_targets(hand[None])[0]
+        seen = simulated.observed_targets(hand[None])[0]
         middle = points.mean(axis=0)
         pixels = TRUE.project((points - middle) @ seen[:3, :3].T + [0.02 * (k % 3 - 1), 0.01, 0.33])
         inside = np.all((pixels > 0) & (pixels < (640, 480)), axis=1)
@@ -99,7 +98,7 @@ def test_from_pictures_to_a_file_that_the_node_reads(tmp_path, capsys):
 
 def test_real_pictures():
     folder = data_dir("handeye_visp_franka")
-    found = calibrate_folder(picture_files(folder), parse("chessboard:9x6:23.6mm"))
+    found = calibrate_folder(list_images(folder), parse_target("chessboard:9x6:23.6mm"))
     published = read_lens(folder / "franka_camera.xml")
     assert len(found.views) == 8 and found.error_px < 0.4
     # The published lens has no distortion; ours, which has, differs by a hundredth.

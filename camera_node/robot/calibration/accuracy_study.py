@@ -1,13 +1,12 @@
-"""What accuracy costs in time, for poses: three tables, measured on a simulated hand with the truth known.
+"""Calibration accuracy against time and number of poses: three tables from a simulated hand with known truth.
 
-- ``pairing``: error of the camera's pose (4.7) against how often the arm reports and how fast it moves,
-  taking the nearest sample (thesis 4.3.3), a straight line with slerp, or the screw between two; and what a
-  pair costs in processor time.
+- ``pairing``: error of the camera's pose (4.7) against the arm's reporting period and speed, for the nearest
+  sample (thesis 4.3.3), linear interpolation with slerp, and screw interpolation; and the processor time of
+  one pairing.
 - ``poses``: error of the hand-eye calibration against the number of poses, by method, beside the Cramer-Rao
-  bound; noise on the arm's side, .5 mm and .002 rad an axis. ``rms_mm_std``, ``rms_deg_std``: standard
-  deviations of the errors over so many trials: an error below its bound is chance, and these say how much of
-  it to expect. ``planned``: the refinement, with poses after
-  the first four where the guided session proposes them; its bound is that of its own poses.
+  bound; arm noise .5 mm and .002 rad an axis. ``rms_mm_std``, ``rms_deg_std``: standard deviations of the
+  errors over the trials (an error below its bound is chance within these). ``planned``: the refinement, with
+  poses after the first four where the guided session proposes them; its bound is that of its own poses.
 - ``offset``: error of the time offset between arm and camera against the length of the recording and speed.
 """
 
@@ -35,15 +34,15 @@ from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, REFINED, angle_deg, distance_mm
 from camera_node.robot.calibration.hand_eye.closed_form import solve
-from camera_node.robot.calibration.hand_eye.joint_refinement import bound, refine
-from camera_node.robot.calibration.hand_eye.next_pose import propose
+from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
+from camera_node.robot.calibration.hand_eye.next_pose import propose_pose
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse
 from camera_node.robot.calibration.hand_eye.time_offset import calibrate_streams
 from freshfield.geometry import Pose
 
 Rows = list[dict[str, Any]]
 
-MIXES: dict[str, Interpolate[Pose] | None] = {
+INTERPOLATIONS: dict[str, Interpolate[Pose] | None] = {
     "nearest": None,
     "line": interpolate_linear,
     "screw": interpolate_screw,
@@ -54,13 +53,12 @@ COUNTS = (4, 6, 8, 10, 15, 20, 30, 50)
 PLANNED = "planned"
 _NOISE = (simulated.ARM_RAD, simulated.ARM_M)
 _FRAMES_PER_S = 30.0
-# What a detector leaves of a target's pose at this distance (measured with rendered pictures).
-_SEEN_RAD, _SEEN_M = 0.0005, 0.0003
+# Error of a detected target pose at this distance (measured with rendered images).
+_DETECTION_RAD, _DETECTION_M = 0.0005, 0.0003
 
 
-def measure(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]:
-    """The three tables, each when it is there. quick: fewer frames and trials, for seconds instead of two
-    minutes."""
+def run_tables(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]:
+    """Yield each table when it is done. quick: fewer frames and trials, seconds instead of two minutes."""
     periods_ms, speeds = (PERIODS_MS[::2], SPEEDS_M_PER_S[1::2]) if quick else (PERIODS_MS, SPEEDS_M_PER_S)
     yield "pairing", pairing(4.0 if quick else 20.0, periods_ms, speeds, seed)
     yield "poses", poses(COUNTS[::2] if quick else COUNTS, 10 if quick else 100, seed)
@@ -68,8 +66,8 @@ def measure(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]:
 
 
 def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, ...], seed: int = 0) -> Rows:
-    """Errors of the camera's pose, and their gaps, over frames at 30 a second whose stamps owe nothing to
-    the arm's. The arm's poses are exact: what is left is the pairing."""
+    """Camera pose errors and pairing gaps over frames at 30 a second, whose stamps are independent of the
+    arm's. The arm's poses are exact, so only the pairing contributes."""
     rng = np.random.default_rng([seed, 1])
     mount = HandEye(EYE_IN_HAND, simulated.CAMERA_IN_HAND)
     rows = []
@@ -80,8 +78,8 @@ def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, 
         for period_ms in periods_ms:
             times_s = np.arange(0.0, seconds + 2.0, period_ms / 1e3)
             hands = [Pose.from_matrix(h) for h in sweep.hands(times_s)]
-            for name, mix in MIXES.items():
-                hand = PoseBuffer(mix, max_gap_ns=10**9, keep_ns=10**12)
+            for name, interpolate in INTERPOLATIONS.items():
+                hand = PoseBuffer(interpolate, max_gap_ns=10**9, keep_ns=10**12)
                 for t_s, pose in zip(times_s, hands):
                     hand.add(round(t_s * 1e9), pose)
                 camera = mount.camera_poses(hand)
@@ -102,7 +100,7 @@ def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, 
 
 
 def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
-    """Root mean square errors over trials; ``failed`` counts those in which a method found nothing."""
+    """Root mean square errors over trials; ``failed`` counts the trials without a solution."""
     rows = []
     x, y = simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE
     methods: dict[str, Callable[[Samples], Any]] = {
@@ -115,10 +113,13 @@ def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
         spent = dict.fromkeys(methods, 0.0)
         for trial in range(trials):
             rng = np.random.default_rng([seed, 2, count, trial])
-            of = {"random": _seen(simulated.random_hands(count, rng), rng), "planned": _planned(count, rng)}
+            of = {
+                "random": _samples(simulated.random_hands(count, rng), rng),
+                "planned": _proposed_hands(count, rng),
+            }
             for name, method in methods.items():
                 exact, samples = of["planned" if name == PLANNED else "random"]
-                bounds[name].append(bound(exact, x, y, _NOISE))
+                bounds[name].append(cramer_rao_bound(exact, x, y, _NOISE))
                 begun = time.process_time()
                 try:
                     found = method(samples)
@@ -152,27 +153,27 @@ def rms(errors: Array) -> tuple[Array, Array]:
     return found, np.divide(deviation, 2.0 * found, out=np.zeros_like(found), where=found > 0.0)
 
 
-def _seen(hands: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:
-    """Exact samples, and those with the arm's noise."""
-    targets = simulated.seen_targets(hands)
-    return Samples(hands, targets), Samples(simulated.disturbed(hands, rng, *_NOISE), targets)
+def _samples(hands: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:
+    """Exact samples, and the same with arm noise."""
+    targets = simulated.observed_targets(hands)
+    return Samples(hands, targets), Samples(simulated.add_noise(hands, rng, *_NOISE), targets)
 
 
-def _planned(count: int, rng: np.random.Generator) -> tuple[Samples, Samples]:
-    """The same for hands that go, after the first four, where they are proposed."""
+def _proposed_hands(count: int, rng: np.random.Generator) -> tuple[Samples, Samples]:
+    """The same for hand poses that follow the proposals after the first four."""
     hands = simulated.random_hands(min(count, 4), rng)
     middle = (inverse(simulated.TARGET_IN_BASE) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
     while len(hands) < count:
-        so_far = Samples(hands, simulated.seen_targets(hands))
-        next_hand = propose(
+        so_far = Samples(hands, simulated.observed_targets(hands))
+        next_hand = propose_pose(
             so_far, simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE, _NOISE, middle, rng
         ).hand
         hands = np.concatenate([hands, next_hand[None]])
-    return _seen(hands, rng)
+    return _samples(hands, rng)
 
 
 def offset(trials: int, durations_s: tuple[float, ...], seed: int = 0) -> Rows:
-    """The arm at 125 Hz with its noise, a camera at 15 Hz with a detector's; true offsets up to a second."""
+    """Time offset errors, with a noisy arm at 125 Hz, noisy detector at 15 Hz, true offsets up to 1 s."""
     rows = []
     for speed in (0.05, 0.1, 0.25):
         for duration_s in durations_s:
@@ -205,13 +206,13 @@ def offset(trials: int, durations_s: tuple[float, ...], seed: int = 0) -> Rows:
 def streams(
     sweep: simulated.Sweep, seconds: float, offset_s: float, rng: np.random.Generator, noise: float = 1.0
 ) -> tuple[Track, Track]:
-    """Hand at 125 Hz and target at 15 Hz, whose stamps of one instant differ by ``offset_s``; noise: factor
-    on both sides' own."""
+    """Hand track at 125 Hz and target track at 15 Hz, with ``offset_s`` between their stamps. noise: factor
+    on the default noise of both."""
     hand_s = np.arange(0.0, seconds, 1 / 125.0)
     seen_s = np.arange(0.1, seconds - 0.1, 1 / 15.0) + float(rng.uniform(0.0, 0.05))
-    hands = simulated.disturbed(sweep.hands(hand_s), rng, simulated.ARM_RAD * noise, simulated.ARM_M * noise)
+    hands = simulated.add_noise(sweep.hands(hand_s), rng, simulated.ARM_RAD * noise, simulated.ARM_M * noise)
     targets = inverse(simulated.CAMERA_IN_HAND) @ inverse(sweep.hands(seen_s)) @ simulated.TARGET_IN_BASE
-    targets = simulated.disturbed(targets, rng, _SEEN_RAD * noise, _SEEN_M * noise)
+    targets = simulated.add_noise(targets, rng, _DETECTION_RAD * noise, _DETECTION_M * noise)
     return (
         Track(
             np.round((hand_s + offset_s) * 1e9).astype(np.int64), hands, PairingCounts(samples=len(hand_s))
@@ -220,8 +221,8 @@ def streams(
     )
 
 
-def show(name: str, rows: Rows) -> str:
-    """A table as text."""
+def format_table(name: str, rows: Rows) -> str:
+    """Format a table as text."""
     keys = list(rows[0])
     width = {k: max(len(k), *(len(_cell(row[k])) for row in rows)) for k in keys}
     lines = ["  ".join(f"{k:>{width[k]}}" for k in keys)]
@@ -229,8 +230,8 @@ def show(name: str, rows: Rows) -> str:
     return "\n".join([name, *lines, ""])
 
 
-def write(name: str, rows: Rows, folder: Path) -> None:
-    """A table as CSV. Raises OSError."""
+def write_csv(name: str, rows: Rows, folder: Path) -> None:
+    """Write a table as CSV. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / f"{name}.csv").open("w", newline="") as file:
         table = csv.DictWriter(file, list(rows[0]))
@@ -238,8 +239,8 @@ def write(name: str, rows: Rows, folder: Path) -> None:
         table.writerows(rows)
 
 
-def draw(tables: dict[str, Rows], path: Path) -> None:
-    """Pairing and number of poses as a picture, where matplotlib is there. Raises OSError."""
+def plot(tables: dict[str, Rows], path: Path) -> None:
+    """Plot the pairing and poses tables; does nothing without matplotlib. Raises OSError."""
     try:
         import matplotlib
     except ImportError:
@@ -250,7 +251,7 @@ def draw(tables: dict[str, Rows], path: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     rows = tables["pairing"]
     speed = sorted({r["speed_m_per_s"] for r in rows})[len({r["speed_m_per_s"] for r in rows}) // 2]
-    for name in MIXES:
+    for name in INTERPOLATIONS:
         chosen = [r for r in rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
         left.loglog([r["arm_period_ms"] for r in chosen], [r["mm_p95"] for r in chosen], "o-", label=name)
     left.set(xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s")
