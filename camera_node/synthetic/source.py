@@ -136,7 +136,7 @@ def _names(scenario: Scenario, scene: Scene) -> dict[str, str]:
 
 
 def fill_in_child(scenario: Scenario, config: WorldConfig, camera: str, stopped: Callable[[], bool]) -> None:
-    """Have one camera's frames rendered by a process of its own, which frees its memory when it ends: casting a
+    """Have one camera's frames rendered by a process of its own, which takes its memory along: casting a
     large image takes hundreds of megabytes. Returns when the frames are there, when ``stopped`` says so, or
     when the child failed; frames that are missing then are rendered as they are needed."""
     log.info("%s: rendering its frames ahead, once: they are kept for next time", camera)

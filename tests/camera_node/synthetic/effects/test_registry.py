@@ -39,7 +39,7 @@ for k in range(12):
     effects.node_ns(k)
 sys.setprofile(None)
 held = tracemalloc.take_snapshot().filter_traces(
-    [tracemalloc.Filter(True, "*world/effects/[a-z]*", all_frames=True)]).statistics("filename")
+    [tracemalloc.Filter(True, "*synthetic/effects/[a-z]*", all_frames=True)]).statistics("filename")
 modules = sorted(m.rsplit(".", 1)[1] for m in sys.modules if m.startswith("camera_node.synthetic.effects."))
 print(modules, streams, calls > 0, sum(s.size for s in held) > 0)
 """
