@@ -166,7 +166,8 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from channel_emu.virtual.simulate import OUTCOMES, simulate
+    from channel_emu.virtual.link_run import OUTCOMES
+    from channel_emu.virtual.simulate import simulate
 
     result = simulate(
         _config_of(args), args.cameras, args.seconds, args.seed, engine=args.engine,

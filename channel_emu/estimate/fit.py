@@ -22,7 +22,7 @@ from channel_emu.estimate import recording as observed
 from channel_emu.estimate.hmm import Estimate, Timeline
 from channel_emu.estimate.recording import Camera, ObservedError, Recording
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 
 MIN_DELAYS = 20
 # A state that fewer frames, or fewer visits, speak for is an outlier and not a state.
@@ -37,8 +37,8 @@ _MISFIT = 1.6
 _REFINEMENTS, _REFINING_STEPS = 4, 5
 _BATCHES, _T_95 = 20, 2.093
 _Z_95 = 1.959964
-_LOST = (str(Kind.LOST), str(Kind.BROKEN))
-_DROPPED = (str(Kind.DROPPED_BUSY), str(Kind.SUPERSEDED))
+_LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
+_DROPPED = (str(EventKind.DROPPED_BUSY), str(EventKind.SUPERSEDED))
 
 Interval = tuple[float, float] | None
 
@@ -309,7 +309,9 @@ def _bursts(cameras: list[Camera]) -> dict[str, Value]:
     """Shares of frames dropped and lost, and runs of frames that did not come. Frames that an arrival process
     never sampled, or that were still inside, are no part of it."""
     found: dict[str, Value] = {}
-    kept = [camera.outcome[(camera.outcome != Kind.SKIPPED) & (camera.outcome != "")] for camera in cameras]
+    kept = [
+        camera.outcome[(camera.outcome != EventKind.SKIPPED) & (camera.outcome != "")] for camera in cameras
+    ]
     gone = [np.isin(outcome, _DROPPED + _LOST) for outcome in kept]
     found["dropped_share"] = _share(
         [np.isin(o, _DROPPED) for o in kept], [np.ones(len(o), bool) for o in kept]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from channel_emu.estimate.hmm import Timeline
 from channel_emu.model import trace
 from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 
 # Longer than any stream lives; whatever takes longer never came.
 MAX_DELAY_MS = 1e9
@@ -44,7 +44,7 @@ class Camera:
     """One camera's frames in order of offering; every array has one entry a frame.
 
     started_ms, delay_ms: NaN where transmission did not start, or is not known to have. arrived_ms: when the
-    link's arrival process took the frame up, NaN where it did not. outcome: a ``link.Kind``'s name, or ""
+    link's arrival process took the frame up, NaN where it did not. outcome: a ``link.EventKind``'s name, or ""
     for a frame that was still inside.
     """
 
@@ -61,7 +61,7 @@ class Camera:
     more is known (``arrived_ms`` is a guess); NaN elsewhere."""
 
     def came(self) -> NDArray[np.bool_]:
-        return self.outcome == Kind.DELIVERED
+        return self.outcome == EventKind.DELIVERED
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Reco
         raise ObservedError(f"{path}: --use-states: expected a trace of two states, its has {len(names)}")
     if not found.records:
         raise ObservedError(f"{path}: there is no frame in it")
-    sampled = any(r.outcome == Kind.SKIPPED for r in found.records)
+    sampled = any(r.outcome == EventKind.SKIPPED for r in found.records)
     first_ns = min(r.offered_ns for r in found.records)
     cameras, endless = [], 0
     for name, records in found.by_camera().items():
@@ -142,10 +142,10 @@ def _sampled(camera: Camera, records: list[trace.Record], first_ns: int, discipl
     following = np.append(offered[1:], math.nan)
     latest = np.fmin(following, np.where(np.isnan(started), ended, started))
     exact = np.where((started < following) & ~_waited(started, records), started, math.nan)
-    exact = np.where(outcome == Kind.DROPPED_BUSY, ended, exact)
+    exact = np.where(outcome == EventKind.DROPPED_BUSY, ended, exact)
     since = offered.copy()
     if discipline == "newest-waits":
-        pushed = np.sort(ended[outcome == Kind.SUPERSEDED])
+        pushed = np.sort(ended[outcome == EventKind.SUPERSEDED])
         place = np.searchsorted(pushed, offered, side="right")
         after = np.append(pushed, math.inf)[place]
         exact = np.where(np.isnan(exact) & (after <= latest), after, exact)
@@ -153,7 +153,7 @@ def _sampled(camera: Camera, records: list[trace.Record], first_ns: int, discipl
         # The last to begin before the window's end; a frame's own start is that end or lies beyond it.
         before = np.append(-math.inf, begun)[np.searchsorted(begun, latest, side="left")]
         since = np.where(before > offered, before, offered)
-    never = (outcome == Kind.SKIPPED) | (outcome == "")
+    never = (outcome == EventKind.SKIPPED) | (outcome == "")
     window = np.where(never | ~np.isnan(exact) | np.isnan(latest), math.nan, latest - since)
     guess = np.where(np.isnan(window), offered, since + window / 2)
     arrived = np.where(never, math.nan, np.where(np.isnan(exact), guess, exact))
@@ -189,7 +189,7 @@ def refined(
 def _waited(started: NDArray[np.float64], records: list[trace.Record]) -> NDArray[np.bool_]:
     """Frames that started in the instant in which another ended: they had been waiting for it (where the
     other was not itself pushed out by them)."""
-    ends = {r.ended_ns for r in records if r.started_ns is not None and r.outcome != Kind.SUPERSEDED}
+    ends = {r.ended_ns for r in records if r.started_ns is not None and r.outcome != EventKind.SUPERSEDED}
     return np.array([r.started_ns in ends for r in records])
 
 
@@ -238,24 +238,24 @@ def _camera_of_rows(
     one that came nobody knows: it may still be on its way; so may one that is younger at the recording's end
     than the longest delay seen (offered at ``sure_ms`` or later), if the link is parallel."""
     n = len(offered)
-    started, outcome = np.full(n, math.nan), np.full(n, str(Kind.LOST), dtype="U16")
+    started, outcome = np.full(n, math.nan), np.full(n, str(EventKind.LOST), dtype="U16")
     free = -math.inf
     for i in range(n):
         if math.isnan(delivered[i]):
             if discipline != "parallel" and offered[i] < free:
                 newest = discipline == "newest-waits"
-                outcome[i] = str(Kind.SUPERSEDED if newest else Kind.DROPPED_BUSY)
+                outcome[i] = str(EventKind.SUPERSEDED if newest else EventKind.DROPPED_BUSY)
             continue
-        outcome[i] = str(Kind.DELIVERED)
+        outcome[i] = str(EventKind.DELIVERED)
         waits = discipline in ("newest-waits", "fcfs")
         started[i] = max(offered[i], free) if waits and free <= delivered[i] else offered[i]
         free = max(free, float(delivered[i]))
-    came = np.flatnonzero(outcome == Kind.DELIVERED)
+    came = np.flatnonzero(outcome == EventKind.DELIVERED)
     if len(came):
         unknown = np.arange(n) > came[-1]
         if discipline == "parallel":
             unknown |= offered >= sure_ms
-        outcome[unknown & (outcome == Kind.LOST)] = ""
+        outcome[unknown & (outcome == EventKind.LOST)] = ""
     return Camera(name, offered, offered, started, delivered - started, outcome, np.full(n, -1))
 
 

@@ -13,7 +13,7 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.model.counter_rng import Uniforms
+from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.instants import NEVER_NS, later, saturate
 
 # A run of the emulator visits every jump. Beyond this many a millisecond that costs more than it tells.
@@ -133,7 +133,7 @@ class Chain:
     def __init__(
         self,
         generator_per_ms: NDArray[np.float64],
-        uniforms: Uniforms,
+        rng: CounterRng,
         initial: int | None = None,
         slot_ms: float | None = None,
     ) -> None:
@@ -141,7 +141,7 @@ class Chain:
         self.generator_per_ms = q
         self.states = len(q)
         self.shares = np.zeros(len(q))  # long-run shares, where there are such and they matter
-        self._uniforms = uniforms
+        self._rng = rng
         self.slot_ns = 0 if slot_ms is None else round(slot_ms * 1e6)
         if slot_ms is not None:
             if self.slot_ns < 1:
@@ -228,7 +228,7 @@ class Chain:
                         "boundaries (sampled: slots)"
                     )
                 mark, mark_ns = self._number, start
-            target = bisect_right(self._jump_lists[self._visited[-1]], self._uniforms.pair(self._number)[1])
+            target = bisect_right(self._jump_lists[self._visited[-1]], self._rng.pair(self._number)[1])
             self._number += 1
             self._starts.append(start)
             self._visited.append(target)
@@ -238,7 +238,7 @@ class Chain:
         pace = self._pace[state]
         if pace == 0.0:
             return NEVER_NS
-        logarithm = math.log(self._uniforms.pair(self._number)[0])
+        logarithm = math.log(self._rng.pair(self._number)[0])
         if not self.slot_ns:
             return later(start_ns, saturate(-logarithm / pace * 1e6))
         slots = logarithm / pace
@@ -248,7 +248,7 @@ class Chain:
 
     def _draw_initial(self) -> int:
         shares = np.cumsum(stationary(self.generator_per_ms))
-        return min(int(np.searchsorted(shares, self._uniforms.uniform(0, 1), side="right")), self.states - 1)
+        return min(int(np.searchsorted(shares, self._rng.uniform(0, 1), side="right")), self.states - 1)
 
     def _is_white(self) -> bool:
         """True for a two-state chain so fast that it is noise. Refuses what is too fast to follow."""
@@ -271,7 +271,7 @@ class Chain:
         )
 
     def _state_of_instant(self, at_ns: int) -> int:
-        return 0 if self._uniforms.uniform(at_ns) < self.shares[0] else 1
+        return 0 if self._rng.uniform(at_ns) < self.shares[0] else 1
 
     @staticmethod
     def _last_targets(off: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -1,4 +1,4 @@
-"""The chain's path over a whole horizon, and work spent along it: ``chain.Chain`` and ``traffic.spend``."""
+"""The chain's path over a whole horizon, and arrivals and work along it: ``chain.Chain`` and ``traffic``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from channel_emu.model.instants import NEVER_NS
 from channel_emu.virtual.kernels.philox import fill
 
 _NEVER = float(NEVER_NS)
-# Numbers drawn ahead: enough to hide the start of a block, little enough to stay in the first cache.
+# Random numbers are drawn in blocks that amortize the call and fit into the L1 cache.
 _BLOCK = 256
 
 
@@ -59,7 +59,7 @@ def chain_path(pace, jumps, slot_ns, key, initial, horizon_ns):
 
 @njit(cache=True, nogil=True)
 def segment(starts, at_ns, hint):
-    """Index of the sojourn that contains ``at_ns``, searched forwards from ``hint``, backwards if it must."""
+    """Index of the sojourn that contains ``at_ns``: a linear search from ``hint`` on, binary before it."""
     i = hint
     if starts[i] > at_ns:
         return np.searchsorted(starts, at_ns, side="right") - 1
@@ -69,8 +69,8 @@ def segment(starts, at_ns, hint):
 
 
 @njit(cache=True, nogil=True)
-def spend(work, rates_per_ns, starts, states, start_ns, hint):
-    """Instant at which ``work`` is used up; NEVER_NS if not before the path's end."""
+def completion_ns(work, rates_per_ns, starts, states, start_ns, hint):
+    """``traffic.completion_ns`` along the path; NEVER_NS if not before its end."""
     alike = True
     for k in range(1, len(rates_per_ns)):
         alike &= rates_per_ns[k] == rates_per_ns[0]
@@ -97,7 +97,7 @@ def spend(work, rates_per_ns, starts, states, start_ns, hint):
 def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
     """Instants of a (Markov-modulated) Poisson process in [0, horizon], int64.
 
-    ``spend`` written out: the same operations in the same order, without a call for each arrival.
+    ``completion_ns`` inlined: the same operations in the same order, without a call for each arrival.
     """
     found = np.empty(1024, np.int64)
     u, v = np.empty(_BLOCK), np.empty(_BLOCK)
@@ -150,7 +150,7 @@ def sample_newest(offered_ns, rates_per_ns, starts, states, key):
         if k == 0:
             fill(n, u, v, key)
         hint = segment(starts, offered_ns[n], hint)
-        at_ns = spend(-math.log(u[k]), rates_per_ns, starts, states, offered_ns[n], hint)
+        at_ns = completion_ns(-math.log(u[k]), rates_per_ns, starts, states, offered_ns[n], hint)
         skipped = n + 1 < len(offered_ns) and at_ns > offered_ns[n + 1]
         sampled[n] = -1 if skipped else at_ns
     return sampled

@@ -1,6 +1,7 @@
-"""Service of one link's arrivals under each discipline: what ``link.Link`` decides, over whole arrays.
+"""One link under each discipline: the decisions of ``link.Link``, over whole arrays.
 
-The hot loops pass no arrays on: numba counts references at each call, which costs more than a decision.
+The hot loops pass no arrays to functions: numba counts references at each call, which costs more than a
+decision.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import numpy as np
 from numba import njit
 
 from channel_emu.model.instants import NEVER_NS
-from channel_emu.virtual.kernels.chain_path import later, saturate, spend
+from channel_emu.virtual.kernels.chain_path import completion_ns, later, saturate
 
-# Outcomes, as in simulate.OUTCOMES.
+# Outcomes, as in link_run.OUTCOMES.
 IN_FLIGHT, DELIVERED, DROPPED_BUSY, SUPERSEDED, SKIPPED = 0, 1, 2, 3, 4
 DROP_NEW, NEWEST_WAITS, FCFS, LCFS_PREEMPT, PARALLEL = 0, 1, 2, 3, 4
 
@@ -58,7 +59,7 @@ def serve(
                 while starts[hint + 1] <= at_ns:
                     hint += 1
                 if modulated:
-                    free_ns = spend(work[i], speeds, starts, states, at_ns, hint)
+                    free_ns = completion_ns(work[i], speeds, starts, states, at_ns, hint)
                 else:
                     if by_state:
                         mean_ms = means_ms[states[hint]]
@@ -119,7 +120,7 @@ def serve(
         while starts[hint + 1] <= at_ns:
             hint += 1
         if modulated:
-            end_ns = spend(work[frame], speeds, starts, states, at_ns, hint)
+            end_ns = completion_ns(work[frame], speeds, starts, states, at_ns, hint)
         else:
             if by_state:
                 mean_ms = means_ms[states[hint]]

@@ -7,8 +7,10 @@ import pytest
 
 from channel_emu.model import ages
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.link import DISCIPLINES, Kind
-from channel_emu.virtual.simulate import OUTCOMES, LinkRun, SimulationError, replay_offers, simulate
+from channel_emu.model.link import DISCIPLINES
+from channel_emu.virtual.link_run import OUTCOMES, LinkRun
+from channel_emu.virtual.replay import replay_offers
+from channel_emu.virtual.simulate import SimulationError, simulate
 from edge_server.live.buffer import FrameBuffer
 from tests.channel_emu.live.emulator import frame_of
 
@@ -97,17 +99,13 @@ def test_known_figures_of_the_presets() -> None:
     assert age(**chain, service_state="modulated") == pytest.approx(84.0, abs=0.7)
 
 
-def test_replaying_offers_gives_the_fates_of_the_simulation() -> None:
+def test_replayed_offers_are_decided_as_in_the_simulation() -> None:
     config = channel_from_mapping({"preset": "ch6", "faults": {"loss": {"probability": 0.2}}})
     run = simulate(config, ["x"], 30, 9, engine="python", frame_period_ms=33.3).runs[0]
-    kinds: list[str] = []
-    fates = replay_offers(
-        config, 9, {"x": [(int(t), 20_000) for t in run.offered_ns]}, run.end_ns,
-        lambda link, event: kinds.append(event.kind),
-    )["x"]  # fmt: skip
-    assert [OUTCOMES.index(t.outcome or "in_flight") for t in fates] == run.outcome.tolist()
-    assert [t.due_ns or -1 for t in fates] == run.due_ns.tolist()
-    assert kinds.count(Kind.DELIVERED) == run.count("delivered")
+    offers = {"x": [(int(t), 20_000) for t in run.offered_ns]}
+    transits = replay_offers(config, 9, offers, run.end_ns)["x"]
+    assert [OUTCOMES.index(t.outcome or "in_flight") for t in transits] == run.outcome.tolist()
+    assert [t.due_ns or -1 for t in transits] == run.due_ns.tolist()
 
 
 @pytest.mark.parametrize(
