@@ -6,8 +6,8 @@ import heapq
 from collections import Counter
 from typing import Any
 
-from channel_emu.model.instants import NEVER_NS
 from channel_emu.model.link import Event, EventKind, Transit
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.trace import Record, TraceError
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import QueueServer
 from channel_emu.model.service_time import NoServiceTime, ServiceTime
 from channel_emu.model.traffic import PoissonArrivals

@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Protocol
 
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.nanoseconds import NEVER_NS
 
 ORDERS = ("fcfs", "newest-first", "round-robin", "oldest-age")
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 from channel_emu.model.chain import Chain
 from channel_emu.model.counter_rng import CounterRng
-from channel_emu.model.instants import later, to_ns
+from channel_emu.model.nanoseconds import saturating_add, to_ns
 from channel_emu.model.traffic import completion_ns
 
 # Frame number -> work of mean one.
@@ -85,7 +85,7 @@ class ServiceTime:
         if self.modulated:
             return completion_ns(work, self._speeds_per_ns, self.chain, start_ns), state
         mean = self.means_ms[state] if len(self.means_ms) > 1 else self.means_ms[0]
-        return later(start_ns, to_ns(work * mean)), state
+        return saturating_add(start_ns, to_ns(work * mean)), state
 
 
 class NoServiceTime:

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
-from channel_emu.model.instants import NEVER_NS
 from channel_emu.model.link import EventKind, Transit
+from channel_emu.model.nanoseconds import NEVER_NS
 
 VERSION = 1
 _INSTANTS = ("offered_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")

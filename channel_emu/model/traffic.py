@@ -1,8 +1,8 @@
 """Arrivals: periodic, Poisson or Markov-modulated Poisson (thesis 6.23, 6.24).
 
 A Poisson process, modulated or not, has no memory: given the chain's path, the next arrival after any instant
-is where the integral of the rate reaches a unit-mean exponential. It is looked up by the number of the waiting
-frame, so arrivals depend on (camera, offer number) only.
+is where the integral of the rate reaches a unit-mean exponential. It is looked up by the number of the
+waiting frame, so arrivals depend on (camera, offer number) only.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from channel_emu.model.chain import Chain
 from channel_emu.model.counter_rng import CounterRng
-from channel_emu.model.instants import NEVER_NS, later, saturate
+from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round
 
 
 def completion_ns(work: float, rates_per_ns: Sequence[float], chain: Chain | None, start_ns: int) -> int:
@@ -32,14 +32,14 @@ def completion_ns(work: float, rates_per_ns: Sequence[float], chain: Chain | Non
             left = float(until_ns - at_ns)
             need = work / rate
             if need <= left:
-                return later(at_ns, saturate(need))
+                return saturating_add(at_ns, saturating_round(need))
             work -= rate * left
         at_ns = until_ns
     return NEVER_NS
 
 
 def _at_rate(work: float, rate_per_ns: float, start_ns: int) -> int:
-    return later(start_ns, saturate(work / rate_per_ns)) if rate_per_ns > 0.0 else NEVER_NS
+    return saturating_add(start_ns, saturating_round(work / rate_per_ns)) if rate_per_ns > 0.0 else NEVER_NS
 
 
 class PoissonArrivals:
@@ -63,4 +63,4 @@ class PeriodicArrivals:
         self.phase_ns = round(phase_ms * 1e6)
 
     def next_ns(self, after_ns: int, number: int) -> int:
-        return later(self.phase_ns, number * self.period_ns)
+        return saturating_add(self.phase_ns, number * self.period_ns)

@@ -19,8 +19,8 @@ from channel_emu.model.chain import Chain
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig, per_state
 from channel_emu.model.counter_rng import stream_key
-from channel_emu.model.instants import NEVER_NS
 from channel_emu.model.link import DISCIPLINES
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import ORDERS
 from channel_emu.virtual.kernels import chain_path, link_service, shared_service, work
 from channel_emu.virtual.link_run import LinkRun, camera_period_ms, name_ranks
@@ -164,7 +164,7 @@ def _path(chain: Chain | None, camera: str, seed: int, end_ns: int) -> Path:
     if chain is None:
         return np.array([0, NEVER_NS], np.int64), np.zeros(1, np.int64)
     key = _key(seed, camera, "channel.chain")
-    return chain_path.chain_path(chain.pace, chain.jumps, chain.slot_ns, key, chain.initial, end_ns)
+    return chain_path.chain_path(chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, end_ns)
 
 
 def _key(seed: int, camera: str, purpose: str) -> NDArray[np.uint64]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from channel_emu.model.instants import saturate
 from channel_emu.model.link import Fault, Transit
+from channel_emu.model.nanoseconds import saturating_round
 
 
 @dataclass(frozen=True)
@@ -22,4 +22,4 @@ class Effect(Fault):
         self.ns_per_byte = 8e3 / params.megabits_per_s
 
     def extra_ns(self, transit: Transit) -> int:
-        return saturate(transit.size_bytes * self.ns_per_byte)
+        return saturating_round(transit.size_bytes * self.ns_per_byte)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from channel_emu.model.instants import to_ns
 from channel_emu.model.link import Fault, Transit
+from channel_emu.model.nanoseconds import to_ns
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from channel_emu.model.counter_rng import CounterRng
-from channel_emu.model.instants import NEVER_NS, later, saturate, to_ns
 from channel_emu.model.link import Fault
+from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round, to_ns
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Effect(Fault):
         if self.mean_ns is None:
             return next((at for at in self.at_ns if at > after_ns), NEVER_NS)
         while self._next_ns <= after_ns:
-            step = saturate(self.rng.exponential(self._number) * self.mean_ns)
-            self._next_ns = later(max(self._next_ns, 0), max(step, 1))
+            step = saturating_round(self.rng.exponential(self._number) * self.mean_ns)
+            self._next_ns = saturating_add(max(self._next_ns, 0), max(step, 1))
             self._number += 1
         return self._next_ns

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.kernels.philox import fill
 
 _NEVER = float(NEVER_NS)
@@ -16,19 +16,19 @@ _BLOCK = 256
 
 
 @njit(cache=True, nogil=True)
-def saturate(span_ns):
+def saturating_round(span_ns):
     return NEVER_NS if span_ns >= _NEVER else np.int64(span_ns + 0.5)
 
 
 @njit(cache=True, nogil=True)
-def later(instant_ns, span_ns):
+def saturating_add(instant_ns, span_ns):
     return min(instant_ns + span_ns, NEVER_NS)
 
 
 @njit(cache=True, nogil=True)
-def chain_path(pace, jumps, slot_ns, key, initial, horizon_ns):
+def chain_path(sojourn_rate, jumps, slot_ns, key, initial, horizon_ns):
     """Sojourns up to the first that ends after the horizon: starts int64 (S + 1,) ending with that end, and
-    states int64 (S,). ``pace`` (M,), ``jumps`` (M, M) and ``slot_ns`` are ``chain.Chain``'s."""
+    states int64 (S,). ``sojourn_rate`` (M,), ``jumps`` (M, M) and ``slot_ns`` are ``chain.Chain``'s."""
     starts = np.empty(1024, np.int64)
     states = np.empty(1024, np.int64)
     starts[0], states[0] = 0, initial
@@ -40,13 +40,15 @@ def chain_path(pace, jumps, slot_ns, key, initial, horizon_ns):
         if k == 0:
             fill(count, u, v, key)
         end = NEVER_NS
-        if pace[state] != 0.0:
+        if sojourn_rate[state] != 0.0:
             if slot_ns == 0:
-                end = later(starts[count], saturate(-math.log(u[k]) / pace[state] * 1e6))
+                end = saturating_add(
+                    starts[count], saturating_round(-math.log(u[k]) / sojourn_rate[state] * 1e6)
+                )
             else:
-                slots = math.log(u[k]) / pace[state]
+                slots = math.log(u[k]) / sojourn_rate[state]
                 if slots * slot_ns < _NEVER:
-                    end = later(starts[count], (np.int64(slots) + 1) * slot_ns)
+                    end = saturating_add(starts[count], (np.int64(slots) + 1) * slot_ns)
         count += 1
         if count + 1 >= len(starts):
             starts = np.concatenate((starts, np.empty_like(starts)))
@@ -76,7 +78,7 @@ def completion_ns(work, rates_per_ns, starts, states, start_ns, hint):
         alike &= rates_per_ns[k] == rates_per_ns[0]
     if alike:
         rate = rates_per_ns[0]
-        return later(start_ns, saturate(work / rate)) if rate > 0.0 else NEVER_NS
+        return saturating_add(start_ns, saturating_round(work / rate)) if rate > 0.0 else NEVER_NS
     at_ns = start_ns
     i = segment(starts, at_ns, hint)
     while i < len(states):
@@ -86,7 +88,7 @@ def completion_ns(work, rates_per_ns, starts, states, start_ns, hint):
             left = float(until_ns - at_ns)
             need = work / rate
             if need <= left:
-                return later(at_ns, saturate(need))
+                return saturating_add(at_ns, saturating_round(need))
             work -= rate * left
         at_ns = until_ns
         i += 1
@@ -111,7 +113,11 @@ def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
             fill(count, u, v, key)
         work = -math.log(u[k])
         if alike:
-            at_ns = later(at_ns, saturate(work / rates_per_ns[0])) if rates_per_ns[0] > 0.0 else NEVER_NS
+            at_ns = (
+                saturating_add(at_ns, saturating_round(work / rates_per_ns[0]))
+                if rates_per_ns[0] > 0.0
+                else NEVER_NS
+            )
         else:
             while True:
                 until_ns = starts[i + 1]
@@ -120,7 +126,7 @@ def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
                     left = float(until_ns - at_ns)
                     need = work / rate
                     if need <= left:
-                        at_ns = later(at_ns, saturate(need))
+                        at_ns = saturating_add(at_ns, saturating_round(need))
                         break
                     work -= rate * left
                 at_ns = until_ns

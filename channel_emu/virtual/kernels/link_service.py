@@ -11,8 +11,8 @@ from heapq import heappop, heappush
 import numpy as np
 from numba import njit
 
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.virtual.kernels.chain_path import completion_ns, later, saturate
+from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.virtual.kernels.chain_path import completion_ns, saturating_add, saturating_round
 
 # Outcomes, as in link_run.OUTCOMES.
 IN_FLIGHT, DELIVERED, DROPPED_BUSY, SUPERSEDED, SKIPPED = 0, 1, 2, 3, 4
@@ -63,7 +63,7 @@ def serve(
                 else:
                     if by_state:
                         mean_ms = means_ms[states[hint]]
-                    free_ns = later(at_ns, saturate(work[i] * mean_ms * 1e6))
+                    free_ns = saturating_add(at_ns, saturating_round(work[i] * mean_ms * 1e6))
                 started[i], due[i] = at_ns, free_ns
                 if free_ns <= horizon_ns:
                     outcome[i] = DELIVERED
@@ -124,7 +124,7 @@ def serve(
         else:
             if by_state:
                 mean_ms = means_ms[states[hint]]
-            end_ns = later(at_ns, saturate(work[frame] * mean_ms * 1e6))
+            end_ns = saturating_add(at_ns, saturating_round(work[frame] * mean_ms * 1e6))
         started[frame], due[frame] = at_ns, end_ns
         serving, free_ns = frame, end_ns
         if discipline == PARALLEL:

@@ -7,8 +7,8 @@ from heapq import heappop, heappush
 import numpy as np
 from numba import njit
 
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.virtual.kernels.chain_path import completion_ns, later, saturate
+from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.virtual.kernels.chain_path import completion_ns, saturating_add, saturating_round
 from channel_emu.virtual.kernels.link_service import (
     DELIVERED,
     DROP_NEW,
@@ -134,7 +134,7 @@ def serve_shared(
             )  # fmt: skip
         else:
             mean_ms = means_ms[states[hints[c]]] if len(means_ms) > 1 else means_ms[0]
-            due[frame] = later(at_ns, saturate(work[frame] * mean_ms * 1e6))
+            due[frame] = saturating_add(at_ns, saturating_round(work[frame] * mean_ms * 1e6))
         started[frame] = at_ns
         serving, free_ns, last = frame, due[frame], c
         if discipline == PARALLEL:

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, Protocol
 from camera_node.capture import Camera
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
-from channel_emu.model.instants import NEVER_NS
 from channel_emu.model.link import Event, EventKind, Link
+from channel_emu.model.nanoseconds import NEVER_NS
 from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget

@@ -7,7 +7,7 @@ import pytest
 
 from channel_emu.model.chain import Chain, ChainError, stationary, transition_matrix, two_state_generator
 from channel_emu.model.counter_rng import CounterRng
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.nanoseconds import NEVER_NS
 
 THREE = np.array([[-0.3, 0.2, 0.1], [0.05, -0.05, 0.0], [0.4, 0.4, -0.8]])
 
@@ -185,5 +185,7 @@ def test_kernel_draws_the_same_path(slot_ms: float | None) -> None:
     for generator in (THREE, two_state_generator(1 / 30, 1 / 60), np.array([[-1.0, 1.0], [0.0, 0.0]])):
         chain = Chain(np.array(generator), CounterRng(9, "", "channel.chain"), None, slot_ms)
         key = np.array(CounterRng(9, "", "channel.chain").key, np.uint64)
-        starts, states = kernel.chain_path(chain.pace, chain.jumps, chain.slot_ns, key, chain.initial, 10**11)
+        starts, states = kernel.chain_path(
+            chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, 10**11
+        )
         assert list(zip(starts[:-1].tolist(), states.tolist())) == chain.recent(0, 10**11)

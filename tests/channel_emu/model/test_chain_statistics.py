@@ -34,7 +34,9 @@ def draw(generator: np.ndarray, sojourns: int, slot_ms: float | None = None) -> 
     chain = Chain(generator, CounterRng(1, "", "channel.chain"), None, slot_ms)
     rate = -stationary(generator) @ np.diag(generator)
     key = np.array(CounterRng(1, "", "channel.chain").key, np.uint64)
-    return chain_path(chain.pace, chain.jumps, chain.slot_ns, key, chain.initial, int(sojourns / rate * NS))
+    return chain_path(
+        chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, int(sojourns / rate * NS)
+    )
 
 
 def at_multiples(path: Path, span_ms: float) -> np.ndarray:

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.instants import NEVER_NS
 from channel_emu.model.link import DISCIPLINES, Event, EventKind, Link
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import ORDERS
 from channel_emu.virtual.simulate import OUTCOMES, simulate
 from tests.channel_emu.virtual.test_simulate import same

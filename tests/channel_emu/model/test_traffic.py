@@ -7,7 +7,7 @@ import pytest
 
 from channel_emu.model.chain import Chain, two_state_generator
 from channel_emu.model.counter_rng import CounterRng
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.service_time import ServiceTime, deterministic, exponential, gamma, lognormal, replayed
 from channel_emu.model.traffic import PoissonArrivals, completion_ns
 

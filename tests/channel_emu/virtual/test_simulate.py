@@ -156,7 +156,7 @@ def test_omega_is_what_a_buffer_would_hold(discipline: str) -> None:
 
 
 def test_ages_by_hand() -> None:
-    """Generated at 0, 10, 20 ms; arriving at 5, 40, 30: the middle one comes too late to matter."""
+    """Generated at 0, 10, 20 ms; delivered at 5, 40, 30: the second is older than the third when it is delivered."""
     saw = ages.sawtooth(np.array([5, 40, 30]) * 10**6, np.array([0, 10, 20]) * 10**6, 50 * 10**6)
     assert saw.delivered_ns.tolist() == [5 * 10**6, 30 * 10**6]
     # Teeth: 5 -> 30 over 25 ms, then 10 -> 30 over 20 ms.
@@ -164,15 +164,15 @@ def test_ages_by_hand() -> None:
     assert ages.peak_age_ms(saw) == pytest.approx(30)
     # At 5, 10, ..., 25: 5 10 15 20 25; at 30, ..., 45: 10 15 20 25.
     assert ages.mean_age_slotted_ms(saw, 5.0) == pytest.approx((75 + 70) / 9)
-    at = ages.ages_at(saw, np.array([0, 5, 29, 30, 50]) * 10**6)
-    np.testing.assert_allclose(at, [np.nan, 5, 29, 10, 30])
+    at = ages.newest_at(saw, np.array([0, 5, 29, 30, 50]) * 10**6)
+    assert at.tolist() == [-1, 0, 0, 20 * 10**6, 20 * 10**6]
 
 
 def test_no_delivery_has_no_age() -> None:
     nothing = ages.sawtooth(np.zeros(0, np.int64), np.zeros(0, np.int64), 10**9)
     assert ages.mean_age_ms(nothing) is None and ages.peak_age_ms(nothing) is None
     assert ages.mean_age_slotted_ms(nothing) is None
-    assert np.isnan(ages.ages_at(nothing, np.array([5]))).all()
+    assert ages.newest_at(nothing, np.array([5])).tolist() == [-1]
 
 
 def test_without_numba_the_links_themselves_run(monkeypatch: pytest.MonkeyPatch) -> None:
