@@ -24,7 +24,7 @@ def test_mmpp_counts_have_the_mean_and_variance_of_theory() -> None:
     path = chain(mu1, mu2, seed=3)
     key = np.array(CounterRng(3, "", "channel.chain").key, np.uint64)
     starts, states = kernel.chain_path(
-        path.pace, path.jumps, path.slot_ns, key, path.initial, horizon_ms * 10**6
+        path.sojourn_rate, path.jumps, path.slot_ns, key, path.initial, horizon_ms * 10**6
     )
     arrivals_key = np.array(CounterRng(3, "cam00", "channel.arrivals").key, np.uint64)
     found = kernel.poisson_arrivals(rates / 1e6, starts, states, arrivals_key, horizon_ms * 10**6)

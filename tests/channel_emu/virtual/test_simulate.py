@@ -156,7 +156,7 @@ def test_omega_is_what_a_buffer_would_hold(discipline: str) -> None:
 
 
 def test_ages_by_hand() -> None:
-    """Generated at 0, 10, 20 ms; delivered at 5, 40, 30: the second is older than the third when it is delivered."""
+    """Generated at 0, 10, 20 ms; delivered at 5, 40, 30: the second comes too late to matter."""
     saw = ages.sawtooth(np.array([5, 40, 30]) * 10**6, np.array([0, 10, 20]) * 10**6, 50 * 10**6)
     assert saw.delivered_ns.tolist() == [5 * 10**6, 30 * 10**6]
     # Teeth: 5 -> 30 over 25 ms, then 10 -> 30 over 20 ms.
