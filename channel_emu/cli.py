@@ -166,7 +166,8 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from channel_emu.virtual.simulate import OUTCOMES, simulate
+    from channel_emu.virtual.link_run import OUTCOMES
+    from channel_emu.virtual.simulate import simulate
 
     result = simulate(
         _config_of(args), args.cameras, args.seconds, args.seed, engine=args.engine,
@@ -295,17 +296,17 @@ def _add_fit(commands: Any) -> None:
 
 
 def _fit(args: argparse.Namespace) -> int:
-    from channel_emu.estimate import report as fitshow
+    from channel_emu.estimate import report
     from channel_emu.estimate.fit import fit
 
     result = fit(args.trace, args.states, discipline=args.discipline, scope=args.scope,
                  use_states=args.use_states)  # fmt: skip
     if args.out:
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(fitshow.scenario(result))
+        args.out.write_text(report.scenario_text(result))
     if args.plot:
-        fitshow.plot(result, args.plot)
-    print(json.dumps(result.summary()) if args.json else fitshow.show(result))
+        report.plot(result, args.plot)
+    print(json.dumps(result.summary()) if args.json else report.format_fit(result))
     return 0
 
 

@@ -1,10 +1,10 @@
 """Fits a channel to a recording: ``channel-emu fit``.
 
-One state (exponential delays, periodic or Poisson arrivals) against two (``hidden``), chosen by Schwarz's
-criterion BIC = k log n - 2 log L (Annals of Statistics 6(2), 1978). Intervals are of 95 %: those of the
-chain, the delays and the rates by observed information on the logarithms of the parameters; those of shares
-and runs by batch means, twenty stretches of equal length (Schmeiser, Operations Research 30(3), 1982),
-because losses that come in bursts are not independent.
+The Bayesian information criterion BIC = k log n - 2 log L (Schwarz, Annals of Statistics 6(2), 1978) chooses
+between one state (exponential delays, periodic or Poisson arrivals) and two (``hmm``). Intervals are 95 %:
+for the chain, delays and rates from the observed information of the parameters' logarithms; for shares and
+runs from means of twenty batches of equal length (Schmeiser, Operations Research 30(3), 1982), because
+losses in bursts are not independent.
 """
 
 from __future__ import annotations
@@ -18,56 +18,64 @@ import numpy as np
 from numpy.typing import NDArray
 
 from channel_emu.estimate import hmm
-from channel_emu.estimate import recording as observed
-from channel_emu.estimate.hmm import Estimate, Timeline
-from channel_emu.estimate.recording import Camera, ObservedError, Recording
+from channel_emu.estimate.hmm import Z_95, Estimate, Timeline
+from channel_emu.estimate.recording import (
+    MAX_DELAY_MS,
+    Camera,
+    Recording,
+    RecordingError,
+    read_recording,
+    refine_arrivals,
+    timelines,
+)
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 
 MIN_DELAYS = 20
-# A state that fewer frames, or fewer visits, speak for is an outlier and not a state.
+# A state with fewer frames or fewer visits is taken for outliers.
 _MIN_FRAMES, _MIN_VISITS = 10.0, 3.0
-# Exponential gaps lie within a quarter of their median with probability .17, a camera's own nearly always.
+# Exponential gaps are within a quarter of their median with probability .17, a camera's own nearly always.
 _NEAR_MEDIAN, _PERIODIC_SHARE = 0.25, 0.5
 _CONSTANT_CV = 0.01
-# Kolmogorov's distance times sqrt(n), for parameters taken from the same data: beyond the 1 % level of
-# Lilliefors' test for the exponential (1.25), with room for what two states and dependence add.
+# Kolmogorov-Smirnov distance times sqrt(n), for parameters fitted to the same data: above the 1 % level of
+# Lilliefors' test for the exponential (1.25), with a margin for two states and dependent delays.
 _MISFIT = 1.6
-# Rounds of guessing again when frames that waited were taken up; each takes most of what is left.
+# Rounds of refining when waiting frames were sampled; each removes most of the remaining error.
 _REFINEMENTS, _REFINING_STEPS = 4, 5
 _BATCHES, _T_95 = 20, 2.093
-_Z_95 = 1.959964
-_LOST = (str(Kind.LOST), str(Kind.BROKEN))
-_DROPPED = (str(Kind.DROPPED_BUSY), str(Kind.SUPERSEDED))
+_LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
+_DROPPED = (str(EventKind.DROPPED_BUSY), str(EventKind.SUPERSEDED))
 
 Interval = tuple[float, float] | None
 
 
 @dataclass(frozen=True)
-class Value:
-    """An estimate and its 95 % interval; None where the recording does not determine one."""
+class IntervalEstimate:
+    """An estimate with its 95 % interval, None if the recording does not determine one."""
 
     value: float
     interval: Interval
 
-    def plain(self) -> dict[str, float | None]:
+    def as_dict(self) -> dict[str, float | None]:
         low, high = self.interval or (None, None)
         return {"value": self.value, "low": low, "high": high}
 
 
 @dataclass(frozen=True)
 class Fit:
-    """recording: what was fitted. parameters: by name, in 1/ms and ms. bic: by number of states tried.
-    bursts: how frames fail to come. channel: the section for a scenario. warnings: what to know before
-    trusting it. estimate, lines: the two-state fit and its data, None if one state was chosen."""
+    """A fitted channel.
+
+    parameters: by name, in 1/ms and ms. bic: by number of states. bursts: statistics of undelivered frames.
+    channel: the section for a scenario. estimate, lines: the two-state fit and its data, if it was chosen.
+    """
 
     recording: Recording
     states: int
     chosen_by: str
     arrivals: str
-    parameters: dict[str, Value]
+    parameters: dict[str, IntervalEstimate]
     bic: dict[int, float]
-    bursts: dict[str, Value]
+    bursts: dict[str, IntervalEstimate]
     channel: dict[str, Any]
     warnings: list[str] = field(default_factory=list)
     estimate: Estimate | None = None
@@ -87,8 +95,8 @@ class Fit:
             "chosen_by": self.chosen_by,
             "bic": {str(k): round(v, 3) for k, v in self.bic.items()},
             "arrivals": self.arrivals,
-            "parameters": {name: value.plain() for name, value in self.parameters.items()},
-            "bursts": {name: value.plain() for name, value in self.bursts.items()},
+            "parameters": {name: value.as_dict() for name, value in self.parameters.items()},
+            "bursts": {name: value.as_dict() for name, value in self.bursts.items()},
             "intervals": "95 %: parameters by observed information, bursts by batch means",
             "warnings": self.warnings,
             "channel": self.channel,
@@ -103,32 +111,37 @@ def fit(
     scope: str = "shared",
     use_states: bool = False,
 ) -> Fit:
-    """Fit the recording in ``path``. states: "1", "2" or "auto" (BIC decides). discipline: of the link, for
-    rows. scope: whether the cameras share one chain or have one each (per-camera), with equal parameters.
-    use_states: take the states as recorded instead of inferring them.
+    """Fit the recording in ``path``.
 
-    Raises ValueError (ObservedError, TraceError) where there is nothing to fit.
+    states: "1", "2" or "auto" (BIC decides).
+    discipline: of the link, for rows (default drop-new).
+    scope: the cameras have one chain (shared) or one each (per-camera), with equal parameters.
+    use_states: use the recorded states instead of inferring them.
+    Raises RecordingError, TraceError (both ValueError) if there is nothing to fit.
     """
     if states not in ("1", "2", "auto"):
-        raise ObservedError(f"--states {states}: expected 1, 2 or auto")
+        raise RecordingError(f"--states {states}: expected 1, 2 or auto")
     if use_states and states == "1":
-        raise ObservedError("--use-states and --states 1 exclude each other")
-    recording = observed.read(path, discipline, use_states)
-    delays_ms = _checked(recording)
+        raise RecordingError("--use-states and --states 1 exclude each other")
+    recording = read_recording(path, discipline, use_states)
+    delays_ms = _usable_delays_ms(recording)
     kind, period_ms = _arrivals(recording)
     constant = float(delays_ms.std()) <= _CONSTANT_CV * float(delays_ms.mean())
     poisson = kind == "poisson"
-    lines = observed.timelines(recording, scope == "shared", poisson)
-    one, bic_1 = _one_state(lines, delays_ms, constant, poisson)
+    lines = timelines(recording, scope == "shared", poisson)
+    one_state, bic_1 = _fit_one_state(lines, delays_ms, constant, poisson)
     bic = {1: bic_1}
-    warnings = _notes(recording, constant, poisson, states)
+    warnings = _data_warnings(recording, constant, poisson, states)
     estimate = None
     if states != "1" and (poisson or not constant):
-        _need_numba(path)
+        _require_numba(path)
         estimate = hmm.fit(lines, not constant, poisson)
-        if not use_states:  # else the likelihood is that of the states too, and compares with nothing
-            bic[2] = len(estimate.model.vector()) * math.log(_seen(lines)) - 2 * estimate.log_likelihood
-        why_not = _not_two(estimate, lines)
+        if not use_states:  # else the likelihood includes the states and cannot be compared
+            bic[2] = (
+                len(estimate.model.log_parameters()) * math.log(_observation_count(lines))
+                - 2 * estimate.log_likelihood
+            )
+        why_not = _reject_two_states(estimate, lines)
         if states == "auto" and not use_states and (why_not or bic[2] >= bic[1]):
             if bic[2] < bic[1]:
                 warnings.append(f"two states were preferred by BIC and set aside: {why_not}")
@@ -136,46 +149,46 @@ def fit(
         elif why_not:
             warnings.append(f"two states as asked, though {why_not}")
     if recording.sampled:
-        # Both numbers of states were compared on the same guesses of when waiting frames were taken up.
+        # The comparison used the same guesses of arrivals for one and two states; now refine them.
         if estimate is None:
-            one = _refine_one(recording, lines, delays_ms, constant, scope)
+            one_state = _refit_one_state(recording, lines, delays_ms, constant, scope)
         else:
-            estimate, lines = _refine_two(recording, lines, estimate, not constant, scope)
-    parameters = one if estimate is None else _two_states(estimate, delays_ms, constant)
+            estimate, lines = _refit_two_states(recording, lines, estimate, not constant, scope)
+    parameters = one_state if estimate is None else _two_state_parameters(estimate, delays_ms, constant)
     if any(value.interval is None for value in parameters.values()):
         warnings.append("the recording does not determine the parameters that stand without an interval")
     names = recording.states or ["low", "high"]
     if not constant:
-        warnings += _misfit(delays_ms, parameters, estimate, lines)
+        warnings += _misfit_warnings(delays_ms, parameters, estimate, lines)
     chosen_by = "recorded states" if use_states else "BIC" if states == "auto" else "asked"
-    bursts = _bursts(recording.cameras)
-    channel = _section(recording, parameters, kind, period_ms, scope, names, bursts)
+    bursts = _loss_statistics(recording.cameras)
+    channel = _channel_section(recording, parameters, kind, period_ms, scope, names, bursts)
     channel_from_mapping(channel, "the fitted channel")
     return Fit(recording, 1 if estimate is None else 2, chosen_by, kind, parameters, bic, bursts, channel,
                warnings, estimate, lines)  # fmt: skip
 
 
-def _checked(recording: Recording) -> NDArray[np.float64]:
+def _usable_delays_ms(recording: Recording) -> NDArray[np.float64]:
     delays_ms = recording.delays_ms()
-    came = sum(int(camera.came().sum()) for camera in recording.cameras)
+    came = sum(int(camera.delivered().sum()) for camera in recording.cameras)
     if not len(delays_ms):
-        raise ObservedError(
+        raise RecordingError(
             f"{recording.path}: none of its {recording.frames} frames came through in less than "
-            f"{observed.MAX_DELAY_MS:g} ms: there is no delay to fit"
+            f"{MAX_DELAY_MS:g} ms: there is no delay to fit"
         )
     if len(delays_ms) < MIN_DELAYS:
-        raise ObservedError(
+        raise RecordingError(
             f"{recording.path}: {len(delays_ms)} delays ({recording.frames} frames, {came} came); at least "
             f"{MIN_DELAYS} are needed, and hundreds for two states: record longer"
         )
     return delays_ms
 
 
-def _need_numba(path: Path) -> None:
+def _require_numba(path: Path) -> None:
     try:
         import numba  # noqa: F401
     except ImportError:
-        raise ObservedError(
+        raise RecordingError(
             f"{path}: two states are fitted with numba (pip install 'freshfield[emu]'); --states 1 needs none"
         ) from None
 
@@ -192,71 +205,73 @@ def _arrivals(recording: Recording) -> tuple[str, float]:
     return ("periodic" if near.mean() > _PERIODIC_SHARE else "poisson"), median
 
 
-def _one_state(
+def _fit_one_state(
     lines: list[Timeline], delays_ms: NDArray[np.float64], constant: bool, poisson: bool
-) -> tuple[dict[str, Value], float]:
+) -> tuple[dict[str, IntervalEstimate], float]:
     mean, n = float(delays_ms.mean()), len(delays_ms)
-    found, log_likelihood = {"mean_ms": Value(mean, (mean, mean))}, 0.0
+    found, log_likelihood = {"mean_ms": IntervalEstimate(mean, (mean, mean))}, 0.0
     if not constant:
-        reach = math.exp(_Z_95 / math.sqrt(n))
-        found["mean_ms"] = Value(mean, (mean / reach, mean * reach))
+        reach = math.exp(Z_95 / math.sqrt(n))
+        found["mean_ms"] = IntervalEstimate(mean, (mean / reach, mean * reach))
         log_likelihood -= n * (math.log(mean) + 1)
     if poisson:
         arrivals = sum(int(line.arrived.sum()) for line in lines)
         rate = arrivals / sum(float(line.span_ms @ line.waiting) for line in lines)
-        reach = math.exp(_Z_95 / math.sqrt(arrivals))
-        found["rate_per_ms"] = Value(rate, (rate / reach, rate * reach))
+        reach = math.exp(Z_95 / math.sqrt(arrivals))
+        found["rate_per_ms"] = IntervalEstimate(rate, (rate / reach, rate * reach))
         log_likelihood += arrivals * (math.log(rate) - 1)
-    return found, ((not constant) + poisson) * math.log(_seen(lines)) - 2 * log_likelihood
+    return found, ((not constant) + poisson) * math.log(_observation_count(lines)) - 2 * log_likelihood
 
 
-def _refine_one(
+def _refit_one_state(
     recording: Recording, lines: list[Timeline], delays_ms: NDArray[np.float64], constant: bool, scope: str
-) -> dict[str, Value]:
-    found, _ = _one_state(lines, delays_ms, constant, True)
+) -> dict[str, IntervalEstimate]:
+    found, _ = _fit_one_state(lines, delays_ms, constant, True)
     for _ in range(_REFINEMENTS):
-        better = observed.refined(recording, found["rate_per_ms"].value)
-        found, _ = _one_state(observed.timelines(better, scope == "shared", True), delays_ms, constant, True)
+        improved = refine_arrivals(recording, found["rate_per_ms"].value)
+        found, _ = _fit_one_state(timelines(improved, scope == "shared", True), delays_ms, constant, True)
     return found
 
 
-def _refine_two(
+def _refit_two_states(
     recording: Recording, lines: list[Timeline], estimate: Estimate, delays: bool, scope: str
 ) -> tuple[Estimate, list[Timeline]]:
     model, expected = estimate.model, estimate.expectation
     for _ in range(_REFINEMENTS):
         at_ms = [line.at_ms() for line in lines]
-        by_state = np.exp(model.vector()[-2:])
+        by_state = np.exp(model.log_parameters()[-2:])
         rates = [states @ by_state for states in expected.states]
 
         def rate(place: int, when: NDArray[np.float64], at_ms=at_ms, rates=rates) -> NDArray[np.float64]:
             which = 0 if len(at_ms) == 1 else place
             return np.interp(when, at_ms[which], rates[which])
 
-        lines = observed.timelines(observed.refined(recording, rate), scope == "shared", True)
-        model, _ = hmm.climb(model, lines, _REFINING_STEPS)
-        expected = hmm.expect(model, lines)
+        lines = timelines(refine_arrivals(recording, rate), scope == "shared", True)
+        model, _ = hmm.run_em(model, lines, _REFINING_STEPS)
+        expected = hmm.e_step(model, lines)
     return hmm.fit(lines, delays, True, model), lines
 
 
-def _two_states(estimate: Estimate, delays_ms: NDArray[np.float64], constant: bool) -> dict[str, Value]:
+def _two_state_parameters(
+    estimate: Estimate, delays_ms: NDArray[np.float64], constant: bool
+) -> dict[str, IntervalEstimate]:
     names = ["mu1_per_ms", "mu2_per_ms"]
     names += [] if estimate.model.mean_ms is None else ["mean_1_ms", "mean_2_ms"]
     names += [] if estimate.model.rate_per_ms is None else ["rate_1_per_ms", "rate_2_per_ms"]
-    values = np.exp(estimate.model.vector())
-    found = {name: Value(float(values[i]), estimate.interval(i)) for i, name in enumerate(names)}
+    values = np.exp(estimate.model.log_parameters())
+    found = {name: IntervalEstimate(float(values[i]), estimate.interval(i)) for i, name in enumerate(names)}
     if constant:
-        found["mean_ms"] = Value(mean := float(delays_ms.mean()), (mean, mean))
+        found["mean_ms"] = IntervalEstimate(mean := float(delays_ms.mean()), (mean, mean))
     return found
 
 
-def _seen(lines: list[Timeline]) -> int:
-    """Observations: delays and arrivals."""
+def _observation_count(lines: list[Timeline]) -> int:
+    """Number of delays and arrivals."""
     return sum(int((~np.isnan(line.delay_ms)).sum() + line.arrived.sum()) for line in lines)
 
 
-def _not_two(estimate: Estimate, lines: list[Timeline]) -> str | None:
-    """Why two states are not to be believed, whatever their likelihood."""
+def _reject_two_states(estimate: Estimate, lines: list[Timeline]) -> str | None:
+    """Why two states are rejected whatever their likelihood, or None."""
     frames = np.zeros(2)
     for line, states in zip(lines, estimate.expectation.states):
         frames += states[~np.isnan(line.delay_ms) | line.arrived].sum(0)
@@ -267,31 +282,31 @@ def _not_two(estimate: Estimate, lines: list[Timeline]) -> str | None:
     return None
 
 
-def _notes(recording: Recording, constant: bool, poisson: bool, states: str) -> list[str]:
+def _data_warnings(recording: Recording, constant: bool, poisson: bool, states: str) -> list[str]:
     notes = []
-    if recording.endless:
-        notes.append(f"{recording.endless} frames took longer than {observed.MAX_DELAY_MS:g} ms: left out")
+    if recording.too_long:
+        notes.append(f"{recording.too_long} frames took longer than {MAX_DELAY_MS:g} ms: left out")
     if constant:
         what = "states are told apart by arrivals alone" if poisson else "there is nothing to tell states by"
         notes.append(f"the delays hardly vary: {what}")
         if states == "2" and not poisson:
-            raise ObservedError(f"{recording.path}: --states 2: the delays hardly vary and the arrivals are "
+            raise RecordingError(f"{recording.path}: --states 2: the delays hardly vary and the arrivals are "
                                 "periodic: there is nothing to tell states by")  # fmt: skip
     return notes
 
 
-def _misfit(
+def _misfit_warnings(
     delays_ms: NDArray[np.float64],
-    parameters: dict[str, Value],
+    parameters: dict[str, IntervalEstimate],
     estimate: Estimate | None,
     lines: list[Timeline],
 ) -> list[str]:
-    """A warning where the delays do not follow the fitted law: Kolmogorov's distance."""
+    """A warning if the delays do not follow the fitted law (Kolmogorov-Smirnov distance)."""
     if estimate is None or estimate.model.mean_ms is None:
         means, shares = np.array([parameters["mean_ms"].value]), np.ones(1)
     else:
-        told = [~np.isnan(line.delay_ms) for line in lines]
-        weight = sum(s[t].sum(0) for s, t in zip(estimate.expectation.states, told))
+        has_delay = [~np.isnan(line.delay_ms) for line in lines]
+        weight = sum(s[t].sum(0) for s, t in zip(estimate.expectation.states, has_delay))
         means, shares = estimate.model.mean_ms, weight / np.sum(weight)
     ordered = np.sort(delays_ms)
     below = (shares * -np.expm1(-ordered[:, None] / means)).sum(1)
@@ -305,26 +320,32 @@ def _misfit(
     ]
 
 
-def _bursts(cameras: list[Camera]) -> dict[str, Value]:
-    """Shares of frames dropped and lost, and runs of frames that did not come. Frames that an arrival process
-    never sampled, or that were still inside, are no part of it."""
-    found: dict[str, Value] = {}
-    kept = [camera.outcome[(camera.outcome != Kind.SKIPPED) & (camera.outcome != "")] for camera in cameras]
+def _loss_statistics(cameras: list[Camera]) -> dict[str, IntervalEstimate]:
+    """Shares of dropped and lost frames, runs of undelivered frames, gaps between deliveries. Skipped frames
+    and those still inside are not counted."""
+    found: dict[str, IntervalEstimate] = {}
+    kept = [
+        camera.outcome[(camera.outcome != EventKind.SKIPPED) & (camera.outcome != "")] for camera in cameras
+    ]
     gone = [np.isin(outcome, _DROPPED + _LOST) for outcome in kept]
-    found["dropped_share"] = _share(
+    found["dropped_share"] = _batch_share(
         [np.isin(o, _DROPPED) for o in kept], [np.ones(len(o), bool) for o in kept]
     )
-    found["lost_share"] = _share([np.isin(o, _LOST) for o in kept], [~np.isin(o, _DROPPED) for o in kept])
+    found["lost_share"] = _batch_share(
+        [np.isin(o, _LOST) for o in kept], [~np.isin(o, _DROPPED) for o in kept]
+    )
     for name, values in (("run_of_missing", gone), ("run_of_delivered", [~g for g in gone])):
         runs = np.concatenate([_runs(value) for value in values])
         if len(runs):
-            found[f"{name}_frames"] = _mean(runs)
-            found[f"longest_{name}_frames"] = Value(float(runs.max()), None)
-    gaps = [np.diff(np.sort((c.started_ms + c.delay_ms)[c.came() & ~np.isnan(c.delay_ms)])) for c in cameras]
+            found[f"{name}_frames"] = _batch_mean(runs)
+            found[f"longest_{name}_frames"] = IntervalEstimate(float(runs.max()), None)
+    gaps = [
+        np.diff(np.sort((c.started_ms + c.delay_ms)[c.delivered() & ~np.isnan(c.delay_ms)])) for c in cameras
+    ]
     together = np.concatenate(gaps)
     if len(together):
-        found["gap_ms"] = _mean(together)
-        found["longest_gap_ms"] = Value(float(together.max()), None)
+        found["gap_ms"] = _batch_mean(together)
+        found["longest_gap_ms"] = IntervalEstimate(float(together.max()), None)
     return found
 
 
@@ -334,8 +355,8 @@ def _runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
 
 
-def _share(counted: list[NDArray[np.bool_]], among: list[NDArray[np.bool_]]) -> Value:
-    """Share of the counted among all that count, with an interval from twenty stretches of the recording."""
+def _batch_share(counted: list[NDArray[np.bool_]], among: list[NDArray[np.bool_]]) -> IntervalEstimate:
+    """Share of ``counted`` in ``among``, with an interval by batch means."""
     top, bottom = np.zeros(_BATCHES), np.zeros(_BATCHES)
     for some, every in zip(counted, among):
         stretch = np.arange(len(some)) * _BATCHES // max(len(some), 1)
@@ -343,35 +364,35 @@ def _share(counted: list[NDArray[np.bool_]], among: list[NDArray[np.bool_]]) -> 
         bottom += np.bincount(stretch, every, _BATCHES)
     total = float(bottom.sum())
     if not total:
-        return Value(0.0, None)
+        return IntervalEstimate(0.0, None)
     share = float(top.sum()) / total
     if not 0 < share < 1:
-        # Nothing seen in n tries: the exact bound of 95 %.
+        # None, or all, of n: the exact 95 % bound.
         bound = 1 - 0.05 ** (1 / total)
-        return Value(share, (0.0, bound) if share == 0 else (1 - bound, 1.0))
-    # A ratio of sums: its variance is that of the stretches' residuals.
+        return IntervalEstimate(share, (0.0, bound) if share == 0 else (1 - bound, 1.0))
+    # Ratio estimator: its variance is that of the batches' residuals.
     reach = _T_95 * float(np.sqrt(((top - share * bottom) ** 2).sum() * _BATCHES / (_BATCHES - 1))) / total
-    return Value(share, (max(share - reach, 0.0), min(share + reach, 1.0)))
+    return IntervalEstimate(share, (max(share - reach, 0.0), min(share + reach, 1.0)))
 
 
-def _mean(values: NDArray[Any]) -> Value:
+def _batch_mean(values: NDArray[Any]) -> IntervalEstimate:
     """Mean of a series with an interval by batch means."""
     mean = float(values.mean())
     if len(values) < 2 * _BATCHES:
-        return Value(mean, None)
+        return IntervalEstimate(mean, None)
     means = np.array([batch.mean() for batch in np.array_split(values.astype(float), _BATCHES)])
     reach = _T_95 * float(means.std(ddof=1)) / math.sqrt(_BATCHES)
-    return Value(mean, (mean - reach, mean + reach))
+    return IntervalEstimate(mean, (mean - reach, mean + reach))
 
 
-def _section(
+def _channel_section(
     recording: Recording,
-    parameters: dict[str, Value],
+    parameters: dict[str, IntervalEstimate],
     arrivals: str,
     period_ms: float,
     scope: str,
     names: list[str],
-    bursts: dict[str, Value],
+    bursts: dict[str, IntervalEstimate],
 ) -> dict[str, Any]:
     """The ``channel:`` section, rounded to six digits."""
 

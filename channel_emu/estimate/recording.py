@@ -1,13 +1,13 @@
-"""What a recording tells about a channel, without knowing the channel: frames, delays, arrivals, losses.
+"""Reads a recording of a channel: frames, delays, arrivals and losses.
 
-Two kinds of recording are read. A trace of this emulator (``trace.py``), whose recorded states are left alone
-unless asked for. Or rows of any other link, one frame a line::
+A recording is a trace of this emulator (``trace.py``), whose recorded states are ignored unless asked for, or
+rows of any other link, one frame a line::
 
     # offered_ms, delivered_ms (blank: it never came), camera (optional)
     0.0, 41.5, cam00
     33.3, , cam00
 
-separated by commas, semicolons or tabs; lines that start with # and a first line of names are passed over.
+separated by commas, semicolons or tabs. Lines that start with # and a first line of names are skipped.
 """
 
 from __future__ import annotations
@@ -22,30 +22,29 @@ from numpy.typing import NDArray
 
 from channel_emu.estimate.hmm import Timeline
 from channel_emu.model import trace
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
+from channel_emu.model.nanoseconds import NEVER_NS
 
-# Longer than any stream lives; whatever takes longer never came.
+# Longer than any stream lives; a frame with a longer delay counts as not delivered.
 MAX_DELAY_MS = 1e9
 _MAX_ROWS_MS = 1e12
 
 
-# What rows can be read for: where a newer frame pushes out the one on its way, only the quick ones come, and
-# their delays are not the link's.
+# Rows of an lcfs-preempt link cannot be fitted: only its fast frames are delivered, so delays are biased.
 ROW_DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "parallel")
 
 
-class ObservedError(ValueError):
-    """A recording from which nothing can be learnt; the message says why."""
+class RecordingError(ValueError):
+    """A recording that cannot be read or fitted; the message says why."""
 
 
 @dataclass(frozen=True)
 class Camera:
     """One camera's frames in order of offering; every array has one entry a frame.
 
-    started_ms, delay_ms: NaN where transmission did not start, or is not known to have. arrived_ms: when the
-    link's arrival process took the frame up, NaN where it did not. outcome: a ``link.Kind``'s name, or ""
-    for a frame that was still inside.
+    started_ms, delay_ms: NaN where transmission did not start, or is not known to have started.
+    arrived_ms: when the link's arrival process sampled the frame, NaN where it did not.
+    outcome: a ``link.EventKind``, or "" for a frame that was still inside.
     """
 
     name: str
@@ -55,26 +54,26 @@ class Camera:
     delay_ms: NDArray[np.float64]
     outcome: NDArray[np.str_]
     state: NDArray[np.int64]
-    since_ms: NDArray[np.float64] | None = None
+    window_start_ms: NDArray[np.float64] | None = None
     window_ms: NDArray[np.float64] | None = None
-    """Where arrivals sample frames: a frame was taken up within ``window_ms`` from ``since_ms`` on, if no
-    more is known (``arrived_ms`` is a guess); NaN elsewhere."""
+    """Where arrivals sample frames: a frame was sampled within ``window_ms`` from ``window_start_ms`` on, and
+    ``arrived_ms`` is a guess; NaN where the instant is known or there is none."""
 
-    def came(self) -> NDArray[np.bool_]:
-        return self.outcome == Kind.DELIVERED
+    def delivered(self) -> NDArray[np.bool_]:
+        return self.outcome == EventKind.DELIVERED
 
 
 @dataclass(frozen=True)
 class Recording:
-    """discipline: of the link. states: names, where the recording knows them. sampled: an arrival process
-    took frames up later than they were offered, or not at all (``skipped``)."""
+    """discipline: of the link. states: names, if the recording knows them. sampled: an arrival process
+    sampled frames later than they were offered, or not at all (``skipped``)."""
 
     path: Path
     cameras: list[Camera]
     discipline: str
     states: list[str]
     sampled: bool
-    endless: int = 0
+    too_long: int = 0
     """Delays left out because they exceed MAX_DELAY_MS."""
 
     @property
@@ -87,109 +86,108 @@ class Recording:
         return values[~np.isnan(values)]
 
 
-def read(path: Path, discipline: str | None = None, use_states: bool = False) -> Recording:
+def read_recording(path: Path, discipline: str | None = None, use_states: bool = False) -> Recording:
     """Read a trace or rows. ``discipline``: how the link of the rows treats a frame while it is busy (default
-    drop-new); a trace knows its own. Raises ObservedError, TraceError."""
+    drop-new); a trace knows its own. Raises RecordingError, TraceError."""
     try:
         begin = path.read_text()[:1]
     except (OSError, UnicodeDecodeError) as error:
-        raise ObservedError(f"{path}: cannot be read: {error}") from None
+        raise RecordingError(f"{path}: cannot be read: {error}") from None
     if begin == "{":
         return from_trace(path, trace.read(path), use_states)
     if use_states:
-        raise ObservedError(f"{path}: rows of instants hold no states: leave out --use-states")
+        raise RecordingError(f"{path}: rows of instants hold no states: leave out --use-states")
     return _from_rows(path, discipline or "drop-new")
 
 
 def from_trace(path: Path, found: trace.Trace, use_states: bool = False) -> Recording:
-    """What the emulator measured: for every frame that started, the delay it got."""
+    """The emulator's own trace, with the delay of every frame that started."""
     names = found.config.state_names
     if use_states and len(names) != 2:
-        raise ObservedError(f"{path}: --use-states: expected a trace of two states, its has {len(names)}")
+        raise RecordingError(f"{path}: --use-states: expected a trace of two states, its has {len(names)}")
     if not found.records:
-        raise ObservedError(f"{path}: there is no frame in it")
-    sampled = any(r.outcome == Kind.SKIPPED for r in found.records)
+        raise RecordingError(f"{path}: there is no frame in it")
+    sampled = any(r.outcome == EventKind.SKIPPED for r in found.records)
     first_ns = min(r.offered_ns for r in found.records)
-    cameras, endless = [], 0
+    cameras, too_long = [], 0
     for name, records in found.by_camera().items():
         started = _ms([r.started_ns for r in records], first_ns)
         drawn = [None if r.drawn_ns is None or (r.due_ns or 0) >= NEVER_NS else r.drawn_ns for r in records]
         delay = _ms(drawn, 0)
-        endless += sum(r.drawn_ns is not None for r in records) - int((delay <= MAX_DELAY_MS).sum())
+        too_long += sum(r.drawn_ns is not None for r in records) - int((delay <= MAX_DELAY_MS).sum())
         delay[~(delay <= MAX_DELAY_MS)] = math.nan
         offered = _ms([r.offered_ns for r in records], first_ns)
         outcome = np.array([r.outcome or "" for r in records])
         state = np.array([r.state if use_states and r.started_ns is not None else -1 for r in records])
         camera = Camera(name, offered, offered, started, delay, outcome, state)
-        cameras.append(_sampled(camera, records, first_ns, found.config.discipline) if sampled else camera)
-    return Recording(path, cameras, found.config.discipline, names if use_states else [], sampled, endless)
+        cameras.append(
+            _infer_arrivals(camera, records, first_ns, found.config.discipline) if sampled else camera
+        )
+    return Recording(path, cameras, found.config.discipline, names if use_states else [], sampled, too_long)
 
 
 def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:
     return np.array([math.nan if v is None else (v - first_ns) / 1e6 for v in instants], float)
 
 
-def _sampled(camera: Camera, records: list[trace.Record], first_ns: int, discipline: str) -> Camera:
-    """The camera with what its frames' fates tell of when a sampling process took each up.
+def _infer_arrivals(camera: Camera, records: list[trace.Record], first_ns: int, discipline: str) -> Camera:
+    """The camera with when its frames were sampled by the arrival process, as far as their outcomes tell.
 
-    A frame that found the link idle started, one that was dropped ended, in that instant. One that waited was
-    taken up between its offer and the next one or its start. Where the newest frame waits there is more: the
-    one whose place it took was superseded in that instant; and if another still began to be served meanwhile,
-    it had not been taken up before.
+    A frame that found the link idle started at that instant; a dropped frame ended at that instant. A frame
+    that waited was sampled between its offer and the next offer or its start. Under newest-waits, the frame
+    that it replaced was superseded at that instant, and it was sampled after any other start in between.
     """
     offered, started, outcome = camera.offered_ms, camera.started_ms, camera.outcome
     ended = _ms([r.ended_ns for r in records], first_ns)
     following = np.append(offered[1:], math.nan)
     latest = np.fmin(following, np.where(np.isnan(started), ended, started))
     exact = np.where((started < following) & ~_waited(started, records), started, math.nan)
-    exact = np.where(outcome == Kind.DROPPED_BUSY, ended, exact)
+    exact = np.where(outcome == EventKind.DROPPED_BUSY, ended, exact)
     since = offered.copy()
     if discipline == "newest-waits":
-        pushed = np.sort(ended[outcome == Kind.SUPERSEDED])
+        pushed = np.sort(ended[outcome == EventKind.SUPERSEDED])
         place = np.searchsorted(pushed, offered, side="right")
         after = np.append(pushed, math.inf)[place]
         exact = np.where(np.isnan(exact) & (after <= latest), after, exact)
         begun = np.sort(started[~np.isnan(started)])
-        # The last to begin before the window's end; a frame's own start is that end or lies beyond it.
+        # The last start before the window's end; a frame's own start is that end or later.
         before = np.append(-math.inf, begun)[np.searchsorted(begun, latest, side="left")]
         since = np.where(before > offered, before, offered)
-    never = (outcome == Kind.SKIPPED) | (outcome == "")
+    never = (outcome == EventKind.SKIPPED) | (outcome == "")
     window = np.where(never | ~np.isnan(exact) | np.isnan(latest), math.nan, latest - since)
     guess = np.where(np.isnan(window), offered, since + window / 2)
     arrived = np.where(never, math.nan, np.where(np.isnan(exact), guess, exact))
-    return replace(camera, arrived_ms=arrived, since_ms=since, window_ms=window)
+    return replace(camera, arrived_ms=arrived, window_start_ms=since, window_ms=window)
 
 
-def refined(
+def refine_arrivals(
     recording: Recording, rates: float | Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 ) -> Recording:
-    """The recording with better guesses of arrivals that are known to a window only: the mean of an
-    exponential of the rate in force, given that it ended within the window.
+    """Better guesses of arrivals known to a window only: the mean of an exponential truncated to the window.
 
-    rates: in 1/ms, one for all, or (place of the camera, instants in ms) to one for each instant.
+    rates: in 1/ms, one for all, or a function of (camera's index, instants in ms) with one for each instant.
     """
     cameras = []
     for place, camera in enumerate(recording.cameras):
         if (
             camera.window_ms is not None
-            and camera.since_ms is not None
-            and (vague := camera.window_ms > 0).any()
+            and camera.window_start_ms is not None
+            and (uncertain := camera.window_ms > 0).any()
         ):
-            window, arrived = camera.window_ms[vague], camera.arrived_ms.copy()
-            rate = rates(place, arrived[vague]) if callable(rates) else rates
+            window, arrived = camera.window_ms[uncertain], camera.arrived_ms.copy()
+            rate = rates(place, arrived[uncertain]) if callable(rates) else rates
             load = np.maximum(rate * window, 1e-6)
             # 1/x - 1/(e^x - 1): 1/2 for a window that is short against the gaps between arrivals.
             share = np.where(load < 1e-3, 0.5 - load / 12, 1 / load - 1 / np.expm1(np.minimum(load, 700.0)))
-            arrived[vague] = camera.since_ms[vague] + share * window
+            arrived[uncertain] = camera.window_start_ms[uncertain] + share * window
             camera = replace(camera, arrived_ms=arrived)
         cameras.append(camera)
     return replace(recording, cameras=cameras)
 
 
 def _waited(started: NDArray[np.float64], records: list[trace.Record]) -> NDArray[np.bool_]:
-    """Frames that started in the instant in which another ended: they had been waiting for it (where the
-    other was not itself pushed out by them)."""
-    ends = {r.ended_ns for r in records if r.started_ns is not None and r.outcome != Kind.SUPERSEDED}
+    """Whether each frame started as another ended (and did not preempt it): then it had been waiting."""
+    ends = {r.ended_ns for r in records if r.started_ns is not None and r.outcome != EventKind.SUPERSEDED}
     return np.array([r.started_ns in ends for r in records])
 
 
@@ -207,63 +205,64 @@ def _from_rows(path: Path, discipline: str) -> Recording:
         except ValueError:
             if not rows and number == 1:
                 continue  # names of the columns
-            raise ObservedError(
+            raise RecordingError(
                 f"{path}: line {number}: expected offered_ms, delivered_ms (not earlier, or blank) and "
                 f"perhaps a camera, got {line.strip()!r}"
             ) from None
         rows.setdefault(words[2] if len(words) > 2 else "cam00", []).append((offered, delivered))
     if not rows:
-        raise ObservedError(f"{path}: there is no frame in it")
+        raise RecordingError(f"{path}: there is no frame in it")
     tables: dict[str, NDArray[np.float64]] = {}
-    endless = 0
+    too_long = 0
     first = min(offered for given in rows.values() for offered, _ in given)
     for name, given in rows.items():
         table = np.array(sorted(given, key=lambda row: row[0])) - first
-        endless += int((table[:, 1] - table[:, 0] > MAX_DELAY_MS).sum())
+        too_long += int((table[:, 1] - table[:, 0] > MAX_DELAY_MS).sum())
         table[table[:, 1] - table[:, 0] > MAX_DELAY_MS, 1] = math.nan
         tables[name] = table
     instants = np.concatenate([table.ravel() for table in tables.values()])
     delays = np.concatenate([table[:, 1] - table[:, 0] for table in tables.values()])
-    # Frames offered after this may still be on their way where others do not wait for them.
+    # On a parallel link, frames offered after this may still be in service.
     sure_ms = float(np.nanmax(instants)) - float(np.nanmax(delays, initial=0.0))
     cameras = [_camera_of_rows(name, t[:, 0], t[:, 1], discipline, sure_ms) for name, t in tables.items()]
-    return Recording(path, cameras, discipline, [], False, endless)
+    return Recording(path, cameras, discipline, [], False, too_long)
 
 
 def _camera_of_rows(
     name: str, offered: NDArray[np.float64], delivered: NDArray[np.float64], discipline: str, sure_ms: float
 ) -> Camera:
-    """Where rows are all there is, transmission starts at the offer, or when the link becomes free; a frame
-    that did not come met a busy link if an earlier one was on its way, and was lost otherwise. After the last
-    one that came nobody knows: it may still be on its way; so may one that is younger at the recording's end
-    than the longest delay seen (offered at ``sure_ms`` or later), if the link is parallel."""
+    """Infer starts and outcomes. Transmission starts at the offer, or when the link becomes free.
+
+    An undelivered frame met a busy link if an earlier one was in service, and was lost otherwise. After the
+    last delivery, and on a parallel link from ``sure_ms`` on, it may still be in service: outcome unknown.
+    """
     n = len(offered)
-    started, outcome = np.full(n, math.nan), np.full(n, str(Kind.LOST), dtype="U16")
+    started, outcome = np.full(n, math.nan), np.full(n, str(EventKind.LOST), dtype="U16")
     free = -math.inf
     for i in range(n):
         if math.isnan(delivered[i]):
             if discipline != "parallel" and offered[i] < free:
                 newest = discipline == "newest-waits"
-                outcome[i] = str(Kind.SUPERSEDED if newest else Kind.DROPPED_BUSY)
+                outcome[i] = str(EventKind.SUPERSEDED if newest else EventKind.DROPPED_BUSY)
             continue
-        outcome[i] = str(Kind.DELIVERED)
+        outcome[i] = str(EventKind.DELIVERED)
         waits = discipline in ("newest-waits", "fcfs")
         started[i] = max(offered[i], free) if waits and free <= delivered[i] else offered[i]
         free = max(free, float(delivered[i]))
-    came = np.flatnonzero(outcome == Kind.DELIVERED)
+    came = np.flatnonzero(outcome == EventKind.DELIVERED)
     if len(came):
         unknown = np.arange(n) > came[-1]
         if discipline == "parallel":
             unknown |= offered >= sure_ms
-        outcome[unknown & (outcome == Kind.LOST)] = ""
+        outcome[unknown & (outcome == EventKind.LOST)] = ""
     return Camera(name, offered, offered, started, delivered - started, outcome, np.full(n, -1))
 
 
 def timelines(recording: Recording, shared: bool, arrivals: bool) -> list[Timeline]:
-    """The cameras' observations in one order where they share a chain, else one timeline each.
+    """One timeline of all cameras if they share a chain, else one each.
 
-    arrivals: whether arrivals count as observations; a sampling process waits from a frame's offer on, one
-    that makes its own frames waits all the time between the camera's first frame and its last.
+    arrivals: whether arrivals count as observations. A sampling process waits from a frame's offer on; a
+    process that generates frames waits from the camera's first frame to its last.
     """
     groups = [recording.cameras] if shared else [[camera] for camera in recording.cameras]
     return [line for group in groups if len((line := _timeline(group, recording.sampled, arrivals)).span_ms)]
@@ -301,7 +300,7 @@ def _timeline(cameras: list[Camera], sampled: bool, arrivals: bool) -> Timeline:
             add(camera.offered_ms[1:-1], 0, True)
             add(camera.offered_ms[-1:], -1, len(camera.offered_ms) > 1)
     when = np.concatenate(at)
-    # Of what happens in one instant the waiting begins first: an arrival finds its camera waiting.
+    # At one instant the waiting begins first, so that an arrival finds its camera waiting.
     order = np.lexsort((-np.concatenate(change), when))
     when = when[order]
     waiting = np.concatenate([[0], np.cumsum(np.concatenate(change)[order])[:-1]]) if len(when) else order

@@ -1,4 +1,4 @@
-"""A fitted channel for people: figures, a scenario's YAML, a picture."""
+"""A fitted channel for people: figures, a scenario's YAML, a plot."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Any
 import numpy as np
 import yaml
 
-from channel_emu.estimate.fit import Fit, Value
+from channel_emu.estimate.fit import Fit, IntervalEstimate
 
-_LEAST_FRAMES, _MOST_FRAMES, _CYCLES = 300, 4000, 40
-_COLOURS, _GREY = ("#0072B2", "#D55E00"), "#777777"
+_MIN_FRAMES, _MAX_FRAMES, _CYCLES = 300, 4000, 40
+_COLORS, _GREY = ("#0072B2", "#D55E00"), "#777777"
 
 
-class FitError(ValueError):
+class PlotError(ValueError):
     """A picture that cannot be drawn; the message says why."""
 
 
-def show(fit: Fit) -> str:
+def format_fit(fit: Fit) -> str:
     """Figures with intervals, warnings, and the section to copy into a scenario."""
     summary = fit.summary()
     lines = [
         f"{summary['file']}: {summary['frames']:,} frames of {summary['cameras']} cameras in "
         f"{summary['seconds']:g} s, {summary['delays']:,} delays; arrivals {fit.arrivals}",
-        f"states {fit.states}, by {fit.chosen_by}" + _compared(fit.bic),
+        f"states {fit.states}, by {fit.chosen_by}" + _bic_difference(fit.bic),
         *(_row(name, value) for name, value in fit.parameters.items()),
     ]
     if fit.states == 2:
@@ -42,33 +42,34 @@ def show(fit: Fit) -> str:
     return "\n".join([*lines, "", _yaml({"channel": fit.channel}).rstrip()])
 
 
-def scenario(fit: Fit) -> str:
-    """A scenario file of the fitted channel, for ``simulate --scenario`` and to add a source to."""
+def scenario_text(fit: Fit) -> str:
+    """A scenario file with the fitted channel, for ``simulate --scenario`` and to add a source to."""
     cameras = [camera.name for camera in fit.recording.cameras]
     head = (
         f"# Fitted to {fit.recording.path.name}: {fit.recording.frames} frames, states by {fit.chosen_by}\n"
     )
-    plan = {"name": "fitted", "seed": 0, "cameras": {"count": len(cameras)}, "channel": fit.channel}
-    return head + _yaml(plan)
+    document = {"name": "fitted", "seed": 0, "cameras": {"count": len(cameras)}, "channel": fit.channel}
+    return head + _yaml(document)
 
 
 def plot(fit: Fit, path: Path) -> None:
-    """Delays against the start of transmission, and the probability of the second state given everything
-    seen; the first part of a long recording. Raises FitError where matplotlib is missing or the file cannot
-    be written."""
+    """Plot delays and the second state's probability over time, for the first part of a long recording.
+
+    Raises PlotError if matplotlib is missing or the file cannot be written.
+    """
     try:
         import matplotlib
     except ImportError:
-        raise FitError("--plot needs matplotlib (pip install 'freshfield[edge]')") from None
+        raise PlotError("--plot needs matplotlib (pip install 'freshfield[edge]')") from None
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     cameras = fit.recording.cameras
     start_s = np.concatenate([c.started_ms for c in cameras]) / 1e3
     delay_ms = np.concatenate([c.delay_ms for c in cameras])
-    told = ~np.isnan(delay_ms)
-    order = np.argsort(start_s[told], kind="stable")[: _shown(fit, np.sort(start_s[told]))]
-    start_s, delay_ms = start_s[told][order], delay_ms[told][order]
+    has_delay = ~np.isnan(delay_ms)
+    order = np.argsort(start_s[has_delay], kind="stable")[: _plotted_frames(fit, np.sort(start_s[has_delay]))]
+    start_s, delay_ms = start_s[has_delay][order], delay_ms[has_delay][order]
     two = fit.estimate is not None
     figure, axes = plt.subplots(
         1 + two, 1, sharex=True, squeeze=False, figsize=(9, 3 + 1.5 * two), layout="constrained",
@@ -81,7 +82,7 @@ def plot(fit: Fit, path: Path) -> None:
     else:
         mean = fit.parameters["mean_ms"].value
         top.scatter(start_s, delay_ms, s=5, color=_GREY)
-        top.axhline(mean, color=_COLOURS[0], lw=0.8, label=f"mean {mean:.3g} ms")
+        top.axhline(mean, color=_COLORS[0], lw=0.8, label=f"mean {mean:.3g} ms")
     if top.get_legend_handles_labels()[0]:
         top.legend(loc="upper right")
     axes[-1, 0].set_xlabel("start of transmission (s)")
@@ -89,32 +90,32 @@ def plot(fit: Fit, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=120)
     except (OSError, ValueError) as error:
-        raise FitError(f"--plot {path}: {error}") from None
+        raise PlotError(f"--plot {path}: {error}") from None
     finally:
         plt.close(figure)
 
 
-def _shown(fit: Fit, start_s: np.ndarray) -> int:
-    """How many of the frames: some forty visits to each state, so that single visits can be seen."""
+def _plotted_frames(fit: Fit, start_s: np.ndarray) -> int:
+    """Number of frames: about forty visits to each state, so that single visits are visible."""
     if fit.states == 1 or not len(start_s):
-        return _MOST_FRAMES
+        return _MAX_FRAMES
     cycle_s = sum(1 / fit.parameters[f"mu{i}_per_ms"].value for i in (1, 2)) / 1e3
     wanted = int(np.searchsorted(start_s, start_s[0] + _CYCLES * cycle_s))
-    return min(max(wanted, _LEAST_FRAMES), _MOST_FRAMES)
+    return min(max(wanted, _MIN_FRAMES), _MAX_FRAMES)
 
 
 def _draw_states(fit: Fit, figure: Any, axes: Any, start_s: np.ndarray, delay_ms: np.ndarray) -> None:
-    """Delays coloured by the state's probability, means, and below the probability over time."""
+    """Delays colored by the state's probability, means, and below the probability over time."""
     assert fit.estimate is not None
     names, (top, bottom) = fit.channel["chain"]["states"], axes
     bottom.set(ylim=(-0.05, 1.05), ylabel=f"P({names[1]})")
-    for i, (name, colour) in enumerate(zip(names, _COLOURS), start=1):
+    for i, (name, color) in enumerate(zip(names, _COLORS), start=1):
         if f"mean_{i}_ms" in fit.parameters:
             mean = fit.parameters[f"mean_{i}_ms"].value
-            top.axhline(mean, color=colour, lw=0.8, label=f"{name}: mean {mean:.3g} ms")
+            top.axhline(mean, color=color, lw=0.8, label=f"{name}: mean {mean:.3g} ms")
     for line, states in zip(fit.lines, fit.estimate.expectation.states):
         at_s = line.at_ms() / 1e3
-        bottom.plot(at_s[at_s <= start_s[-1]], states[at_s <= start_s[-1], 1], lw=0.8, color=_COLOURS[1])
+        bottom.plot(at_s[at_s <= start_s[-1]], states[at_s <= start_s[-1], 1], lw=0.8, color=_COLORS[1])
         if len(fit.lines) == 1:
             second = states[np.minimum(np.searchsorted(at_s, start_s), len(at_s) - 1), 1]
             drawn = top.scatter(start_s, delay_ms, c=second, s=8, cmap="coolwarm", vmin=0, vmax=1)
@@ -123,17 +124,17 @@ def _draw_states(fit: Fit, figure: Any, axes: Any, start_s: np.ndarray, delay_ms
         top.scatter(start_s, delay_ms, s=5, color=_GREY)
 
 
-def _compared(bic: dict[int, float]) -> str:
+def _bic_difference(bic: dict[int, float]) -> str:
     if len(bic) < 2:
         return ""
     better = "one" if bic[1] <= bic[2] else "two"
     return f" (that of {better} is {abs(bic[1] - bic[2]):.1f} lower; 10 is strong evidence)"
 
 
-def _row(name: str, value: Value) -> str:
+def _row(name: str, value: IntervalEstimate) -> str:
     interval = "" if value.interval is None else f"  [{value.interval[0]:.5g}, {value.interval[1]:.5g}]"
     return f"  {name:34} {value.value:10.5g}{interval}"
 
 
-def _yaml(plan: dict[str, Any]) -> str:
-    return yaml.safe_dump(plan, sort_keys=False, default_flow_style=None, width=100)
+def _yaml(document: dict[str, Any]) -> str:
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)

@@ -10,7 +10,7 @@ from typing import Any
 import grpc.aio
 
 from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message, ServedCall
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 
 # Messages that are read ahead of the one being written, at most; then the sender waits. Behind a message that
 # is still in the link any number are read, because the link decides about each at once. Those it drops are
@@ -69,10 +69,10 @@ class CallFlow:
             self.close()
             reader.cancel()
 
-    def settle(self, message: Message, kind: Kind) -> None:
-        if kind is Kind.DUPLICATED:
+    def settle(self, message: Message, kind: EventKind) -> None:
+        if kind is EventKind.DUPLICATED:
             return  # ``_pass`` writes the second copy
-        message.delivered = kind is Kind.DELIVERED
+        message.delivered = kind is EventKind.DELIVERED
         if not message.delivered:
             message.raw = b""
         elif self._closed:
@@ -111,7 +111,7 @@ class CallFlow:
                 self._read += 1
                 self._messages.append(message)
                 if self._link is None:
-                    self.settle(message, Kind.DELIVERED)
+                    self.settle(message, EventKind.DELIVERED)
                 else:
                     self._link.offer(message, self._now_ns())
                 if len(self._messages) >= _MOST_READY and self._messages[0].delivered is not None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from channel_emu.live.live_link import LiveLink, Message
 from channel_emu.live.upstream import Upstream
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 from freshfield.clock import Clock
 from freshfield.ledger import Ledger
 from freshfield.v1 import frames_pb2 as pb
@@ -49,14 +49,14 @@ class CameraFlow:
         if header.role == pb.ROLE_HELD_OUT:
             self.held_out += 1
             self.upstream.send(message)
-        elif self.link.offer(message, now_ns - self._origin_ns).outcome is Kind.DROPPED_BUSY:
+        elif self.link.offer(message, now_ns - self._origin_ns).outcome is EventKind.DROPPED_BUSY:
             outcome = pb.OUTCOME_DROPPED_BUSY
         return pb.PushResponse(sequence=header.sequence, outcome=outcome)
 
-    def settle(self, message: Message, kind: Kind) -> None:
-        if kind is not Kind.DELIVERED:
+    def settle(self, message: Message, kind: EventKind) -> None:
+        if kind is not EventKind.DELIVERED:
             self._write(message, str(kind), self._clock.now_ns())
-        if kind in (Kind.DELIVERED, Kind.DUPLICATED):
+        if kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
             self.upstream.send(message)
 
     def describe(self, message: Message) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from channel_emu.live.timer import LoopTimer
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.nanoseconds import NEVER_NS
 from freshfield.clock import Clock
 
 # Beyond four entries a link and these, outdated entries are removed.

@@ -18,7 +18,7 @@ from channel_emu.live.event_queue import EventQueue
 from channel_emu.live.histogram import Histogram
 from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model.ages import RunningAge
-from channel_emu.model.link import Event, Kind, Link, Transit
+from channel_emu.model.link import Event, EventKind, Link, Transit
 from channel_emu.model.trace import TraceWriter
 
 STREAM_ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
@@ -34,7 +34,7 @@ class HardLimit(RuntimeError):
 class Receiver(Protocol):
     """Passes messages on when the link has decided: one direction of a call, or a camera's frames."""
 
-    def settle(self, message: Message, kind: Kind) -> None:
+    def settle(self, message: Message, kind: EventKind) -> None:
         """DELIVERED: pass the message on. DUPLICATED: pass it on once more. Any other kind: it is dropped."""
 
     def describe(self, message: Message) -> str:
@@ -179,20 +179,20 @@ class LiveLink:
 
     def _act(self, events: list[Event]) -> None:
         for event in events:
-            if event.kind is Kind.DUPLICATED:  # the record of the first copy says so already
+            if event.kind is EventKind.DUPLICATED:  # the record of the first copy says so already
                 event.transit.item.duplicated = True
         for event in events:
             message: Message = event.transit.item
             # An offer's own events come before ``offer`` knows the transit.
             message.transit = event.transit
             kind = event.kind
-            if kind is Kind.STARTED:
+            if kind is EventKind.STARTED:
                 self.stats.drawn.add((event.transit.drawn_ns or 0) / 1e6)
                 continue
-            if kind is Kind.DELIVERED and event.transit.flips:
+            if kind is EventKind.DELIVERED and event.transit.flips:
                 message.raw = self._damage(message.raw, event.transit.flips)
             message.receiver.settle(message, kind)
-            if kind is not Kind.DELIVERED and kind is not Kind.DUPLICATED:
+            if kind is not EventKind.DELIVERED and kind is not EventKind.DUPLICATED:
                 self.record(message)
         if self.model.resets != self._resets:
             self._resets = self.model.resets

@@ -31,7 +31,7 @@ from channel_emu.live.replay_link import ReplayLink
 from channel_emu.live.report import Report, figures_of
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
-from channel_emu.model.link import Kind, Link
+from channel_emu.model.link import EventKind, Link
 from channel_emu.model.trace import Trace, TraceWriter
 from freshfield.clock import Clock, WallClock
 from freshfield.transport import CLIENT_OPTIONS, Transport
@@ -304,7 +304,7 @@ class Proxy(grpc.GenericRpcHandler):
         if self._hook is not None:
             return self._hook.pending
         return sum(
-            link.model.counts[Kind.DELIVERED] - link.forwarded - link.cancelled
+            link.model.counts[EventKind.DELIVERED] - link.forwarded - link.cancelled
             for link in self.links.values()
         )
 

@@ -6,8 +6,8 @@ import heapq
 from collections import Counter
 from typing import Any
 
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import Event, Kind, Transit
+from channel_emu.model.link import Event, EventKind, Transit
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.trace import Record, TraceError
 
 
@@ -30,7 +30,7 @@ class ReplayLink:
         self.now_ns = 0
         self.chain = None
         self._records = records
-        self._events: list[tuple[int, int, Kind, Transit]] = []
+        self._events: list[tuple[int, int, EventKind, Transit]] = []
         self._inside: set[int] = set()
         self._order = 0
 
@@ -52,15 +52,15 @@ class ReplayLink:
         self._inside.add(transit.number)
         if record.started_ns is not None and record.due_ns is not None:
             transit.due_ns = min(record.due_ns + shift, NEVER_NS)
-            self._schedule(record.started_ns + shift, Kind.STARTED, transit)
+            self._schedule(record.started_ns + shift, EventKind.STARTED, transit)
         outcome, ended_ns = record.outcome, record.ended_ns
         if outcome is None or ended_ns is None:
             # How it ended was not recorded. When it was due was recorded if transmission had started.
-            outcome = Kind.SUPERSEDED if record.due_ns is None else Kind.DELIVERED
+            outcome = EventKind.SUPERSEDED if record.due_ns is None else EventKind.DELIVERED
             ended_ns = record.due_ns if record.due_ns is not None else record.offered_ns
-        self._schedule(ended_ns + shift, Kind(outcome), transit)
+        self._schedule(ended_ns + shift, EventKind(outcome), transit)
         if record.duplicated:
-            self._schedule(ended_ns + shift, Kind.DUPLICATED, transit)
+            self._schedule(ended_ns + shift, EventKind.DUPLICATED, transit)
         return transit, events + self.advance(at_ns)
 
     def advance(self, to_ns: int) -> list[Event]:
@@ -70,11 +70,11 @@ class ReplayLink:
         events = []
         while self._events and self._events[0][0] <= self.now_ns and self._events[0][0] < NEVER_NS:
             at_ns, _, kind, transit = heapq.heappop(self._events)
-            if kind is Kind.STARTED:
+            if kind is EventKind.STARTED:
                 transit.started_ns = at_ns
             else:
                 self.counts[kind] += 1
-                if kind is not Kind.DUPLICATED:
+                if kind is not EventKind.DUPLICATED:
                     transit.outcome, transit.ended_ns = kind, at_ns
                     self._inside.discard(transit.number)
             events.append(Event(kind, at_ns, transit))
@@ -85,6 +85,6 @@ class ReplayLink:
         inside = {t.number: t for _, _, _, t in self._events if t.number in self._inside}
         return [inside[number] for number in sorted(inside)]
 
-    def _schedule(self, at_ns: int, kind: Kind, transit: Transit) -> None:
+    def _schedule(self, at_ns: int, kind: EventKind, transit: Transit) -> None:
         self._order += 1
         heapq.heappush(self._events, (min(at_ns, NEVER_NS), self._order, kind, transit))

@@ -8,17 +8,17 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from channel_emu.live.live_link import DelayStats, LiveLink
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 
-DROPPED = (Kind.DROPPED_BUSY, Kind.SUPERSEDED, Kind.SKIPPED, Kind.LOST, Kind.BROKEN)
+DROPPED = (EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED, EventKind.LOST, EventKind.BROKEN)
 
 
 @dataclass(frozen=True)
 class Figures:
     """Of one link, or of all links together: offered = delivered + dropped + in_flight.
 
-    outcomes: by ``link.Kind``, with ``forwarded`` (handed on) and ``cancelled`` (delivered after the call was
-        over).
+    outcomes: by ``link.EventKind``, with ``forwarded`` (handed on) and ``cancelled`` (delivered after the
+        call was over).
     mean_age_ms, peak_age_ms: age of the newest message handed on, counted from when the proxy received it,
         between the first one handed on and the last that came in or went out; the mean over links, None where
         there is none.
@@ -60,7 +60,7 @@ def figures_of(links: Sequence[LiveLink], stats: DelayStats) -> Figures:
         outcomes.update(forwarded=link.forwarded, cancelled=link.cancelled)
     return Figures(
         offered=sum(link.model.offered for link in links),
-        delivered=outcomes[Kind.DELIVERED],
+        delivered=outcomes[EventKind.DELIVERED],
         dropped=sum(outcomes[kind] for kind in DROPPED),
         in_flight=sum(link.model.in_flight for link in links),
         outcomes={name: count for name, count in outcomes.items() if count},

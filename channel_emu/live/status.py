@@ -12,7 +12,7 @@ from channel_emu.live.camera_flow import CameraFlow
 from channel_emu.live.histogram import Histogram
 from channel_emu.live.live_link import DelayStats
 from channel_emu.model.channel import Channel
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 from freshfield.files import write_json
 
 _SERIES_S = 60.0
@@ -90,9 +90,9 @@ def _counts(flow: CameraFlow) -> dict[str, int]:
         "received": link.offered + flow.held_out,
         "held_out": flow.held_out,
         "forwarded": flow.forwarded,
-        **{str(kind): link.counts[kind] for kind in Kind if kind is not Kind.STARTED},
+        **{str(kind): link.counts[kind] for kind in EventKind if kind is not EventKind.STARTED},
         # Both a stream reset by the channel and an edge that was away break frames.
-        "broken": link.counts[Kind.BROKEN] + flow.broken,
+        "broken": link.counts[EventKind.BROKEN] + flow.broken,
         "in_flight": link.in_flight + flow.upstream.pending,
         "clock_backwards": link.clock_backwards,
     }

@@ -1,8 +1,8 @@
 """Age of information from what was delivered when (thesis 5.1 to 5.6).
 
-Two averages, never mixed: ``mean_age_ms`` is the continuous time average, the integral of the sawtooth over
+Two averages: ``mean_age_ms`` is the continuous time average, the integral of the sawtooth over
 its length; ``mean_age_slotted_ms`` samples the sawtooth at slot boundaries just after deliveries, as (5.2)
-does, and is therefore about half a slot lower for a sawtooth that falls on the boundaries.
+does, and is therefore about half a slot lower if deliveries fall on the boundaries.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Sawtooth:
 
 
 def sawtooth(delivered_ns: Instants, generated_ns: Instants, end_ns: int) -> Sawtooth:
-    """From all deliveries in any order: late ones that bring nothing newer do not change the age (5.4)."""
+    """From all deliveries in any order; a delivery of an older frame does not change the age (5.4)."""
     due, born = delivered_ns, generated_ns
     if (due[1:] < due[:-1]).any():  # only where frames overtake each other
         order = np.argsort(due, kind="stable")
@@ -76,15 +76,8 @@ def newest_at(saw: Sawtooth, at_ns: Instants) -> Instants:
     return np.where(k >= 0, saw.generated_ns[np.maximum(k, 0)], -1)
 
 
-def ages_at(saw: Sawtooth, at_ns: Instants) -> NDArray[np.float64]:
-    """Age in ms at any instants (T,) (5.5); NaN before the first delivery."""
-    born_ns = newest_at(saw, at_ns)
-    return np.where(born_ns >= 0, (np.asarray(at_ns, np.int64) - born_ns) / 1e6, np.nan)
-
-
 class RunningAge:
-    """``mean_age_ms`` and ``peak_age_ms`` of deliveries as they come, in fixed memory. Deliveries come in
-    order of time."""
+    """``mean_age_ms`` and ``peak_age_ms`` of deliveries added in order of time, in constant memory."""
 
     def __init__(self) -> None:
         self._first_ns = self._delivered_ns = self._generated_ns = 0
@@ -93,7 +86,7 @@ class RunningAge:
         self._teeth = 0
 
     def add(self, delivered_ns: int, generated_ns: int) -> None:
-        """A delivery; one that brings nothing newer changes nothing."""
+        """Add a delivery; one of an older frame changes nothing."""
         if self._teeth and generated_ns <= self._generated_ns:
             return
         if self._teeth:
@@ -115,13 +108,13 @@ class RunningAge:
         return self._peaks_ns / (self._teeth - 1) / 1e6 if self._teeth > 1 else None
 
     def _tooth(self, until_ns: int) -> int:
-        """Twice the area under the present tooth."""
+        """Twice the area under the current tooth."""
         length = until_ns - self._delivered_ns
         return length * (2 * (self._delivered_ns - self._generated_ns) + length)
 
 
 def _teeth(saw: Sawtooth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Age at the foot and length of each tooth, in ns. Differences first, in integers: float64 would lose
-    nanoseconds of absolute time."""
+    """Age at the start and length of each tooth, in ns. Integers are subtracted first, because float64 would
+    lose nanoseconds of absolute time."""
     edges = np.append(saw.delivered_ns, saw.end_ns)
     return (saw.delivered_ns - saw.generated_ns).astype(float), np.diff(edges).astype(float)

@@ -1,8 +1,8 @@
 """The network's state: a continuous-time Markov chain of M states, sampled exactly (thesis 6.2.5).
 
-Every jump of the chain is drawn at its own instant, so a chain that switches many times within a frame's
-transit is right too. Where ``slot_ms`` is given the state is drawn anew at slot boundaries only and kept in
-between, as the thesis does (6.27): the same at the boundaries, but blind to what happens between them.
+Every jump of the chain has its own instant, so a chain that switches many times during a frame's transit is
+exact too. With ``slot_ms`` the state is drawn at slot boundaries only and kept in between, as in the thesis
+(6.27): the same distribution at the boundaries, without the jumps between them.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.instants import NEVER_NS, later, saturate
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round
 
-# A run of the emulator visits every jump. Beyond this many a millisecond that costs more than it tells.
+# The emulator visits every jump. A chain with more jumps a millisecond than this is refused.
 MAX_JUMPS_PER_MS = 1_000.0
 # From this relaxation rate on, states one nanosecond apart are independent to 2^-53: nothing is lost by
 # drawing each instant's state directly.
@@ -25,7 +25,7 @@ _CHECK_EVERY = 100_000
 
 
 class ChainError(ValueError):
-    """A generator that is none, or a chain that cannot be sampled; the message says why."""
+    """An invalid generator, or a chain that cannot be sampled; the message says why."""
 
 
 def two_state_generator(mu1_per_ms: float, mu2_per_ms: float) -> NDArray[np.float64]:
@@ -64,7 +64,7 @@ def transition_matrix(generator_per_ms: NDArray[np.float64], span_ms: float) -> 
             return np.eye(2)
         moved = -math.expm1(-(a + b) * span_ms) / (a + b)
         kept = math.exp(-(a + b) * span_ms)
-        # Sums, not one minus the others: a state that is hardly ever kept has digits too.
+        # Sums, not one minus the others: small probabilities keep their digits.
         return np.array([[(b + a * kept) / (a + b), a * moved], [b * moved, (a + b * kept) / (a + b)]])
     fastest = float(-q.diagonal().min())
     if fastest * span_ms == 0.0:
@@ -123,7 +123,7 @@ def leaving(transitions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Chain:
-    """A path of the chain, extended on demand. Instants may be asked for in any order until forgotten.
+    """A path of the chain, extended on demand. Instants may be queried in any order until forgotten.
 
     generator_per_ms: (M, M). initial: the first state; drawn from the stationary distribution if None.
     slot_ms: None follows every jump; a number samples the state every so many ms. A state then lasts a
@@ -133,15 +133,15 @@ class Chain:
     def __init__(
         self,
         generator_per_ms: NDArray[np.float64],
-        uniforms: Uniforms,
+        rng: CounterRng,
         initial: int | None = None,
         slot_ms: float | None = None,
     ) -> None:
         q = check_generator(generator_per_ms)
         self.generator_per_ms = q
         self.states = len(q)
-        self.shares = np.zeros(len(q))  # long-run shares, where there are such and they matter
-        self._uniforms = uniforms
+        self.shares = np.zeros(len(q))  # long-run shares, needed for white noise only
+        self._rng = rng
         self.slot_ns = 0 if slot_ms is None else round(slot_ms * 1e6)
         if slot_ms is not None:
             if self.slot_ns < 1:
@@ -151,25 +151,27 @@ class Chain:
         leave = leaving(q) if self.slot_ns else off.sum(1)
         with np.errstate(invalid="ignore", divide="ignore"):
             jumps = np.cumsum(off / off.sum(1)[:, None], 1)
-            # Per state what the length of a sojourn follows from: its rate in 1/ms; in slots, the logarithm
-            # of the probability to stay for one more.
-            self.pace = np.log1p(-leave) if self.slot_ns else leave
+            # Parameter of the sojourn's length by state: the leaving rate in 1/ms; in slots, the logarithm of
+            # the probability to stay for one more.
+            self.sojourn_rate = np.log1p(-leave) if self.slot_ns else leave
         # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
         self.jumps = np.where(np.arange(self.states) >= self._last_targets(off)[:, None], 1.0, jumps)
         self._jump_lists = self.jumps.tolist()
-        self._pace = [float(p) for p in self.pace]
+        self._sojourn_rates = [float(r) for r in self.sojourn_rate]
         self.white = not self.slot_ns and self._is_white()
         self.initial = self._draw_initial() if initial is None else initial
         self._starts = [0]
         self._visited = [self.initial]
-        self._number = 0  # of the sojourn now last: its length and the jump at its end are that number's pair
+        self._number = (
+            0  # of the last sojourn: the pair of this number gives its length and the jump at its end
+        )
         self._until = self._sojourn_end(0, self.initial)
-        self._spent_ns = [0] * self.states  # in the part of the path that was forgotten
+        self._spent_ns = [0] * self.states  # in the forgotten part of the path
 
     def segment(self, at_ns: int) -> tuple[int, int]:
-        """State at ``at_ns`` and the instant of its end (NEVER_NS if it has none)."""
+        """State at ``at_ns`` and the end of its sojourn (NEVER_NS if it has none)."""
         if self.white:
-            return self._state_of_instant(at_ns), at_ns + 1
+            return self._white_noise_state(at_ns), at_ns + 1
         if self._until <= at_ns:
             self._extend(at_ns)
         starts = self._starts
@@ -221,40 +223,40 @@ class Chain:
         while self._until <= at_ns:
             start = self._until
             if self._number - mark == _CHECK_EVERY:
-                # A rate that the stationary distribution did not foretell, as before an absorbing state.
+                # The stationary distribution does not show this rate, as before an absorbing state.
                 if (start - mark_ns) * MAX_JUMPS_PER_MS * 10 < _CHECK_EVERY * 10**6:
                     raise ChainError(
                         "the chain switches more than 10000 times a ms: slow it down, or sample it at slot "
                         "boundaries (sampled: slots)"
                     )
                 mark, mark_ns = self._number, start
-            target = bisect_right(self._jump_lists[self._visited[-1]], self._uniforms.pair(self._number)[1])
+            target = bisect_right(self._jump_lists[self._visited[-1]], self._rng.pair(self._number)[1])
             self._number += 1
             self._starts.append(start)
             self._visited.append(target)
             self._until = self._sojourn_end(start, target)
 
     def _sojourn_end(self, start_ns: int, state: int) -> int:
-        pace = self._pace[state]
-        if pace == 0.0:
+        rate = self._sojourn_rates[state]
+        if rate == 0.0:
             return NEVER_NS
-        logarithm = math.log(self._uniforms.pair(self._number)[0])
+        logarithm = math.log(self._rng.pair(self._number)[0])
         if not self.slot_ns:
-            return later(start_ns, saturate(-logarithm / pace * 1e6))
-        slots = logarithm / pace
+            return saturating_add(start_ns, saturating_round(-logarithm / rate * 1e6))
+        slots = logarithm / rate
         if slots * self.slot_ns >= NEVER_NS:
             return NEVER_NS
-        return later(start_ns, (int(slots) + 1) * self.slot_ns)
+        return saturating_add(start_ns, (int(slots) + 1) * self.slot_ns)
 
     def _draw_initial(self) -> int:
         shares = np.cumsum(stationary(self.generator_per_ms))
-        return min(int(np.searchsorted(shares, self._uniforms.uniform(0, 1), side="right")), self.states - 1)
+        return min(int(np.searchsorted(shares, self._rng.uniform(0, 1), side="right")), self.states - 1)
 
     def _is_white(self) -> bool:
-        """True for a two-state chain so fast that it is noise. Refuses what is too fast to follow."""
+        """Whether a two-state chain is so fast that it is white noise. ChainError if too fast to follow."""
         rates_per_ms = -self.generator_per_ms.diagonal()
         if not rates_per_ms.all():
-            return False  # it comes to rest somewhere
+            return False  # it has an absorbing state
         try:
             self.shares = stationary(self.generator_per_ms)
         except ChainError:
@@ -270,8 +272,8 @@ class Chain:
             "sample it at slot boundaries (sampled: slots)"
         )
 
-    def _state_of_instant(self, at_ns: int) -> int:
-        return 0 if self._uniforms.uniform(at_ns) < self.shares[0] else 1
+    def _white_noise_state(self, at_ns: int) -> int:
+        return 0 if self._rng.uniform(at_ns) < self.shares[0] else 1
 
     @staticmethod
     def _last_targets(off: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -1,8 +1,9 @@
-"""What the mean age must be, exactly, where arrivals are periodic and a busy link drops (thesis 5.2 to 5.5).
+"""Exact mean age with periodic arrivals under drop-new (thesis 5.2 to 5.5).
 
 Renewal argument over periods: a frame that starts in state i keeps the link for K periods, then the next one
-starts; over that cycle the age is what the earlier frame took plus the time since. ``accuracy`` measures the
-simulator against this, and with ``slot_ms`` it says what sampling the chain at slot boundaries changes.
+starts; over that cycle the age is the earlier frame's delay plus the time since its delivery.
+``accuracy_cost`` compares the simulator with this; ``slot_ms`` gives the bias of sampling the chain at slot
+boundaries.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def drop_new_age_ms(
         mean_ms = np.linalg.solve(eye - through, -np.expm1(-rates * slot_ms) / rates)
     r = np.linalg.inv(eye - unfinished)
     finished = after - unfinished
-    alpha = _left_fixed(r @ finished)
+    alpha = _stationary(r @ finished)
     mean_k = alpha @ r @ one
     mean_k2 = alpha @ (eye + unfinished) @ r @ r @ one
     return float((period_ms * mean_k2 / 2 + alpha @ r @ r @ finished @ mean_ms) / mean_k)
@@ -64,16 +65,16 @@ def slotted_drop_new_age_ms(mean_ms: float, period_ms: float, slot_ms: float) ->
 
 
 def _unfinished(q: NDArray[np.float64], rates: NDArray[np.float64], span_ms: float) -> NDArray[np.float64]:
-    """Probability of going from state to state in ``span_ms`` with the service not over, (M, M): that of a
-    chain with one more state, in which it is."""
+    """Transition probabilities (M, M) within ``span_ms`` with the service unfinished; a finished service is
+    an additional, absorbing state."""
     with_end = np.zeros((len(q) + 1, len(q) + 1))
     with_end[:-1, :-1] = q - np.diag(rates)
     with_end[:-1, -1] = rates
     return transition_matrix(with_end, span_ms)[:-1, :-1]
 
 
-def _left_fixed(stochastic: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The distribution that the matrix (M, M) leaves alone."""
+def _stationary(stochastic: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The stationary distribution of a stochastic matrix (M, M)."""
     size = len(stochastic)
     system = np.vstack((stochastic.T - np.eye(size), np.ones(size)))
     return np.linalg.lstsq(system, np.append(np.zeros(size), 1.0), rcond=None)[0]

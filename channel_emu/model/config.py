@@ -1,7 +1,7 @@
-"""The scenario's ``channel:`` section as data: strict, with every default visible.
+"""The scenario's ``channel:`` section as validated dataclasses with all defaults.
 
-Rates are per millisecond and delays in milliseconds, as in the thesis. Where a value may follow the chain's
-state it is one number, or a list with one entry a state.
+Rates are per millisecond and delays in milliseconds, as in the thesis. A value that may depend on
+the chain's state is one number, or a list with one entry a state.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ SAMPLINGS = ("continuous", "slots")
 class ArrivalsConfig:
     """When frames enter the link.
 
-    as-offered: whenever the camera offers one. periodic: the same on a live link (the camera keeps the
-    period); simulations make one frame every ``period_ms``. poisson: at the instants of a Poisson process the
-    newest offered frame is sampled; with a rate for each state this is an MMPP.
+    as-offered: whenever the camera offers one.
+    periodic: the same on a live link (the camera sets the period); one every ``period_ms`` in simulations.
+    poisson: a Poisson process samples the newest offered frame; with a rate for each state this is an MMPP.
     """
 
     process: str = "as-offered"
     period_ms: float | None = None
     rate_per_ms: float | list[float] | None = None
     spread: bool = False
-    """Simulations: periodic cameras take turns, evenly over the period, instead of all at one instant."""
+    """Simulations: periodic cameras capture evenly spread over the period, not at one instant."""
 
     def __post_init__(self) -> None:
         _one_of("process", self.process, PROCESSES)
@@ -80,7 +80,7 @@ class ChainConfig:
     scope: str = "shared"
     sampled: str = "continuous"
     """continuous: every switch at its own instant. slots: the state is drawn at slot boundaries and kept for
-    the slot, as the thesis does; ``channel-emu accuracy`` shows what that costs."""
+    the slot, as the thesis does; ``channel-emu accuracy`` measures the bias."""
     slot_ms: float | None = None
 
     def __post_init__(self) -> None:
@@ -161,13 +161,13 @@ class ServiceConfig:
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """Who transmits. By default every camera has a line of its own. ``shared``: all cameras' frames compete
-    for one line; ``server`` says what each discipline and order then means. Cameras that capture at one
-    instant ask for the line in the order of their names: under drop-new the first of them keeps it."""
+    """By default every camera has a server of its own. ``shared``: all cameras compete for one server;
+    ``queue_server`` explains the disciplines and orders. Cameras that capture at one instant arrive in the
+    order of their names: under drop-new the first of them is served."""
 
     shared: bool = False
     order: str = "fcfs"
-    """Whose waiting frame is next when the line falls free (newest-waits and fcfs)."""
+    """Whose waiting frame is next when the server becomes free (newest-waits and fcfs)."""
 
     def __post_init__(self) -> None:
         _one_of("order", self.order, ORDERS)
@@ -189,10 +189,10 @@ class ChannelConfig:
     discipline: str = "drop-new"
     server: ServerConfig = field(default_factory=ServerConfig)
     queue_limit: int = 1024
-    """Most frames waiting (fcfs) or on their way at once (parallel), so that memory is bounded; of a shared
-    server, all cameras' together."""
+    """Most frames waiting (fcfs) or in service (parallel), so that memory is bounded; for all cameras
+    together if the server is shared."""
     hard_limit_ms: float | None = None
-    """Live only: end the emulator as soon as a frame leaves this much later than it was due."""
+    """Live only: stop the emulator if a frame leaves this much later than it was due."""
     faults: dict[str, Any] = field(default_factory=dict)
     """Parameters of the listed faults, by name."""
 
@@ -218,14 +218,14 @@ class ChannelConfig:
             self._refuse_endless("service.mean_ms", rates)
 
     def _refuse_endless(self, key: str, rates_per_ms: list[float]) -> None:
-        """Refuse what would have to follow the chain through millions of jumps for a single frame."""
+        """Refuse a chain with millions of jumps during a single frame."""
         if self.chain is None or len(set(rates_per_ms)) == 1:
             return
         generator = self.chain.generator()
         try:
             shares = stationary(generator)
         except ChainError:
-            return  # it comes to rest, so no frame is followed for long
+            return  # an absorbing state bounds the jumps during a frame
         jumps = self.chain.switches_per_ms()
         rate = max(r for r, share in zip(rates_per_ms, shares) if share > 1e-12)
         if jumps > 1e5 * rate and jumps <= MAX_JUMPS_PER_MS:

@@ -1,9 +1,9 @@
-"""Uniform random numbers that are looked up, not drawn: by seed, camera, purpose and number.
+"""Counter-based random numbers, looked up by seed, camera, purpose and number.
 
-A stateful generator would make a frame's fate depend on how many numbers other frames used. Here number
+A stateful generator would make a frame's outcome depend on how many numbers other frames used. Here number
 ``n`` of a stream is a pure function (Philox4x32-10, Salmon et al., "Parallel random numbers: as easy as
 1, 2, 3", SC 2011), so adding a camera changes nothing for the others, and the kernel in
-``kernels/philox.py`` finds the same numbers in any order.
+``virtual/kernels/philox.py`` computes the same numbers in any order.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ def _unit(low: int, high: int) -> float:
 def stream_key(seed: int, camera: str, purpose: str) -> tuple[int, int]:
     """The key of one camera's stream for one purpose. Seeds are whole numbers from 0 to 2^63 - 1.
 
-    The camera enters by its name, not its place in a list: that is what makes cameras independent of each
-    other's presence.
+    It depends on the camera's name, not on its place in a list, so cameras are independent of each other.
     """
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed: expected a whole number from 0 to 2^63 - 1, got {seed}")
@@ -46,10 +45,10 @@ def stream_key(seed: int, camera: str, purpose: str) -> tuple[int, int]:
     return int(low), int(high)
 
 
-class Uniforms:
-    """One stream: ``pair(n)`` are two independent uniforms in (0, 1) for number ``n``.
+class CounterRng:
+    """One stream: ``pair(n)`` are two independent rng in (0, 1) for number ``n``.
 
-    ``again`` indexes further pairs of the same number, for methods that reject.
+    ``attempt`` indexes further pairs of the same number, for rejection sampling.
     """
 
     __slots__ = ("key",)
@@ -57,12 +56,12 @@ class Uniforms:
     def __init__(self, seed: int, camera: str, purpose: str) -> None:
         self.key = stream_key(seed, camera, purpose)
 
-    def pair(self, n: int, again: int = 0) -> tuple[float, float]:
-        a, b, c, d = philox4x32((n & _WORD, n >> 32, again, 0), self.key)
+    def pair(self, n: int, attempt: int = 0) -> tuple[float, float]:
+        a, b, c, d = philox4x32((n & _WORD, n >> 32, attempt, 0), self.key)
         return _unit(a, b), _unit(c, d)
 
-    def uniform(self, n: int, again: int = 0) -> float:
-        return self.pair(n, again)[0]
+    def uniform(self, n: int, attempt: int = 0) -> float:
+        return self.pair(n, attempt)[0]
 
     def exponential(self, n: int) -> float:
         """Unit-mean exponential number ``n``."""

@@ -1,8 +1,8 @@
-"""How long the link takes to carry a frame: delay laws, following the chain's state (thesis 6.23, 6.24).
+"""Service times: how long the link takes to transmit a frame, by the chain's state (thesis 6.23, 6.24).
 
-A law is a shape of mean one; the state sets the mean. ``at-start``: the delay is drawn for the state in
-which transmission starts and kept (the thesis). ``modulated``: the frame's work is served at the speed of
-whatever state the chain passes through (the closed form of the Gilbert-Elliott-modulated link).
+A law draws a frame's work, of mean one; the state sets the mean delay. ``at-start``: the state in which
+transmission starts sets the delay (the thesis). ``modulated``: the work is served at the rate of each state
+that the chain passes through (the closed form of the Gilbert-Elliott-modulated link).
 """
 
 from __future__ import annotations
@@ -11,86 +11,85 @@ import math
 from collections.abc import Callable, Sequence
 
 from channel_emu.model.chain import Chain
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.instants import later, to_ns
-from channel_emu.model.traffic import spend
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.nanoseconds import saturating_add, to_ns
+from channel_emu.model.traffic import completion_ns
 
-# Number of a frame -> its work, a draw of mean one.
-Shape = Callable[[int], float]
-
-
-def exponential(uniforms: Uniforms) -> Shape:
-    return uniforms.exponential
+# Frame number -> work of mean one.
+WorkSampler = Callable[[int], float]
 
 
-def deterministic() -> Shape:
+def exponential(rng: CounterRng) -> WorkSampler:
+    return rng.exponential
+
+
+def deterministic() -> WorkSampler:
     return lambda number: 1.0
 
 
-def lognormal(uniforms: Uniforms, sigma: float) -> Shape:
+def lognormal(rng: CounterRng, sigma: float) -> WorkSampler:
     """exp(sigma Z - sigma²/2), Z standard normal by Box and Muller."""
 
     def draw(number: int) -> float:
-        return math.exp(sigma * _normal(*uniforms.pair(number)) - sigma * sigma / 2)
+        return math.exp(sigma * _normal(*rng.pair(number)) - sigma * sigma / 2)
 
     return draw
 
 
-def gamma(uniforms: Uniforms, shape: float) -> Shape:
+def gamma(rng: CounterRng, shape: float) -> WorkSampler:
     """Gamma of the given shape over its mean. Marsaglia and Tsang, ACM TOMS 26(3), 2000; shapes below one by
-    their boost. Each rejection looks at the frame's next pairs, so frames stay independent."""
+    their boost. A rejected attempt uses the frame's next pairs, so frames stay independent."""
     boosted = shape if shape >= 1.0 else shape + 1.0
     d = boosted - 1.0 / 3.0
     c = 1.0 / math.sqrt(9.0 * d)
 
     def draw(number: int) -> float:
-        again = 1
+        attempt = 1
         while True:
-            x = _normal(*uniforms.pair(number, again))
+            x = _normal(*rng.pair(number, attempt))
             v = (1.0 + c * x) ** 3
-            u = uniforms.uniform(number, again + 1)
+            u = rng.uniform(number, attempt + 1)
             if v > 0.0 and math.log(u) < 0.5 * x * x + d - d * v + d * math.log(v):
                 break
-            again += 2
+            attempt += 2
         value = d * v
         if shape < 1.0:
-            value *= uniforms.uniform(number) ** (1.0 / shape)
+            value *= rng.uniform(number) ** (1.0 / shape)
         return value / shape
 
     return draw
 
 
-def recorded(delays_ms: Sequence[float]) -> Shape:
-    """The given delays in turn, from the first again at their end (mean_ms is then 1: works are ms)."""
+def replayed(delays_ms: Sequence[float]) -> WorkSampler:
+    """The given delays in turn, from the start again after the last (mean_ms is then 1: works are ms)."""
     return lambda number: delays_ms[number % len(delays_ms)]
 
 
-class Service:
-    """Draws (delay, due) for a frame that starts transmission."""
+class ServiceTime:
+    """When a frame that starts transmission will be delivered."""
 
     def __init__(
-        self, shape: Shape, means_ms: Sequence[float], chain: Chain | None, modulated: bool = False
+        self, draw_work: WorkSampler, means_ms: Sequence[float], chain: Chain | None, modulated: bool = False
     ) -> None:
-        """``means_ms``: mean delay, one for all states or one a state."""
-        self.shape = shape
+        """means_ms: mean delay, one for all states or one a state."""
+        self.draw_work = draw_work
         self.means_ms = list(means_ms)
         self.chain = chain
         self.modulated = modulated and chain is not None and len(self.means_ms) > 1
         self._speeds_per_ns = [1.0 / (mean * 1e6) if mean > 0.0 else math.inf for mean in self.means_ms]
 
     def due_ns(self, start_ns: int, number: int) -> tuple[int, int]:
-        """Instant at which frame ``number``, started at ``start_ns``, arrives; and the chain's state then
-        (at the start)."""
+        """Delivery instant of frame ``number`` that starts at ``start_ns``, and the chain's state then."""
         state = 0 if self.chain is None else self.chain.state(start_ns)
-        work = self.shape(number)
+        work = self.draw_work(number)
         if self.modulated:
-            return spend(work, self._speeds_per_ns, self.chain, start_ns), state
+            return completion_ns(work, self._speeds_per_ns, self.chain, start_ns), state
         mean = self.means_ms[state] if len(self.means_ms) > 1 else self.means_ms[0]
-        return later(start_ns, to_ns(work * mean)), state
+        return saturating_add(start_ns, to_ns(work * mean)), state
 
 
-class NoService:
-    """Arrives as it starts: the ideal link."""
+class NoServiceTime:
+    """The ideal link: a frame is delivered as it starts."""
 
     means_ms: Sequence[float] = (0.0,)
     modulated = False

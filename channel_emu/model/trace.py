@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import Kind, Transit
+from channel_emu.model.link import EventKind, Transit
+from channel_emu.model.nanoseconds import NEVER_NS
 
 VERSION = 1
 _INSTANTS = ("offered_ns", "started_ns", "drawn_ns", "due_ns", "ended_ns", "actual_ns")
@@ -130,7 +130,7 @@ def read(path: Path) -> Trace:
             instant = getattr(record, key)
             if instant is not None and (type(instant) is not int or not 0 <= instant <= NEVER_NS):
                 raise TraceError(f"{path}: line {number}: {key}: expected nanoseconds, got {instant!r}")
-        if record.outcome is not None and record.outcome not in list(Kind):
+        if record.outcome is not None and record.outcome not in list(EventKind):
             raise TraceError(f"{path}: line {number}: outcome: unknown, got {record.outcome!r}")
         records.append(record)
     return Trace(seed, config, records)

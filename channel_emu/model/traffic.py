@@ -1,8 +1,8 @@
-"""When frames enter the link: periodic, Poisson or Markov-modulated Poisson arrivals (thesis 6.23, 6.24).
+"""Arrivals: periodic, Poisson or Markov-modulated Poisson (thesis 6.23, 6.24).
 
-A Poisson process, modulated or not, has no memory: given the chain's path, the wait for the next arrival
-from any instant on is found by spending one unit-mean exponential along the path's rates. The exponential is
-looked up by the number of the frame that waits, so arrivals are a function of (camera, offer number) too.
+A Poisson process, modulated or not, has no memory: given the chain's path, the next arrival after any instant
+is where the integral of the rate reaches a unit-mean exponential. It is looked up by the number of the
+waiting frame, so arrivals depend on (camera, offer number) only.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from channel_emu.model.chain import Chain
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.instants import NEVER_NS, later, saturate
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round
 
 
-def spend(work: float, rates_per_ns: Sequence[float], chain: Chain | None, start_ns: int) -> int:
-    """Instant at which ``work`` is used up from ``start_ns`` on, at the rate of the chain's state.
+def completion_ns(work: float, rates_per_ns: Sequence[float], chain: Chain | None, start_ns: int) -> int:
+    """Instant at which the integral of the chain's rate from ``start_ns`` on reaches ``work``, or NEVER_NS.
 
-    ``rates_per_ns`` has one entry a state, or one entry for all. NEVER_NS if it never is.
+    rates_per_ns: one entry a state, or one for all.
     """
     if chain is None or len(rates_per_ns) == 1 or rates_per_ns.count(rates_per_ns[0]) == len(rates_per_ns):
         return _at_rate(work, rates_per_ns[0], start_ns)
     if chain.white:
-        # What is noise from one nanosecond to the next is its average over any longer span.
+        # White noise acts through its average over any span longer than a nanosecond.
         return _at_rate(work, sum(r * float(p) for r, p in zip(rates_per_ns, chain.shares)), start_ns)
     at_ns = start_ns
     while at_ns < NEVER_NS:
@@ -32,35 +32,35 @@ def spend(work: float, rates_per_ns: Sequence[float], chain: Chain | None, start
             left = float(until_ns - at_ns)
             need = work / rate
             if need <= left:
-                return later(at_ns, saturate(need))
+                return saturating_add(at_ns, saturating_round(need))
             work -= rate * left
         at_ns = until_ns
     return NEVER_NS
 
 
 def _at_rate(work: float, rate_per_ns: float, start_ns: int) -> int:
-    return later(start_ns, saturate(work / rate_per_ns)) if rate_per_ns > 0.0 else NEVER_NS
+    return saturating_add(start_ns, saturating_round(work / rate_per_ns)) if rate_per_ns > 0.0 else NEVER_NS
 
 
 class PoissonArrivals:
     """Poisson arrivals, one rate a chain state (or one for all): MMPP where the chain has several states."""
 
-    def __init__(self, rates_per_ms: Sequence[float], chain: Chain | None, uniforms: Uniforms) -> None:
+    def __init__(self, rates_per_ms: Sequence[float], chain: Chain | None, rng: CounterRng) -> None:
         self.rates_per_ns = [rate / 1e6 for rate in rates_per_ms]
         self.chain = chain
-        self.uniforms = uniforms
+        self.rng = rng
 
     def next_ns(self, after_ns: int, number: int) -> int:
         """First arrival after ``after_ns``, by the exponential of frame ``number``."""
-        return spend(self.uniforms.exponential(number), self.rates_per_ns, self.chain, after_ns)
+        return completion_ns(self.rng.exponential(number), self.rates_per_ns, self.chain, after_ns)
 
 
 class PeriodicArrivals:
-    """One arrival every period; only simulations need it, live cameras keep their own time."""
+    """One arrival every period, for simulations; live cameras keep their own time."""
 
     def __init__(self, period_ms: float, phase_ms: float = 0.0) -> None:
         self.period_ns = round(period_ms * 1e6)
         self.phase_ns = round(phase_ms * 1e6)
 
     def next_ns(self, after_ns: int, number: int) -> int:
-        return later(self.phase_ns, number * self.period_ns)
+        return saturating_add(self.phase_ns, number * self.period_ns)

@@ -1,9 +1,9 @@
-"""What accuracy costs in time, for the simulation itself: three trade-offs, measured against exact ages.
+"""The simulation's accuracy against its cost: three trade-offs, measured against exact ages.
 
-- ``duration``: error of the mean age against seconds simulated and seconds of computing (thesis's chapter 5
-  channel, exact age by ``theory``).
-- ``slots``: bias of a slot grid against its length and speed: of the chain's sampling (exact and measured)
-  and of stepping time itself (``bench_virtual.periodic_loop``).
+- ``duration``: error of the mean age against seconds simulated and seconds of computing (the thesis's chapter
+  5 channel, exact age by ``closed_forms``).
+- ``slots``: bias and speed of a slot grid against its length: of the chain's sampling (exact and measured)
+  and of stepping time itself (``benchmark.periodic_loop``).
 - ``seeds``: width of a 95 % interval of the mean age against the number of seeds.
 """
 
@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from channel_emu.model.chain import two_state_generator
 from channel_emu.model.closed_forms import drop_new_age_ms, slotted_drop_new_age_ms
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
 from channel_emu.virtual.benchmark import periodic_loop
@@ -26,7 +27,7 @@ Rows = list[dict[str, Any]]
 CAMERAS = 18
 _PERIOD_MS, _MEAN_MS = 30.0, 60.0
 # (name, mu1, mu2 in 1/ms, mean delays in ms by state, period in ms, slots in ms). The fast chain switches
-# many times a period, which is where a grid goes wrong; the thesis's does not.
+# many times a period, where a grid is biased; the thesis's does not.
 CHAINS = (
     ("fast", 5.0, 5.0, (0.2, 2.0), 2.0, (0.01, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)),
     ("thesis", 1 / 30, 1 / 30, (30.0, 60.0), 30.0, (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)),
@@ -69,7 +70,7 @@ def chain_slots(repeats: int, frames: int, seed: int = 0) -> Rows:
     slot_ms 0 is continuous time."""
     rows = []
     for name, mu1, mu2, means_ms, period_ms, slots_ms in CHAINS:
-        generator = np.array([[-mu1, mu1], [mu2, -mu2]])
+        generator = two_state_generator(mu1, mu2)
         exact = drop_new_age_ms(generator, np.array(means_ms), period_ms)
         for slot_ms in (0.0, *slots_ms):
             more = {"sampled": "slots", "slot_ms": slot_ms} if slot_ms else {}
@@ -93,8 +94,8 @@ def chain_slots(repeats: int, frames: int, seed: int = 0) -> Rows:
 
 
 def loop_slots(repeats: int, seconds: float, seed: int = 0) -> Rows:
-    """The same for a loop over slots, which pays for every slot. Its ages are sampled just after deliveries:
-    half a slot is added to compare them with the time average."""
+    """The same for a loop over slots. Its ages are sampled just after deliveries, so half a slot is added to
+    compare them with the time average."""
     exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
     rows = []
     for slot_ms in LOOP_SLOTS_MS:
@@ -115,8 +116,8 @@ def seeds(most: int, seconds: float, seed: int = 0) -> Rows:
     """Half width of the 95 % interval of the mean age from 2, 4, 8, ... seeds, and the share of groups of
     that many whose interval holds the exact age.
 
-    More seeds narrow the interval around what a run of this length gives, and that has a bias of its own: it
-    starts with a delivery, when the age is least. Longer runs remove it, more seeds only lay it bare.
+    A run of this length is biased, because it starts with a delivery, when the age is least. Longer runs
+    remove the bias; more seeds only make it visible.
     """
     exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
     config = channel_from_mapping({"preset": "ch5"})
@@ -126,7 +127,7 @@ def seeds(most: int, seconds: float, seed: int = 0) -> Rows:
     bias_width = _half_width(found)
     rows = []
     count = 2
-    while count <= most // 4:  # groups enough to say how often the interval is right
+    while count <= most // 4:  # enough groups to estimate how often the interval holds the exact age
         groups = found[: most // count * count].reshape(-1, count)
         widths = np.array([_half_width(group) for group in groups])
         inside = np.abs(groups.mean(1) - exact) <= widths

@@ -1,7 +1,7 @@
-"""Measures the links in virtual time: how fast they are beside a plain loop, and what a frame costs.
+"""Benchmarks the links in virtual time: speed against a plain loop, and the cost of a frame.
 
-The loop is what one would write first, and what the thesis describes: every slot, every link, one step. It is
-kept short and as fast as plain Python allows, because a slow peer proves nothing.
+The loop steps every link in every slot, as the thesis describes. It is as fast as plain Python allows, so
+that the comparison is fair.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def bench_simulate(
 ) -> dict[str, Any]:
     """Link-slots (of 1 ms) a wall second: links in virtual time, with and without their ages, and the loop.
 
-    Simulator and loop take turns, so that both meet the same machine; medians, compile time excluded.
+    Simulator and loop alternate, so that both see the same machine load. Medians, without compile time.
     """
     config = channel_from_mapping({"preset": preset})
     simulate(config, cameras, 1.0, engine="kernel")
@@ -139,10 +139,10 @@ def show_simulate(result: dict[str, Any]) -> str:
 
 
 def bench_cost(frames: int = 1000, rounds: int = 41) -> list[dict[str, Any]]:
-    """ns a frame of one ideal Python link, and what each thing a channel may list adds.
+    """ns a frame of one ideal Python link, and what each option of a channel adds.
 
-    Every round measures all of them, and an addition is a difference within its round, so that a machine with
-    other work to do moves both sides. Medians. Rows: what, ns_per_frame, added_ns.
+    Every round measures all of them, and ``added_ns`` is a difference within its round, so that other load on
+    the machine affects both sides. Medians. Rows: what, ns_per_frame, added_ns.
     """
     cases: dict[str, ChannelConfig] = {"ideal link": channel_from_mapping({})}
     for name, params in FAULTS.items():

@@ -1,18 +1,39 @@
-"""Decides a recorded trace again in virtual time and compares every decision."""
+"""Replays offers in virtual time, and compares a recorded trace with what the links decide today."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from channel_emu.model.channel import Channel
+from channel_emu.model.config import ChannelConfig
+from channel_emu.model.link import Transit
 from channel_emu.model.trace import Trace
-from channel_emu.virtual.simulate import replay_offers
+
+
+def replay_offers(
+    config: ChannelConfig, seed: int, offers: dict[str, list[tuple[int, int]]], end_ns: int
+) -> dict[str, list[Transit]]:
+    """Offer frames to fresh links, as the live emulator would have been offered them.
+
+    offers: (instant in ns, bytes) of each frame, by camera. Returns the transits by camera, as of ``end_ns``.
+    """
+    channel = Channel(config, seed)
+    links = {camera: channel.link(camera) for camera in offers}
+    transits: dict[str, list[Transit]] = {camera: [] for camera in offers}
+    merged = sorted((at_ns, camera, size) for camera, given in offers.items() for at_ns, size in given)
+    for at_ns, camera, size in merged:
+        transits[camera].append(links[camera].offer(at_ns, None, size)[0])
+    for link in links.values():
+        link.advance(end_ns)
+    return transits
 
 
 def compare(trace: Trace) -> dict[str, Any]:
-    """Offer every recorded message again, at its recorded instant, to fresh links of the recorded channel.
+    """Offer every recorded message again at its recorded instant and compare the link's decisions.
+
+    Outcome, start, due instant and state of each message must be those recorded.
 
     Returns {frames: records compared, equal: decided as recorded, different: [one line each, at most 20]}.
-    Outcome, start, due instant and state of each message must be those recorded.
     """
     last_ns = max((max(r.offered_ns, r.started_ns or 0, r.ended_ns or 0) for r in trace.records), default=0)
     decided = replay_offers(trace.config, trace.seed, trace.offers(), last_ns)

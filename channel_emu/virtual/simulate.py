@@ -1,14 +1,12 @@
-"""The same links in virtual time: thousands of camera-seconds in a moment, from one seed.
+"""Simulates the links in virtual time: thousands of camera-seconds in a moment, from one seed.
 
-Two engines give the same frames the same fates: ``python`` drives ``link.Link`` by an event loop,
-``kernel`` (numba) computes whole arrays. Faults and a chain that is white noise need the Python one.
+Two engines decide the same for every frame: ``python`` runs ``link.Link`` in an event loop, ``kernel``
+(numba) computes whole arrays. Faults and a chain that is white noise need the Python engine.
 """
 
 from __future__ import annotations
 
-import heapq
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,45 +16,14 @@ from numpy.typing import NDArray
 from channel_emu.model import ages
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
-from channel_emu.model.link import Kind, Link, Transit
-from channel_emu.model.traffic import PeriodicArrivals, PoissonArrivals
+from channel_emu.virtual import python_engine
+from channel_emu.virtual.link_run import OUTCOMES, LinkRun, camera_period_ms
 
-OUTCOMES = ("in_flight", *(str(k) for k in (Kind.DELIVERED, Kind.DROPPED_BUSY, Kind.SUPERSEDED, Kind.SKIPPED,
-                                            Kind.LOST, Kind.BROKEN)))  # fmt: skip
-_CODES = {name: code for code, name in enumerate(OUTCOMES)}
-DEFAULT_FRAME_PERIOD_MS = 1000 / 30
 _MOST_FRAMES = 1e9
 
 
 class SimulationError(ValueError):
     """A simulation that cannot be run as asked; the message says why."""
-
-
-@dataclass(frozen=True)
-class LinkRun:
-    """One camera's frames: instants int64 ns (n,), -1 where there is none; outcome: index into OUTCOMES."""
-
-    camera: str
-    offered_ns: NDArray[np.int64]
-    outcome: NDArray[np.int8]
-    started_ns: NDArray[np.int64]
-    due_ns: NDArray[np.int64]
-    end_ns: int
-    state_share: list[float]
-    duplicated: int = 0
-
-    def count(self, outcome: str) -> int:
-        return int((self.outcome == _CODES[outcome]).sum())
-
-    def sawtooth(self) -> ages.Sawtooth:
-        """Ages run from capture, which in virtual time is the offer."""
-        arrived = self.outcome == _CODES["delivered"]
-        return ages.sawtooth(self.due_ns[arrived], self.offered_ns[arrived], self.end_ns)
-
-    def delays_ms(self) -> NDArray[np.float64]:
-        """The drawn delay of every frame whose transmission ended within the run."""
-        done = (self.started_ns >= 0) & (self.due_ns <= self.end_ns)
-        return (self.due_ns - self.started_ns)[done] / 1e6
 
 
 @dataclass(frozen=True)
@@ -69,10 +36,10 @@ class Simulation:
     runs: list[LinkRun] = field(repr=False)
 
     def omega(self, at_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The set Omega(t) at any instants (T,), in any order: when the newest frame that had arrived of each
-        camera was generated, int64 ns (T, cameras); -1 before a camera's first delivery (thesis 5.4, 6.2).
+        """The set Omega(t) at instants (T,) in any order (thesis 5.4, 6.2): generation time of each camera's
+        newest delivered frame, int64 ns (T, cameras); -1 before its first delivery.
 
-        What is delivered at an instant counts at it, as for a decision that falls on it.
+        A frame delivered at an instant counts at that instant.
         """
         at = np.asarray(at_ns, np.int64)
         return np.stack([ages.newest_at(run.sawtooth(), at) for run in self.runs], -1)
@@ -102,7 +69,7 @@ class Simulation:
             **counts,
             "duplicated": sum(run.duplicated for run in self.runs),
             "state_share": dict(zip(self.config.state_names, (round(float(s), 6) for s in share))),
-            "delay_ms": spread(delays),
+            "delay_ms": _mean_and_percentiles(delays),
             "cameras": len(self.runs),
             "seconds": self.seconds,
             "slot_ms": self.slot_ms,
@@ -113,8 +80,7 @@ class Simulation:
         }  # fmt: skip
 
 
-def spread(values: NDArray[np.float64]) -> dict[str, float | None]:
-    """Mean, median and 95th percentile; None where there are no values."""
+def _mean_and_percentiles(values: NDArray[np.float64]) -> dict[str, float | None]:
     if not len(values):
         return {"mean": None, "p50": None, "p95": None}
     p50, p95 = np.percentile(values, [50, 95])
@@ -135,11 +101,13 @@ def simulate(
 ) -> Simulation:
     """Run every camera's link for ``seconds`` of virtual time.
 
-    cameras: how many (cam00, cam01, ...) or their names. frame_period_ms: the cameras' own period. With
-    Poisson arrivals frames are made by the arrivals themselves (arrival = capture, as in the thesis) unless
-    it is given: then the arrivals sample the camera's newest frame, as the live emulator does.
-    engine: auto, python or kernel. threads: of the kernel; None takes what the machine has where a run is
-    long enough. The result does not depend on it. Raises SimulationError.
+    cameras: their number (cam00, cam01, ...) or their names.
+    engine: auto, python or kernel.
+    frame_period_ms: the cameras' capture period. Without it Poisson arrivals generate the frames (arrival =
+        capture, as in the thesis); with it they sample the camera's newest frame, as the live emulator does.
+    slot_ms: slot of the slotted mean age (5.2).
+    threads: of the kernel; None uses every processor if the run is long enough. Results do not depend on it.
+    Raises SimulationError.
     """
     names = [f"cam{i:02d}" for i in range(cameras)] if isinstance(cameras, int) else cameras
     if not names:
@@ -155,7 +123,7 @@ def simulate(
         raise SimulationError(f"about {frames:.1e} frames: expected at most {_MOST_FRAMES:.0e} in one run")
     end_ns = round(seconds * 1e9)
     channel = Channel(config, seed)
-    why_not = _kernel_lacks(config, channel)
+    why_not = _kernel_unsupported(config, channel)
     if engine == "kernel" and why_not:
         raise SimulationError(f"engine kernel: {why_not}")
     if engine == "auto":
@@ -165,113 +133,21 @@ def simulate(
 
         runs = kernel_engine.run(config, channel, names, end_ns, frame_period_ms, threads)
     elif engine == "python":
-        runs = _run_python(config, channel, names, end_ns, frame_period_ms, frame_bytes)
+        runs = python_engine.run(config, channel, names, end_ns, frame_period_ms, frame_bytes)
     else:
         raise SimulationError(f"engine: expected auto, python or kernel, got {engine!r}")
     return Simulation(config, seed, seconds, slot_ms, engine, runs)
 
 
-def replay_offers(
-    config: ChannelConfig,
-    seed: int,
-    offers: dict[str, list[tuple[int, int]]],
-    end_ns: int,
-    on_event: Callable[[Link, Any], None] | None = None,
-) -> dict[str, list[Transit]]:
-    """Offer frames at the given (instant ns, bytes) to fresh links, merged in time; the fates by camera.
-
-    This is what the live emulator would have decided, had it been offered frames at those instants.
-    """
-    channel = Channel(config, seed)
-    links = {camera: channel.link(camera) for camera in offers}
-    fates: dict[str, list[Transit]] = {camera: [] for camera in offers}
-    merged = sorted((at_ns, camera, size) for camera, given in offers.items() for at_ns, size in given)
-    for at_ns, camera, size in merged:
-        transit, events = links[camera].offer(at_ns, None, size)
-        fates[camera].append(transit)
-        for event in events if on_event else ():
-            on_event(links[camera], event)  # type: ignore[misc]
-    for link in links.values():
-        for event in link.advance(end_ns):
-            if on_event:
-                on_event(link, event)
-    return fates
-
-
-def _run_python(
-    config: ChannelConfig,
-    channel: Channel,
-    names: list[str],
-    end_ns: int,
-    frame_period_ms: float | None,
-    frame_bytes: int,
-) -> list[LinkRun]:
-    sampled = frame_period_ms is not None
-    links = [channel.link(name, sampled=sampled) for name in names]
-    rank = ranks(names)
-    sources = [
-        _source(config, channel, link, frame_period_ms, k / len(names)) for link, k in zip(links, rank)
-    ]
-    fates: list[list[Transit]] = [[] for _ in names]
-    # (next offer's instant, camera's rank, camera, number of the offer)
-    offers = [(source.next_ns(0, 0), rank[i], i, 0) for i, source in enumerate(sources)]
-    heapq.heapify(offers)
-    while offers[0][0] <= end_ns:
-        at_ns, _, i, number = offers[0]
-        fates[i].append(links[i].offer(at_ns, None, frame_bytes)[0])
-        heapq.heapreplace(offers, (sources[i].next_ns(at_ns, number + 1), rank[i], i, number + 1))
-    for link in links:
-        link.advance(end_ns)
-    return [_collect(link, transits, end_ns) for link, transits in zip(links, fates)]
-
-
-def _source(
-    config: ChannelConfig, channel: Channel, link: Link, frame_period_ms: float | None, turn: float
-) -> PeriodicArrivals | PoissonArrivals:
-    """turn: in [0, 1), the part of the period by which a camera that takes turns is late."""
-    if frame_period_ms is None and config.arrivals.process == "poisson":
-        arrivals = channel.arrivals(link.camera, link.chain)
-        assert arrivals is not None
-        return arrivals
-    every_ms = period_ms(config, frame_period_ms)
-    return PeriodicArrivals(every_ms, turn * every_ms if config.arrivals.spread else 0.0)
-
-
-def ranks(names: list[str]) -> list[int]:
-    """Each camera's place in the order of names, which decides between frames of one instant."""
-    return [sorted(names).index(name) for name in names]
-
-
-def period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
-    """The cameras' own period."""
-    return frame_period_ms or config.arrivals.period_ms or DEFAULT_FRAME_PERIOD_MS
-
-
 def _frames_per_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
-    """Of one camera, at most. Arrivals that only sample a camera's frames make none."""
+    """Upper bound for one camera. Arrivals that sample a camera's frames generate none."""
     rates = config.arrivals.rate_per_ms
     if rates is None or frame_period_ms is not None:
-        return 1 / period_ms(config, frame_period_ms)
+        return 1 / camera_period_ms(config, frame_period_ms)
     return max(rates) if isinstance(rates, list) else rates
 
 
-def _collect(link: Link, transits: list[Transit], end_ns: int) -> LinkRun:
-    def column(values: list[int | None]) -> NDArray[np.int64]:
-        return np.array([-1 if v is None else v for v in values], np.int64)
-
-    return LinkRun(
-        link.camera,
-        column([t.offered_ns for t in transits]),
-        np.array([_CODES[t.outcome] if t.outcome else 0 for t in transits], np.int8),
-        column([t.started_ns for t in transits]),
-        column([t.due_ns for t in transits]),
-        end_ns,
-        [1.0] if link.chain is None else link.chain.occupancy(end_ns),
-        link.counts[Kind.DUPLICATED],
-    )
-
-
-def _kernel_lacks(config: ChannelConfig, channel: Channel) -> str | None:
+def _kernel_unsupported(config: ChannelConfig, channel: Channel) -> str | None:
     """Why the kernel cannot run this channel, or None."""
     if config.faults:
         return f"faults ({', '.join(config.faults)}) are simulated by the python engine only"

@@ -8,9 +8,9 @@ import pytest
 from channel_emu.model.chain import Chain, ChainError, two_state_generator
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import DISCIPLINES, Kind
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.link import DISCIPLINES, EventKind
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.simulate import simulate
 
 MS = 10**6
@@ -89,16 +89,16 @@ def test_chains_too_fast_to_follow_are_refused_with_a_reason() -> None:
         run({"preset": "ch6", "chain": {"mu1_per_ms": 1e6, "mu2_per_ms": 1e6}})
     fast = np.array([[-1e9, 1e9, 0.0], [0.0, -1e9, 1e9], [1e9, 0.0, -1e9]])
     with pytest.raises(ChainError, match="at most 1000 are"):
-        Chain(fast, Uniforms(0, "", "c"))
+        Chain(fast, CounterRng(0, "", "c"))
     # Named start, closed class only reached later: found out while running, not by hanging.
     late = np.array([[-1.0, 1.0, 0, 0], [0, -1e9, 1e9, 0], [0, 1e9, -1e9, 0], [0, 0, 0, 0]])
     with pytest.raises(ChainError, match="more than 10000 times"):
-        Chain(late, Uniforms(0, "", "c"), initial=0).state(10**12)
+        Chain(late, CounterRng(0, "", "c"), initial=0).state(10**12)
 
 
 def test_rates_of_1e_minus_9_and_1e9_together() -> None:
     """Rarely leaves the first state, and is back at once: what happens is the first state's."""
-    chain = Chain(two_state_generator(1e-9, 1e9), Uniforms(0, "", "c"))
+    chain = Chain(two_state_generator(1e-9, 1e9), CounterRng(0, "", "c"))
     assert chain.occupancy(10**15) == [1.0, 0.0]
     found = run({"preset": "ch6", "chain": {"mu1_per_ms": 1e-9, "mu2_per_ms": 1e9}}, seconds=100)
     assert found["state_share"]["low"] == pytest.approx(1.0)
@@ -136,7 +136,9 @@ def test_a_frame_after_years_of_silence() -> None:
     link = Channel(channel_from_mapping({"preset": "ch5"}), 0).link("late")
     transit, _ = link.offer(3 * 365 * 86_400 * 10**9)
     events = link.advance(NEVER_NS)
-    assert events[-1].kind is Kind.DELIVERED and transit.drawn_ns is not None and transit.drawn_ns < 10**9
+    assert (
+        events[-1].kind is EventKind.DELIVERED and transit.drawn_ns is not None and transit.drawn_ns < 10**9
+    )
 
 
 def test_a_clock_that_jumps() -> None:
@@ -145,7 +147,7 @@ def test_a_clock_that_jumps() -> None:
     for at in range(20):
         link.offer(at * MS)
     events = link.advance(10**18)
-    assert [e.kind for e in events].count(Kind.DELIVERED) == 20
+    assert [e.kind for e in events].count(EventKind.DELIVERED) == 20
     assert [e.at_ns for e in events] == sorted(e.at_ns for e in events)
     transit, _ = link.offer(5)
     assert transit.offered_ns == 10**18 and link.clock_backwards == 1
@@ -158,7 +160,7 @@ def test_frames_of_the_same_instant() -> None:
         for _ in range(50):
             link.offer(7)
         link.advance(10**15)
-        assert sum(n for k, n in link.counts.items() if k != Kind.DUPLICATED) == 50
+        assert sum(n for k, n in link.counts.items() if k != EventKind.DUPLICATED) == 50
 
 
 def test_ages_keep_nanoseconds_after_a_year() -> None:

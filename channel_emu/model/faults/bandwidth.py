@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from channel_emu.model.faults import NoFault
-from channel_emu.model.instants import saturate
-from channel_emu.model.link import Transit
+from channel_emu.model.link import Fault, Transit
+from channel_emu.model.nanoseconds import saturating_round
 
 
 @dataclass(frozen=True)
@@ -18,9 +17,9 @@ class Params:
             raise ValueError(f"megabits_per_s: expected more than 0, got {self.megabits_per_s:g}")
 
 
-class Effect(NoFault):
+class Effect(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.ns_per_byte = 8e3 / params.megabits_per_s
 
     def extra_ns(self, transit: Transit) -> int:
-        return saturate(transit.size_bytes * self.ns_per_byte)
+        return saturating_round(transit.size_bytes * self.ns_per_byte)

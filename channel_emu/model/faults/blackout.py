@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from channel_emu.model.faults import NoFault
-from channel_emu.model.instants import to_ns
-from channel_emu.model.link import Transit
+from channel_emu.model.link import Fault, Transit
+from channel_emu.model.nanoseconds import to_ns
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Params:
             raise ValueError("expected windows_ms, or every_ms with for_ms")
 
 
-class Effect(NoFault):
+class Effect(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.windows_ns = [(to_ns(a), to_ns(b)) for a, b in params.windows_ms]
         self.every_ns = to_ns(params.every_ms) if params.every_ms is not None else 0

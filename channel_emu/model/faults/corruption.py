@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.faults import NoFault, probability
-from channel_emu.model.link import Transit
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.faults import probability
+from channel_emu.model.link import Fault, Transit
 
 
 @dataclass(frozen=True)
@@ -21,15 +21,15 @@ class Params:
             raise ValueError(f"count: expected 1 to 1000 bytes, got {self.count}")
 
 
-class Effect(NoFault):
+class Effect(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.params = params
-        self.uniforms = Uniforms(seed, camera, "channel.corruption")
+        self.rng = CounterRng(seed, camera, "channel.corruption")
 
     def flips(self, transit: Transit) -> tuple[tuple[float, int], ...]:
-        if self.uniforms.uniform(transit.number) >= self.params.probability:
+        if self.rng.uniform(transit.number) >= self.params.probability:
             return ()
-        pairs = (self.uniforms.pair(transit.number, 1 + i) for i in range(self.params.count))
+        pairs = (self.rng.pair(transit.number, 1 + i) for i in range(self.params.count))
         return tuple((place, 1 + int(value * 255)) for place, value in pairs)
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.faults import NoFault, probability
-from channel_emu.model.link import Transit
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.faults import probability
+from channel_emu.model.link import Fault, Transit
 
 
 @dataclass(frozen=True)
@@ -17,10 +17,10 @@ class Params:
         probability("probability", self.probability)
 
 
-class Effect(NoFault):
+class Effect(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.params = params
-        self.uniforms = Uniforms(seed, camera, "channel.duplication")
+        self.rng = CounterRng(seed, camera, "channel.duplication")
 
     def duplicates(self, transit: Transit) -> bool:
-        return self.uniforms.uniform(transit.number) < self.params.probability
+        return self.rng.uniform(transit.number) < self.params.probability

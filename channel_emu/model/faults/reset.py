@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.faults import NoFault
-from channel_emu.model.instants import NEVER_NS, later, saturate, to_ns
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.link import Fault
+from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round, to_ns
 
 
 @dataclass(frozen=True)
@@ -26,18 +26,18 @@ class Params:
             raise ValueError("at_ms: expected no negative instants")
 
 
-class Effect(NoFault):
+class Effect(Fault):
     def __init__(self, params: Params, seed: int, camera: str) -> None:
         self.mean_ns = None if params.mean_interval_ms is None else params.mean_interval_ms * 1e6
         self.at_ns = sorted({to_ns(at) for at in params.at_ms})
-        self.uniforms = Uniforms(seed, camera, "channel.reset")
+        self.rng = CounterRng(seed, camera, "channel.reset")
         self._number, self._next_ns = 0, -1
 
     def next_reset_ns(self, after_ns: int) -> int:
         if self.mean_ns is None:
             return next((at for at in self.at_ns if at > after_ns), NEVER_NS)
         while self._next_ns <= after_ns:
-            step = saturate(self.uniforms.exponential(self._number) * self.mean_ns)
-            self._next_ns = later(max(self._next_ns, 0), max(step, 1))
+            step = saturating_round(self.rng.exponential(self._number) * self.mean_ns)
+            self._next_ns = saturating_add(max(self._next_ns, 0), max(step, 1))
             self._number += 1
         return self._next_ns

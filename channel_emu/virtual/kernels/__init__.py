@@ -1,2 +1,2 @@
-"""Numba kernels of the simulator. Each has its plain counterpart in the package, which the tests compare it
-with decision for decision; nothing here is imported unless a simulation asks for speed."""
+"""Numba kernels of the simulator, imported only by its kernel engine. Each has a plain counterpart in
+``channel_emu.model``; the tests compare the two decision for decision."""

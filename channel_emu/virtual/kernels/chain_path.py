@@ -1,4 +1,4 @@
-"""The chain's path over a whole horizon, and work spent along it: ``chain.Chain`` and ``traffic.spend``."""
+"""The chain's path over a whole horizon, and arrivals and work along it: ``chain.Chain`` and ``traffic``."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import math
 import numpy as np
 from numba import njit
 
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.virtual.kernels.philox import fill
 
 _NEVER = float(NEVER_NS)
-# Numbers drawn ahead: enough to hide the start of a block, little enough to stay in the first cache.
+# Random numbers are drawn in blocks that amortize the call and fit into the L1 cache.
 _BLOCK = 256
 
 
 @njit(cache=True, nogil=True)
-def saturate(span_ns):
+def saturating_round(span_ns):
     return NEVER_NS if span_ns >= _NEVER else np.int64(span_ns + 0.5)
 
 
 @njit(cache=True, nogil=True)
-def later(instant_ns, span_ns):
+def saturating_add(instant_ns, span_ns):
     return min(instant_ns + span_ns, NEVER_NS)
 
 
 @njit(cache=True, nogil=True)
-def chain_path(pace, jumps, slot_ns, key, initial, horizon_ns):
+def chain_path(sojourn_rate, jumps, slot_ns, key, initial, horizon_ns):
     """Sojourns up to the first that ends after the horizon: starts int64 (S + 1,) ending with that end, and
-    states int64 (S,). ``pace`` (M,), ``jumps`` (M, M) and ``slot_ns`` are ``chain.Chain``'s."""
+    states int64 (S,). ``sojourn_rate`` (M,), ``jumps`` (M, M) and ``slot_ns`` are ``chain.Chain``'s."""
     starts = np.empty(1024, np.int64)
     states = np.empty(1024, np.int64)
     starts[0], states[0] = 0, initial
@@ -40,13 +40,15 @@ def chain_path(pace, jumps, slot_ns, key, initial, horizon_ns):
         if k == 0:
             fill(count, u, v, key)
         end = NEVER_NS
-        if pace[state] != 0.0:
+        if sojourn_rate[state] != 0.0:
             if slot_ns == 0:
-                end = later(starts[count], saturate(-math.log(u[k]) / pace[state] * 1e6))
+                end = saturating_add(
+                    starts[count], saturating_round(-math.log(u[k]) / sojourn_rate[state] * 1e6)
+                )
             else:
-                slots = math.log(u[k]) / pace[state]
+                slots = math.log(u[k]) / sojourn_rate[state]
                 if slots * slot_ns < _NEVER:
-                    end = later(starts[count], (np.int64(slots) + 1) * slot_ns)
+                    end = saturating_add(starts[count], (np.int64(slots) + 1) * slot_ns)
         count += 1
         if count + 1 >= len(starts):
             starts = np.concatenate((starts, np.empty_like(starts)))
@@ -59,7 +61,7 @@ def chain_path(pace, jumps, slot_ns, key, initial, horizon_ns):
 
 @njit(cache=True, nogil=True)
 def segment(starts, at_ns, hint):
-    """Index of the sojourn that contains ``at_ns``, searched forwards from ``hint``, backwards if it must."""
+    """Index of the sojourn that contains ``at_ns``: a linear search from ``hint`` on, binary before it."""
     i = hint
     if starts[i] > at_ns:
         return np.searchsorted(starts, at_ns, side="right") - 1
@@ -69,14 +71,14 @@ def segment(starts, at_ns, hint):
 
 
 @njit(cache=True, nogil=True)
-def spend(work, rates_per_ns, starts, states, start_ns, hint):
-    """Instant at which ``work`` is used up; NEVER_NS if not before the path's end."""
+def completion_ns(work, rates_per_ns, starts, states, start_ns, hint):
+    """``traffic.completion_ns`` along the path; NEVER_NS if not before its end."""
     alike = True
     for k in range(1, len(rates_per_ns)):
         alike &= rates_per_ns[k] == rates_per_ns[0]
     if alike:
         rate = rates_per_ns[0]
-        return later(start_ns, saturate(work / rate)) if rate > 0.0 else NEVER_NS
+        return saturating_add(start_ns, saturating_round(work / rate)) if rate > 0.0 else NEVER_NS
     at_ns = start_ns
     i = segment(starts, at_ns, hint)
     while i < len(states):
@@ -86,7 +88,7 @@ def spend(work, rates_per_ns, starts, states, start_ns, hint):
             left = float(until_ns - at_ns)
             need = work / rate
             if need <= left:
-                return later(at_ns, saturate(need))
+                return saturating_add(at_ns, saturating_round(need))
             work -= rate * left
         at_ns = until_ns
         i += 1
@@ -97,7 +99,7 @@ def spend(work, rates_per_ns, starts, states, start_ns, hint):
 def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
     """Instants of a (Markov-modulated) Poisson process in [0, horizon], int64.
 
-    ``spend`` written out: the same operations in the same order, without a call for each arrival.
+    ``completion_ns`` inlined: the same operations in the same order, without a call for each arrival.
     """
     found = np.empty(1024, np.int64)
     u, v = np.empty(_BLOCK), np.empty(_BLOCK)
@@ -111,7 +113,11 @@ def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
             fill(count, u, v, key)
         work = -math.log(u[k])
         if alike:
-            at_ns = later(at_ns, saturate(work / rates_per_ns[0])) if rates_per_ns[0] > 0.0 else NEVER_NS
+            at_ns = (
+                saturating_add(at_ns, saturating_round(work / rates_per_ns[0]))
+                if rates_per_ns[0] > 0.0
+                else NEVER_NS
+            )
         else:
             while True:
                 until_ns = starts[i + 1]
@@ -120,7 +126,7 @@ def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
                     left = float(until_ns - at_ns)
                     need = work / rate
                     if need <= left:
-                        at_ns = later(at_ns, saturate(need))
+                        at_ns = saturating_add(at_ns, saturating_round(need))
                         break
                     work -= rate * left
                 at_ns = until_ns
@@ -150,7 +156,7 @@ def sample_newest(offered_ns, rates_per_ns, starts, states, key):
         if k == 0:
             fill(n, u, v, key)
         hint = segment(starts, offered_ns[n], hint)
-        at_ns = spend(-math.log(u[k]), rates_per_ns, starts, states, offered_ns[n], hint)
+        at_ns = completion_ns(-math.log(u[k]), rates_per_ns, starts, states, offered_ns[n], hint)
         skipped = n + 1 < len(offered_ns) and at_ns > offered_ns[n + 1]
         sampled[n] = -1 if skipped else at_ns
     return sampled

@@ -1,6 +1,7 @@
-"""Service of one link's arrivals under each discipline: what ``link.Link`` decides, over whole arrays.
+"""One link under each discipline: the decisions of ``link.Link``, over whole arrays.
 
-The hot loops pass no arrays on: numba counts references at each call, which costs more than a decision.
+The hot loops pass no arrays to functions: numba counts references at each call, which costs more than a
+decision.
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ from heapq import heappop, heappush
 import numpy as np
 from numba import njit
 
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.virtual.kernels.chain_path import later, saturate, spend
+from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.virtual.kernels.chain_path import completion_ns, saturating_add, saturating_round
 
-# Outcomes, as in simulate.OUTCOMES.
+# Outcomes, as in link_run.OUTCOMES.
 IN_FLIGHT, DELIVERED, DROPPED_BUSY, SUPERSEDED, SKIPPED = 0, 1, 2, 3, 4
 DROP_NEW, NEWEST_WAITS, FCFS, LCFS_PREEMPT, PARALLEL = 0, 1, 2, 3, 4
 
@@ -58,11 +59,11 @@ def serve(
                 while starts[hint + 1] <= at_ns:
                     hint += 1
                 if modulated:
-                    free_ns = spend(work[i], speeds, starts, states, at_ns, hint)
+                    free_ns = completion_ns(work[i], speeds, starts, states, at_ns, hint)
                 else:
                     if by_state:
                         mean_ms = means_ms[states[hint]]
-                    free_ns = later(at_ns, saturate(work[i] * mean_ms * 1e6))
+                    free_ns = saturating_add(at_ns, saturating_round(work[i] * mean_ms * 1e6))
                 started[i], due[i] = at_ns, free_ns
                 if free_ns <= horizon_ns:
                     outcome[i] = DELIVERED
@@ -119,11 +120,11 @@ def serve(
         while starts[hint + 1] <= at_ns:
             hint += 1
         if modulated:
-            end_ns = spend(work[frame], speeds, starts, states, at_ns, hint)
+            end_ns = completion_ns(work[frame], speeds, starts, states, at_ns, hint)
         else:
             if by_state:
                 mean_ms = means_ms[states[hint]]
-            end_ns = later(at_ns, saturate(work[frame] * mean_ms * 1e6))
+            end_ns = saturating_add(at_ns, saturating_round(work[frame] * mean_ms * 1e6))
         started[frame], due[frame] = at_ns, end_ns
         serving, free_ns = frame, end_ns
         if discipline == PARALLEL:

@@ -1,4 +1,4 @@
-"""The numbers of ``channel_emu.model.counter_rng``, at machine speed."""
+"""The numbers of ``channel_emu.model.counter_rng``, compiled."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ def pair(number, again, key):
 
 @njit(cache=True, nogil=True)
 def fill(first, u, v, key):
-    """The pairs of numbers first, first + 1, ... into u and v, float64 of one length: ten times as fast as
-    ``pair`` one by one, because the processor then works on several at once. For that the rounds are written
-    out once more here; the tests compare the two."""
+    """Write the pairs of numbers first, first + 1, ... into u and v (float64, one length).
+
+    The loop vectorizes, which is ten times as fast as ``pair`` one by one. That is why the rounds stand here
+    a second time; the tests compare the two.
+    """
     n = np.uint64(first)
     key_0, key_1 = key[0], key[1]
     for i in range(len(u)):

@@ -1,4 +1,4 @@
-"""Service of several cameras' arrivals by one server: what ``server.Server`` decides, over whole arrays."""
+"""One server for several cameras: the decisions of ``queue_server.QueueServer``, over whole arrays."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from heapq import heappop, heappush
 import numpy as np
 from numba import njit
 
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.virtual.kernels.chain_path import later, saturate, spend
+from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.virtual.kernels.chain_path import completion_ns, saturating_add, saturating_round
 from channel_emu.virtual.kernels.link_service import (
     DELIVERED,
     DROP_NEW,
@@ -21,12 +21,12 @@ from channel_emu.virtual.kernels.link_service import (
     speeds_per_ns,
 )
 
-# Orders, as in server.ORDERS.
+# Orders, as in queue_server.ORDERS.
 FIRST_COME, NEWEST_FIRST, ROUND_ROBIN, OLDEST_AGE = 0, 1, 2, 3
 
 
 @njit(cache=True, nogil=True)
-def _choose(order, head, turn, last, newest_delivered_ns):
+def _choose(order, head, ticket, last, newest_delivered_ns):
     """The camera whose waiting frame is next; at least one waits."""
     cameras = len(head)
     best = -1
@@ -37,10 +37,10 @@ def _choose(order, head, turn, last, newest_delivered_ns):
         if best < 0:
             best = c
         elif order == FIRST_COME:
-            if turn[head[c]] < turn[head[best]]:
+            if ticket[head[c]] < ticket[head[best]]:
                 best = c
         elif order == NEWEST_FIRST:
-            if turn[head[c]] > turn[head[best]]:
+            if ticket[head[c]] > ticket[head[best]]:
                 best = c
         elif order == OLDEST_AGE and newest_delivered_ns[c] < newest_delivered_ns[best]:
             best = c
@@ -66,7 +66,7 @@ def serve_shared(
     due = np.full(count, -1, np.int64)
     speeds = speeds_per_ns(means_ms)
     hints = path_from.copy()
-    turn = np.arange(count)
+    ticket = np.arange(count)
     head = np.full(cameras, -1, np.int64)  # of each camera's waiting frames, which ``follower`` links
     tail = np.full(cameras, -1, np.int64)
     follower = np.full(count if discipline == FCFS else 1, -1, np.int64)
@@ -103,7 +103,7 @@ def serve_shared(
                     if head[c] >= 0:
                         outcome[head[c]] = SUPERSEDED
                         if order == FIRST_COME:
-                            turn[frame] = turn[head[c]]
+                            ticket[frame] = ticket[head[c]]
                     else:
                         waiting += 1
                     head[c] = frame
@@ -121,20 +121,20 @@ def serve_shared(
                     continue
                 outcome[serving] = SUPERSEDED
         else:
-            c = _choose(order, head, turn, last, newest_delivered_ns)
+            c = _choose(order, head, ticket, last, newest_delivered_ns)
             frame = head[c]
             head[c] = follower[frame] if discipline == FCFS else -1
             waiting -= 1
         while starts[hints[c] + 1] <= at_ns:
             hints[c] += 1
         if modulated:
-            due[frame] = spend(
+            due[frame] = completion_ns(
                 work[frame], speeds, starts[path_from[c] : path_to[c]], states[path_from[c] : path_to[c] - 1],
                 at_ns, hints[c] - path_from[c],
             )  # fmt: skip
         else:
             mean_ms = means_ms[states[hints[c]]] if len(means_ms) > 1 else means_ms[0]
-            due[frame] = later(at_ns, saturate(work[frame] * mean_ms * 1e6))
+            due[frame] = saturating_add(at_ns, saturating_round(work[frame] * mean_ms * 1e6))
         started[frame] = at_ns
         serving, free_ns, last = frame, due[frame], c
         if discipline == PARALLEL:

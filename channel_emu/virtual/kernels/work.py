@@ -1,4 +1,4 @@
-"""The work of a link's frames, drawn ahead for all of them: the shapes of ``service``."""
+"""The work of all frames of a link, drawn ahead by the laws of ``service_time``."""
 
 from __future__ import annotations
 
@@ -49,8 +49,7 @@ def _gamma(number, shape, key):
 
 @njit(cache=True, nogil=True)
 def draw(count, law, parameter, delays_ms, key):
-    """Work of mean one of the frames 0, 1, ..., float64 (count,); of law ``trace`` it is the delay in ms, and
-    of no law nothing."""
+    """Work of mean one of frames 0, 1, ..., float64 (count,); law ``trace``: the delay in ms, ``none``: 0."""
     if law == LAW_EXPONENTIAL:
         return exponentials(0, count, key)
     if law == LAW_LOGNORMAL:

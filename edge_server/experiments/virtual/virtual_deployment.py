@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, Protocol
 from camera_node.capture import Camera
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import Event, Kind, Link
+from channel_emu.model.link import Event, EventKind, Link
+from channel_emu.model.nanoseconds import NEVER_NS
 from edge_server.config import ComputeConfig
 from edge_server.fidelity.scorer import Score
 from edge_server.fields import Budget
@@ -207,11 +207,17 @@ class VirtualDeployment:
         sent = sum(self.captured.values())
         ends = {
             kind.value: sum(link.counts[kind] for link in self._links.values())
-            for kind in (Kind.SKIPPED, Kind.DROPPED_BUSY, Kind.SUPERSEDED, Kind.LOST, Kind.BROKEN)
+            for kind in (
+                EventKind.SKIPPED,
+                EventKind.DROPPED_BUSY,
+                EventKind.SUPERSEDED,
+                EventKind.LOST,
+                EventKind.BROKEN,
+            )
         }
         return {
             "captured": sent, "replaced": 0, "waiting": 0, "sent": sent, **ends,
-            "duplicated": sum(link.counts[Kind.DUPLICATED] for link in self._links.values()),
+            "duplicated": sum(link.counts[EventKind.DUPLICATED] for link in self._links.values()),
             "delivered": sum(self.delivered.values()),
             "rejected": dict(self.rejected),
             "in_flight": sum(link.in_flight for link in self._links.values()),
@@ -247,7 +253,7 @@ class VirtualDeployment:
 
     def _take(self, events: Sequence[Event]) -> None:
         for event in events:
-            if event.kind in (Kind.DELIVERED, Kind.DUPLICATED):
+            if event.kind in (EventKind.DELIVERED, EventKind.DUPLICATED):
                 self._deliver(event.transit.item, event.transit.flips)
 
     def _flush(self, now_ns: int) -> None:

@@ -15,9 +15,9 @@ import yaml
 from channel_emu.cli import main
 from channel_emu.estimate import hmm
 from channel_emu.estimate import hmm_kernels as kernel
-from channel_emu.estimate import recording as observed
-from channel_emu.estimate.fit import Fit, Value, fit
-from channel_emu.estimate.hmm import Timeline, TwoStates
+from channel_emu.estimate import recording as recordings
+from channel_emu.estimate.fit import Fit, IntervalEstimate, fit
+from channel_emu.estimate.hmm import Timeline, TwoStateModel
 from channel_emu.model.chain import transition_matrix, two_state_generator
 from channel_emu.model.config import channel_from_mapping
 from freshfield import scenario
@@ -39,7 +39,7 @@ CH6_TRUE = {"mu1_per_ms": 1 / 30, "mu2_per_ms": 1 / 30, "mean_1_ms": 30.0, "mean
 SLOW_TRUE = {**CH6_TRUE, "mu1_per_ms": 1 / 3000, "mu2_per_ms": 1 / 3000}
 
 
-def holds(found: Value, true: float, widened: float = 1.0) -> bool:
+def holds(found: IntervalEstimate, true: float, widened: float = 1.0) -> bool:
     """Whether the interval, widened about the value on the logarithmic scale, holds the truth."""
     assert found.interval is not None
     low, high = (math.log(v / found.value) * widened for v in found.interval)
@@ -90,27 +90,27 @@ def test_frames_that_waited_to_be_served_do_not_bias_the_rate(tmp_path: Path) ->
     the time, with arrivals as frequent as offers, the middle of what is possible makes the rate 5 % low."""
     section = {"preset": "ch6-high", "service": {"mean_ms": 150.0}}
     path = write_trace(tmp_path / "t.jsonl", section, 4, cameras=6, seconds=200, frame_period_ms=90.0)
-    recording, found = observed.read(path), fit(path, "1").parameters["rate_per_ms"]
+    recording, found = recordings.read_recording(path), fit(path, "1").parameters["rate_per_ms"]
     assert found.interval is not None and found.interval[1] / found.interval[0] < 1.05
     assert holds(found, 1 / 60)
-    (line,) = observed.timelines(recording, True, True)
+    (line,) = recordings.timelines(recording, True, True)
     assert not holds(found, line.arrived.sum() / (line.span_ms @ line.waiting))
 
 
 def test_a_guess_within_a_window_is_the_mean_of_a_cut_off_exponential(tmp_path: Path) -> None:
     path = write_trace(tmp_path / "t.jsonl", {"preset": "ch6-high"}, 1, cameras=1, seconds=30,
                        frame_period_ms=90.0)  # fmt: skip
-    recording = observed.read(path)
+    recording = recordings.read_recording(path)
     (before,) = recording.cameras
-    assert before.window_ms is not None and before.since_ms is not None
+    assert before.window_ms is not None and before.window_start_ms is not None
     vague = before.window_ms > 0
     assert 20 < vague.sum() < (~np.isnan(before.arrived_ms)).sum()
     for rate in (1e-9, 1 / 60, 10.0):
-        (after,) = observed.refined(recording, rate).cameras
+        (after,) = recordings.refine_arrivals(recording, rate).cameras
         known = ~np.isnan(before.arrived_ms) & ~vague
         assert (after.arrived_ms[known] == before.arrived_ms[known]).all()
         for since, window, arrived in zip(
-            before.since_ms[vague], before.window_ms[vague], after.arrived_ms[vague]
+            before.window_start_ms[vague], before.window_ms[vague], after.arrived_ms[vague]
         ):
             at = (np.arange(20_000) + 0.5) / 20_000 * window
             weight = np.exp(-rate * at)
@@ -279,7 +279,7 @@ def test_the_command_writes_a_scenario_and_a_picture(tmp_path: Path, capsys) -> 
     assert main(["fit", str(path), "--plot", str(path / "no" / "f.png")]) == 2
 
 
-MODEL = TwoStates(np.array([0.02, 0.05]), np.array([20.0, 90.0]), np.array([0.01, 0.04]))
+MODEL = TwoStateModel(np.array([0.02, 0.05]), np.array([20.0, 90.0]), np.array([0.01, 0.04]))
 
 
 def line_of(n: int = 60, seed: int = 0) -> Timeline:
@@ -293,7 +293,7 @@ def line_of(n: int = 60, seed: int = 0) -> Timeline:
 def test_without_arrivals_a_step_is_the_chains_transition_matrix() -> None:
     span_ms = np.array([0.0, 1e-9, 0.3, 40.0, 1e5])
     silent = dataclasses.replace(MODEL, rate_per_ms=None)
-    steps = hmm._Span(silent, 3).steps(span_ms)
+    steps = hmm._Propagator(silent, 3).steps(span_ms)
     for span, step in zip(span_ms, steps):
         assert step == pytest.approx(transition_matrix(two_state_generator(0.02, 0.05), span), abs=1e-14)
 
@@ -309,7 +309,7 @@ def test_steps_and_moments_against_small_time_steps() -> None:
     powers = [np.eye(2)]
     for _ in range(parts):
         powers.append(powers[-1] @ short)
-    span = hmm._Span(MODEL, 2)
+    span = hmm._Propagator(MODEL, 2)
     assert span.steps(np.array([span_ms]))[0] == pytest.approx(powers[-1], rel=1e-6)
     weight = np.array([[0.3, 0.1], [0.4, 0.2]])
     path = np.array(powers)
@@ -322,7 +322,7 @@ def test_steps_and_moments_against_small_time_steps() -> None:
 def test_the_kernel_agrees_with_sums_over_all_paths() -> None:
     """Eight observations, every one of the 2^9 paths: likelihood and pair probabilities."""
     line = line_of(8)
-    steps, (seen, _) = hmm._steps(MODEL, line), hmm._seen(MODEL, line)
+    steps, (seen, _) = hmm._propagators(MODEL, line), hmm._emissions(MODEL, line)
     total, pairs = 0.0, np.zeros((8, 2, 2))
     for path in np.ndindex(*[2] * 9):
         p = 0.5 * math.prod(steps[k, path[k], path[k + 1]] * seen[k, path[k + 1]] for k in range(8))
@@ -340,24 +340,24 @@ def test_every_step_of_em_gains_and_its_end_is_flat() -> None:
     lines = [line_of(400, 1), line_of(300, 2)]
     model, before = MODEL, -math.inf
     for _ in range(30):
-        found = hmm.expect(model, lines)
+        found = hmm.e_step(model, lines)
         assert found.log_likelihood == pytest.approx(hmm.log_likelihood(model, lines), rel=1e-12)
         assert found.log_likelihood >= before - 1e-9
         assert found.time_ms.sum() == pytest.approx(sum(line.span_ms.sum() for line in lines), rel=1e-9)
-        before, model = found.log_likelihood, hmm._improve(model, lines, found)
+        before, model = found.log_likelihood, hmm._m_step(model, lines, found)
 
 
 def test_timelines_count_who_is_waiting(tmp_path: Path) -> None:
     path = write_trace(
         tmp_path / "t.jsonl", {"preset": "ch6"}, 1, cameras=3, seconds=20, frame_period_ms=33.0
     )
-    recording = observed.read(path)
-    (line,) = observed.timelines(recording, True, True)
+    recording = recordings.read_recording(path)
+    (line,) = recordings.timelines(recording, True, True)
     assert line.waiting.min() >= 0 and line.waiting[line.span_ms > 0].max() == 3
     taken = sum(int((~np.isnan(c.arrived_ms)).sum()) for c in recording.cameras)
     assert line.arrived.sum() == taken > 300
     assert (~np.isnan(line.delay_ms)).sum() == len(recording.delays_ms())
-    assert len(observed.timelines(recording, False, True)) == 3
+    assert len(recordings.timelines(recording, False, True)) == 3
 
 
 @pytest.mark.parametrize(
@@ -380,12 +380,12 @@ def test_odd_recordings_give_finite_figures_or_one_line(tmp_path: Path, seed: in
             for i, (o, d, gone) in enumerate(zip(np.cumsum(gaps), delays, lost))]  # fmt: skip
     path = tmp_path / "rows.csv"
     path.write_text("".join(rows))
-    discipline = observed.ROW_DISCIPLINES[seed % 4]
+    discipline = recordings.ROW_DISCIPLINES[seed % 4]
     with np.errstate(divide="raise", invalid="raise", over="raise"):
         for states in ("auto", "2"):
             try:
                 found = fit(path, states, discipline=discipline)
-            except observed.ObservedError as error:
+            except recordings.RecordingError as error:
                 assert "delay" in str(error) and "\n" not in str(error)
                 continue
             assert channel_from_mapping(found.channel).discipline == discipline
@@ -440,13 +440,13 @@ def test_what_is_still_on_its_way_is_not_lost(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     path.write_text("".join(f"{o},{c if c <= 10_000 else ''}\n" for o, c in zip(offered, came)))
     assert (came > 10_000).sum() > 2
-    (camera,) = observed.read(path, "parallel").cameras
+    (camera,) = recordings.read_recording(path, "parallel").cameras
     assert not (camera.outcome == "lost").any() and (camera.outcome == "").sum() == (came > 10_000).sum()
     # One that is missing long before the end is lost.
     lines = path.read_text().splitlines()
     lines[300] = f"{offered[300]},"
     path.write_text("\n".join(lines))
-    (camera,) = observed.read(path, "parallel").cameras
+    (camera,) = recordings.read_recording(path, "parallel").cameras
     assert np.flatnonzero(camera.outcome == "lost").tolist() == [300]
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from channel_emu.model import ages, trace
-from channel_emu.model.link import Kind, Transit
+from channel_emu.model.link import EventKind, Transit
 from channel_emu.model.trace import Record
-from channel_emu.virtual.simulate import replay_offers
+from channel_emu.virtual.replay import replay_offers
 from tests.channel_emu.live.emulator import CAMERAS, emulate, run
 from tests.channel_emu.live.test_frame_stream import FAST, frame_account
 
@@ -74,7 +74,7 @@ def test_a_trace_replayed_twice_is_decided_and_delivered_alike(tmp_path: Path) -
         for known, a, b in zip(then, one, two, strict=True):
             assert known.outcome == a.outcome == b.outcome
             assert known.drawn_ns == a.drawn_ns == b.drawn_ns
-            if known.outcome != Kind.DELIVERED:
+            if known.outcome != EventKind.DELIVERED:
                 continue
             lasted = [_lasted(r) for r in (known, a, b)]
             assert lasted[0] == lasted[1] == lasted[2]

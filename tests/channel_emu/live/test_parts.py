@@ -23,7 +23,7 @@ from channel_emu.live.live_link import Message, ServedCall
 from channel_emu.live.timer import LoopTimer
 from channel_emu.live.wire import WireError, damage_payload, header_of
 from channel_emu.model import ages
-from channel_emu.model.link import Kind
+from channel_emu.model.link import EventKind
 from freshfield.frame import FrameRejected, from_request, to_request
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import frame_of
@@ -175,8 +175,8 @@ def test_dropped_messages_hold_no_bytes() -> None:
     async def live() -> None:
         flow = CallFlow(0, ServedCall(mock.Mock()), None, lambda: 0)
         dropped, kept = Message(b"x" * 100, "call0", 0, flow), Message(b"y", "call0", 1, flow)
-        flow.settle(dropped, Kind.LOST)
-        flow.settle(kept, Kind.DELIVERED)
+        flow.settle(dropped, EventKind.LOST)
+        flow.settle(kept, EventKind.DELIVERED)
         assert dropped.raw == b"" and kept.raw == b"y"
 
     asyncio.run(live())

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from channel_emu.model.chain import Chain, ChainError, stationary, transition_matrix, two_state_generator
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.instants import NEVER_NS
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.nanoseconds import NEVER_NS
 
 THREE = np.array([[-0.3, 0.2, 0.1], [0.05, -0.05, 0.0], [0.4, 0.4, -0.8]])
 
 
 def path(generator, seed: int = 0, initial: int | None = None) -> Chain:
-    return Chain(np.array(generator, float), Uniforms(seed, "", "channel.chain"), initial)
+    return Chain(np.array(generator, float), CounterRng(seed, "", "channel.chain"), initial)
 
 
 def sojourns(chain: Chain, until_ns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +149,7 @@ def test_forgetting_keeps_memory_bounded_and_shares_exact() -> None:
 
 def test_a_slot_keeps_its_state_and_slots_forget_what_was_between() -> None:
     """Switching a thousand times a slot, each slot is drawn anew: an even coin, whatever came before."""
-    chain = Chain(two_state_generator(1e3, 1e3), Uniforms(0, "", "channel.chain"), 0, 1.0)
+    chain = Chain(two_state_generator(1e3, 1e3), CounterRng(0, "", "channel.chain"), 0, 1.0)
     assert all(chain.state(slot * 10**6 + 1) == chain.state(slot * 10**6 + 999_999) for slot in range(100))
     states = np.array([chain.state(slot * 10**6) for slot in range(4000)])
     assert states.mean() == pytest.approx(0.5, abs=4 * 0.5 / 4000**0.5)
@@ -161,20 +161,20 @@ def test_slots_take_what_is_too_fast_to_follow() -> None:
     stiff = np.array([[-1e9, 5e8, 5e8], [1e9, -2e9, 1e9], [1e9, 1e9, -2e9]])
     with pytest.raises(ChainError, match="sampled: slots"):
         path(stiff)
-    chain = Chain(stiff, Uniforms(0, "", "channel.chain"), None, 1.0)
+    chain = Chain(stiff, CounterRng(0, "", "channel.chain"), None, 1.0)
     np.testing.assert_allclose(chain.occupancy(20_000 * 10**6), stationary(stiff), atol=0.02)
     # The state that is left once in 1e9 ms is kept.
-    assert Chain(fast, Uniforms(0, "", "channel.chain"), 2, 1.0).segment(0)[1] > 10**6 * 10**6
+    assert Chain(fast, CounterRng(0, "", "channel.chain"), 2, 1.0).segment(0)[1] > 10**6 * 10**6
     with pytest.raises(ChainError, match="at least a nanosecond"):
-        Chain(stiff, Uniforms(0, "", "channel.chain"), None, 1e-9)
+        Chain(stiff, CounterRng(0, "", "channel.chain"), None, 1e-9)
 
 
 @pytest.mark.parametrize("slot_ms", [None, 1.0])
 def test_degenerate_chains(slot_ms: float | None) -> None:
     """One state; and an absorbing one, in which it ends."""
-    one = Chain(np.zeros((1, 1)), Uniforms(0, "", "channel.chain"), None, slot_ms)
+    one = Chain(np.zeros((1, 1)), CounterRng(0, "", "channel.chain"), None, slot_ms)
     assert one.segment(10**15) == (0, NEVER_NS) and one.occupancy(10**15) == [1.0]
-    absorbed = Chain(np.array([[-1.0, 1.0], [0.0, 0.0]]), Uniforms(0, "", "channel.chain"), 0, slot_ms)
+    absorbed = Chain(np.array([[-1.0, 1.0], [0.0, 0.0]]), CounterRng(0, "", "channel.chain"), 0, slot_ms)
     left = absorbed.segment(0)[1]
     assert left < 100 * 10**6 and absorbed.segment(left) == (1, NEVER_NS)
 
@@ -183,7 +183,9 @@ def test_degenerate_chains(slot_ms: float | None) -> None:
 def test_kernel_draws_the_same_path(slot_ms: float | None) -> None:
     kernel = pytest.importorskip("channel_emu.virtual.kernels.chain_path")
     for generator in (THREE, two_state_generator(1 / 30, 1 / 60), np.array([[-1.0, 1.0], [0.0, 0.0]])):
-        chain = Chain(np.array(generator), Uniforms(9, "", "channel.chain"), None, slot_ms)
-        key = np.array(Uniforms(9, "", "channel.chain").key, np.uint64)
-        starts, states = kernel.chain_path(chain.pace, chain.jumps, chain.slot_ns, key, chain.initial, 10**11)
+        chain = Chain(np.array(generator), CounterRng(9, "", "channel.chain"), None, slot_ms)
+        key = np.array(CounterRng(9, "", "channel.chain").key, np.uint64)
+        starts, states = kernel.chain_path(
+            chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, 10**11
+        )
         assert list(zip(starts[:-1].tolist(), states.tolist())) == chain.recent(0, 10**11)

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("numba", reason="paths this long are drawn by the kernel")
 
 from channel_emu.model.chain import Chain, stationary, transition_matrix, two_state_generator
-from channel_emu.model.counter_rng import Uniforms
+from channel_emu.model.counter_rng import CounterRng
 from channel_emu.virtual.kernels.chain_path import chain_path, poisson_arrivals
 
 TOLERANCE = 0.01
@@ -31,10 +31,12 @@ Path = tuple[np.ndarray, np.ndarray]
 
 def draw(generator: np.ndarray, sojourns: int, slot_ms: float | None = None) -> Path:
     """Start instants (S + 1,) and states (S,) of about that many sojourns."""
-    chain = Chain(generator, Uniforms(1, "", "channel.chain"), None, slot_ms)
+    chain = Chain(generator, CounterRng(1, "", "channel.chain"), None, slot_ms)
     rate = -stationary(generator) @ np.diag(generator)
-    key = np.array(Uniforms(1, "", "channel.chain").key, np.uint64)
-    return chain_path(chain.pace, chain.jumps, chain.slot_ns, key, chain.initial, int(sojourns / rate * NS))
+    key = np.array(CounterRng(1, "", "channel.chain").key, np.uint64)
+    return chain_path(
+        chain.sojourn_rate, chain.jumps, chain.slot_ns, key, chain.initial, int(sojourns / rate * NS)
+    )
 
 
 def at_multiples(path: Path, span_ms: float) -> np.ndarray:
@@ -123,7 +125,7 @@ def test_variance_of_mmpp_counts() -> None:
     """Var N(w) = mean w + 2 (l1 - l2)² p1 p2 (w/r - (1 - e^(-rw))/r²), at rw = 10, where it goes with 1/r."""
     mu, rates, window_ms, windows = 1 / 12, np.array([0.05, 1.5]), 60.0, 500_000
     path = draw(two_state_generator(mu, mu), round(windows * window_ms * mu))
-    key = np.array(Uniforms(1, "cam00", "channel.arrivals").key, np.uint64)
+    key = np.array(CounterRng(1, "cam00", "channel.arrivals").key, np.uint64)
     end_ns = int((windows - 1) * window_ms * NS * 0.99)
     found = poisson_arrivals(rates / NS, *path, key, end_ns)
     counts = np.bincount(found // round(window_ms * NS))[:-1]

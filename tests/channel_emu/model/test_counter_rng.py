@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from channel_emu.model.counter_rng import Uniforms, philox4x32, stream_key
+from channel_emu.model.counter_rng import CounterRng, philox4x32, stream_key
 
 
 @pytest.mark.parametrize(
@@ -37,9 +37,9 @@ def test_streams_differ_by_seed_camera_and_purpose_and_by_nothing_else() -> None
 
 
 def test_uniforms_are_uniform_and_uncorrelated() -> None:
-    stream = Uniforms(1, "cam00", "test")
+    stream = CounterRng(1, "cam00", "test")
     pairs = np.array([stream.pair(n) for n in range(20_000)])
-    # Means of 20,000 uniforms lie within 5 standard deviations, and so do the correlations.
+    # Means of 20,000 rng lie within 5 standard deviations, and so do the correlations.
     assert abs(pairs.mean(0) - 0.5).max() < 5 * (1 / 12 / 20_000) ** 0.5
     assert abs(np.corrcoef(pairs[:, 0], pairs[:, 1])[0, 1]) < 5 / 20_000**0.5
     assert abs(np.corrcoef(pairs[1:, 0], pairs[:-1, 0])[0, 1]) < 5 / 20_000**0.5
@@ -50,14 +50,14 @@ def test_uniforms_are_uniform_and_uncorrelated() -> None:
 
 @given(st.integers(0, 2**62), st.integers(0, 2**31), st.integers(0, 2**63 - 1))
 def test_never_zero_and_never_one(number: int, again: int, seed: int) -> None:
-    u, v = Uniforms(seed, "c", "p").pair(number, again)
+    u, v = CounterRng(seed, "c", "p").pair(number, again)
     assert 0.0 < u < 1.0 and 0.0 < v < 1.0
 
 
 @given(st.integers(0, 2**62), st.integers(0, 1000))
 def test_kernel_finds_the_same_numbers(number: int, again: int) -> None:
     philox = pytest.importorskip("channel_emu.virtual.kernels.philox")
-    stream = Uniforms(3, "cam01", "channel.service")
+    stream = CounterRng(3, "cam01", "channel.service")
     assert philox.pair(number, again, np.array(stream.key, np.uint64)) == stream.pair(number, again)
 
 
@@ -69,7 +69,7 @@ def test_seed_out_of_range_is_refused(seed: int) -> None:
 
 def test_numbers_drawn_in_blocks_are_the_same() -> None:
     philox = pytest.importorskip("channel_emu.virtual.kernels.philox")
-    stream = Uniforms(5, "cam", "x")
+    stream = CounterRng(5, "cam", "x")
     u, v = np.empty(300), np.empty(300)
     for first in (0, 2**32 - 100):
         philox.fill(first, u, v, np.array(stream.key, np.uint64))

@@ -6,7 +6,7 @@ import pytest
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
 from channel_emu.model.faults.corruption import damage
-from channel_emu.model.link import Kind, Link
+from channel_emu.model.link import EventKind, Link
 
 MS = 10**6
 
@@ -25,21 +25,21 @@ def offer_many(subject: Link, count: int, size: int = 1000) -> list:
 
 def test_loss_takes_its_share_and_its_time() -> None:
     transits = offer_many(link({"loss": {"probability": 0.2}}), 4000)
-    lost = [t for t in transits if t.outcome is Kind.LOST]
+    lost = [t for t in transits if t.outcome is EventKind.LOST]
     assert len(lost) == pytest.approx(800, abs=4 * (4000 * 0.16) ** 0.5)
     assert all(t.ended_ns == t.offered_ns + MS for t in lost)
 
 
 def test_cameras_lose_independently() -> None:
-    lost = [[t.outcome is Kind.LOST for t in offer_many(link({"loss": {"probability": 0.5}}, camera=c), 2000)]
-            for c in ("cam00", "cam01")]  # fmt: skip
+    links = [link({"loss": {"probability": 0.5}}, camera=camera) for camera in ("cam00", "cam01")]
+    lost = [[t.outcome is EventKind.LOST for t in offer_many(each, 2000)] for each in links]
     assert abs(np.corrcoef(lost)[0, 1]) < 5 / 2000**0.5
 
 
 def test_duplication_is_an_event_beside_the_delivery() -> None:
     subject = link({"duplication": {"probability": 1.0}})
     events = subject.offer(0)[1] + subject.advance(5 * MS)
-    assert [e.kind for e in events] == [Kind.STARTED, Kind.DELIVERED, Kind.DUPLICATED]
+    assert [e.kind for e in events] == [EventKind.STARTED, EventKind.DELIVERED, EventKind.DUPLICATED]
     assert subject.counts == {"delivered": 1, "duplicated": 1}
 
 
@@ -59,12 +59,12 @@ def test_blackout_loses_what_is_on_the_way_during_a_window() -> None:
     subject = link({"blackout": {"windows_ms": [[100, 200]]}}, delay_ms=20)
     fates = {at: subject.offer(at * MS)[0] for at in (0, 79, 100, 150, 190, 220)}
     subject.advance(1000 * MS)
-    lost = [at for at, t in fates.items() if t.outcome is Kind.LOST]
+    lost = [at for at, t in fates.items() if t.outcome is EventKind.LOST]
     assert lost == [100, 150, 190]  # 79 arrives at 99; 100 and later overlap the window; 220 starts after it
     subject = link({"blackout": {"every_ms": 100, "for_ms": 10}}, delay_ms=20)
     fates = {at: subject.offer(at * MS)[0] for at in (0, 69, 95, 160, 185, 350)}
     subject.advance(1000 * MS)
-    assert [at for at, t in fates.items() if t.outcome is Kind.LOST] == [95, 185]
+    assert [at for at, t in fates.items() if t.outcome is EventKind.LOST] == [95, 185]
 
 
 def test_resets_break_what_is_inside_at_their_instants() -> None:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import DISCIPLINES, Event, Kind, Link
+from channel_emu.model.link import DISCIPLINES, Event, EventKind, Link
+from channel_emu.model.nanoseconds import NEVER_NS
 
 MS = 10**6
 
@@ -68,7 +68,7 @@ def test_parallel_frames_overtake() -> None:
 def test_zero_delay_delivers_at_once() -> None:
     subject = Channel(channel_from_mapping({}), 0).link("cam00")
     transit, events = subject.offer(5)
-    assert [e.kind for e in events] == [Kind.STARTED, Kind.DELIVERED]
+    assert [e.kind for e in events] == [EventKind.STARTED, EventKind.DELIVERED]
     assert transit.ended_ns == 5 and subject.in_flight == 0 and subject.next_event_ns == NEVER_NS
 
 
@@ -91,7 +91,7 @@ def test_sampling_takes_the_newest_offered_frame() -> None:
     # Sampled at the first arrival after each offer: one per 120 ms on average, and each within its period.
     assert counts["delivered"] == pytest.approx(4000 * (1 - 2.718281828 ** (-10 / 120)), rel=0.12)
     for t in transits:
-        if t.outcome is Kind.DELIVERED:
+        if t.outcome is EventKind.DELIVERED:
             assert t.started_ns is not None and 0 <= t.started_ns - t.offered_ns <= 10 * MS
 
 
@@ -101,9 +101,9 @@ def test_a_flush_breaks_off_what_is_inside_and_frees_the_line(discipline: str) -
     events = [e for at in (0, 12, 14) for e in subject.offer(at * MS)[1]]
     events += subject.flush(20 * MS)
     events += subject.offer(21 * MS)[1] + subject.advance(100 * MS)
-    ends = Counter(str(e.kind) for e in events if e.kind is not Kind.STARTED)
+    ends = Counter(str(e.kind) for e in events if e.kind is not EventKind.STARTED)
     assert ends["delivered"] == 2 and ends["broken"] >= 1 and sum(ends.values()) == 4
-    assert [e.at_ns for e in events if e.kind is Kind.DELIVERED] == [10 * MS, 71 * MS]
+    assert [e.at_ns for e in events if e.kind is EventKind.DELIVERED] == [10 * MS, 71 * MS]
     assert subject.resets == 0 and subject.in_flight == 0
     assert subject.flush(100 * MS) == []
 
@@ -118,7 +118,7 @@ def test_a_clock_that_runs_backwards_is_held_and_counted() -> None:
     subject = link("drop-new", [10])
     subject.offer(50 * MS)
     transit, _ = subject.offer(20 * MS)
-    assert transit.offered_ns == 50 * MS and transit.outcome is Kind.DROPPED_BUSY
+    assert transit.offered_ns == 50 * MS and transit.outcome is EventKind.DROPPED_BUSY
     assert subject.clock_backwards == 1
     assert subject.advance(10 * MS) == [] and subject.clock_backwards == 2
     assert [e.at_ns for e in subject.advance(60 * MS)] == [60 * MS]
@@ -186,13 +186,15 @@ def tell(story: Story) -> tuple[list, list[Event]]:
 def test_every_frame_ends_exactly_once(story: Story) -> None:
     transits, events = tell(story)
     subject = story.subject
-    ends = Counter(e.transit.number for e in events if e.kind not in (Kind.STARTED, Kind.DUPLICATED))
+    ends = Counter(
+        e.transit.number for e in events if e.kind not in (EventKind.STARTED, EventKind.DUPLICATED)
+    )
     assert max(ends.values(), default=0) <= 1
     assert len(transits) == sum(ends.values()) + subject.in_flight == subject.offered
     assert {t.number for t in subject.pending()} == {t.number for t in transits} - set(ends)
     by_kind = Counter(e.kind for e in events)
-    by_kind.pop(Kind.STARTED, None)
-    assert by_kind == Counter({Kind(k): n for k, n in subject.counts.items() if n})
+    by_kind.pop(EventKind.STARTED, None)
+    assert by_kind == Counter({EventKind(k): n for k, n in subject.counts.items() if n})
     for t in transits:
         assert (t.outcome is None) == (t.number not in ends)
 
@@ -205,7 +207,7 @@ def test_time_runs_forwards(story: Story) -> None:
     for t in transits:
         if t.started_ns is not None:
             assert t.due_ns is not None and t.offered_ns <= t.started_ns <= t.due_ns
-        if t.outcome in (Kind.DELIVERED, Kind.LOST):
+        if t.outcome in (EventKind.DELIVERED, EventKind.LOST):
             assert t.ended_ns == t.due_ns
         elif t.outcome is not None:
             assert t.ended_ns is not None and t.ended_ns >= t.offered_ns
@@ -219,21 +221,21 @@ def test_what_each_discipline_promises(story: Story) -> None:
     delivered = []
     started: set[int] = set()
     for e in events:
-        if e.kind is Kind.STARTED:
+        if e.kind is EventKind.STARTED:
             started.add(e.transit.number)
             inside += 1
             most = max(most, inside)
-        elif e.kind is not Kind.DUPLICATED and e.transit.number in started:
+        elif e.kind is not EventKind.DUPLICATED and e.transit.number in started:
             inside -= 1
-        if e.kind is Kind.DELIVERED:
+        if e.kind is EventKind.DELIVERED:
             delivered.append(e.transit.number)
     assert most <= (story.subject.queue_limit if discipline == "parallel" else 1)
     if discipline != "parallel":
         assert delivered == sorted(delivered)
     if discipline in ("newest-waits", "lcfs-preempt"):
-        assert story.subject.counts[Kind.DROPPED_BUSY] == 0
+        assert story.subject.counts[EventKind.DROPPED_BUSY] == 0
     if discipline == "drop-new":
-        assert story.subject.counts[Kind.SUPERSEDED] == 0
+        assert story.subject.counts[EventKind.SUPERSEDED] == 0
 
 
 @settings(max_examples=50, deadline=None)

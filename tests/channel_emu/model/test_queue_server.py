@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.link import DISCIPLINES, Event, Kind, Link
+from channel_emu.model.link import DISCIPLINES, Event, EventKind, Link
+from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import ORDERS
 from channel_emu.virtual.simulate import OUTCOMES, simulate
 from tests.channel_emu.virtual.test_simulate import same
@@ -34,7 +34,7 @@ def play(links: dict[str, Link], offers: list[tuple[str, float]], until_ms: floa
     def note(camera: str, events: list[Event]) -> None:
         for e in events:  # at one instant what ends comes before what starts in its place
             line = f"{camera}{e.transit.number} {e.kind} {e.at_ns / MS:g}"
-            told.append((e.at_ns, e.kind is Kind.STARTED, line))
+            told.append((e.at_ns, e.kind is EventKind.STARTED, line))
 
     for camera, at_ms in offers:
         note(camera, links[camera].offer(round(at_ms * MS))[1])
@@ -99,9 +99,9 @@ def test_what_others_cause_is_told_at_once() -> None:
     links = shared("newest-waits", [10, 7])
     links["a"].offer(0)
     assert links["b"].offer(2 * MS)[1] == [] and links["b"].next_event_ns == NEVER_NS
-    assert [e.kind for e in links["a"].advance(12 * MS)] == [Kind.DELIVERED]
+    assert [e.kind for e in links["a"].advance(12 * MS)] == [EventKind.DELIVERED]
     assert links["b"].next_event_ns == 10 * MS  # in the past: there is news
-    assert [(e.kind, e.at_ns) for e in links["b"].advance(12 * MS)] == [(Kind.STARTED, 10 * MS)]
+    assert [(e.kind, e.at_ns) for e in links["b"].advance(12 * MS)] == [(EventKind.STARTED, 10 * MS)]
     assert links["b"].next_event_ns == 20 * MS
     # One clock for all: c cannot offer before what was decided already.
     assert links["c"].offer(5 * MS)[0].offered_ns == 12 * MS and links["c"].clock_backwards == 1
@@ -109,8 +109,8 @@ def test_what_others_cause_is_told_at_once() -> None:
 
 def test_a_reset_breaks_one_camera_and_frees_the_line() -> None:
     links = shared("fcfs", [50], faults={"reset": {"mean_interval_ms": 1e9}})
-    links["a"]._reset_ns = 20 * MS  # at an instant of our choice
-    links["a"]._reckon()
+    links["a"]._next_reset_ns = 20 * MS  # at an instant of our choice
+    links["a"]._update_next_event()
     lines = play(links, [("a", 0), ("b", 1), ("a", 2)])
     assert lines == ["a0 started 0", "a0 broken 20", "a1 broken 20", "b0 started 20", "b0 delivered 70"]
     assert links["a"].resets == 1 and links["b"].resets == 0
@@ -199,10 +199,10 @@ def test_every_frame_ends_once_and_looking_changes_nothing(
                 transits.append(transit)
             else:
                 events = links[extra[i][0]].advance(at_ms * MS)
-            ends.update(id(e.transit) for e in events if e.kind is not Kind.STARTED)
+            ends.update(id(e.transit) for e in events if e.kind is not EventKind.STARTED)
         for link in links.values():
             events = link.advance(2000 * MS)
-            ends.update(id(e.transit) for e in events if e.kind is not Kind.STARTED)
+            ends.update(id(e.transit) for e in events if e.kind is not EventKind.STARTED)
         assert max(ends.values(), default=0) <= 1
         assert len(transits) == len(ends) + sum(link.in_flight for link in links.values())
         server = links["a"].server

@@ -9,7 +9,7 @@ from channel_emu.live.replay_link import ReplayLink
 from channel_emu.model import trace
 from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
-from channel_emu.model.link import Event, Kind
+from channel_emu.model.link import Event, EventKind
 from channel_emu.model.trace import TraceError, TraceWriter
 from channel_emu.virtual.replay import compare
 
@@ -29,9 +29,9 @@ def record(path: Path, config: ChannelConfig, seed: int = 3, frames: int = 400) 
         for n in range(frames):
             events += link.offer((33 * n + phase) * MS, n, 1000 + n)[1]
         events += link.advance(33 * frames * MS)
-        doubled = {e.transit.number for e in events if e.kind is Kind.DUPLICATED}
+        doubled = {e.transit.number for e in events if e.kind is EventKind.DUPLICATED}
         for e in events:
-            if e.kind not in (Kind.STARTED, Kind.DUPLICATED):
+            if e.kind not in (EventKind.STARTED, EventKind.DUPLICATED):
                 writer.write(camera, "s1", e.transit.item, e.transit, None, e.transit.number in doubled)
         for transit in link.pending():
             writer.write(camera, "s1", transit.item, transit)
@@ -48,7 +48,7 @@ def test_a_recorded_trace_is_decided_again_exactly(tmp_path: Path, preset: str) 
     assert found.seed == 3 and dataclasses.replace(found.config, preset=preset) == config
     assert {c: len(r) for c, r in found.by_camera().items()} == {"a": 400, "b": 400}
     assert sum(r.outcome == "delivered" for r in found.by_camera()["a"]) == sum(
-        e.kind is Kind.DELIVERED for e in told["a"]
+        e.kind is EventKind.DELIVERED for e in told["a"]
     )
     assert compare(found) == {"frames": 800, "equal": 800, "different": []}
     # It would notice: another seed decides otherwise.

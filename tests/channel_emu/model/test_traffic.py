@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from channel_emu.model.chain import Chain, two_state_generator
-from channel_emu.model.counter_rng import Uniforms
-from channel_emu.model.instants import NEVER_NS
-from channel_emu.model.service_time import Service, deterministic, exponential, gamma, lognormal, recorded
-from channel_emu.model.traffic import PoissonArrivals, spend
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.nanoseconds import NEVER_NS
+from channel_emu.model.service_time import ServiceTime, deterministic, exponential, gamma, lognormal, replayed
+from channel_emu.model.traffic import PoissonArrivals, completion_ns
 
 
 def chain(mu1: float, mu2: float, seed: int = 0, initial: int | None = None) -> Chain:
-    return Chain(two_state_generator(mu1, mu2), Uniforms(seed, "", "channel.chain"), initial)
+    return Chain(two_state_generator(mu1, mu2), CounterRng(seed, "", "channel.chain"), initial)
 
 
 def test_mmpp_counts_have_the_mean_and_variance_of_theory() -> None:
@@ -22,11 +22,11 @@ def test_mmpp_counts_have_the_mean_and_variance_of_theory() -> None:
     mu1, mu2, rates, window = 1 / 300, 1 / 150, np.array([1 / 120, 1 / 10]), 200.0
     horizon_ms = 40_000_000
     path = chain(mu1, mu2, seed=3)
-    key = np.array(Uniforms(3, "", "channel.chain").key, np.uint64)
+    key = np.array(CounterRng(3, "", "channel.chain").key, np.uint64)
     starts, states = kernel.chain_path(
-        path.pace, path.jumps, path.slot_ns, key, path.initial, horizon_ms * 10**6
+        path.sojourn_rate, path.jumps, path.slot_ns, key, path.initial, horizon_ms * 10**6
     )
-    arrivals_key = np.array(Uniforms(3, "cam00", "channel.arrivals").key, np.uint64)
+    arrivals_key = np.array(CounterRng(3, "cam00", "channel.arrivals").key, np.uint64)
     found = kernel.poisson_arrivals(rates / 1e6, starts, states, arrivals_key, horizon_ms * 10**6)
     counts = np.bincount(found // round(window * 1e6), minlength=int(horizon_ms / window))
     r, p1, p2 = mu1 + mu2, mu2 / (mu1 + mu2), mu1 / (mu1 + mu2)
@@ -41,15 +41,15 @@ def test_mmpp_counts_have_the_mean_and_variance_of_theory() -> None:
 def test_python_arrivals_are_the_kernels() -> None:
     kernel = pytest.importorskip("channel_emu.virtual.kernels.chain_path")
     path = chain(1 / 30, 1 / 50, seed=6)
-    uniforms = Uniforms(6, "cam00", "channel.arrivals")
-    arrivals = PoissonArrivals([1 / 120, 1 / 30], path, uniforms)
+    rng = CounterRng(6, "cam00", "channel.arrivals")
+    arrivals = PoissonArrivals([1 / 120, 1 / 30], path, rng)
     found, at_ns = [], 0
     while (at_ns := arrivals.next_ns(at_ns, len(found))) <= 10**11:
         found.append(at_ns)
     pairs = path.recent(0, 2 * 10**11)
     starts = np.array([p[0] for p in pairs] + [NEVER_NS])
     states = np.array([p[1] for p in pairs])
-    key = np.array(uniforms.key, np.uint64)
+    key = np.array(rng.key, np.uint64)
     same = kernel.poisson_arrivals(np.array([1 / 120, 1 / 30]) / 1e6, starts, states, key, 10**11)
     assert same.tolist() == found
 
@@ -59,22 +59,22 @@ def test_spending_follows_the_state() -> None:
     path = chain(1.0, 0.0, seed=1, initial=0)
     ((_, until),) = [path.segment(0)]
     at_ms = until / 1e6
-    assert spend(at_ms / 2, [1e-6, 2e-6], path, 0) == pytest.approx(until / 2, abs=1)
-    assert spend(at_ms + 3.0, [1e-6, 2e-6], path, 0) == pytest.approx(until + 1.5e6, abs=1)
-    assert spend(at_ms + 3.0, [1e-6, 0.0], path, 0) == NEVER_NS
+    assert completion_ns(at_ms / 2, [1e-6, 2e-6], path, 0) == pytest.approx(until / 2, abs=1)
+    assert completion_ns(at_ms + 3.0, [1e-6, 2e-6], path, 0) == pytest.approx(until + 1.5e6, abs=1)
+    assert completion_ns(at_ms + 3.0, [1e-6, 0.0], path, 0) == NEVER_NS
 
 
 @pytest.mark.parametrize(
     ("shape", "mean", "cv"),
     [
-        (exponential(Uniforms(2, "c", "s")), 1.0, 1.0),
+        (exponential(CounterRng(2, "c", "s")), 1.0, 1.0),
         (deterministic(), 1.0, 0.0),
-        (gamma(Uniforms(2, "c", "s"), 4.0), 1.0, 0.5),
-        (gamma(Uniforms(2, "c", "s"), 0.5), 1.0, 2**0.5),
-        (lognormal(Uniforms(2, "c", "s"), 0.5), 1.0, math.sqrt(math.exp(0.25) - 1)),
-        (recorded([1.0, 2.0, 6.0]), 3.0, math.sqrt(14 / 3) / 3),
+        (gamma(CounterRng(2, "c", "s"), 4.0), 1.0, 0.5),
+        (gamma(CounterRng(2, "c", "s"), 0.5), 1.0, 2**0.5),
+        (lognormal(CounterRng(2, "c", "s"), 0.5), 1.0, math.sqrt(math.exp(0.25) - 1)),
+        (replayed([1.0, 2.0, 6.0]), 3.0, math.sqrt(14 / 3) / 3),
     ],
-    ids=["exponential", "deterministic", "gamma 4", "gamma 0.5", "lognormal", "recorded"],
+    ids=["exponential", "deterministic", "gamma 4", "gamma 0.5", "lognormal", "replayed"],
 )
 def test_delay_laws_have_their_moments(shape, mean: float, cv: float) -> None:
     draws = np.array([shape(n) for n in range(10_000)])
@@ -87,8 +87,8 @@ def test_delay_laws_have_their_moments(shape, mean: float, cv: float) -> None:
 def test_delay_laws_have_their_shape(law: str, parameter: float) -> None:
     """Kolmogorov and Smirnov against scipy's distributions: a wrong shape of right moments would fail."""
     stats = pytest.importorskip("scipy.stats")
-    uniforms = Uniforms(5, "c", "s")
-    shape = gamma(uniforms, parameter) if law == "gamma" else lognormal(uniforms, parameter)
+    rng = CounterRng(5, "c", "s")
+    shape = gamma(rng, parameter) if law == "gamma" else lognormal(rng, parameter)
     exact = (
         stats.gamma(parameter, scale=1 / parameter)
         if law == "gamma"
@@ -100,9 +100,9 @@ def test_delay_laws_have_their_shape(law: str, parameter: float) -> None:
 def test_service_at_start_keeps_the_delay_of_the_state_it_started_in() -> None:
     path = chain(1.0, 1e-6, initial=0)
     switch = path.segment(0)[1]
-    service = Service(deterministic(), [10.0, 1000.0], path)
+    service = ServiceTime(deterministic(), [10.0, 1000.0], path)
     assert service.due_ns(0, 0) == (10 * 10**6, 0)
     assert service.due_ns(switch, 1) == (switch + 1000 * 10**6, 1)
-    modulated = Service(deterministic(), [10.0, 1000.0], path, modulated=True)
+    modulated = ServiceTime(deterministic(), [10.0, 1000.0], path, modulated=True)
     left = 1.0 - switch / 10e6  # of the work, after the first state's share
     assert modulated.due_ns(0, 0)[0] == pytest.approx(switch + left * 1000e6, abs=2)

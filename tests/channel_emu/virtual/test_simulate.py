@@ -7,8 +7,10 @@ import pytest
 
 from channel_emu.model import ages
 from channel_emu.model.config import channel_from_mapping
-from channel_emu.model.link import DISCIPLINES, Kind
-from channel_emu.virtual.simulate import OUTCOMES, LinkRun, SimulationError, replay_offers, simulate
+from channel_emu.model.link import DISCIPLINES
+from channel_emu.virtual.link_run import OUTCOMES, LinkRun
+from channel_emu.virtual.replay import replay_offers
+from channel_emu.virtual.simulate import SimulationError, simulate
 from edge_server.live.buffer import FrameBuffer
 from tests.channel_emu.live.emulator import frame_of
 
@@ -97,17 +99,13 @@ def test_known_figures_of_the_presets() -> None:
     assert age(**chain, service_state="modulated") == pytest.approx(84.0, abs=0.7)
 
 
-def test_replaying_offers_gives_the_fates_of_the_simulation() -> None:
+def test_replayed_offers_are_decided_as_in_the_simulation() -> None:
     config = channel_from_mapping({"preset": "ch6", "faults": {"loss": {"probability": 0.2}}})
     run = simulate(config, ["x"], 30, 9, engine="python", frame_period_ms=33.3).runs[0]
-    kinds: list[str] = []
-    fates = replay_offers(
-        config, 9, {"x": [(int(t), 20_000) for t in run.offered_ns]}, run.end_ns,
-        lambda link, event: kinds.append(event.kind),
-    )["x"]  # fmt: skip
-    assert [OUTCOMES.index(t.outcome or "in_flight") for t in fates] == run.outcome.tolist()
-    assert [t.due_ns or -1 for t in fates] == run.due_ns.tolist()
-    assert kinds.count(Kind.DELIVERED) == run.count("delivered")
+    offers = {"x": [(int(t), 20_000) for t in run.offered_ns]}
+    transits = replay_offers(config, 9, offers, run.end_ns)["x"]
+    assert [OUTCOMES.index(t.outcome or "in_flight") for t in transits] == run.outcome.tolist()
+    assert [t.due_ns or -1 for t in transits] == run.due_ns.tolist()
 
 
 @pytest.mark.parametrize(
@@ -158,7 +156,7 @@ def test_omega_is_what_a_buffer_would_hold(discipline: str) -> None:
 
 
 def test_ages_by_hand() -> None:
-    """Generated at 0, 10, 20 ms; arriving at 5, 40, 30: the middle one comes too late to matter."""
+    """Generated at 0, 10, 20 ms; delivered at 5, 40, 30: the second comes too late to matter."""
     saw = ages.sawtooth(np.array([5, 40, 30]) * 10**6, np.array([0, 10, 20]) * 10**6, 50 * 10**6)
     assert saw.delivered_ns.tolist() == [5 * 10**6, 30 * 10**6]
     # Teeth: 5 -> 30 over 25 ms, then 10 -> 30 over 20 ms.
@@ -166,15 +164,15 @@ def test_ages_by_hand() -> None:
     assert ages.peak_age_ms(saw) == pytest.approx(30)
     # At 5, 10, ..., 25: 5 10 15 20 25; at 30, ..., 45: 10 15 20 25.
     assert ages.mean_age_slotted_ms(saw, 5.0) == pytest.approx((75 + 70) / 9)
-    at = ages.ages_at(saw, np.array([0, 5, 29, 30, 50]) * 10**6)
-    np.testing.assert_allclose(at, [np.nan, 5, 29, 10, 30])
+    at = ages.newest_at(saw, np.array([0, 5, 29, 30, 50]) * 10**6)
+    assert at.tolist() == [-1, 0, 0, 20 * 10**6, 20 * 10**6]
 
 
 def test_no_delivery_has_no_age() -> None:
     nothing = ages.sawtooth(np.zeros(0, np.int64), np.zeros(0, np.int64), 10**9)
     assert ages.mean_age_ms(nothing) is None and ages.peak_age_ms(nothing) is None
     assert ages.mean_age_slotted_ms(nothing) is None
-    assert np.isnan(ages.ages_at(nothing, np.array([5]))).all()
+    assert ages.newest_at(nothing, np.array([5])).tolist() == [-1]
 
 
 def test_without_numba_the_links_themselves_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,56 @@
+"""What an engine returns for one camera, and what both engines derive from a configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from channel_emu.model import ages
+from channel_emu.model.config import ChannelConfig
+from channel_emu.model.link import EventKind
+
+OUTCOMES = (
+    "in_flight",
+    *map(str, (EventKind.DELIVERED, EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED,
+               EventKind.LOST, EventKind.BROKEN)),
+)  # fmt: skip
+OUTCOME_CODES = {name: code for code, name in enumerate(OUTCOMES)}
+DEFAULT_FRAME_PERIOD_MS = 1000 / 30
+
+
+@dataclass(frozen=True)
+class LinkRun:
+    """One camera's frames: instants int64 ns (n,), -1 where there is none; outcome: index into OUTCOMES."""
+
+    camera: str
+    offered_ns: NDArray[np.int64]
+    outcome: NDArray[np.int8]
+    started_ns: NDArray[np.int64]
+    due_ns: NDArray[np.int64]
+    end_ns: int
+    state_share: list[float]
+    duplicated: int = 0
+
+    def count(self, outcome: str) -> int:
+        return int((self.outcome == OUTCOME_CODES[outcome]).sum())
+
+    def sawtooth(self) -> ages.Sawtooth:
+        """Ages run from capture, which in virtual time is the offer."""
+        delivered = self.outcome == OUTCOME_CODES["delivered"]
+        return ages.sawtooth(self.due_ns[delivered], self.offered_ns[delivered], self.end_ns)
+
+    def delays_ms(self) -> NDArray[np.float64]:
+        """The drawn delay of every frame whose transmission ended within the run."""
+        done = (self.started_ns >= 0) & (self.due_ns <= self.end_ns)
+        return (self.due_ns - self.started_ns)[done] / 1e6
+
+
+def name_ranks(names: list[str]) -> list[int]:
+    """Each camera's place in the order of names, which decides between frames of one instant."""
+    return [sorted(names).index(name) for name in names]
+
+
+def camera_period_ms(config: ChannelConfig, frame_period_ms: float | None) -> float:
+    return frame_period_ms or config.arrivals.period_ms or DEFAULT_FRAME_PERIOD_MS
