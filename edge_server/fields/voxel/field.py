@@ -298,7 +298,7 @@ class VoxelField:
     def _one_step(self, data: Views, decay: float, diffuse_by: float) -> float:
         """One optimizer step; returns its mean squared error.
 
-        decay: share of the full rates. diffuse_by: share of the way to its neighbors' mean that a vertex moves
+        decay: share of the full rates. diffuse_by: share of the way to its neighbors' mean that it moves
         in ``DIFFUSE_PHASES`` steps at full rates.
         """
         self._grow(self.step)
