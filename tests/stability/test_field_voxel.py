@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields.voxel.field import VoxelField
-from edge_server.fields.voxel.kernels.update import DENSEST
+from edge_server.fields.voxel.kernels.update import MAX_DENSITY
 from tests.edge_server.fields.bounds import run_with_bounds_checks
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.voxel.small import TINY
@@ -23,7 +23,7 @@ def _poison_table(field: VoxelField) -> None:
 
 
 def _poison_moments(field: VoxelField) -> None:
-    field._v[::3] = np.nan
+    field._second_moment[::3] = np.nan
 
 
 def _poison_gradient(field: VoxelField) -> None:
@@ -36,7 +36,7 @@ def _overflow(field: VoxelField) -> None:
 
 
 def _saturate(field: VoxelField) -> None:
-    field._voxels.table[:] = DENSEST
+    field._voxels.table[:] = MAX_DENSITY
 
 
 @pytest.mark.parametrize("damage", [_poison_table, _poison_moments, _poison_gradient])

@@ -1,9 +1,9 @@
-"""What a field learns of each camera's look: a few numbers that colours may depend on, density never.
+"""Appearance embeddings: a few numbers learned for each camera, on which colors depend and density does not.
 
 Nerfacto's appearance embedding (Tancik et al. 2023; from NeRF in the Wild, Martin-Brualla et al. 2021),
-with two differences. The network gives colour's dependence on the numbers directly (``add_looks``) instead
-of taking them as input, since density and colour are one network here. And the mean over cameras is kept
-at 0, so that rendering with the mean embedding is rendering without any, and costs nothing.
+with two differences. The network outputs the derivative of color by the numbers (``add_appearance``) instead
+of taking them as input, since one network gives density and color here. And the mean over cameras is kept at
+0, so that rendering at the mean embedding costs nothing.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from edge_server.fields.common.training_schedule import BETA1, BETA2
 
 Array = NDArray[np.float64]
 
-_FIRST = 0.3  # standard deviation of first values: at 0 the network could not learn what to do with them
+_FIRST = 0.3  # standard deviation of first values: from 0 the network would get no gradient
 _RATE = 2e-2
 _EPSILON = 1e-4
 _LIMIT = 3.0  # bound of every number
 
 
-class Appearances:
-    """Embeddings by camera, learnt by Adam. size: numbers a camera."""
+class AppearanceEmbeddings:
+    """Embeddings by camera, trained by Adam. size: numbers a camera."""
 
     def __init__(self, size: int, seed: int) -> None:
         self.size, self.seed = size, seed
@@ -39,14 +39,14 @@ class Appearances:
         self.steps = 0
 
     def rows(self, cameras: Sequence[str]) -> NDArray[np.float32]:
-        """float32 (V, size) for the kernels. First values depend on the camera's name only, and the seed."""
+        """Embeddings of cameras, float32 (V, size). First values depend on the seed and the name only."""
         fresh = [name for name in cameras if name not in self.known]
         for name in fresh:
             rng = np.random.default_rng(np.random.SeedSequence([self.seed, zlib.crc32(name.encode())]))
             value = rng.normal(0.0, _FIRST, self.size)
             self.known[name] = np.stack([value, np.zeros(self.size), np.zeros(self.size)])
         if fresh:
-            self._centre()
+            self._center_mean()
         return np.array([self.known[name][0] for name in cameras], dtype=np.float32)
 
     def learn(self, cameras: Sequence[str], gradient: NDArray[np.float32], rays: int) -> None:
@@ -62,59 +62,59 @@ class Appearances:
             root = np.sqrt(v / (1.0 - BETA2**self.steps)) + _EPSILON
             value = value - _RATE * m / (1.0 - BETA1**self.steps) / root
             self.known[name] = np.stack([np.clip(value, -_LIMIT, _LIMIT), m, v])
-        self._centre()
+        self._center_mean()
 
-    def _centre(self) -> None:
+    def _center_mean(self) -> None:
         mean = np.mean([known[0] for known in self.known.values()], axis=0)
         for known in self.known.values():
             known[0] -= mean
 
 
-class CameraLooks(CameraRefinement):
-    """What one field knows of its cameras: errors (``refinement``) and, where asked for, appearances.
+class CameraAppearance(CameraRefinement):
+    """A field's camera corrections (``CameraRefinement``) and, if enabled, appearance embeddings.
 
-    now: float32 (V, A), the embeddings of the views in training. gradient: float32 (chunks, V, A), filled
-    by each step. rays: of that step.
+    embeddings: float32 (V, A), of the views in training. gradient: float32 (chunks, V, A), of the last step.
+    rays: of that step.
     """
 
     def __init__(self, exposure: bool, most_m: float, most_deg: float, size: int, seed: int) -> None:
         super().__init__(exposure, most_m, most_deg)
-        self.appearances = Appearances(size, seed) if size else None
-        self.now = np.zeros((0, 0), np.float32)
+        self.appearances = AppearanceEmbeddings(size, seed) if size else None
+        self.embeddings = np.zeros((0, 0), np.float32)
         self.gradient, self.rays = np.zeros((0, 0, 0), np.float32), 0
 
     @property
     def enabled(self) -> bool:
-        """Whether any error or look is to be learnt."""
+        """Whether corrections or appearances are learned."""
         return super().enabled or self.appearances is not None
 
     def corrected(self, views: Sequence[View], data: Views, box: SceneBox) -> Views:
-        """``data`` as it is to be read with what is known by now; takes note of the embeddings."""
+        """``data`` with the current corrections; also updates ``embeddings``."""
         if self.appearances is not None:
-            self.now = self.appearances.rows([v.camera for v in views])
+            self.embeddings = self.appearances.rows([v.camera for v in views])
         else:
-            self.now = np.zeros((len(views), 0), np.float32)
+            self.embeddings = np.zeros((len(views), 0), np.float32)
         return super().corrected(views, data, box)
 
     def learn(
         self, views: Sequence[View], data: Views, box: SceneBox, step: int, seed: int,
         sums: NDArray[np.float64], make_renderer: Callable[[], RaySnapshot],
     ) -> Views:  # fmt: skip
-        """After ``step``: learn from it; returns the corrected data."""
+        """Update from the gradients of ``step``; returns the corrected data."""
         if self.appearances is not None:
             cameras = [v.camera for v in views]
             self.appearances.learn(cameras, self.gradient, self.rays)
-            self.now = self.appearances.rows(cameras)
+            self.embeddings = self.appearances.rows(cameras)
         return super().learn(views, data, box, step, seed, sums, make_renderer)
 
     def meta(self) -> dict[str, Any]:
-        """What a state keeps, ready for JSON, to the last bit."""
+        """Everything a state keeps, exactly, as JSON types."""
         own = self.appearances
         known = {name: k.tolist() for name, k in own.known.items()} if own else {}
         return {**super().meta(), "appearances": known, "appearance_steps": own.steps if own else 0}
 
     def load(self, meta: dict[str, Any]) -> None:
-        """Undo ``meta``."""
+        """Restore what ``meta`` returned."""
         super().load(meta)
         if self.appearances is not None:
             known = meta.get("appearances", {})

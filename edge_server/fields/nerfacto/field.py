@@ -1,6 +1,6 @@
-"""Nerfacto for CPUs (Tancik et al. 2023): the hash grid of ``ngp``, sampled where a learnt proposal says.
+"""Nerfacto for CPUs (Tancik et al. 2023): the hash grid of ``ngp``, with samples from a learned proposal.
 
-``trained_field`` does everything; here is what is particular: samples from a proposal instead of a raster
+``trained_field`` does the common part. This file adds samples from a proposal instead of a raster
 (``kernels.proposal``), appearance embeddings (``appearance``), and rendering from the proposal.
 """
 
@@ -24,10 +24,10 @@ from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.trained_field import TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
-from edge_server.fields.nerfacto.appearance import CameraLooks
-from edge_server.fields.nerfacto.kernels.proposal import Plan, Proposed, scatter_proposal
-from edge_server.fields.nerfacto.kernels.render import ROOM, render_proposed
-from edge_server.fields.nerfacto.kernels.train import Bins, BinScratch, train_proposed
+from edge_server.fields.nerfacto.appearance import CameraAppearance
+from edge_server.fields.nerfacto.kernels.proposal import ProposalGrid, ProposalSampling, scatter_proposal
+from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, render_with_proposal
+from edge_server.fields.nerfacto.kernels.train import ProposalGradients, ProposalScratch, train_with_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings, make_settings
 from freshfield.geometry import Pinhole
 
@@ -36,7 +36,7 @@ from freshfield.geometry import Pinhole
 class NerfactoSnapshot(RaySnapshot):
     """A snapshot that is rendered with samples from its proposal, at the mean appearance."""
 
-    plan: Plan
+    sampling: ProposalSampling
 
     def render_pixels(
         self,
@@ -45,28 +45,28 @@ class NerfactoSnapshot(RaySnapshot):
         pixels: NDArray[np.float64],
         max_samples: int | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Colour (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
+        """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
         pose = np.asarray(camera_to_world, dtype=np.float64)
         n, workers = len(pixels), self.pool.threads
         color, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
         opacity = np.empty(n, np.float32)
-        samples = min(self.plan.samples, max_samples or self.plan.samples)
+        samples = min(self.sampling.samples, max_samples or self.sampling.samples)
         self.pool.run(
-            render_proposed,
+            render_with_proposal,
             np.array(lens_row(intrinsics), dtype=np.float64),
             np.ascontiguousarray(pose[:3, :3]),
             self.box.normalise(pose[:3, 3]),
             np.ascontiguousarray(pixels, dtype=np.float64),
-            self.plan._replace(samples=samples),
+            self.sampling._replace(samples=samples),
             self.space,
             self.encoding,
             self.levels,
             self.net,
             self.harmonics,
             self.background,
-            np.empty((workers, int(self.net.widths.sum()), ROOM), np.float32),
-            np.empty((workers, 3, ROOM), np.float32),
-            np.empty((workers, 3, ROOM), np.float32),
+            np.empty((workers, int(self.net.widths.sum()), SAMPLE_BATCH), np.float32),
+            np.empty((workers, 3, SAMPLE_BATCH), np.float32),
+            np.empty((workers, 3, SAMPLE_BATCH), np.float32),
             color,
             depth,
             opacity,
@@ -84,19 +84,19 @@ class NerfactoField(TrainedField):
         "harmonics", "cells", "proposal_cells", "appearance",
     )  # fmt: skip
     settings: NerfactoSettings
-    _cameras: CameraLooks
+    _cameras: CameraAppearance
 
     def __init__(self, settings: NerfactoSettings | None = None, pool: Pool | None = None) -> None:
         super().__init__(settings or NerfactoSettings(), pool)
 
-    def _make(self, rng: np.random.Generator) -> tuple[Proposed, Net]:
+    def _make(self, rng: np.random.Generator) -> tuple[ProposalGrid, Net]:
         s = self.settings
         grid = make_grid(s, self.view_store.box, rng)
         per_segment = SEGMENT * FEATURES
         rows = -(-(s.proposal_cells**3) // per_segment) * SEGMENT
         table = np.concatenate([grid.table, np.zeros((rows, FEATURES), np.float32)])
         net = init_net(FEATURES * s.levels, s, rng, s.appearance)
-        return Proposed(grid.resolution, grid.first, grid.dense, table, s.proposal_cells), net
+        return ProposalGrid(grid.resolution, grid.first, grid.dense, table, s.proposal_cells), net
 
     def _tiny(self) -> NerfactoSettings:
         return replace(self.settings, **TINY, log2_table=10, proposal_cells=8)
@@ -107,15 +107,15 @@ class NerfactoField(TrainedField):
     def _forget_parameters(self) -> None:
         super()._forget_parameters()
         s, chunks, workers = self.settings, len(self._batch.samples), self.pool.threads
-        self._cameras = CameraLooks(s.exposure, s.refine_m, s.refine_deg, s.appearance, s.seed)
+        self._cameras = CameraAppearance(s.exposure, s.refine_m, s.refine_deg, s.appearance, s.seed)
         most = CHUNK_RAYS * s.bins
-        self._bins = Bins(
+        self._proposal_gradients = ProposalGradients(
             cell=np.zeros((chunks, most), np.int32),
             grad=np.zeros((chunks, most), np.float32),
             counts=np.zeros(chunks, np.int64),
-            looks=np.zeros((chunks, 0, s.appearance), np.float32),
+            d_embeddings=np.zeros((chunks, 0, s.appearance), np.float32),
         )
-        self._bin_scratch = BinScratch(
+        self._proposal_scratch = ProposalScratch(
             line=np.zeros((workers, 4, CHUNK), np.float32),
             depth=np.zeros((workers, most), np.float32),
             weight=np.zeros((workers, most), np.float32),
@@ -123,34 +123,34 @@ class NerfactoField(TrainedField):
             first=np.zeros((workers, CHUNK_RAYS + 1), np.int64),
         )
 
-    def _plan(self) -> Plan:
-        """How rays are sampled at this step."""
+    def _sampling(self) -> ProposalSampling:
+        """Settings of the sampling at this step."""
         s = self.settings
         ramp = min(self.step / s.samples_ramp, 1.0) if s.samples_ramp else 1.0
         fresh = max(1.0 - self.step / s.anneal, 0.0) if s.anneal else 0.0
         even = s.even + (1.0 - s.even) * fresh if s.interlevel > 0 else 1.0
-        return Plan(
+        return ProposalSampling(
             bins=s.bins,
             samples=round(s.samples_start + ramp * (s.samples - s.samples_start)),
-            even=np.float32(even),
+            uniform_share=np.float32(even),
             interlevel=np.float32(s.interlevel),
             decay=np.float32(s.proposal_decay),
         )
 
     def _train(self, data: Views, recipe: RaySampling, space: Space, weights: Weights) -> None:
-        cameras, bins = self._cameras, self._bins
-        if bins.looks.shape[1:] != cameras.now.shape:
-            bins = self._bins = bins._replace(
-                looks=np.zeros((len(bins.counts), *cameras.now.shape), np.float32)
+        cameras, bins = self._cameras, self._proposal_gradients
+        if bins.d_embeddings.shape[1:] != cameras.embeddings.shape:
+            bins = self._proposal_gradients = bins._replace(
+                d_embeddings=np.zeros((len(bins.counts), *cameras.embeddings.shape), np.float32)
             )
         self.pool.run(
-            train_proposed, data, recipe, self._plan(), space, self._encoding, self._net, cameras.now,
-            weights, self._batch, bins, self._scratch, self._bin_scratch,
+            train_with_proposal, data, recipe, self._sampling(), space, self._encoding, self._net,
+            cameras.embeddings, weights, self._batch, bins, self._scratch, self._proposal_scratch,
         )  # fmt: skip
-        cameras.gradient, cameras.rays = bins.looks, int(self._batch.rays.sum())
+        cameras.gradient, cameras.rays = bins.d_embeddings, int(self._batch.rays.sum())
 
     def _gather(self, levels: int, scale: float) -> None:
-        batch, bins, e = self._batch, self._bins, self._encoding
+        batch, bins, e = self._batch, self._proposal_gradients, self._encoding
         grid = Grid(e.resolution, e.first, e.dense, e.table)
         self.pool.run(
             scatter, grid, levels, batch.x, batch.d_features, batch.columns, self._table_g, self._dirty
@@ -162,11 +162,11 @@ class NerfactoField(TrainedField):
     def _live(self) -> NerfactoSnapshot:
         live = super()._live()
         known = {f.name: getattr(live, f.name) for f in fields(live)}
-        return NerfactoSnapshot(**known, plan=self._plan())
+        return NerfactoSnapshot(**known, sampling=self._sampling())
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``nerfacto_settings``). ValueError where CUDA is asked for."""
+    """A field from plain options (``nerfacto.settings``). ValueError where CUDA is asked for."""
     settings = make_settings(options, seed)
     if settings.device == "cuda":
         raise ValueError("nerfacto: runs on CPUs only; use device cpu or auto, or the field ngp")

@@ -1,4 +1,4 @@
-"""Settings of the proposal-sampled field: one dataclass whose texts become help and error messages."""
+"""Settings of the proposal-sampled field; their texts become help and error messages."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from edge_server.fields.common.trainer_settings import HashGridSettings, help_of
 
 @dataclass(frozen=True)
 class NerfactoSettings(HashGridSettings):
-    """What can be chosen about a ``NerfactoField``. Lengths in metres; None: found from the cameras."""
+    """What can be chosen about a ``NerfactoField``. Lengths in meters; None: found from the cameras."""
 
     name = "nerfacto"
 
     rate_net: float = option(2e-2, "learning rate of the network at the start of a fit")
-    samples: int = option(24, "samples of a ray, drawn where the proposal says")
-    samples_start: int = option(24, "the same at first")
+    samples: int = option(24, "samples of a ray, placed by the proposal")
+    samples_start: int = option(24, "samples of a ray at first")
     samples_ramp: int = option(200, "steps after which ``samples`` is reached")
-    bins: int = option(96, "bins a ray is cut into: where the proposal is looked up")
+    bins: int = option(96, "bins of a ray, each a lookup in the proposal")
     proposal_cells: int = option(64, "cells a side of the proposal")
-    interlevel: float = option(5.0, "weight of the proposal's loss; 0: it stays even")
+    interlevel: float = option(5.0, "weight of the proposal's loss; 0: samples stay uniform")
     proposal_decay: float = option(3e-2, "pull of the proposal's raw densities back to thin fog")
-    even: float = option(0.4, "share of a ray's samples that is dealt evenly, whatever the proposal says")
-    anneal: int = option(40, "steps over which that share falls from 1: first there is nothing to follow")
+    even: float = option(0.4, "share of a ray's samples that is allocated uniformly")
+    anneal: int = option(40, "steps over which that share falls from 1, while the proposal is untrained")
     smooth: float = option(3e-3, "weight of the total variation of the levels that are not hashed")
     device: str = option("auto", "cpu or auto: it runs on CPUs only")
-    appearance: int = option(0, "numbers learnt of each camera's look (exposure, tint); 0: none")
+    appearance: int = option(0, "numbers learned for each camera's appearance (exposure, tint); 0: none")
 
     def __post_init__(self) -> None:
         self._within(
@@ -45,7 +45,7 @@ class NerfactoSettings(HashGridSettings):
                 f"{self.name}: proposal_cells must be a multiple of 4, not {self.proposal_cells}"
             )
         if self.appearance and self.exposure:
-            # Measured: together they undo each other, and the field is worse than with neither.
+            # Measured: they compensate each other, and the field is worse than with neither.
             raise ValueError(f"{self.name}: appearance and exposure explain the same thing: choose one")
         super().__post_init__()
 

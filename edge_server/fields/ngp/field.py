@@ -1,6 +1,6 @@
 """Instant-NGP style radiance field on CPUs: hash grid, small network, numba kernels (thesis 3.1, 4.4.4).
 
-``trained_field`` does everything; here is what is particular to the hash grid.
+``trained_field`` does the common part; this file adds the hash grid.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings, make_settings
 
-assert SEGMENT * FEATURES == DIRTY, "scatter and adam must mean the same by a dirty flag"
+assert SEGMENT * FEATURES == DIRTY, "scatter and adam must use the same segments"
 
 
 class NgpField(TrainedField):

@@ -1,4 +1,4 @@
-"""Settings of the hash-grid field: one dataclass whose texts become help and error messages."""
+"""Settings of the hash-grid field; their texts become help and error messages."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ STATE_SHAPE = (
     "levels", "log2_table", "base_resolution", "finest_resolution", "hidden", "hidden_layers", "harmonics",
     "cells", "samples",
 )  # fmt: skip
-"""Settings that decide the shape of a saved state: those of a loaded one must be equal."""
+"""Options in which a state and the field that loads it must agree."""
 
 
 @dataclass(frozen=True)
 class NgpSettings(HashGridSettings):
-    """What can be chosen about an ``NgpField``. Lengths in metres; None means: found from the cameras."""
+    """What can be chosen about an ``NgpField``. Lengths in meters; None means: found from the cameras."""
 
     name = "ngp"
 

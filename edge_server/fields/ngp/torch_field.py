@@ -1,9 +1,8 @@
 """``NgpField`` for CUDA devices, in plain torch (also runs on a CPU, slowly, which is how it is tested).
 
-The same state as ``NgpField``: a checkpoint of one loads into the other. The same settings, too, but for
-those in ``ONLY_KERNELS``, which are refused, ``smooth`` and the depth guide where none is asked for by
-name, which are left out, and ``batch_samples``: every ray
-of a step is taken, however many samples it has.
+The state is that of ``NgpField``: checkpoints load both ways. So are the settings, with three differences:
+options in ``KERNEL_OPTIONS`` are refused; ``smooth`` and an automatic depth guide are ignored; so is
+``batch_samples``: every ray of a step is used, however many samples it has.
 """
 
 from __future__ import annotations
@@ -41,27 +40,29 @@ from edge_server.fields.common.training_schedule import (
 )
 from edge_server.fields.common.view_store import Arrays, ViewStore
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings
-from edge_server.fields.ngp.torch_model import TorchGrid, encode, mlp, ray_losses, shade, to_torch, weights_of
+from edge_server.fields.ngp.torch_model import (
+    TorchGrid,
+    encode,
+    mlp,
+    ray_losses,
+    ray_weights,
+    shade,
+    to_torch,
+)
 from freshfield.geometry import Pinhole
 
-RENDER_RAYS = 8192  # at a time
-ONLY_KERNELS = (
-    "exposure",
-    "refine_m",
-    "refine_deg",
-    "near_fade",
-    "depth_guide",
-)  # options that have no code here
+RENDER_RAYS = 8192  # rendered at a time
+KERNEL_OPTIONS = ("exposure", "refine_m", "refine_deg", "near_fade", "depth_guide")  # not implemented here
 
 
-def lacks(settings: NgpSettings) -> tuple[str, ...]:
-    """The options in ``settings`` that ask for what only the kernels do."""
-    return tuple(name for name in ONLY_KERNELS if getattr(settings, name))
+def unsupported_options(settings: NgpSettings) -> tuple[str, ...]:
+    """Enabled options that only the kernels implement."""
+    return tuple(name for name in KERNEL_OPTIONS if getattr(settings, name))
 
 
 @contextmanager
-def _repeatable() -> Iterator[None]:
-    """Sums of gradients in a fixed order, where torch has that (on CUDA, cumulative sums may lack it)."""
+def _deterministic() -> Iterator[None]:
+    """Sum gradients in a fixed order where torch can (on CUDA, cumulative sums may not)."""
     before = torch.are_deterministic_algorithms_enabled()
     warn = torch.is_deterministic_algorithms_warn_only_enabled()
     torch.use_deterministic_algorithms(True, warn_only=True)
@@ -121,7 +122,7 @@ class TorchModel:
         return t, delta, u, inside & (t < leave[:, None])
 
     def query(self, d: Tensor, u: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (R, S) and colour (R, S, 3) of marched samples; 0 where not ``inside``."""
+        """Density (R, S) and color (R, S, 3) of marched samples; 0 where not ``inside``."""
         direction = d[:, None].expand(-1, u.shape[1], -1)[inside]
         raw = mlp(self.widths, self.net, encode(self.grid, self.levels, u[inside]))
         sigma, color = shade(raw, self.settings.harmonics, direction)
@@ -134,7 +135,7 @@ class TorchModel:
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Colour (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
+        """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
         device, pose = self.net.device, np.asarray(camera_to_world, dtype=np.float64)
         rays = (intrinsics.rays(pixels) @ pose[:3, :3].T).astype(np.float32)
         origin = self.box.normalise(pose[:3, 3]).astype(np.float32)
@@ -144,7 +145,7 @@ class TorchModel:
             o = torch.as_tensor(origin, device=device).expand_as(d)
             t, delta, u, inside = self.march(o, d, torch.full((len(d),), 0.5, device=device))
             sigma, color = self.query(d, u, inside)
-            weight, left = weights_of(sigma, delta)
+            weight, left = ray_weights(sigma, delta)
             opacity = 1.0 - left
             depth = (weight * t).sum(-1) / opacity.clamp(min=1e-3)
             rgb = (weight[..., None] * color).sum(1) + left[:, None] * self.background
@@ -164,7 +165,7 @@ class TorchSnapshot:
     def render(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, max_samples: int | None = None
     ) -> Rendering:
-        """The picture a camera at this pose would take; max_samples is for the kernels only."""
+        """Render a camera; max_samples is ignored."""
         w, h = intrinsics.width, intrinsics.height
         v, u = np.mgrid[0:h, 0:w]
         pixels = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=-1)
@@ -177,12 +178,11 @@ class TorchSnapshot:
 
 
 class NgpTorchField:
-    """See ``NgpField``: the protocol and its meaning are the same. ValueError for a device that is not here,
-    and for options that only the kernels have (``lacks``)."""
+    """``NgpField`` in torch. Raises ValueError for a missing device and for ``unsupported_options``."""
 
     def __init__(self, settings: NgpSettings | None = None, device: str = "cuda") -> None:
         self.settings = settings or NgpSettings()
-        if missing := lacks(self.settings):
+        if missing := unsupported_options(self.settings):
             raise ValueError(f"ngp: {', '.join(missing)} needs device cpu: the torch field lacks it")
         self.device = device
         if self.device.startswith("cuda") and not cuda_present():
@@ -200,24 +200,30 @@ class NgpTorchField:
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
         if not views:
             return FitReport(0, 0.0, 0.0, 0, 0, note="no views: nothing was done")
-        pace, losses, samples, dropped = StepBudget(budget, self.now), [0.0], 0, 0
+        step_budget, losses, samples, dropped = StepBudget(budget, self.now), [0.0], 0, 0
         with self._lock:
-            intake = self.view_store.add(views)
-            if intake.box_changed:
+            update = self.view_store.add(views)
+            if update.box_changed:
                 self._forget_parameters()
-            if intake.visibility_changed:
+            if update.visibility_changed:
                 self._occupancy.recount_views(self.pool, self.view_store)
-            data = self.view_store.without_outliers(views, intake, self.step, self._model())
-        while (progress := pace.begin_step(self._usual)) is not None:
+            data = self.view_store.without_outliers(views, update, self.step, self._model())
+        while (progress := step_budget.begin_step(self._step_timer)) is not None:
             with self._lock:
                 loss, used, bad = self._one_step(data, progress)
             losses, samples, dropped = [*losses[-31:], loss], samples + used, dropped + bad
-            pace.end_step()
+            step_budget.end_step()
         self.dropped += dropped
-        rays = pace.steps * self.settings.rays
+        rays = step_budget.steps * self.settings.rays
         refused = self.view_store.refused_among(views)
         return FitReport(
-            pace.steps, pace.elapsed_s(), float(np.mean(losses)), rays, samples, dropped, refused
+            step_budget.steps,
+            step_budget.elapsed_s(),
+            float(np.mean(losses)),
+            rays,
+            samples,
+            dropped,
+            refused,
         )
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
@@ -234,7 +240,7 @@ class NgpTorchField:
             return TorchSnapshot(model, self.view_store.views)
 
     def warm_up(self) -> float:
-        """Nothing to compile; the same call as the kernels' field has."""
+        """Nothing to compile: 0 seconds."""
         return 0.0
 
     def state(self) -> Arrays:
@@ -273,7 +279,7 @@ class NgpTorchField:
     def _forget_parameters(self) -> None:
         rng = np.random.default_rng(np.random.SeedSequence(self.settings.seed))
         self.step = self._updates = 0
-        self._usual = StepTimer()
+        self._step_timer = StepTimer()
         self._grid = to_torch(make_grid(self.settings, self.view_store.box, rng), self.device)
         net = init_net(FEATURES * self.settings.levels, self.settings, rng)
         self._widths = net.widths.tolist()
@@ -312,13 +318,13 @@ class NgpTorchField:
         error, loss = ray_losses(sigma, color, t, delta, target, background, s.distortion, s.sparsity)
         error, loss = error * weight, loss * weight
         good = torch.isfinite(error)
-        with _repeatable():
+        with _deterministic():
             torch.where(good, loss, torch.zeros_like(loss)).sum().backward()
         self.step += 1
         self._updates += 1
         with torch.no_grad():
-            scale, bad, fall = NOMINAL_RAYS / len(d), int((~good).sum()), s.rate_end**progress
-            rates = (s.rate * fall, s.rate_net * fall)
+            scale, bad, rate_decay = NOMINAL_RAYS / len(d), int((~good).sum()), s.rate_end**progress
+            rates = (s.rate * rate_decay, s.rate_net * rate_decay)
             for p, (m, v), rate, decay in zip((table, net), self._moments, rates, (s.decay, 0.0)):
                 bad += self._adam(p, m, v, scale, rate, decay)
         self._grid.table.requires_grad_(False)

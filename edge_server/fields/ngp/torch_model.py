@@ -1,8 +1,7 @@
-"""The hash-grid field once more, in plain torch: what the kernels are compared with, and what
-``ngp_torch_field`` runs on CUDA devices.
+"""The hash-grid field in plain torch: the reference for the kernels, and what ``torch_field`` runs on CUDA.
 
-Same parameters, same layout, same formulas as ``kernels``; autograd finds the gradients. The functions
-take torch tensors on any device; shapes are noted beside them.
+Parameters, layout and formulas are those of ``kernels``; autograd computes the gradients. Functions take
+tensors on any device.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ PRIMES = (1, 2654435761, 805459861)
 
 @dataclass(frozen=True)
 class TorchGrid:
-    """``kernels.grid.Grid`` as tensors: table (vertices, 2) float."""
+    """``hash_grid.Grid`` as tensors: table (vertices, 2) float."""
 
     resolution: list[int]
     first: list[int]
@@ -81,7 +80,7 @@ def harmonics(count: int, d: Tensor) -> Tensor:
 
 
 def shade(raw: Tensor, count: int, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Net output (N, >= 1 + 3 count) and directions (N, 3) -> density (N,), colour (N, 3). The clamp has
+    """Net output (N, >= 1 + 3 count) and directions (N, 3) -> density (N,), color (N, 3). The clamp has
     no gradient outside its bounds, forward and backward alike."""
     sigma = raw[:, 0].clamp(RAW_LOW, RAW_HIGH).exp()
     shares = raw[:, 4 : 1 + 3 * count].view(len(raw), count - 1, 3)
@@ -89,8 +88,8 @@ def shade(raw: Tensor, count: int, d: Tensor) -> tuple[Tensor, Tensor]:
     return sigma, color.sigmoid()
 
 
-def weights_of(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Density and step length (R, S), 0 where there is no sample -> weights (R, S) and what light is left
+def ray_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
+    """Density and step length (R, S), 0 where there is no sample -> weights (R, S) and transmittance
     behind the last sample (R,). Samples behind the point of opacity have no weight. Eq. 3.21."""
     depth = (sigma * delta).cumsum(dim=-1)
     before = torch.nn.functional.pad(depth, (1, 0))[:, :-1]
@@ -103,9 +102,9 @@ def ray_losses(
     sigma: Tensor, color: Tensor, t: Tensor, delta: Tensor, target: Tensor, background: Tensor,
     distortion: float, sparsity: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Colour errors (R,) and losses (R,) of rays with samples (R, S): 3.22, mip-NeRF 360's distortion
+    """Color errors (R,) and losses (R,) of rays with samples (R, S): 3.22, mip-NeRF 360's distortion
     loss, and optical depth of what is seen."""
-    weight, left = weights_of(sigma, delta)
+    weight, left = ray_weights(sigma, delta)
     rendered = (weight[..., None] * color).sum(dim=1) + left[:, None] * background
     error = (rendered - target).square().sum(dim=-1)
     apart = (t[:, :, None] - t[:, None, :]).abs()

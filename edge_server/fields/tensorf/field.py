@@ -1,7 +1,7 @@
 """Vector-matrix factors on CPUs (TensoRF; Chen et al. 2022): planes, lines, small network, numba kernels.
 
-``trained_field`` does everything; here is what is particular: density without a network, and planes and
-lines that get finer while the field is trained (section 4.4 of the paper).
+``trained_field`` does the common part. This file adds density without a network, and planes and lines that
+get finer during training (section 4.4 of the paper).
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from edge_server.fields.tensorf.kernels.vector_matrix import (
     MODES,
     ROWS,
     Planes,
-    regularise,
+    regularize,
     scatter_planes,
 )
 from edge_server.fields.tensorf.settings import TensorfSettings, make_settings
 
-assert ROWS * CHANNELS == DIRTY, "scatter_planes and adam must mean the same by a dirty flag"
+assert ROWS * CHANNELS == DIRTY, "scatter_planes and adam must use the same segments"
 
-FINEST = 256  # vertices a side, unless more are asked for: finer planes outgrow the second-level cache
+FINEST = 256  # vertices a side by default: finer planes outgrow the second-level cache
 
 
 class TensorfField(TrainedField):
-    """Planes, lines and a small network for colour. See ``fields.Field`` for the protocol."""
+    """Planes, lines and a small network for color. See ``fields.Field`` for the protocol."""
 
     name = "tensorf"
     shape = (
@@ -61,7 +61,7 @@ class TensorfField(TrainedField):
         return planes, init_net(CHANNELS * color, s, rng)
 
     def _feature_rows(self) -> int:
-        return int(self._net.widths[0]) + 1  # density's own
+        return int(self._net.widths[0]) + 1  # and one for density
 
     def _grow(self) -> None:
         size = size_at(self.settings, self.view_store.box, self.step)
@@ -69,7 +69,7 @@ class TensorfField(TrainedField):
         if size == planes.size:
             return
         old = (planes.table, self._table_m, self._table_v)
-        tables = [finer(table, planes.groups, planes.size, size) for table in old]
+        tables = [upsample_table(table, planes.groups, planes.size, size) for table in old]
         self._encoding = planes._replace(size=size, rows=_rows(size), table=tables[0])
         self._take_table(tables[0])
         self._table_m, self._table_v = tables[1:]
@@ -81,11 +81,11 @@ class TensorfField(TrainedField):
         )
         if s.smooth or s.sparse:
             weights = np.float32(s.smooth / scale), np.float32(s.sparse / scale)
-            self.pool.run(regularise, planes, *weights, self._table_g, self._dirty)
+            self.pool.run(regularize, planes, *weights, self._table_g, self._dirty)
 
 
 def size_at(settings: TensorfSettings, box: SceneBox | None, step: int) -> int:
-    """Vertices a side at a step: growing geometrically, coarse to fine."""
+    """Vertices a side at a step, growing geometrically."""
     first, last = settings.resolution_start, settings.resolution
     if last is None:
         last = int(np.clip(box.pixels_across if box is not None else first, first, max(FINEST, first)))
@@ -94,7 +94,7 @@ def size_at(settings: TensorfSettings, box: SceneBox | None, step: int) -> int:
     return round(first * (last / first) ** (done / stages)) if settings.upsample else last
 
 
-def finer(table: NDArray[np.float32], groups: int, size: int, new: int) -> NDArray[np.float32]:
+def upsample_table(table: NDArray[np.float32], groups: int, size: int, new: int) -> NDArray[np.float32]:
     """The table of a ``Planes`` of ``size`` vertices a side, interpolated to ``new`` vertices a side."""
     old = table.reshape(groups, -1, CHANNELS)
     planes = old[:, : size * size].reshape(groups, size, size, CHANNELS)
@@ -116,12 +116,12 @@ def finer(table: NDArray[np.float32], groups: int, size: int, new: int) -> NDArr
 
 
 def _rows(size: int) -> int:
-    """Rows of a group, rounded up so that no dirty flag stands for two groups."""
+    """Rows of a group, rounded up so that no segment belongs to two groups."""
     return -(-size * (size + 1) // ROWS) * ROWS
 
 
 def make(options: dict[str, Any], seed: int = 0) -> Field:
-    """A field from plain options (``tensorf_settings``). ValueError where CUDA is asked for."""
+    """A field from plain options (``tensorf.settings``). ValueError where CUDA is asked for."""
     settings = make_settings(options, seed)
     if settings.device == "cuda":
         raise ValueError("tensorf: runs on CPUs only; use device cpu or auto, or the field ngp")

@@ -1,4 +1,4 @@
-"""Settings of the vector-matrix field: one dataclass whose texts become help and error messages."""
+"""Settings of the vector-matrix field; their texts become help and error messages."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from edge_server.fields.common.trainer_settings import TrainerSettings, help_of,
 
 @dataclass(frozen=True)
 class TensorfSettings(TrainerSettings):
-    """What can be chosen about a ``TensorfField``. Lengths in metres; None: found from the cameras."""
+    """What can be chosen about a ``TensorfField``. Lengths in meters; None: found from the cameras."""
 
     name = "tensorf"
 
     density_rank: int = option(8, "components of density for each orientation, a multiple of 8")
-    color_rank: int = option(16, "components of colour for each orientation, a multiple of 8")
+    color_rank: int = option(16, "components of color for each orientation, a multiple of 8")
     resolution_start: int = option(48, "vertices a side of planes and lines at first")
     resolution: int | None = option(None, "vertices a side in the end; None: about a pixel, 256 at most")
     upsample: tuple[int, ...] = option((100, 200, 400), "steps after which planes and lines get finer")
@@ -25,7 +25,7 @@ class TensorfSettings(TrainerSettings):
     decay: float = option(0.0, "pull of planes and lines towards zero, per step and rate")
     smooth: float = option(0.0, "weight of the planes' total variation")
     sparse: float = option(0.0, "weight of the absolute values of the density's factors")
-    first: float = option(0.1, "standard deviation of the factors' first values")
+    first: float = option(0.1, "standard deviation of the factors' initial values")
 
     def __post_init__(self) -> None:
         self._within(

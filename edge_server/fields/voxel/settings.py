@@ -1,4 +1,4 @@
-"""Settings of the voxel field: one dataclass whose texts become help and error messages."""
+"""Settings of the voxel field; their texts become help and error messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from edge_server.fields.common.trainer_settings import (
     settings_from,
 )
 
-# Options of fields with a network, which this one has not.
+# Inherited options of fields with a network, which this field lacks.
 _NOT_HERE = (
     "hidden", "hidden_layers", "harmonics", "batch_samples", "samples", "samples_start", "samples_ramp",
     "rate_net", "distortion", "sparsity", "near_fade", "exposure", "refine_m", "refine_deg",
@@ -26,7 +26,7 @@ _NOT_HERE = (
 
 @dataclass(frozen=True)
 class VoxelSettings(TrainerSettings):
-    """What can be chosen about a ``VoxelField``. Lengths in metres; None: found from the cameras."""
+    """What can be chosen about a ``VoxelField``. Lengths in meters; None: found from the cameras."""
 
     name = "voxel"
 
@@ -34,31 +34,33 @@ class VoxelSettings(TrainerSettings):
     refine_at: tuple[int, ...] = option((15, 40, 80), "steps after which the next of ``sizes`` is taken")
     rays: int = option(8192, "rays of one step")
     rate: float = option(0.05, "learning rate of density at the start of a fit")
-    rate_color: float = option(0.06, "learning rate of colour at the start of a fit")
+    rate_color: float = option(0.06, "learning rate of color at the start of a fit")
     settle: float = option(
-        3.0, "passes over all pixels, after which a fit's rates fall as 1 / steps; 0: never"
+        3.0, "passes over all pixels, after which a fit's rates decay as 1 / steps; 0: never"
     )
     warm: float = option(0.3, "share of the rates in a fit that starts from a grid of its last size")
     soften: float = option(0.2, "largest optical depth of one step left where something moved")
-    growth: float = option(20.0, "how much faster density is learnt where there is some: times 1 + growth x")
+    growth: float = option(20.0, "growth of density's rate with density x: times 1 + growth x")
     epsilon: float = option(5e-3, "Adam's epsilon: larger trusts rarely seen vertices less")
-    l1: float = option(0.003, "pull of density towards zero, in rates: empties what no picture needs")
-    outline: float = option(0.25, "weight of the error of opacity, which alpha or a plain background tells")
+    l1: float = option(0.003, "pull of density towards zero, in rates: empties what no image needs")
+    outline: float = option(
+        0.25, "weight of the error of opacity, where alpha or a plain background gives it"
+    )
     diffuse: float = option(
-        1.0, "share of the way to its neighbours' mean that a vertex goes in four steps at full rates"
+        1.0, "share of the way to its neighbors' mean that a vertex goes in four steps at full rates"
     )
     diffuse_edge: float = option(
-        0.025, "difference of two neighbours, of the largest possible, of which no more counts for that"
+        0.025, "bound of a difference between neighbors in ``diffuse``, as a share of the largest possible"
     )
     diffuse_views: int = option(
-        32, "places seen from, of which more weaken ``diffuse``: by so many to all of them"
+        32, "viewpoints above which ``diffuse`` weakens: times this number over theirs"
     )
-    first: float = option(0.1, "optical depth of one step before anything is known")
-    prune: float = option(0.2, "optical depth of one step below which a cell is taken to be empty")
-    prune_from: int = option(15, "step from which on empty cells are left out, and the others diffuse")
+    first: float = option(0.1, "initial optical depth of one step")
+    prune: float = option(0.2, "optical depth of one step below which a cell counts as empty")
+    prune_from: int = option(15, "step from which empty cells are skipped and others diffuse")
     cells: int = option(48, "cells a side of the occupancy grid, a multiple of 4")
     device: str = option("auto", "cpu or auto: it runs on CPUs only")
-    parts: int = option(2, "gradient buffers: so many cores train at once; results depend on it")
+    parts: int = option(2, "gradient buffers, the number of cores that train at once; results depend on it")
 
     def __post_init__(self) -> None:
         self._within(
@@ -98,10 +100,7 @@ EFFORTS: dict[str, dict[str, Any]] = {
     "high": {"sizes": (32, 64, 96, 128, 192), "refine_at": (15, 40, 80, 200), "rays": 16384, "cells": 64},
 }
 
-COARSEST, FINEST = (
-    64,
-    192,
-)  # of the last grid where the pictures decide: finer ones outgrow caches and patience
+COARSEST, FINEST = 64, 192  # last grid size chosen from the images: finer ones outgrow caches and patience
 
 
 def sizes_of(settings: VoxelSettings, box: SceneBox | None) -> tuple[int, ...]:
@@ -130,7 +129,7 @@ def make_settings(options: dict[str, Any], seed: int = 0) -> VoxelSettings:
 
 
 def voxel_options() -> list[str]:
-    """The options that mean something here."""
+    """The options that this field uses."""
     return [name for name in option_names(VoxelSettings) if name not in _NOT_HERE]
 
 

@@ -1,4 +1,4 @@
-"""An immutable copy of a voxel field: renders from any thread while the field itself trains on."""
+"""An immutable copy of a voxel field, which renders from any thread while the field trains on."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.ray_snapshot import surface_points
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
-from edge_server.fields.voxel.kernels.rays import ROOM, Clearing, Trace, Voxels, render_rays
+from edge_server.fields.voxel.kernels.rays import MAX_SAMPLES, RayScratch, SkipGrid, Voxels, render_rays
 from freshfield.geometry import Pinhole
 
 
-def make_trace(workers: int) -> Trace:
-    """Memory for ``workers`` rays at a time."""
-    return Trace(
-        row=np.zeros((workers, ROOM), np.int64),
-        line=np.zeros((workers, ROOM, 9), np.float32),
+def make_ray_scratch(workers: int) -> RayScratch:
+    """Scratch memory for that many workers."""
+    return RayScratch(
+        row=np.zeros((workers, MAX_SAMPLES), np.int64),
+        line=np.zeros((workers, MAX_SAMPLES, 9), np.float32),
         ray=np.zeros((workers, 12), np.float32),
     )
 
 
 @dataclass(frozen=True)
 class VoxelSnapshot:
-    """Grid, occupancy and cameras of one instant. Nothing in it is written after it is made."""
+    """Grid, occupancy and cameras of one instant, never written after construction."""
 
     box: SceneBox
     voxels: Voxels
-    space: Clearing
+    space: SkipGrid
     background: NDArray[np.float32]
     cameras: tuple[View, ...]
     pool: Pool
@@ -48,7 +48,7 @@ class VoxelSnapshot:
     def render_pixels(
         self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole, pixels: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Colour (N, 3), depth (N,) in metres and opacity (N,) at image points (N, 2)."""
+        """Color (N, 3), depth (N,) in meters and opacity (N,) at image points (N, 2)."""
         pose = np.asarray(camera_to_world, dtype=np.float64)
         n = len(pixels)
         color, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
@@ -62,7 +62,7 @@ class VoxelSnapshot:
             self.space,
             self.voxels,
             self.background,
-            make_trace(self.pool.threads),
+            make_ray_scratch(self.pool.threads),
             color,
             depth,
             opacity,
@@ -71,6 +71,6 @@ class VoxelSnapshot:
         return color, depth, opacity
 
     def points(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Up to ``count`` points (N, 3) in world metres, with colours (N, 3), where the known cameras' rays
+        """Up to ``count`` points (N, 3) in world meters, with colors (N, 3), where the known cameras' rays
         meet a surface."""
         return surface_points(self, self.cameras, count)

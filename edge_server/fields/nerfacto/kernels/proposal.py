@@ -1,11 +1,12 @@
-"""Where a ray's samples go, learnt: a grid of density alone, sampled along the whole ray, says where to look.
+"""Proposal sampling: a learned density grid decides where along a ray the samples go.
 
-Proposal networks of mip-NeRF 360 (Barron et al. 2022, section 3) as nerfacto (Tancik et al. 2023) uses them,
-for CPUs: the proposal is a dense grid of one number a cell and no network, so a look at it is one load.
-A ray is cut into bins of equal length in contracted space, which share the ray's samples by their weight.
-Every sample lies inside one bin or a few whole ones, so the bound of the paper's eq. 12 is their weight.
+These are the proposal networks of mip-NeRF 360 (Barron et al. 2022, section 3) as nerfacto (Tancik et al.
+2023) uses them, for CPUs: the proposal is a dense grid of one number a cell without a network, so a lookup
+is one load. A ray is divided into bins of equal length in contracted space, and samples are allocated to bins
+by weight. Every sample lies in one bin or a group of whole bins, so the bound of the paper's eq. 12 is the
+weight of that group.
 
-The grid stands behind the hash levels in the same table: one optimiser, one state, one snapshot.
+The grid follows the hash levels in the same table: one optimizer, one state, one snapshot.
 """
 
 from __future__ import annotations
@@ -23,19 +24,21 @@ from edge_server.fields.common.kernels.rays import slab
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 
-GAIN = 4.0  # raw density per unit of the table: it must rise in tens of steps at the hash levels' rate
-START = -1.2  # raw density where the table is 0: the same thin fog the network starts with
-DARK = 10.0  # optical depth behind which a proposal needs no bins
-SLABS = 8  # tasks that the gradient of the grid is divided into
-DIM = 0.1  # of a sample in full light that a dark bin counts when samples are dealt evenly
-FLOOR = 1e-3  # of a bin's weight in the interlevel loss's denominator: no weight, no division by it
+RAW_GAIN = 4.0  # raw density per unit of the table: it must rise in tens of steps at the hash levels' rate
+RAW_START = -1.2  # raw density where the table is 0: the thin fog that the network starts with too
+CUTOFF_DEPTH = 10.0  # optical depth behind which bins are dropped
+SCATTER_TASKS = 8  # of the kernel that adds up the gradient of the grid
+DARK_SHARE = 0.1  # weight of a bin without light in uniform allocation; one in full light: 1 more
+WEIGHT_FLOOR = 1e-3  # in the interlevel loss's denominator, so that a weight of 0 does not divide
 
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 
-class Proposed(NamedTuple):
-    """A hash grid (``grid.Grid``: resolution, first, dense, table) and, from row first[-1] of its table on,
-    the proposal: cells^3 float32, x fastest, raw density / GAIN less START."""
+class ProposalGrid(NamedTuple):
+    """A hash grid (``hash_grid.Grid``) and, in its table from row first[-1] on, the proposal.
+
+    The proposal is cells^3 float32, x fastest; raw density is RAW_GAIN times a number, plus RAW_START.
+    """
 
     resolution: NDArray[np.int32]
     first: NDArray[np.int64]
@@ -44,21 +47,23 @@ class Proposed(NamedTuple):
     cells: int
 
 
-class Plan(NamedTuple):
-    """How a ray is sampled. bins: along the whole ray. samples: shared among them. even: float32, the share
-    of samples that is dealt evenly. interlevel: float32, weight of the proposal's loss; decay: float32, of
-    the pull of its raw densities to the fog they started as."""
+class ProposalSampling(NamedTuple):
+    """How a ray is sampled and the proposal trained.
+
+    bins: along the whole ray. samples: allocated to them. uniform_share: of the samples, allocated uniformly.
+    interlevel: weight of the proposal's loss. decay: weight of the pull of raw densities to RAW_START.
+    """
 
     bins: int
     samples: int
-    even: np.float32
+    uniform_share: np.float32
     interlevel: np.float32
     decay: np.float32
 
 
 @part
 def unit_cube(contracted, px, py, pz):
-    """Scene units -> the encoding's unit cube, [0, 1)."""
+    """Map a point in scene units to the encoding's unit cube, [0, 1)."""
     scale, top = _HALF, np.float32(0.9999999)
     if contracted:
         scale = np.float32(0.25)
@@ -74,8 +79,8 @@ def unit_cube(contracted, px, py, pz):
 
 
 @part
-def proposal_of(encoding):
-    """The proposal's cells, flat."""
+def proposal_cells_of(encoding):
+    """The proposal's cells as a flat array."""
     return encoding.table[encoding.first[encoding.first.size - 1] :].reshape(-1)
 
 
@@ -87,10 +92,10 @@ def _cell(cells, ux, uy, uz):
 
 @part
 def warp(contracted, ox, oy, oz, dx, dy, dz, enter, leave):
-    """The spacing of bins: linear in distance as far as the box of interest goes, then in disparity.
+    """Spacing of bins: linear in distance up to the end of the box of interest, then linear in disparity.
 
-    Returns (knee, slope, end): warped distance u is t up to the knee, then knee + (1 - 1 / (1 + (t - knee)
-    slope)) / slope; end is that of ``leave``. Equal steps in u are about equal in contracted space.
+    Returns (knee, slope, end). Warped distance u is t up to the knee, then knee + (1 - 1 / (1 + (t - knee)
+    slope)) / slope; end is the warped ``leave``. Equal steps in u are about equal in contracted space.
     """
     if not contracted:
         return leave, _F1, leave
@@ -105,24 +110,24 @@ def warp(contracted, ox, oy, oz, dx, dy, dz, enter, leave):
 
 @part
 def unwarp(u, knee, slope):
-    """Distance along the ray of warped distance u."""
+    """Distance along the ray at warped distance u, the inverse of ``warp``."""
     return u if u <= knee else knee + (_F1 / (_F1 - (u - knee) * slope) - _F1) / slope
 
 
 @part
-def propose(
+def make_bins(
     space, encoding, bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell, depth, edges, at
 ):
-    """Cut a ray into bins; keep those in cells worth a sample (``occupancy``), up to where it is dark.
+    """Divide a ray into bins and keep those in occupied cells, up to optical depth CUTOFF_DEPTH.
 
-    shift: in [0, 1), moves the raster of bins. From ``first`` on, cell: int32 (N,), proposal cell of each
-    bin kept; depth: float32 (N,), its optical depth. edges: float32 (2, bins + 1), where the k-th begins and
-    ends. at: int32 (2, bins), scratch. Returns (bins kept, whether all densities met are finite).
+    shift: in [0, 1), moves the raster of bins. Written from ``first`` on: cell, int32 (N,), proposal cell of
+    each kept bin; depth, float32 (N,), its optical depth. edges: float32 (2, bins + 1), receives start and
+    end of the k-th kept bin. at: int32 (2, bins), scratch. Returns (bins kept, whether densities are finite).
     """
     knee, slope, end = warp(space.contracted, ox, oy, oz, dx, dy, dz, enter, leave)
     step = (end - enter) / np.float32(bins - 1)
-    raw_of = proposal_of(encoding)
-    # Loops of one thing each: all but the one that looks into the grids are vector loops.
+    raw_of = proposal_cells_of(encoding)
+    # Separate loops, so that LLVM vectorizes all but the one that reads the grids.
     begin, finish = edges[0], edges[1]
     for j in range(bins + 1):
         begin[j] = unwarp(min(enter + max(np.float32(j) - shift, _F0) * step, end), knee, slope)
@@ -145,20 +150,20 @@ def propose(
             count += 1
     own = depth[first : first + count]
     for k in range(count):
-        raw = np.float32(GAIN) * own[k] + np.float32(START)
+        raw = np.float32(RAW_GAIN) * own[k] + np.float32(RAW_START)
         sigma = exp32(min(max(raw, np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
         own[k] = sigma * (finish[k] - begin[k])
     total = _F0
     for k in range(count):
         total += own[k]
-        if total > np.float32(DARK):
+        if total > np.float32(CUTOFF_DEPTH):
             return np.int64(k + 1), finite
     return count, finite
 
 
 @part
-def weigh(depth, first, count, weight):
-    """Weights of bins in volume rendering (3.21): depth, weight: float32, from ``first`` on."""
+def bin_weights(depth, first, count, weight):
+    """Volume rendering weights (3.21) of bins from their optical depths, both float32 from ``first`` on."""
     total, before = _F0, _F1
     for k in range(first, first + count):
         total += depth[k]
@@ -168,30 +173,30 @@ def weigh(depth, first, count, weight):
 
 
 @part
-def deal(weight, first, count, samples, even, shift, group, share):
-    """Inverse-CDF sampling: how a ray's bins share its samples.
+def allocate_samples(weight, first, count, samples, even, shift, group, share):
+    """Inverse-CDF sampling: allocate a ray's samples to its bins.
 
-    A bin that earns a sample or more is a group of its own, and share[g] (int64, one for each bin at least)
-    tells how many it gets. Lesser ones are put together until they have earned one, so that samples stand
-    for the ray's whole length: what has no sample would be seen through. group: int32, from ``first`` on, the
-    group of each bin. Returns the number of groups; there are at most 2 samples + 1 samples.
+    A bin that earns at least one sample is a group of its own, with share[g] samples (int64, as long as the
+    number of bins). Bins that earn less are merged until they earn one, so that samples cover the whole ray:
+    a part without a sample would be transparent. group: int32, receives from ``first`` on the group of each
+    bin. Returns the number of groups; there are at most 2 samples + 1 samples.
 
-    A bin counts with its neighbours' weights, too (mip-NeRF's filter: the mean of the larger on either
-    side), since a surface may lie just across the edge. even: the share that is dealt by the light that
-    arrives, whatever is there. shift: in [0, 1).
+    Weights are dilated (mip-NeRF's filter: the mean of the larger on either side), since a surface may lie
+    just across the edge. even: share of samples allocated by the light that arrives, whatever the weights.
+    shift: in [0, 1), rounds the number of samples up or down.
     """
     total, light, lights = _F0, _F1, _F0
     for k in range(first, first + count):
         total += _dilated(weight, k, first, first + count)
-        lights += light + np.float32(DIM)
+        lights += light + np.float32(DARK_SHARE)
         light -= weight[k]
     evenly = even if total > np.float32(1e-12) else _F1
     norm = np.float32(samples) * (_F1 - evenly) / max(total, np.float32(1e-12))
-    each = np.float32(samples) * evenly / max(lights, np.float32(DIM))
+    each = np.float32(samples) * evenly / max(lights, np.float32(DARK_SHARE))
     light = _F1
     g, pending = np.int64(0), _F0
     for k in range(first, first + count):
-        earned = norm * _dilated(weight, k, first, first + count) + each * (light + np.float32(DIM))
+        earned = norm * _dilated(weight, k, first, first + count) + each * (light + np.float32(DARK_SHARE))
         light -= weight[k]
         if pending > _F0 and (earned >= _F1 or pending + earned > np.float32(1.0001)):
             g += 1
@@ -213,11 +218,13 @@ def _dilated(weight, k, first, end):
 
 
 @part
-def place(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, shift, n, limit, x, line):
-    """Append a ray's samples, of equal length in each group; shift: in [0, 1), where in its part each lies.
+def place_samples(
+    contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, shift, n, limit, x, line
+):
+    """Append a ray's samples, of equal length within a group, from column n on.
 
-    x: float32 (3, N), unit cube. line: float32 (>= 3, N): distance, length, number of the group. Returns
-    the number of samples, at most ``limit``.
+    shift: in [0, 1), position of a sample within its part. x: float32 (3, N), points in the unit cube. line:
+    float32 (>= 3, N), distance, length and group. Returns the new number of samples, at most ``limit``.
     """
     k = np.int64(0)
     while k < count:
@@ -225,7 +232,7 @@ def place(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share,
         while k < count and group[first + k] == g:
             length += edges[1, k] - edges[0, k]
             k += 1
-        # A group of several bins may have gaps, where nothing is: its sample lies in one of them.
+        # A group of several bins may have empty gaps between them: its sample lies in one of the bins.
         chosen, within = a, shift
         if k - a > 1:
             spread = shift * np.float32(k - a)
@@ -245,20 +252,21 @@ def place(contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share,
 
 
 @part
-def interlevel(
-    encoding, cell, depth, weight, group, first, count, w, group_of, start, stop, plan, slope, grad
+def interlevel_loss(
+    encoding, cell, depth, weight, group, first, count, w, group_of, start, stop, sampling, slope, grad
 ):
-    """The proposal's loss on one ray (eq. 13) and its gradient: no group of bins may weigh less than the
-    samples in it.
+    """The proposal's loss on one ray (eq. 13) and its gradient: a group of bins must not weigh less than its
+    samples.
 
-    sum over groups of max(0, W - bound)^2 / (W + FLOOR): W the sum of the samples' weights w (float32,
-    samples start to stop, in groups group_of), constants here; bound that of the bins' weights. cell, depth,
-    weight, group: of bins first to first + count. slope: float32 (2, bins), scratch. grad: float32, like
-    depth, receives ``plan.interlevel`` times dLoss / dcell, and the gradient of plan.decay / 2 times the
-    square by which raw densities exceed their first value: a bound holds what is too high for ever, and
-    behind an opaque bin no gradient says that the surface has moved. Returns the loss.
+    The loss is the sum over groups of max(0, W - bound)^2 / (W + WEIGHT_FLOOR). W sums the weights w of the
+    samples start to stop (in groups group_of), constants here; bound sums the weights of the bins.
+    cell, depth, weight, group: of bins first to first + count. slope: float32 (2, bins), scratch.
+    grad: float32, like depth, receives ``sampling.interlevel`` times dLoss / dcell, plus the gradient of
+    sampling.decay / 2 times the squared excess of raw densities over RAW_START: an upper bound never lowers
+    what is too high, and behind an opaque bin no gradient tells that the surface has moved.
+    Returns the loss.
     """
-    raw_of = proposal_of(encoding)
+    raw_of = proposal_cells_of(encoding)
     loss = _F0
     inside, bound = slope[0], slope[1]
     for k in range(count):
@@ -268,9 +276,9 @@ def interlevel(
     for k in range(first, first + count):
         bound[group[k]] += weight[k]
     for g in range(count):
-        lack, norm = max(inside[g] - bound[g], _F0), inside[g] + np.float32(FLOOR)
+        lack, norm = max(inside[g] - bound[g], _F0), inside[g] + np.float32(WEIGHT_FLOOR)
         loss += lack * lack / norm
-        inside[g] = np.float32(-2.0) * plan.interlevel * lack / norm
+        inside[g] = np.float32(-2.0) * sampling.interlevel * lack / norm
     total, behind = _F0, _F0
     for k in range(first, first + count):
         total += depth[k]
@@ -280,25 +288,27 @@ def interlevel(
         d_depth = d_w * after - behind
         behind += own * d_w
         after += own
-        raw = np.float32(GAIN) * raw_of[cell[first + k]] + np.float32(START)
+        raw = np.float32(RAW_GAIN) * raw_of[cell[first + k]] + np.float32(RAW_START)
         free = raw > np.float32(RAW_LOW) and raw < np.float32(RAW_HIGH)
-        pull = plan.decay * max(raw - np.float32(START), _F0)
-        grad[first + k] = np.float32(GAIN) * (pull + (d_depth * depth[first + k] if free else _F0))
+        pull = sampling.decay * max(raw - np.float32(RAW_START), _F0)
+        grad[first + k] = np.float32(RAW_GAIN) * (pull + (d_depth * depth[first + k] if free else _F0))
     return loss
 
 
 @kernel
 def scatter_proposal(counter, worker, encoding, cell, grad, counts, gradient, dirty):
-    """Add the proposal's gradient to ``gradient`` (float32 like ``encoding.table``); a task is a slab of
-    cells, so nothing races. cell: int32 (chunks, N), grad: float32 (chunks, N), the first counts[c] in use.
-    dirty: bool (table rows / SEGMENT,), set where a segment received anything."""
+    """Add the proposal's gradient to ``gradient`` (float32 like ``encoding.table``).
+
+    A task is a range of cells, so nothing races. cell: int32 (chunks, N), grad: float32 (chunks, N), the
+    first counts[c] are in use. dirty: bool (table rows / SEGMENT,), set where a segment received a gradient.
+    """
     row = encoding.first[encoding.first.size - 1]
     flat, flags = gradient[row:].reshape(-1), dirty[row // SEGMENT :]
     width = SEGMENT * FEATURES
-    size = (flags.size + SLABS - 1) // SLABS * width
+    size = (flags.size + SCATTER_TASKS - 1) // SCATTER_TASKS * width
     while True:
         task = fetch_add(counter, 1)
-        if task >= SLABS:
+        if task >= SCATTER_TASKS:
             return
         low, high = task * size, (task + 1) * size
         for c in range(counts.size):
@@ -316,7 +326,7 @@ def _grid(e):
 
 @overload(query_density)
 def _query_density(encoding, levels, net, x, start, end, acts):
-    if not is_a(encoding, Proposed):
+    if not is_a(encoding, ProposalGrid):
         return None
 
     def run(encoding, levels, net, x, start, end, acts):
@@ -327,13 +337,13 @@ def _query_density(encoding, levels, net, x, start, end, acts):
 
 @overload(query_color)
 def _query_color(encoding, levels, net, x, start, end, acts):
-    """The network has said it already."""
-    return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, Proposed) else None
+    """Nothing to do: ``query_density`` has evaluated the whole network."""
+    return (lambda encoding, levels, net, x, start, end, acts: None) if is_a(encoding, ProposalGrid) else None
 
 
 @overload(query_backward)
 def _query_backward(encoding, net, acts, d_acts, n, d_params, d_features):
-    if not is_a(encoding, Proposed):
+    if not is_a(encoding, ProposalGrid):
         return None
 
     def run(encoding, net, acts, d_acts, n, d_params, d_features):

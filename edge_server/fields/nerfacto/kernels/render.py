@@ -1,4 +1,4 @@
-"""``render`` with samples from a proposal: every ray gets its few samples at once."""
+"""Rendering with samples from a proposal: all samples of a ray are placed at once."""
 
 from __future__ import annotations
 
@@ -9,29 +9,37 @@ from edge_server.fields.common.kernels.radiance_model import query_color, query_
 from edge_server.fields.common.kernels.rays import interval, pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, activate, add_harmonics
-from edge_server.fields.nerfacto.kernels.proposal import deal, place, propose, weigh
+from edge_server.fields.nerfacto.kernels.proposal import (
+    allocate_samples,
+    bin_weights,
+    make_bins,
+    place_samples,
+)
 
 TILE = 256  # rays a task
-ROOM = 2048  # samples side by side
+SAMPLE_BATCH = 2048  # samples that the network evaluates at a time
 
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 
 @kernel
-def render_proposed(counter, worker, lens, rotation, origin, pixels, plan, space, encoding, levels, net,
-                    harmonics, background, acts, x, line, color, depth, opacity):  # fmt: skip
-    """pixels: float64 (N, 2), image points. color: float32 (N, 3), depth (scene units) and opacity: (N,),
-    all written. acts: float32 (W, units, ROOM), x: (W, 3, same), line: (W, 3, same), scratch."""
+def render_with_proposal(counter, worker, lens, rotation, origin, pixels, sampling, space, encoding, levels,
+                         net, harmonics, background, acts, x, line, color, depth, opacity):  # fmt: skip
+    """Render image points: pixels, float64 (N, 2).
+
+    Writes color, float32 (N, 3), depth in scene units and opacity, (N,). Scratch: acts, float32 (W, units,
+    SAMPLE_BATCH); x and line, (W, 3, SAMPLE_BATCH).
+    """
     out = acts[worker, acts.shape[1] - net.widths[-1] :]
     ts, dts = line[worker, 0], line[worker, 1]
-    edges, share = np.empty((2, plan.bins + 1), np.float32), np.empty(plan.bins, np.int64)
-    at = np.empty((2, plan.bins), np.int32)
-    cell, tau = np.empty(plan.bins, np.int32), np.empty(plan.bins, np.float32)
-    group = np.empty(plan.bins, np.int32)
-    weight, way = np.empty(plan.bins, np.float32), np.empty((TILE, 3), np.float32)
+    edges, share = np.empty((2, sampling.bins + 1), np.float32), np.empty(sampling.bins, np.int64)
+    at = np.empty((2, sampling.bins), np.int32)
+    cell, tau = np.empty(sampling.bins, np.int32), np.empty(sampling.bins, np.float32)
+    group = np.empty(sampling.bins, np.int32)
+    weight, way = np.empty(sampling.bins, np.float32), np.empty((TILE, 3), np.float32)
     first = np.empty(TILE + 1, np.int64)
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
-    zero, room = np.int64(0), np.int64(ROOM)
+    zero, room = np.int64(0), np.int64(SAMPLE_BATCH)
     while True:
         base = fetch_add(counter, 1) * TILE
         if base >= pixels.shape[0]:
@@ -40,19 +48,21 @@ def render_proposed(counter, worker, lens, rotation, origin, pixels, plan, space
         while done < rays:
             n, here = np.int64(0), 0
             first[0] = 0
-            while done + here < rays and (n + 2 * plan.samples + 1 <= ROOM or here == 0):
+            while done + here < rays and (n + 2 * sampling.samples + 1 <= SAMPLE_BATCH or here == 0):
                 pixel = base + done + here
                 dx, dy, dz = pixel_direction(lens, rotation, pixels[pixel, 0], pixels[pixel, 1])
                 way[here, 0], way[here, 1], way[here, 2] = dx, dy, dz
                 enter, leave = interval(space, ox, oy, oz, dx, dy, dz)
                 if leave > enter:
-                    count, _ = propose(
-                        space, encoding, plan.bins, ox, oy, oz, dx, dy, dz, enter, leave, _HALF, zero, cell,
-                        tau, edges, at,
+                    count, _ = make_bins(
+                        space, encoding, sampling.bins, ox, oy, oz, dx, dy, dz, enter, leave, _HALF, zero,
+                        cell, tau, edges, at,
                     )  # fmt: skip
-                    weigh(tau, zero, count, weight)
-                    deal(weight, zero, count, plan.samples, plan.even, _HALF, group, share)
-                    n = place(
+                    bin_weights(tau, zero, count, weight)
+                    allocate_samples(
+                        weight, zero, count, sampling.samples, sampling.uniform_share, _HALF, group, share
+                    )
+                    n = place_samples(
                         space.contracted, ox, oy, oz, dx, dy, dz, edges, group, zero, count, share, _HALF, n,
                         room, x[worker], line[worker],
                     )  # fmt: skip

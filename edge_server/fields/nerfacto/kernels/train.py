@@ -1,4 +1,4 @@
-"""``train`` with samples from a proposal: chunks of rays through proposal, field, losses and back."""
+"""A training step with samples from a proposal: proposal, field, losses and gradients of chunks of rays."""
 
 from __future__ import annotations
 
@@ -20,28 +20,36 @@ from edge_server.fields.common.kernels.volume_rendering import (
     ray_loss,
     samples_until_opaque,
 )
-from edge_server.fields.nerfacto.kernels.proposal import deal, interlevel, place, propose, weigh
+from edge_server.fields.nerfacto.kernels.proposal import (
+    allocate_samples,
+    bin_weights,
+    interlevel_loss,
+    make_bins,
+    place_samples,
+)
 
 _F0, _HALF = np.float32(0.0), np.float32(0.5)
 
 
-class Bins(NamedTuple):
-    """What the chunks of a step leave behind for the proposal and the appearances, C of them.
+class ProposalGradients(NamedTuple):
+    """Gradients of the proposal and of the appearance embeddings, by chunk (C of them).
 
-    cell: int32 (C, N), grad: float32 (C, N), the first counts[c] in use: int64 (C,). looks: float32
-    (C, V, A), dLoss / dembedding of each view.
+    cell: int32 (C, N), grad: float32 (C, N), of bins; the first counts[c], int64 (C,), are in use.
+    d_embeddings: float32 (C, V, A), dLoss / dembedding of each view.
     """
 
     cell: NDArray[np.int32]
     grad: NDArray[np.float32]
     counts: NDArray[np.int64]
-    looks: NDArray[np.float32]
+    d_embeddings: NDArray[np.float32]
 
 
-class BinScratch(NamedTuple):
-    """Memory of each worker, W of them, R rays. line: float32 (W, 4, CHUNK): distance, length, group and
-    weight of each sample. depth, weight: float32, group: int32 (W, R bins). first: int64 (W, R + 1), a
-    ray's first bin."""
+class ProposalScratch(NamedTuple):
+    """Memory of the W workers, for R rays.
+
+    line: float32 (W, 4, CHUNK), distance, length, group and weight of each sample. depth, weight: float32,
+    group: int32, all (W, R bins). first: int64 (W, R + 1), a ray's first bin.
+    """
 
     line: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -51,35 +59,35 @@ class BinScratch(NamedTuple):
 
 
 @part
-def add_looks(out, row, look, a, b):
-    """Add an appearance's share to the raw colours of samples a to b: rows 1 to 3 of out.
+def add_appearance(out, row, embedding, a, b):
+    """Add the effect of an appearance embedding to the raw colors of samples a to b, rows 1 to 3 of out.
 
-    An embedding mixes what the network says from ``row`` on, three rows for each of its numbers, as
-    harmonics mix the colours of directions: density cannot depend on it, and zeros cost no rendering.
+    Each number of the embedding weighs three outputs of the network, from ``row`` on, as harmonics weigh the
+    colors of directions: density cannot depend on it, and rendering at 0 costs nothing.
     """
-    for k in range(look.size):
+    for k in range(embedding.size):
         for c in range(3):
             base, share = out[1 + c, a:b], out[row + 3 * k + c, a:b]
             for s in range(base.size):
-                base[s] += look[k] * share[s]
+                base[s] += embedding[k] * share[s]
 
 
 @part
-def spread_looks(out, d_out, row, look, a, b, d_look):
-    """The gradient of ``add_looks``: rows ``row`` on of d_out, and d_look, added to."""
-    for k in range(look.size):
+def add_appearance_backward(out, d_out, row, embedding, a, b, d_embedding):
+    """Backward of ``add_appearance``: writes rows ``row`` on of d_out and adds to d_embedding."""
+    for k in range(embedding.size):
         total = _F0
         for c in range(3):
             base, share, d = d_out[1 + c, a:b], out[row + 3 * k + c, a:b], d_out[row + 3 * k + c, a:b]
             for s in range(base.size):
                 total += base[s] * share[s]
-                d[s] = look[k] * base[s]
-        d_look[k] += total
+                d[s] = embedding[k] * base[s]
+        d_embedding[k] += total
 
 
 @part
-def keep(rows, a, b, to):
-    """Move columns a to b of every row to ``to`` <= a."""
+def compact_columns(rows, a, b, to):
+    """Move columns a to b of every row to column ``to`` <= a."""
     for k in range(rows.shape[0]):
         row = rows[k]
         for s in range(b - a):
@@ -87,21 +95,23 @@ def keep(rows, a, b, to):
 
 
 @part
-def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell,
+def sample_chunk(views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell,
                   depth, weight, group, bin_first):  # fmt: skip
-    """Fill a chunk with rays, their bins, their samples and what ``query_density`` says of them. Samples that
-    cannot be seen are left out, and their room is filled again.
-    Returns (rays, samples, rays whose proposal is not finite)."""
+    """Fill a chunk with rays, their bins, their samples and the result of ``query_density``.
+
+    Hidden samples are removed, and further rays fill their place. Returns (rays, samples, rays whose
+    proposal is not finite).
+    """
     dts, out = line[1], acts[acts.shape[0] - net.widths[-1] :]
     limit = min(recipe.chunk_rays, ray.shape[0])
-    edges, share = np.empty((2, plan.bins + 1), np.float32), np.empty(plan.bins, np.int64)
-    at = np.empty((2, plan.bins), np.int32)
+    edges, share = np.empty((2, sampling.bins + 1), np.float32), np.empty(sampling.bins, np.int64)
+    at = np.empty((2, sampling.bins), np.int32)
     n, rays, room, none = np.int64(0), np.int64(0), np.int64(CHUNK), np.int64(0)
     broken = 0
     ray_first[0] = bin_first[0] = 0
     while rays < limit and CHUNK - n > CHUNK // 8:
         end, drawn = n, rays
-        while drawn < limit and end + 2 * plan.samples + 1 <= CHUNK:
+        while drawn < limit and end + 2 * sampling.samples + 1 <= CHUNK:
             index = chunk * CHUNK_RAYS + drawn
             view = draw_ray(views, recipe, index, ray[drawn])
             ray[drawn, 9] = np.float32(view)
@@ -113,14 +123,16 @@ def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray
             if leave > enter:
                 shift = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(6))
                 within = uniform(recipe.key, np.uint64(index) * np.uint64(8) + np.uint64(7))
-                count, finite = propose(
-                    space, encoding, plan.bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell,
+                count, finite = make_bins(
+                    space, encoding, sampling.bins, ox, oy, oz, dx, dy, dz, enter, leave, shift, first, cell,
                     depth, edges, at,
                 )  # fmt: skip
                 broken += 0 if finite else 1
-                weigh(depth, first, count, weight)
-                deal(weight, first, count, plan.samples, plan.even, within, group, share)
-                end = place(
+                bin_weights(depth, first, count, weight)
+                allocate_samples(
+                    weight, first, count, sampling.samples, sampling.uniform_share, within, group, share
+                )
+                end = place_samples(
                     space.contracted, ox, oy, oz, dx, dy, dz, edges, group, first, count, share, within, end,
                     room, x, line,
                 )  # fmt: skip
@@ -135,9 +147,9 @@ def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray
             stop = ray_first[r + 1]
             kept = samples_until_opaque(out, dts, begin, stop)
             if n < begin:
-                keep(acts, begin, begin + kept, n)
-                keep(x, begin, begin + kept, n)
-                keep(line[:3], begin, begin + kept, n)
+                compact_columns(acts, begin, begin + kept, n)
+                compact_columns(x, begin, begin + kept, n)
+                compact_columns(line[:3], begin, begin + kept, n)
             n += kept
             ray_first[r + 1] = n
             begin = stop
@@ -146,27 +158,27 @@ def fill_proposed(views, recipe, plan, space, encoding, net, chunk, x, acts, ray
 
 
 @kernel
-def train_proposed(counter, worker, views, recipe, plan, space, encoding, net, looks, weights, batch, bins,
-                   scratch, bin_scratch):  # fmt: skip
-    """Tasks are chunks: everything but the gradients of the encoding and of the proposal's cells, which
-    their scatter kernels add up. looks: float32 (V, A), an embedding a view; A = 0: none."""
+def train_with_proposal(counter, worker, views, recipe, sampling, space, encoding, net, embeddings, weights,
+                        batch, bins, scratch, proposal_scratch):  # fmt: skip
+    """Forward and backward of a step; a task is a chunk. Scatter kernels then add up the gradients of the
+    encoding and of the proposal. embeddings: float32 (V, A), one a view; A = 0: none."""
     acts, d_acts = scratch.acts[worker], scratch.d_acts[worker]
-    line, depth, weight = bin_scratch.line[worker], bin_scratch.depth[worker], bin_scratch.weight[worker]
-    group = bin_scratch.group[worker]
+    line, depth = proposal_scratch.line[worker], proposal_scratch.depth[worker]
+    weight, group = proposal_scratch.weight[worker], proposal_scratch.group[worker]
     ts, dts, group_of, w = line[0], line[1], line[2], line[3]
-    bin_first = bin_scratch.first[worker]
+    bin_first = proposal_scratch.first[worker]
     ray_first, ray = scratch.ray_first[worker], scratch.ray[worker]
     outputs, row = net.widths[-1], 1 + 3 * recipe.harmonics
     out, d_out = acts[acts.shape[0] - outputs :], d_acts[acts.shape[0] - outputs :]
-    slope = np.empty((2, plan.bins), np.float32)
+    slope = np.empty((2, sampling.bins), np.float32)
     while True:
         chunk = fetch_add(counter, 1)
         if chunk >= batch.samples.size:
             return
         x, cell, grad = batch.x[chunk], bins.cell[chunk], bins.grad[chunk]
-        bins.looks[chunk] = _F0
-        rays, n, broken = fill_proposed(
-            views, recipe, plan, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell, depth,
+        bins.d_embeddings[chunk] = _F0
+        rays, n, broken = sample_chunk(
+            views, recipe, sampling, space, encoding, net, chunk, x, acts, ray_first, ray, line, cell, depth,
             weight, group, bin_first,
         )  # fmt: skip
         query_color(encoding, recipe.levels, net, x, np.int64(0), n, acts)
@@ -174,8 +186,8 @@ def train_proposed(counter, worker, views, recipe, plan, space, encoding, net, l
             a, b = ray_first[r], ray_first[r + 1]
             if recipe.harmonics > 1:
                 add_harmonics(out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
-            if looks.shape[1] > 0:
-                add_looks(out, row, looks[np.int64(ray[r, 9])], a, b)
+            if embeddings.shape[1] > 0:
+                add_appearance(out, row, embeddings[np.int64(ray[r, 9])], a, b)
         activate_color(out, np.int64(0), n)
         d_out[4:, :n] = _F0
         loss, dropped = 0.0, broken
@@ -195,15 +207,18 @@ def train_proposed(counter, worker, views, recipe, plan, space, encoding, net, l
                     for s in range(a, b):
                         d_out[k, s] *= ray[r, 10]
             loss += error
-            interlevel(encoding, cell, depth, weight, group, p, q - p, w, group_of, a, b, plan, slope,
-                       grad)  # fmt: skip
+            interlevel_loss(
+                encoding, cell, depth, weight, group, p, q - p, w, group_of, a, b, sampling, slope, grad
+            )
             if batch.exposure.shape[1] > 0:
                 add_exposure_sums(out, w, dts, a, b, ray[r], batch.exposure[chunk])
             if recipe.harmonics > 1:
                 add_harmonics_backward(d_out, recipe.harmonics, a, b, ray[r, 0], ray[r, 1], ray[r, 2])
-            if looks.shape[1] > 0:
+            if embeddings.shape[1] > 0:
                 view = np.int64(ray[r, 9])
-                spread_looks(out, d_out, row, looks[view], a, b, bins.looks[chunk, view])
+                add_appearance_backward(
+                    out, d_out, row, embeddings[view], a, b, bins.d_embeddings[chunk, view]
+                )
         batch.d_params[chunk] = _F0
         query_backward(encoding, net, acts, d_acts, n, batch.d_params[chunk], batch.d_features[chunk])
         batch.columns[chunk], batch.samples[chunk], batch.rays[chunk] = n, n, rays

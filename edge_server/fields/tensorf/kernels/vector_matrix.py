@@ -1,11 +1,9 @@
 """Vector-matrix factors (TensoRF; Chen et al. 2022, eq. 6 and 8): features of points and their gradient.
 
-A group is eight components: a plane over two axes times a line along the third. Density is the sum over all
-components of its groups; colour's components feed the network (the paper's basis matrix is the network's
-first layer). Groups take turns at the three orientations. A point is given in the unit cube; planes are
+A group is eight components, each a plane over two axes times a line along the third; groups cycle through the
+three orientations. Density is the sum of the components of its groups and needs no network. Color components
+feed the network, whose first layer is the paper's basis matrix. Points lie in the unit cube; planes are
 interpolated bilinearly, lines linearly, eight channels at a time in one vector register.
-
-Density needs no network: it is known before colour is asked for.
 """
 
 from __future__ import annotations
@@ -23,8 +21,8 @@ from edge_server.fields.common.kernels.mlp import backward, forward
 from edge_server.fields.common.kernels.radiance_model import is_a, query_backward, query_color, query_density
 from edge_server.fields.common.kernels.simd import fetch_add
 
-CHANNELS = 8  # of a group; one 256-bit register
-ROWS = 4  # of a table that a dirty flag stands for
+CHANNELS = 8  # components of a group; one 256-bit register
+ROWS = 4  # of a table in a segment, for which a dirty flag stands
 MODES = 3  # orientations: plane xy and line z, plane xz and line y, plane yz and line x
 TILE = 16  # samples side by side: a cache line of each row of ``acts`` is written as a whole
 
@@ -69,7 +67,7 @@ def _store(builder: Any, value: Any, pointer: Any) -> None:
     builder.store(value, pointer).align = 4
 
 
-def _spread(builder: Any, number: Any) -> Any:
+def _broadcast(builder: Any, number: Any) -> Any:
     one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), number, _I32(0))
     return builder.shuffle_vector(
         one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_I32, CHANNELS), [0] * CHANNELS)
@@ -87,7 +85,7 @@ def _blend(context: Any, builder: Any, array_type: Any, array: Any, rows: Any, w
 
 def _unpack(builder: Any, rows: Any, weights: Any) -> tuple[list[Any], list[Any]]:
     places = [builder.extract_value(rows, k) for k in range(6)]
-    shares = [_spread(builder, builder.extract_value(weights, k)) for k in range(6)]
+    shares = [_broadcast(builder, builder.extract_value(weights, k)) for k in range(6)]
     return places, shares
 
 
@@ -111,8 +109,10 @@ def store_products(typingctx: Any, table: Any, rows: Any, weights: Any, out: Any
 
 
 @intrinsic
-def add_factors(typingctx: Any, table: Any, rows: Any, weights: Any, d: Any, at: Any, gradient: Any) -> Any:
-    """The gradient of ``store_products``: d[at] is dLoss / dout[at]; added to ``gradient``, like table."""
+def store_products_backward(
+    typingctx: Any, table: Any, rows: Any, weights: Any, d: Any, at: Any, gradient: Any
+) -> Any:
+    """Backward of ``store_products``: d[at] is dLoss / dout[at]; adds to ``gradient``, shaped like table."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         places, shares = _unpack(builder, args[1], args[2])
@@ -130,7 +130,7 @@ def add_factors(typingctx: Any, table: Any, rows: Any, weights: Any, d: Any, at:
 
 
 @part
-def _place(x, size):
+def _vertex(x, size):
     """Lower vertex (uint32) and fraction of coordinate x in [0, 1] among ``size`` vertices."""
     scaled = x * np.float32(size - 1)
     i = min(max(np.int32(scaled), np.int32(0)), np.int32(size - 2))
@@ -138,12 +138,12 @@ def _place(x, size):
 
 
 @part
-def _neighbours(size, u, v, w):
+def _neighbors(size, u, v, w):
     """Rows within a group and weights: the plane's four vertices around (u, v), the line's two around w."""
     one = np.uint32(1)
-    i, fu = _place(u, size)
-    j, fv = _place(v, size)
-    k, fw = _place(w, size)
+    i, fu = _vertex(u, size)
+    j, fv = _vertex(v, size)
+    k, fw = _vertex(w, size)
     side = np.uint32(size)
     a = np.uint32(i + np.uint32(j * side))
     b = np.uint32(a + side)
@@ -155,7 +155,7 @@ def _neighbours(size, u, v, w):
 
 @part
 def _axes(x, group):
-    """The coordinates of a group's plane, first and second axis, and of its line."""
+    """Coordinates along the two axes of a group's plane and along its line."""
     mode = group % MODES
     u, v, w = x[0], x[1], x[2]
     if mode == 1:
@@ -166,17 +166,17 @@ def _axes(x, group):
 
 
 @part
-def products(table, size, x, group, a, count, tile):
-    """The components of one group at samples a to a + count (at most TILE): tile, float32 (TILE, 8).
-    table: the group's own rows."""
+def group_components(table, size, x, group, a, count, tile):
+    """Components of one group at samples a to a + count (at most TILE) into tile, float32 (TILE, 8).
+    table: the group's rows."""
     u, v, w = _axes(x, group)
     for s in range(count):
-        rows, weights = _neighbours(size, u[a + s], v[a + s], w[a + s])
+        rows, weights = _neighbors(size, u[a + s], v[a + s], w[a + s])
         store_products(table, rows, weights, tile, np.uint32(s))
 
 
 @part
-def density(planes, x, start, end, out):
+def raw_density(planes, x, start, end, out):
     """Raw density (eq. 6) of samples start to end into ``out``, float32 (N,)."""
     tile = np.empty((TILE, CHANNELS), np.float32)
     for a in range(start, end, TILE):
@@ -186,7 +186,7 @@ def density(planes, x, start, end, out):
             raw[s] = planes.bias
         for g in range(planes.density_groups):
             table = planes.table[g * planes.rows : (g + 1) * planes.rows]
-            products(table, planes.size, x, g, a, count, tile)
+            group_components(table, planes.size, x, g, a, count, tile)
             for s in range(count):
                 total = _F0
                 for c in range(CHANNELS):
@@ -195,14 +195,14 @@ def density(planes, x, start, end, out):
 
 
 @part
-def components(planes, x, start, end, acts):
-    """The colour groups' components of samples start to end into the first rows of acts."""
+def color_components(planes, x, start, end, acts):
+    """Components of the color groups at samples start to end into the first rows of acts."""
     tile = np.empty((TILE, CHANNELS), np.float32)
     for a in range(start, end, TILE):
         count = min(TILE, end - a)
         for g in range(planes.density_groups, planes.groups):
             table = planes.table[g * planes.rows : (g + 1) * planes.rows]
-            products(table, planes.size, x, g, a, count, tile)
+            group_components(table, planes.size, x, g, a, count, tile)
             first = (g - planes.density_groups) * CHANNELS
             for c in range(CHANNELS):
                 row = acts[first + c, a : a + count]
@@ -211,8 +211,8 @@ def components(planes, x, start, end, acts):
 
 
 @part
-def _mark(dirty, a, b):
-    """Flag the segments of two neighbouring vertices."""
+def _flag_segments(dirty, a, b):
+    """Flag the segments of two neighboring vertices."""
     i, j = a >> np.uint32(2), b >> np.uint32(2)
     dirty[i] = True
     if j != i:
@@ -223,7 +223,7 @@ def _mark(dirty, a, b):
 def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dirty):
     """Add the factors' gradient of all samples to ``gradient``; a task is a group, so nothing races.
 
-    x: float32 (chunks, 3, N). d_features: float32 (chunks, 8 colour groups + 1, N), dLoss / dcomponent;
+    x: float32 (chunks, 3, N). d_features: float32 (chunks, 8 color groups + 1, N), dLoss / dcomponent;
     the last row is dLoss / draw density. counts: int64 (chunks,), columns in use. gradient: float32 like
     ``planes.table``. dirty: bool (table rows / ROWS,), set where a segment received anything.
     """
@@ -248,26 +248,25 @@ def scatter_planes(counter, worker, planes, x, d_features, counts, gradient, dir
                     for s in range(count):
                         d[s, c] = row[s]
                 for s in range(count):
-                    # Samples without weight, and dead units of the network, have no gradient at all.
+                    # Samples without weight and dead units of the network have no gradient.
                     some = False
                     for c in range(CHANNELS):
                         some |= d[s, c] != _F0
                     if not some:
                         continue
-                    rows, weights = _neighbours(planes.size, u[a + s], v[a + s], w[a + s])
-                    add_factors(table, rows, weights, d, np.uint32(s), to)
-                    _mark(flags, rows[0], rows[1])
-                    _mark(flags, rows[2], rows[3])
-                    _mark(flags, rows[4], rows[5])
+                    rows, weights = _neighbors(planes.size, u[a + s], v[a + s], w[a + s])
+                    store_products_backward(table, rows, weights, d, np.uint32(s), to)
+                    _flag_segments(flags, rows[0], rows[1])
+                    _flag_segments(flags, rows[2], rows[3])
+                    _flag_segments(flags, rows[4], rows[5])
 
 
 @kernel
-def regularise(counter, worker, planes, smooth, sparse, gradient, dirty):
-    """Add the gradients of two regularisers (section 4.4) to what is about to be updated; a task is a group.
+def regularize(counter, worker, planes, smooth, sparse, gradient, dirty):
+    """Add the gradients of two regularizers (section 4.4) in dirty segments only; a task is a group.
 
-    smooth: float32, weight of half the squared differences between neighbouring vertices of the planes
-    (total variation). sparse: float32, weight of the absolute values of the density's factors (L1). Only
-    segments that are dirty already: what no ray reaches stays as it is.
+    smooth: float32, weight of half the squared differences between neighboring vertices of the planes (total
+    variation). sparse: float32, weight of the absolute values of the density's factors (L1).
     """
     size = planes.size
     while True:
@@ -300,7 +299,7 @@ def _query_density(encoding, levels, net, x, start, end, acts):
         return None
 
     def run(encoding, levels, net, x, start, end, acts):
-        density(encoding, x, start, end, acts[acts.shape[0] - net.widths[-1]])
+        raw_density(encoding, x, start, end, acts[acts.shape[0] - net.widths[-1]])
 
     return run
 
@@ -311,10 +310,10 @@ def _query_color(encoding, levels, net, x, start, end, acts):
         return None
 
     def run(encoding, levels, net, x, start, end, acts):
-        # The network has an output in density's place, which means nothing: what stands there is kept.
+        # The network's output in density's row is meaningless: restore the density.
         sigma = acts[acts.shape[0] - net.widths[-1], start:end]
         kept = sigma.copy()
-        components(encoding, x, start, end, acts)
+        color_components(encoding, x, start, end, acts)
         forward(net, acts, start, end)
         for s in range(kept.size):
             sigma[s] = kept[s]

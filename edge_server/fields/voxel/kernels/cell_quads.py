@@ -1,6 +1,6 @@
-"""A cell of a voxel grid read and added to four pairs of vertices at a time: eight float32, one register.
+"""Reads and updates a cell of a voxel grid as four pairs of vertices: eight float32, one register each.
 
-Two vertices that are neighbours along x lie side by side, four float32 each; a cell is four such pairs.
+Vertices that are neighbors along x are adjacent in memory, four float32 each; a cell is four such pairs.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ def cell_value(typingctx: Any, table: Any, row: Any, size: Any, x: Any, y: Any, 
 @intrinsic
 def add_to_cell(typingctx: Any, table: Any, row: Any, size: Any, x: Any, y: Any, z: Any,
                 a: Any, b: Any, c: Any, d: Any) -> Any:  # fmt: skip
-    """Add (a, b, c, d) to the vertices of a cell, each with its share at (x, y, z): the gradient of
-    ``cell_value``."""
+    """Add (a, b, c, d) to a cell's vertices by their weights at (x, y, z): backward of ``cell_value``."""
     f32 = types.float32
     signature = types.void(table, types.int64, types.int64, *[f32] * 7)
 

@@ -1,5 +1,4 @@
-"""What happens to a voxel grid between steps: Adam where there was a gradient, diffusion, refinement,
-occupancy."""
+"""Updates of a voxel grid: sparse Adam, diffusion, upsampling, and the cells that rays skip."""
 
 from __future__ import annotations
 
@@ -14,42 +13,44 @@ from edge_server.fields.common.kernels.simd import fetch_add, is_finite
 from edge_server.fields.voxel.kernels.cell_quads import cell_value
 from edge_server.fields.voxel.kernels.rays import SEGMENT
 
-WIDTH = 4 * SEGMENT  # parameters of a segment
-PART = 256  # dirty flags a task
-FARTHEST = 100  # what ``clear`` counts up to
-DENSEST = 4.0  # optical depth of one step at most: a denser vertex has no gradient left to get clear again
+SEGMENT_VALUES = 4 * SEGMENT  # parameters in a segment
+TASK_FLAGS = 256  # dirty flags a task
+MAX_CLEARANCE = 100  # largest distance in ``SkipGrid.clearance``
+MAX_DENSITY = 4.0  # optical depth of one step: a denser vertex would have no gradient left
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
-class VoxelRule(NamedTuple):
-    """One step's rule. each: float32 (4 WIDTH,), for every parameter of a segment its rate, then by how
-    much that grows with the parameter, then what pulls it towards zero (in rates), then its largest value:
-    one array, since LLVM vectorises no loop that has more than a few to tell apart. beta2, epsilon: Adam's;
-    correct2: 1 / (1 - beta2^t)."""
+class AdamRule(NamedTuple):
+    """Constants of one Adam step.
 
-    each: NDArray[np.float32]
+    constants: float32 (4 SEGMENT_VALUES,), for every parameter of a segment its rate, the growth of the rate
+    with the parameter, the L1 pull towards zero (in rates), and its largest value. One array, since LLVM does
+    not vectorize loops over more than a few. beta2, epsilon: Adam's. correct2: 1 / (1 - beta2^t).
+    """
+
+    constants: NDArray[np.float32]
     beta2: np.float32
     epsilon: np.float32
     correct2: np.float32
 
 
-def each_of(*pairs: tuple[float, float]) -> NDArray[np.float32]:
-    """``VoxelRule.each`` from the rate, growth, pull and largest value of (density, colours)."""
+def adam_constants(*pairs: tuple[float, float]) -> NDArray[np.float32]:
+    """``AdamRule.constants`` from rate, growth, pull and largest value, each a pair (density, colors)."""
     return np.concatenate([np.tile(np.float32([a, b, b, b]), SEGMENT) for a, b in pairs])
 
 
 @kernel
 def voxel_adam(counter, worker, table, v, gradient, dirty, rule, dropped):
-    """Adam (Kingma and Ba 2015) without its first moment on the vertices with a flag; clears gradients and
-    flags.
+    """Adam (Kingma and Ba 2015) without first moment on flagged vertices; clears gradients and flags.
 
     table, v: float32 (N, 4). gradient: float32 (P, N, 4), summed in the order of P. dirty: uint8
-    (P, N / SEGMENT). Parameters are projected to [0, top], not activated: an empty vertex keeps its
-    gradient. What got no gradient keeps its moment. dropped: int64 (tasks,), gradients not finite.
+    (P, N / SEGMENT). dropped: int64 (tasks,), receives the number of gradients that are not finite.
+    Parameters are projected to [0, largest value] instead of activated, so that an empty vertex keeps its
+    gradient. Parameters without a gradient keep their moment.
     """
     parts, flags = dirty.shape
-    each, width, limit = rule.each, WIDTH, np.float32(GRADIENT_LIMIT)
+    constants, width, limit = rule.constants, SEGMENT_VALUES, np.float32(GRADIENT_LIMIT)
     flat, flat_v, flat_g = table.reshape(-1), v.reshape(-1), gradient.reshape(parts, -1)
     total = np.empty(width, np.float32)
     while True:
@@ -57,7 +58,7 @@ def voxel_adam(counter, worker, table, v, gradient, dirty, rule, dropped):
         if task >= dropped.size:
             return
         bad = 0
-        for flag in range(task * PART, min((task + 1) * PART, flags)):
+        for flag in range(task * TASK_FLAGS, min((task + 1) * TASK_FLAGS, flags)):
             found = 0
             a, b = flag * width, (flag + 1) * width
             for buffer in range(parts):
@@ -84,46 +85,44 @@ def voxel_adam(counter, worker, table, v, gradient, dirty, rule, dropped):
                 d = min(max(raw, -limit), limit)
                 v0 = second[k] if is_finite(second[k]) else _F0
                 v1 = rule.beta2 * v0 + (_F1 - rule.beta2) * d * d
-                way = d / (np.sqrt(v1 * rule.correct2) + rule.epsilon) + each[2 * WIDTH + k]
-                q = p[k] - each[k] * (_F1 + each[WIDTH + k] * p[k]) * way
+                way = d / (np.sqrt(v1 * rule.correct2) + rule.epsilon) + constants[2 * SEGMENT_VALUES + k]
+                q = p[k] - constants[k] * (_F1 + constants[SEGMENT_VALUES + k] * p[k]) * way
                 second[k] = v1 if use else v0
-                q = min(max(q if use else p[k], _F0), each[3 * WIDTH + k])
+                q = min(max(q if use else p[k], _F0), constants[3 * SEGMENT_VALUES + k])
                 p[k] = q if is_finite(p[k]) else _F0
         dropped[task] = bad
 
 
 class DiffusionRule(NamedTuple):
-    """edge: float32 (4,), of the difference between two neighbours in density and each colour so much counts
-    at most: what differs by more is an edge, and is drawn together no faster. share: float32, of the sum of a
-    vertex's six differences by which it moves; up to 1/6 no pattern between neighbours grows."""
+    """edge: float32 (4,), bound of the difference to a neighbor, by channel: larger differences are edges and
+    diffuse no faster. share: of the sum of the six differences that a vertex moves; stable up to 1/6."""
 
     edge: NDArray[np.float32]
     share: np.float32
 
 
 @kernel
-def diffuse(counter, worker, turn, turns, voxels, away, cells, rule):
-    """Draw vertices together with their six neighbours, in cells where away (see ``Clearing``) is 0: a step
-    down the grid's total variation, made smooth where it is small (Huber 1964; diffusion that stops at edges,
-    Perona and Malik 1990).
+def diffuse(counter, worker, phase, phases, voxels, clearance, cells, rule):
+    """Diffuse vertices towards their six neighbors, in occupied cells (clearance 0, see ``SkipGrid``).
 
-    Only every ``turns``-th layer moves (2 or more): the layers beside it stand still meanwhile, and the
-    result is the same however many work at once. After all turns, 0 to turns - 1, each layer has moved once;
-    the grid's outermost vertices stay.
+    This is a descent step on the Huber-smoothed total variation of the grid (Huber 1964; edge-stopping
+    diffusion, Perona and Malik 1990). Only every ``phases``-th layer moves (2 or more) while its neighbors
+    stand still, so the result does not depend on the number of workers. After all phases, 0 to phases - 1,
+    each layer has moved once; the outermost vertices stay.
     """
     size, share = voxels.size, rule.share
     flat, plane, row = voxels.table.reshape(-1), 4 * size * size, 4 * size
-    edges = np.empty(row, np.float32)  # flat, as everything here: LLVM vectorises this alone
+    edges = np.empty(row, np.float32)  # flat arrays, since LLVM vectorizes nothing else here
     for k in range(row):
         edges[k] = rule.edge[k & 3]
     tops = np.full(row, _F1)
-    tops[::4] = DENSEST
+    tops[::4] = MAX_DENSITY
     before = np.empty(row, np.float32)
     starts = np.empty(cells + 1, np.int64)  # the first vertex of each cell that may move
     for c in range(cells + 1):
         starts[c] = min(max((c * (size - 1) + cells - 1) // cells, 1), size - 1)
     while True:
-        z = turns * fetch_add(counter, 1) + 1 + turn
+        z = phases * fetch_add(counter, 1) + 1 + phase
         if z >= size - 1:
             return
         layer = cells * cells * (z * cells // (size - 1))
@@ -132,11 +131,11 @@ def diffuse(counter, worker, turn, turns, voxels, away, cells, rule):
             line = 4 * size * (y + size * z)
             c, copied = 0, False
             while c < cells:
-                if away[cell + c] != 0:
+                if clearance[cell + c] != 0:
                     c += 1
                     continue
                 end = c + 1
-                while end < cells and away[cell + end] == 0:
+                while end < cells and clearance[cell + end] == 0:
                     end += 1
                 if not copied:
                     before[:] = flat[line : line + row]
@@ -149,25 +148,24 @@ def diffuse(counter, worker, turn, turns, voxels, away, cells, rule):
                 below, above = flat[a - plane : a - plane + n], flat[a + plane : a + plane + n]
                 for k in range(n):
                     q, e = old[k + 4], edge[k]
-                    way = _bounded(old[k] - q, e) + _bounded(old[k + 8] - q, e)
-                    way += _bounded(south[k] - q, e) + _bounded(north[k] - q, e)
-                    way += _bounded(below[k] - q, e) + _bounded(above[k] - q, e)
+                    way = _clamp(old[k] - q, e) + _clamp(old[k + 8] - q, e)
+                    way += _clamp(south[k] - q, e) + _clamp(north[k] - q, e)
+                    way += _clamp(below[k] - q, e) + _clamp(above[k] - q, e)
                     p[k] = min(max(q + share * way, _F0), top[k])
 
 
 @part
-def _bounded(d, edge):
-    """d between -edge and edge; NaN counts as -edge, so that it does not spread."""
+def _clamp(d, edge):
+    """Clamp d to [-edge, edge]; NaN becomes -edge, so that it does not spread."""
     d = d if d > -edge else -edge
     return d if d < edge else edge
 
 
 @kernel
-def refine(counter, worker, old, size, new, new_size):
+def upsample_grid(counter, worker, old, size, new, new_size):
     """Interpolate old, float32 (size^3, 4), to new (new_size^3, 4).
 
-    Density belongs to a step, and steps get shorter: what is opaque stays so and gets thinner, which is what
-    a finer grid is for.
+    Density is optical depth of one step, and steps get shorter: opaque surfaces stay opaque and get thinner.
     """
     scale = (size - 1) / (new_size - 1)
     while True:
@@ -189,9 +187,10 @@ def refine(counter, worker, old, size, new, new_size):
 
 
 @kernel
-def densest(counter, worker, phase, phases, fade, voxels, per_unit, cells, seen, min_views, density):
-    """Refresh every ``phases``-th layer of cells: the larger of the faded old density and the densest vertex
-    that reaches into a cell, times per_unit. Cells that fewer than min_views cameras see are 0."""
+def update_cell_density(counter, worker, phase, phases, fade, voxels, per_unit, cells, seen, min_views,
+                        density):  # fmt: skip
+    """Refresh every ``phases``-th layer of cells: the larger of the faded old density and the density of the
+    densest vertex that reaches into a cell, times per_unit. Cells seen by fewer than min_views get 0."""
     size, table = voxels.size, voxels.table
     scale = (size - 1) / cells
     while True:
@@ -217,23 +216,23 @@ def densest(counter, worker, phase, phases, fade, voxels, per_unit, cells, seen,
 
 
 @kernel
-def clear(occupied, cells, away):
-    """Fill away, uint8 (cells^3,), from occupied: how many cells it is to the nearest occupied one,
-    diagonals counting one; FARTHEST at most. (Rosenfeld and Pfaltz 1966: once forward, once back.)"""
-    for cell in range(away.size):
-        away[cell] = np.uint8(0) if occupied[cell] != 0 else np.uint8(FARTHEST)
+def distance_transform(occupied, cells, clearance):
+    """Fill clearance, uint8 (cells^3,), with the distance to the nearest occupied cell in cells, diagonals
+    counting one, MAX_CLEARANCE at most. A forward and a backward pass (Rosenfeld and Pfaltz 1966)."""
+    for cell in range(clearance.size):
+        clearance[cell] = np.uint8(0) if occupied[cell] != 0 else np.uint8(MAX_CLEARANCE)
     last, one = cells - 1, np.uint8(1)
-    for turn in range(2):
-        for n in range(away.size):
-            cell = n if turn == 0 else away.size - 1 - n
-            best = away[cell]
+    for phase in range(2):
+        for n in range(clearance.size):
+            cell = n if phase == 0 else clearance.size - 1 - n
+            best = clearance[cell]
             if best <= one:
                 continue
             i, j, k = cell % cells, (cell // cells) % cells, cell // (cells * cells)
-            # The layer before, in the order of this turn, and this one.
-            for c in range(max(k - 1 + turn, 0), min(k + turn, last) + 1):
+            # The previous layer, in the order of this pass, and this one.
+            for c in range(max(k - 1 + phase, 0), min(k + phase, last) + 1):
                 for b in range(max(j - 1, 0), min(j + 1, last) + 1):
                     row = cells * (b + cells * c)
                     for a in range(max(i - 1, 0), min(i + 1, last) + 1):
-                        best = min(best, np.uint8(away[row + a] + one))
-            away[cell] = best
+                        best = min(best, np.uint8(clearance[row + a] + one))
+            clearance[cell] = best

@@ -16,23 +16,23 @@ from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 from edge_server.fields.common.occupancy_grid import OccupancyGrid
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.kernels.proposal import (
-    DARK,
-    DIM,
-    FLOOR,
-    GAIN,
-    START,
-    Plan,
-    Proposed,
-    deal,
-    interlevel,
-    place,
-    propose,
+    CUTOFF_DEPTH,
+    DARK_SHARE,
+    RAW_GAIN,
+    RAW_START,
+    WEIGHT_FLOOR,
+    ProposalGrid,
+    ProposalSampling,
+    allocate_samples,
+    bin_weights,
+    interlevel_loss,
+    make_bins,
+    place_samples,
     scatter_proposal,
     unwarp,
     warp,
-    weigh,
 )
-from edge_server.fields.nerfacto.kernels.train import add_looks, spread_looks
+from edge_server.fields.nerfacto.kernels.train import add_appearance, add_appearance_backward
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from tests.edge_server.fields.scenes import ring
 
@@ -47,17 +47,17 @@ def _space(contracted: bool, occupied: np.ndarray | None = None) -> Space:
     return Space(cells, coarse, np.zeros(0, F), 16, contracted, F(0.1), F(0.1))
 
 
-def _encoding(values: np.ndarray) -> Proposed:
+def _encoding(values: np.ndarray) -> ProposalGrid:
     """Four vertices of a hash level, then the proposal's cells."""
     table = np.concatenate([np.full((SEGMENT, FEATURES), 50.0, F), values.astype(F).reshape(-1, FEATURES)])
     first = np.array([0, SEGMENT], np.int64)
-    return Proposed(np.array([2], np.int32), first, np.array([True]), table, CELLS)
+    return ProposalGrid(np.array([2], np.int32), first, np.array([True]), table, CELLS)
 
 
-def _proposed(space: Space, encoding: Proposed, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
+def _bins_of(space: Space, encoding: ProposalGrid, shift: float = 0.4, leave: float = 6.0, bins: int = BINS):
     cell, depth = np.full(bins + 5, -1, np.int32), np.full(bins + 5, np.nan, F)
     edges, at = np.empty((2, bins + 1), F), np.empty((2, bins), np.int32)
-    count, finite = propose(
+    count, finite = make_bins(
         space, encoding, bins, *START_AT, *TOWARDS, F(0.1), F(leave), F(shift), 5, cell, depth, edges, at
     )
     return cell[5 : 5 + count], depth[5 : 5 + count], edges[:, :count].copy(), finite
@@ -73,20 +73,20 @@ def _unit(points: np.ndarray, contracted: bool) -> np.ndarray:
 @pytest.mark.parametrize("shift", [0.0, 0.5, 0.99])
 def test_bins_cover_the_ray_and_know_their_cells(contracted: bool, shift: float) -> None:
     values = np.random.default_rng(0).normal(-0.3, 0.3, CELLS**3)
-    cell, depth, edges, finite = _proposed(_space(contracted), _encoding(values), shift)
+    cell, depth, edges, finite = _bins_of(_space(contracted), _encoding(values), shift)
     assert finite and len(cell) >= BINS - 1
     assert edges[0, 0] == pytest.approx(0.1) and edges[1, -1] == pytest.approx(6.0, rel=1e-5)
     np.testing.assert_array_equal(edges[0, 1:], edges[1, :-1])
     middle = edges.mean(axis=0)[:, None] * np.array(TOWARDS) + np.array(START_AT)
     index = np.clip((_unit(middle, contracted) * CELLS).astype(int), 0, CELLS - 1)
     expected = index[:, 0] + CELLS * (index[:, 1] + CELLS * index[:, 2])
-    assert (cell == expected).mean() > 0.95  # float32 may round a middle into the neighbour
-    sigma = np.exp(np.clip(GAIN * values.astype(F)[cell] + START, RAW_LOW, RAW_HIGH))
+    assert (cell == expected).mean() > 0.95  # float32 may round a middle into the neighbor
+    sigma = np.exp(np.clip(RAW_GAIN * values.astype(F)[cell] + RAW_START, RAW_LOW, RAW_HIGH))
     np.testing.assert_allclose(depth, sigma * (edges[1] - edges[0]), rtol=1e-5)
 
 
 def test_spacing_is_linear_in_the_box_and_even_in_contracted_space_beyond() -> None:
-    _, _, edges, _ = _proposed(_space(True), _encoding(np.zeros(CELLS**3)), shift=0.0, leave=19.0)
+    _, _, edges, _ = _bins_of(_space(True), _encoding(np.zeros(CELLS**3)), shift=0.0, leave=19.0)
     points = edges[0][:, None] * np.array(TOWARDS) + np.array(START_AT)
     length = np.diff(edges[0])
     inside = np.abs(points).max(axis=1)[:-1] < 1.0
@@ -100,34 +100,34 @@ def test_spacing_is_linear_in_the_box_and_even_in_contracted_space_beyond() -> N
 
 
 def test_bins_end_where_it_is_dark_and_skip_what_is_empty() -> None:
-    _, depth, _, _ = _proposed(_space(False), _encoding(np.full(CELLS**3, 1.5)), leave=2.4)
-    assert depth.sum() > DARK > depth[:-1].sum()
+    _, depth, _, _ = _bins_of(_space(False), _encoding(np.full(CELLS**3, 1.5)), leave=2.4)
+    assert depth.sum() > CUTOFF_DEPTH > depth[:-1].sum()
     occupied = np.ones((16, 16, 16), np.uint8)
     occupied[:, :, 6:10] = 0  # x in the middle
-    _, _, edges, _ = _proposed(_space(False, occupied.ravel()), _encoding(np.zeros(CELLS**3)), leave=2.4)
+    _, _, edges, _ = _bins_of(_space(False, occupied.ravel()), _encoding(np.zeros(CELLS**3)), leave=2.4)
     x = edges.mean(axis=0) * TOWARDS[0] + START_AT[0]
     assert not ((x > -0.24) & (x < 0.24)).any() and (x < -0.26).any() and (x > 0.26).any()
-    _, _, edges, _ = _proposed(_space(False, np.zeros(4096, np.uint8)), _encoding(np.zeros(CELLS**3)))
+    _, _, edges, _ = _bins_of(_space(False, np.zeros(4096, np.uint8)), _encoding(np.zeros(CELLS**3)))
     assert edges.shape[1] == 0
 
 
 def test_a_proposal_that_is_not_finite_is_noticed_and_passes_for_fog() -> None:
     values = np.full(CELLS**3, np.nan)
-    cell, depth, edges, finite = _proposed(_space(False), _encoding(values), leave=2.4)
+    cell, depth, edges, finite = _bins_of(_space(False), _encoding(values), leave=2.4)
     assert not finite and len(cell) > 0
-    np.testing.assert_allclose(depth, np.exp(START) * (edges[1] - edges[0]), rtol=1e-5)
+    np.testing.assert_allclose(depth, np.exp(RAW_START) * (edges[1] - edges[0]), rtol=1e-5)
 
 
-def _dealt(weight: np.ndarray, samples: int, even: float, shift: float):
+def _allocated(weight: np.ndarray, samples: int, even: float, shift: float):
     group, share = np.full(len(weight), -1, np.int32), np.full(len(weight), -1, np.int64)
-    groups = deal(weight.astype(F), ZERO, len(weight), samples, F(even), F(shift), group, share)
+    groups = allocate_samples(weight.astype(F), ZERO, len(weight), samples, F(even), F(shift), group, share)
     return group, share[:groups]
 
 
 def _earned(weight: np.ndarray, samples: int, even: float) -> np.ndarray:
     left, right = np.r_[weight[0], weight[:-1]], np.r_[weight[1:], weight[-1]]
     wide = 0.5 * (np.maximum(left, weight) + np.maximum(weight, right))
-    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + DIM
+    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + DARK_SHARE
     return samples * ((1 - even) * wide / wide.sum() + even * light / light.sum())
 
 
@@ -140,7 +140,7 @@ def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
     earned = _earned(weight, samples, even)
     counts = np.zeros(40)
     for shift in np.linspace(0, 1, 64, endpoint=False):
-        group, share = _dealt(weight, samples, even, shift)
+        group, share = _allocated(weight, samples, even, shift)
         assert group[0] == 0 and group[-1] == len(share) - 1 and set(np.diff(group)) <= {0, 1}
         assert (share >= 1).all() and share.sum() <= 2 * samples + 1
         for g, n in enumerate(share):
@@ -156,25 +156,25 @@ def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
 
 def test_even_and_empty_weights_are_dealt_evenly() -> None:
     for weight, even in ((np.zeros(48), 0.1), (np.full(48, 1e-30), 0.0)):
-        _, share = _dealt(weight, 16, even, 0.3)
+        _, share = _allocated(weight, 16, even, 0.3)
         assert (share == 1).all() and len(share) in (16, 24)  # three bins each, or two where rounding forbids
-    assert _dealt(np.zeros(0), 16, 0.5, 0.3)[1].size == 0
-    assert _dealt(np.array([1e-3]), 16, 0.5, 0.3)[1].tolist() == [16]
+    assert _allocated(np.zeros(0), 16, 0.5, 0.3)[1].size == 0
+    assert _allocated(np.array([1e-3]), 16, 0.5, 0.3)[1].tolist() == [16]
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.5, 0.999])
 def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> None:
     values = np.random.default_rng(2).normal(0.0, 0.5, CELLS**3)
     occupied = (np.random.default_rng(3).random(4096) < 0.7).astype(np.uint8)
-    _, depth, edges, _ = _proposed(_space(True, occupied), _encoding(values - 0.5))
+    _, depth, edges, _ = _bins_of(_space(True, occupied), _encoding(values - 0.5))
     count = len(depth)
     weight = np.empty(count, F)
-    weigh(depth, ZERO, count, weight)
+    bin_weights(depth, ZERO, count, weight)
     total = np.r_[0.0, np.cumsum(depth, dtype=float)]
     np.testing.assert_allclose(weight, np.exp(-total[:-1]) - np.exp(-total[1:]), atol=1e-6)
-    group, share = _dealt(weight, 16, 0.2, shift)
+    group, share = _allocated(weight, 16, 0.2, shift)
     x, line = np.empty((3, 99), F), np.empty((3, 99), F)
-    n = place(
+    n = place_samples(
         True, *START_AT, *TOWARDS, edges, group, ZERO, count, share, F(shift), np.int64(2), np.int64(99), x,
         line,
     )  # fmt: skip
@@ -187,7 +187,7 @@ def test_samples_lie_in_their_groups_and_stand_for_all_of_them(shift: float) -> 
         assert ((edges[0, members] <= t[k]) & (t[k] <= edges[1, members])).any()
     points = t[:, None] * np.array(TOWARDS) + np.array(START_AT)
     np.testing.assert_allclose(x[:, 2:n].T, _unit(points, True), atol=1e-5)
-    limited = place(
+    limited = place_samples(
         True, *START_AT, *TOWARDS, edges, group, ZERO, count, share, F(shift), ZERO, np.int64(3), x, line
     )
     assert limited == 3
@@ -202,7 +202,7 @@ def _interlevel_case(seed: int):
     length = rng.random(count) * 0.4
     if seed % 2:
         cell[4], length[4] = 7, 1e-4
-    raw = np.clip(GAIN * values.astype(F)[cell] + START, RAW_LOW, RAW_HIGH)
+    raw = np.clip(RAW_GAIN * values.astype(F)[cell] + RAW_START, RAW_LOW, RAW_HIGH)
     depth = np.r_[0, 0, np.exp(raw) * length].astype(F)
     group = np.r_[9, 9, 0, 0, 1, 2, 2, 2, 3, 4, 5, 5, 6, 6].astype(np.int32)
     of = np.repeat(np.arange(7), [1, 4, 1, 3, 2, 1, 1]).astype(F)
@@ -212,14 +212,14 @@ def _interlevel_case(seed: int):
 
 def _interlevel_oracle(values: torch.Tensor, cell, length, group, of, w) -> tuple[torch.Tensor, torch.Tensor]:
     """Eq. 13 over groups of bins, in double precision; and all that the gradient is of."""
-    raw = GAIN * values[torch.as_tensor(cell, dtype=torch.long)] + START
+    raw = RAW_GAIN * values[torch.as_tensor(cell, dtype=torch.long)] + RAW_START
     depth = torch.as_tensor(length) * raw.clamp(RAW_LOW, RAW_HIGH).exp()
-    pull = 0.02 * (raw - START).clamp(min=0).square().sum()
+    pull = 0.02 * (raw - RAW_START).clamp(min=0).square().sum()
     after = torch.exp(-depth.cumsum(0))
     weight = torch.cat([torch.ones(1, dtype=after.dtype), after[:-1]]) - after
     inside = torch.zeros(7, dtype=torch.float64).index_add(0, torch.as_tensor(of, dtype=torch.long), w)
     bound = torch.zeros(7, dtype=torch.float64).index_add(0, torch.as_tensor(group, dtype=torch.long), weight)
-    loss = ((inside - bound).clamp(min=0).square() / (inside + FLOOR)).sum()
+    loss = ((inside - bound).clamp(min=0).square() / (inside + WEIGHT_FLOOR)).sum()
     return loss, 1.5 * loss + pull
 
 
@@ -227,10 +227,10 @@ def _interlevel_oracle(values: torch.Tensor, cell, length, group, of, w) -> tupl
 def test_interlevel_loss_and_gradient_equal_the_oracle_and_finite_differences(seed: int) -> None:
     encoding, cell, length, depth, group, of, w = _interlevel_case(seed)
     weight, grad = np.empty(14, F), np.full(14, 7.0, F)
-    weigh(depth, 2, 12, weight)
-    loss = interlevel(
+    bin_weights(depth, 2, 12, weight)
+    loss = interlevel_loss(
         encoding, np.r_[0, 0, cell].astype(np.int32), depth, weight, group, 2, 12, w, of, 0, len(of),
-        Plan(BINS, 16, F(0.1), F(1.5), F(0.04)), np.empty((2, BINS), F), grad,
+        ProposalSampling(BINS, 16, F(0.1), F(1.5), F(0.04)), np.empty((2, BINS), F), grad,
     )  # fmt: skip
     values = torch.as_tensor(encoding.table[SEGMENT:].reshape(-1), dtype=torch.float64).requires_grad_(True)
     rest = cell, length, group[2:], of, torch.as_tensor(w, dtype=torch.float64)
@@ -267,7 +267,7 @@ def test_the_proposals_gradient_is_added_up_once() -> None:
 def test_appearances_equal_the_oracle_and_finite_differences() -> None:
     rng = np.random.default_rng(5)
     size, row, a, b = 2, 4, 3, 17
-    raw, look = rng.normal(size=(12, 20)).astype(F), rng.normal(size=size).astype(F)
+    raw, embedding = rng.normal(size=(12, 20)).astype(F), rng.normal(size=size).astype(F)
     wanted = rng.normal(size=(3, 20)).astype(F)
 
     def oracle(shares: torch.Tensor, e: torch.Tensor) -> torch.Tensor:
@@ -275,29 +275,29 @@ def test_appearances_equal_the_oracle_and_finite_differences() -> None:
         return mixed[:, a:b]
 
     shares = torch.as_tensor(raw, dtype=torch.float64).requires_grad_(True)
-    e = torch.as_tensor(look, dtype=torch.float64).requires_grad_(True)
+    e = torch.as_tensor(embedding, dtype=torch.float64).requires_grad_(True)
     out = raw.copy()
-    add_looks(out, row, look, a, b)
+    add_appearance(out, row, embedding, a, b)
     np.testing.assert_allclose(out[1:4, a:b], oracle(shares, e).detach().numpy(), atol=1e-5)
     np.testing.assert_array_equal(np.delete(out[1:4], np.s_[a:b], axis=1), raw[1:4][:, [0, 1, 2, 17, 18, 19]])
     (oracle(shares, e) * torch.as_tensor(wanted[:, a:b])).sum().backward()
-    d_out, d_look = np.zeros((12, 20), F), np.zeros(size, F)
+    d_out, d_embedding = np.zeros((12, 20), F), np.zeros(size, F)
     d_out[1:4] = wanted
-    spread_looks(out, d_out, row, look, a, b, d_look)
+    add_appearance_backward(out, d_out, row, embedding, a, b, d_embedding)
     assert shares.grad is not None and e.grad is not None
     np.testing.assert_allclose(d_out[4:10, a:b], shares.grad.numpy()[4:10, a:b], atol=1e-5)
-    np.testing.assert_allclose(d_look, e.grad.numpy(), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(d_embedding, e.grad.numpy(), rtol=1e-5, atol=1e-5)
     for k in range(size):
         step = torch.zeros(size, dtype=torch.float64)
         step[k] = 1e-4
         with torch.no_grad():
             both = oracle(shares, e + step) - oracle(shares, e - step)
         slope = (both * torch.as_tensor(wanted[:, a:b])).sum().item() / 2e-4
-        assert slope == pytest.approx(d_look[k], rel=1e-4)
+        assert slope == pytest.approx(d_embedding[k], rel=1e-4)
 
 
 def test_a_whole_steps_gradients_equal_finite_differences() -> None:
-    """Of the colour error, by the network's parameters and by the cameras' embeddings."""
+    """Of the color error, by the network's parameters and by the cameras' embeddings."""
     settings = NerfactoSettings(
         levels=3, log2_table=9, base_resolution=4, finest_resolution=24, hidden=8, rays=64,
         batch_samples=4096, samples=12, samples_start=12, bins=24, cells=16, proposal_cells=8,
@@ -320,9 +320,9 @@ def test_a_whole_steps_gradients_equal_finite_differences() -> None:
 
     loss()
     rays = int(field._batch.rays.sum())
-    slopes = field._batch.d_params.sum(axis=0), field._bins.looks.sum(axis=0)
+    slopes = field._batch.d_params.sum(axis=0), field._proposal_gradients.d_embeddings.sum(axis=0)
     assert rays == 64 and field._batch.samples.sum() > 64 and np.abs(slopes[1]).max() > 1e-4
-    net, looks = field._net.params, field._cameras.now
+    net, looks = field._net.params, field._cameras.embeddings
     checked = 0
     for array, slope in ((net, slopes[0]), (looks, slopes[1])):
         flat, wanted = array.reshape(-1), slope.reshape(-1)

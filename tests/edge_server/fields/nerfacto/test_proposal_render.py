@@ -14,9 +14,9 @@ from edge_server.fields.common.kernels.hash_grid import Grid
 from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.nerfacto.field import NerfactoField, NerfactoSnapshot
-from edge_server.fields.nerfacto.kernels.render import ROOM, TILE, render_proposed
+from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, TILE, render_with_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings
-from edge_server.fields.ngp.torch_model import encode, mlp, shade, to_torch, weights_of
+from edge_server.fields.ngp.torch_model import encode, mlp, ray_weights, shade, to_torch
 from tests.edge_server.fields.scenes import ring
 
 VIEWS = ring(6, size=24)
@@ -38,13 +38,16 @@ def _render(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Places (N, 3), distances and lengths (2, N) of the samples that stay in the scratch; RGBDA (P, 5)."""
     view, n = VIEWS[2], len(pixels)
-    x, line = np.full((1, 3, ROOM), np.nan, np.float32), np.full((1, 3, ROOM), np.nan, np.float32)
+    x, line = (
+        np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32),
+        np.full((1, 3, SAMPLE_BATCH), np.nan, np.float32),
+    )
     out = np.full((n, 3), np.nan, np.float32), np.full(n, np.nan, np.float32), np.full(n, np.nan, np.float32)
     CallerPool().run(
-        render_proposed, np.array(lens_row(view.intrinsics)), view.camera_to_world[:3, :3].copy(),
-        snapshot.box.normalise(view.camera_to_world[:3, 3]), pixels, snapshot.plan, snapshot.space,
+        render_with_proposal, np.array(lens_row(view.intrinsics)), view.camera_to_world[:3, :3].copy(),
+        snapshot.box.normalise(view.camera_to_world[:3, 3]), pixels, snapshot.sampling, snapshot.space,
         snapshot.encoding, snapshot.levels, snapshot.net, snapshot.harmonics, snapshot.background,
-        np.empty((1, int(snapshot.net.widths.sum()), ROOM), np.float32), x, line, *out,
+        np.empty((1, int(snapshot.net.widths.sum()), SAMPLE_BATCH), np.float32), x, line, *out,
     )  # fmt: skip
     here = np.isfinite(x[0, 0])
     return x[0][:, here].T, line[0, 0, here], line[0, 1, here], np.column_stack(out)
@@ -63,7 +66,7 @@ def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: NerfactoSnapshot) ->
         at, d = torch.as_tensor(places, dtype=torch.float64), torch.as_tensor(way, dtype=torch.float64)
         raw = mlp(snapshot.net.widths.tolist(), params, encode(grid, snapshot.levels, at))
         sigma, color = shade(raw, snapshot.harmonics, d)
-        weight, left = weights_of(sigma[None], torch.as_tensor(delta, dtype=torch.float64)[None])
+        weight, left = ray_weights(sigma[None], torch.as_tensor(delta, dtype=torch.float64)[None])
         back = torch.as_tensor(snapshot.background, dtype=torch.float64)
         expected = (weight[0, :, None] * color).sum(dim=0) + left[0] * back
         np.testing.assert_allclose(rendered[0, :3], expected.clamp(0.0, 1.0).numpy(), atol=2e-5)
@@ -78,7 +81,7 @@ def test_a_ray_is_what_torch_makes_of_its_samples(snapshot: NerfactoSnapshot) ->
 def test_rays_do_not_depend_on_those_beside_them(snapshot: NerfactoSnapshot) -> None:
     """More rays than one task holds, and more samples than there is room for at a time."""
     pixels = np.random.default_rng(1).uniform(0.0, 24.0, (TILE + 30, 2))
-    assert TILE * SETTINGS.samples >= 2 * ROOM
+    assert TILE * SETTINGS.samples >= 2 * SAMPLE_BATCH
     together = _render(snapshot, pixels)[-1]
     alone = np.concatenate([_render(snapshot, p[None])[-1] for p in pixels])
     np.testing.assert_allclose(together, alone, atol=1e-6)

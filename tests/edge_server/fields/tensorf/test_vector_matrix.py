@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from edge_server.fields.tensorf.field import TensorfField, finer
+from edge_server.fields.tensorf.field import TensorfField, upsample_table
 from edge_server.fields.tensorf.kernels.vector_matrix import (
     CHANNELS,
     ROWS,
     Planes,
-    components,
-    density,
-    regularise,
+    color_components,
+    raw_density,
+    regularize,
     scatter_planes,
 )
 from edge_server.fields.tensorf.settings import TensorfSettings
@@ -54,8 +54,8 @@ def _oracle(planes: Planes, table: torch.Tensor, x: torch.Tensor) -> torch.Tenso
 def test_density_and_components_equal_the_oracle() -> None:
     planes, (x, _) = _planes(), _points(300)
     raw, acts = np.full(300, np.nan, np.float32), np.full((60, 300), np.nan, np.float32)
-    density(planes, x[0], 0, 300, raw)
-    components(planes, x[0], 0, 300, acts)
+    raw_density(planes, x[0], 0, 300, raw)
+    color_components(planes, x[0], 0, 300, acts)
     expected = _oracle(planes, torch.as_tensor(planes.table), torch.as_tensor(x[0].T)).numpy()
     summed = planes.bias + expected[:, : planes.density_groups].sum(axis=(1, 2))
     np.testing.assert_allclose(raw, summed, atol=1e-3)
@@ -67,8 +67,8 @@ def test_density_and_components_equal_the_oracle() -> None:
 def test_a_range_leaves_the_other_samples_alone() -> None:
     planes, (x, _) = _planes(), _points(64)
     raw, acts = np.full(64, 7.0, np.float32), np.full((60, 64), 7.0, np.float32)
-    density(planes, x[0], 10, 31, raw)
-    components(planes, x[0], 10, 31, acts)
+    raw_density(planes, x[0], 10, 31, raw)
+    color_components(planes, x[0], 10, 31, acts)
     for row in (raw, *acts[:48]):
         assert (row[:10] == 7.0).all() and (row[31:] == 7.0).all() and not (row[10:31] == 7.0).any()
 
@@ -118,7 +118,7 @@ def test_gradient_equals_finite_differences() -> None:
         assert slope.item() / 2e-4 == pytest.approx(gradient[row, column], rel=1e-3, abs=1e-4)
 
 
-def test_regularisers_equal_the_oracle_where_something_is_dirty() -> None:
+def test_regularizers_equal_the_oracle_where_something_is_dirty() -> None:
     planes = _planes()
     table = torch.as_tensor(planes.table).requires_grad_(True)
     n, total = planes.size, torch.zeros(())
@@ -132,7 +132,7 @@ def test_regularisers_equal_the_oracle_where_something_is_dirty() -> None:
     assert table.grad is not None
     gradient, dirty = np.zeros_like(planes.table), np.zeros(len(planes.table) // ROWS, np.bool_)
     dirty[::3] = True
-    regularise(np.zeros(1, np.int64), 0, planes, np.float32(0.1), np.float32(0.03), gradient, dirty)
+    regularize(np.zeros(1, np.int64), 0, planes, np.float32(0.1), np.float32(0.03), gradient, dirty)
     expected = np.where(np.repeat(dirty, ROWS)[:, None], table.grad.numpy(), 0.0)
     np.testing.assert_allclose(gradient, expected, atol=1e-5)
 
@@ -141,7 +141,7 @@ def test_regularisers_equal_the_oracle_where_something_is_dirty() -> None:
 def test_finer_planes_say_the_same(new: int) -> None:
     """Exactly at 2 n - 1 vertices a side; nearly, otherwise."""
     planes, (x, _) = _planes(), _points(200)
-    table = finer(planes.table, planes.groups, planes.size, new)
+    table = upsample_table(planes.table, planes.groups, planes.size, new)
     fine = planes._replace(size=new, rows=len(table) // planes.groups, table=table)
     points = torch.as_tensor(x[0].T)
     before = _oracle(planes, torch.as_tensor(planes.table), points).numpy()

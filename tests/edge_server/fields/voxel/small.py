@@ -2,7 +2,7 @@
 
 from edge_server.fields import Rendering
 from edge_server.fields.voxel.field import VoxelField
-from edge_server.fields.voxel.kernels.update import DENSEST
+from edge_server.fields.voxel.kernels.update import MAX_DENSITY
 from edge_server.fields.voxel.settings import VoxelSettings
 
 FIELD = VoxelField
@@ -19,4 +19,4 @@ REACHED_DB = {
 def check_bounds(field: VoxelField, out: Rendering) -> None:
     """Of parameters, after anything that may have happened to them."""
     table = field.state()["table"]
-    assert table.min() >= 0.0 and table[:, 0].max() <= DENSEST and table[:, 1:].max() <= 1.0
+    assert table.min() >= 0.0 and table[:, 0].max() <= MAX_DENSITY and table[:, 1:].max() <= 1.0

@@ -87,13 +87,13 @@ def test_a_plain_background_is_known_to_be_empty_in_spite_of_noise() -> None:
     noisy = [replace(v, image=np.clip(v.image + n, 0, 255).astype(np.uint8)) for v, n in zip(SEEN, noise)]
     field = VoxelField(SMALL)
     field.fit(noisy, Budget(steps=2))
-    assert field._outlines is not None
-    alpha = field._outlines[1].pixels[:, 3]
+    assert field._outline_views is not None
+    alpha = field._outline_views[1].pixels[:, 3]
     sky = np.concatenate([(v.image == v.image[0, 0]).all(axis=-1).ravel() for v in SEEN])
     assert alpha[sky].mean() < 1.0 and alpha[~sky].mean() > 250.0
     without = VoxelField(replace(SMALL, outline=0.0))
     without.fit(noisy, Budget(steps=2))
-    assert without._outlines is not None and without._outlines[1].pixels.shape[1] == 3
+    assert without._outline_views is not None and without._outline_views[1].pixels.shape[1] == 3
 
 
 def test_it_is_registered_and_its_options_are_checked() -> None:

@@ -15,20 +15,27 @@ from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.kernels.train import RaySampling
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_views
-from edge_server.fields.voxel.kernels.rays import SEGMENT, Clearing, Voxels, spread, trace, train_rays
+from edge_server.fields.voxel.kernels.rays import (
+    SEGMENT,
+    SkipGrid,
+    Voxels,
+    march_ray,
+    march_ray_backward,
+    train_rays,
+)
 from edge_server.fields.voxel.kernels.update import (
-    DENSEST,
-    FARTHEST,
+    MAX_CLEARANCE,
+    MAX_DENSITY,
+    AdamRule,
     DiffusionRule,
-    VoxelRule,
-    clear,
-    densest,
+    adam_constants,
     diffuse,
-    each_of,
-    refine,
+    distance_transform,
+    update_cell_density,
+    upsample_grid,
     voxel_adam,
 )
-from edge_server.fields.voxel.snapshot import VoxelSnapshot, make_trace
+from edge_server.fields.voxel.snapshot import VoxelSnapshot, make_ray_scratch
 from tests.edge_server.fields.scenes import ring
 
 SIZE, CELLS = 9, 8
@@ -53,13 +60,13 @@ def _voxels(seed: int = 0, densest: float = 1.5) -> Voxels:
     return Voxels(SIZE, table)
 
 
-def _space(contracted: bool, occupied: NDArray[np.uint8] | None = None) -> Clearing:
+def _space(contracted: bool, occupied: NDArray[np.uint8] | None = None) -> SkipGrid:
     if occupied is None:
         occupied = np.ones(CELLS**3, np.uint8)
-    away = np.full(CELLS**3, 77, np.uint8)
-    clear(occupied, CELLS, away)
+    clearance = np.full(CELLS**3, 77, np.uint8)
+    distance_transform(occupied, CELLS, clearance)
     step = np.float32((4.0 if contracted else 2.0) / (SIZE - 1))
-    return Clearing(away, CELLS, contracted, step, np.float32(0.1))
+    return SkipGrid(clearance, CELLS, contracted, step, np.float32(0.1))
 
 
 def _rays(count: int, contracted: bool) -> list[Ray]:
@@ -75,7 +82,7 @@ def _rays(count: int, contracted: bool) -> list[Ray]:
     return rays
 
 
-def _sampled(space: Clearing, ray: Ray) -> tuple[NDArray, NDArray]:
+def _sampled(space: SkipGrid, ray: Ray) -> tuple[NDArray, NDArray]:
     """Unit-cube places (N, 3) and distances (N,) of a ray's samples, one after the other, none left out but
     those in empty cells. float64."""
     t, places, ts = np.float64(np.float32(ray.enter)), [], []
@@ -87,7 +94,7 @@ def _sampled(space: Clearing, ray: Ray) -> tuple[NDArray, NDArray]:
             step, p = step * m * m, p * (2.0 - 1.0 / m) / m
         u = np.clip(p * scale + 0.5, 0.0, 0.9999999)
         i, j, k = (u * CELLS).astype(int)
-        if space.away[i + CELLS * (j + CELLS * k)] == 0:
+        if space.clearance[i + CELLS * (j + CELLS * k)] == 0:
             places.append(u)
             ts.append(t)
         t += step
@@ -97,7 +104,7 @@ def _sampled(space: Clearing, ray: Ray) -> tuple[NDArray, NDArray]:
 def _oracle(
     table: torch.Tensor, places: NDArray, ts: NDArray
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Colour (3,) over BACK, weighted distance and opacity of one ray, by torch's own interpolation."""
+    """Color (3,) over BACK, weighted distance and opacity of one ray, by torch's own interpolation."""
     grid = table[: SIZE**3].reshape(SIZE, SIZE, SIZE, 4).permute(3, 0, 1, 2)[None]
     at = torch.as_tensor(2.0 * places - 1.0)[None, None, None]
     values = torch.nn.functional.grid_sample(grid, at, align_corners=True, padding_mode="border")
@@ -110,9 +117,9 @@ def _oracle(
     return color, (weights * torch.as_tensor(ts)).sum(), 1.0 - left
 
 
-def _traced(space: Clearing, voxels: Voxels, ray: Ray):
-    memory = make_trace(1)
-    found = trace(
+def _traced(space: SkipGrid, voxels: Voxels, ray: Ray):
+    memory = make_ray_scratch(1)
+    found = march_ray(
         space, voxels, *ray.origin, *ray.direction, np.float32(ray.enter), np.float32(ray.leave),
         memory.row[0], memory.line[0],
     )  # fmt: skip
@@ -124,22 +131,24 @@ def test_color_distance_and_gradient_equal_the_oracle(contracted: bool) -> None:
     voxels, space = _voxels(densest=0.4), _space(contracted)
     target, checked = np.array([0.2, 0.9, 0.4], np.float32), 0
     for ray in _rays(40, contracted):
-        memory, (n, through, red, green, blue, far) = _traced(space, voxels, ray)
+        memory, (n, transmittance, red, green, blue, far) = _traced(space, voxels, ray)
         places, ts = _sampled(space, ray)
-        if n != len(places) or through < 2e-3:
+        if n != len(places) or transmittance < 2e-3:
             continue  # the raster's end falls on the box's side, or the ray ends early
         checked += 1
         table = torch.tensor(voxels.table, dtype=torch.float64, requires_grad=True)
         color, distance, solid = _oracle(table, places, ts)
-        mine = np.array([red, green, blue]) + through * BACK
+        mine = np.array([red, green, blue]) + transmittance * BACK
         np.testing.assert_allclose(mine, color.detach().numpy(), atol=2e-6)
         assert far == pytest.approx(float(distance.detach()), rel=1e-5, abs=1e-6)
         error = torch.sum((color - torch.as_tensor(target, dtype=torch.float64)) ** 2)
         (error + OUTLINE * (solid - ALPHA) ** 2).backward()
         gradient, dirty = np.zeros_like(voxels.table), np.zeros(len(voxels.table) // SEGMENT, np.uint8)
         d = (2.0 * (mine - target)).astype(np.float32)
-        d_solid = np.float32(2.0 * OUTLINE * (1.0 - through - ALPHA) * through)
-        spread(memory.row[0], memory.line[0], n, SIZE, *d, np.float32(d @ mine), d_solid, gradient, dirty)
+        d_depth_total = np.float32(2.0 * OUTLINE * (1.0 - transmittance - ALPHA) * transmittance)
+        march_ray_backward(
+            memory.row[0], memory.line[0], n, SIZE, *d, np.float32(d @ mine), d_depth_total, gradient, dirty
+        )
         assert table.grad is not None
         np.testing.assert_allclose(gradient, table.grad.numpy(), atol=3e-6)
         touched = (gradient.reshape(-1, 4 * SEGMENT) != 0).any(axis=1)
@@ -153,14 +162,16 @@ def test_gradients_are_those_of_finite_differences() -> None:
     target = np.array([0.9, 0.1, 0.5], np.float32)
 
     def loss() -> float:
-        _, (_, through, *color, _) = _traced(space, voxels, ray)
-        return float(((np.array(color, np.float64) + through * BACK - target) ** 2).sum())
+        _, (_, transmittance, *color, _) = _traced(space, voxels, ray)
+        return float(((np.array(color, np.float64) + transmittance * BACK - target) ** 2).sum())
 
-    memory, (n, through, red, green, blue, _) = _traced(space, voxels, ray)
-    mine = np.array([red, green, blue]) + through * BACK
+    memory, (n, transmittance, red, green, blue, _) = _traced(space, voxels, ray)
+    mine = np.array([red, green, blue]) + transmittance * BACK
     d = (2.0 * (mine - target)).astype(np.float32)
     gradient, dirty = np.zeros_like(voxels.table), np.zeros(len(voxels.table) // SEGMENT, np.uint8)
-    spread(memory.row[0], memory.line[0], n, SIZE, *d, np.float32(d @ mine), np.float32(0), gradient, dirty)
+    march_ray_backward(
+        memory.row[0], memory.line[0], n, SIZE, *d, np.float32(d @ mine), np.float32(0), gradient, dirty
+    )
     largest = np.argsort(-np.abs(gradient), axis=0)[:15]  # of each channel
     for k in (4 * largest + np.arange(4)).ravel():
         flat = voxels.table.reshape(-1)
@@ -193,7 +204,7 @@ def test_empty_cells_are_stepped_over_on_the_same_raster() -> None:
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_pictures_are_those_of_the_oracle(contracted: bool) -> None:
-    """Colour, depth and opacity of a distorted camera's pixels, whichever worker renders them."""
+    """Color, depth and opacity of a distorted camera's pixels, whichever worker renders them."""
     lower = np.repeat(np.array([1, 0], np.uint8), CELLS**3 // 2)
     voxels, space, view = _voxels(6, densest=0.4), _space(contracted, lower), ring(5, size=12)[2]
     camera = replace(view.intrinsics, distortion=(-0.1, 0.02, 0.003, -0.002))
@@ -209,8 +220,8 @@ def test_pictures_are_those_of_the_oracle(contracted: bool) -> None:
         enter, leave = interval(space, *origin, *directions[at])
         ray = Ray(origin, directions[at], float(enter + 0.5 * space.step), float(leave))
         places, ts = _sampled(space, ray)
-        _, (n, through, *_) = _traced(space, voxels, ray)
-        if n != len(places) or through < 2e-3:
+        _, (n, transmittance, *_) = _traced(space, voxels, ray)
+        if n != len(places) or transmittance < 2e-3:
             continue  # the raster's end falls on the box's side, or the ray ends early
         color, distance, solid = (x.numpy() for x in _oracle(table, places, ts))
         np.testing.assert_allclose(rendered.color[at], color, atol=1e-5)
@@ -224,11 +235,11 @@ def test_pictures_are_those_of_the_oracle(contracted: bool) -> None:
 def test_a_ray_ends_where_it_is_opaque() -> None:
     voxels, space, ray = _voxels(), _space(False), _rays(1, False)[0]
     voxels.table[:, 0] = 12.0
-    _, (n, through, *_) = _traced(space, voxels, ray)
-    assert n == 1 and through < 1e-5
+    _, (n, transmittance, *_) = _traced(space, voxels, ray)
+    assert n == 1 and transmittance < 1e-5
     voxels.table[:, 0] = 1.0
-    _, (n, through, *_) = _traced(space, voxels, ray)
-    assert n == 7 and through == pytest.approx(np.exp(-7.0), rel=1e-5)
+    _, (n, transmittance, *_) = _traced(space, voxels, ray)
+    assert n == 7 and transmittance == pytest.approx(np.exp(-7.0), rel=1e-5)
 
 
 def _training(parts: int, rays: int, outline: float = 0.0, alpha: int | None = None, densest: float = 1.5):
@@ -243,7 +254,7 @@ def _training(parts: int, rays: int, outline: float = 0.0, alpha: int | None = N
     samples, dropped, loss = np.zeros(parts, np.int64), np.zeros(parts, np.int64), np.zeros(parts)
     recipe = RaySampling(np.uint64(77), rays, 1, 1, np.float32(0.0), BACK, False)
     pool = CallerPool()
-    pool.run(train_rays, data, recipe, _space(False), voxels, rays, np.float32(outline), make_trace(1),
+    pool.run(train_rays, data, recipe, _space(False), voxels, rays, np.float32(outline), make_ray_scratch(1),
              gradient, dirty, samples, dropped, loss)  # fmt: skip
     return gradient, dirty, samples, dropped, loss
 
@@ -282,9 +293,9 @@ def test_adam_equals_torch_without_its_first_moment() -> None:
         adam.step()
         with torch.no_grad():
             theirs.clamp_(min=0.0)
-            theirs.clamp_(max=torch.tensor([DENSEST, 1.0, 1.0, 1.0], dtype=torch.float64))
-        each = each_of((0.05, 0.05), (0, 0), (0, 0), (DENSEST, 1))
-        rule = VoxelRule(each, np.float32(0.95), np.float32(5e-3),
+            theirs.clamp_(max=torch.tensor([MAX_DENSITY, 1.0, 1.0, 1.0], dtype=torch.float64))
+        constants = adam_constants((0.05, 0.05), (0, 0), (0, 0), (MAX_DENSITY, 1))
+        rule = AdamRule(constants, np.float32(0.95), np.float32(5e-3),
                          np.float32(1.0 / (1.0 - 0.95**step)))  # fmt: skip
         pool.run(voxel_adam, table, second, gradient, dirty, rule, dropped)
         np.testing.assert_allclose(table[: 4 * SEGMENT], theirs.detach().numpy(), atol=1e-5)
@@ -298,8 +309,8 @@ def test_adam_grows_pulls_projects_and_drops_what_is_not_finite() -> None:
     gradient[0, 0] = (1e30, np.nan, np.inf, 0.0)  # limited; dropped twice; not touched
     gradient[0, 1] = (1e-20, 1.0, -1e3, 0.0)  # touched, nothing else
     dirty, dropped = np.ones((1, 1), np.uint8), np.zeros(1, np.int64)
-    each = each_of((0.01, 2.0), (20.0, 0.0), (0.1, 0.0), (DENSEST, 1.0))
-    rule = VoxelRule(each, np.float32(0.0), np.float32(1e-6), np.float32(1.0))
+    constants = adam_constants((0.01, 2.0), (20.0, 0.0), (0.1, 0.0), (MAX_DENSITY, 1.0))
+    rule = AdamRule(constants, np.float32(0.0), np.float32(1e-6), np.float32(1.0))
     CallerPool().run(voxel_adam, table, second, gradient, dirty, rule, dropped)
     np.testing.assert_allclose(table[0], [0.5 - 0.11 * 1.1, 0.5, 0.5, 0.5], rtol=1e-5)
     np.testing.assert_allclose(table[1], [0.5 - 0.011, 0.0, 1.0, 0.5], rtol=1e-5)
@@ -314,24 +325,24 @@ def _grid(size: int, seed: int) -> Voxels:
 
 
 def _diffused(
-    voxels: Voxels, away: NDArray[np.uint8], cells: int, rule: DiffusionRule, turns: int = 4
+    voxels: Voxels, clearance: NDArray[np.uint8], cells: int, rule: DiffusionRule, phases: int = 4
 ) -> NDArray[np.float32]:
-    """The grid (size, size, size, 4) after all turns: z, y, x."""
+    """The grid (size, size, size, 4) after all phases: z, y, x."""
     size = voxels.size
     own = Voxels(size, voxels.table.copy())
-    for turn in range(turns):
-        CallerPool().run(diffuse, turn, turns, own, away, cells, rule)
+    for phase in range(phases):
+        CallerPool().run(diffuse, phase, phases, own, clearance, cells, rule)
     np.testing.assert_array_equal(own.table[size**3 :], voxels.table[size**3 :])
     return own.table[: size**3].reshape(size, size, size, 4)
 
 
 def _diffused_by_numpy(
-    voxels: Voxels, away: NDArray[np.uint8], cells: int, rule: DiffusionRule, turns: int
+    voxels: Voxels, clearance: NDArray[np.uint8], cells: int, rule: DiffusionRule, phases: int
 ) -> NDArray[np.float64]:
     size = voxels.size
     grid = voxels.table[: size**3].reshape(size, size, size, 4).astype(np.float64)
-    empty = away.reshape(cells, cells, cells) != 0
-    for z in (z for turn in range(turns) for z in range(1 + turn, size - 1, turns)):
+    empty = clearance.reshape(cells, cells, cells) != 0
+    for z in (z for phase in range(phases) for z in range(1 + phase, size - 1, phases)):
         for y in range(1, size - 1):
             new = grid[z, y].copy()
             for x in range(1, size - 1):
@@ -339,48 +350,48 @@ def _diffused_by_numpy(
                 around = np.stack([*near, grid[z - 1, y, x], grid[z + 1, y, x]])
                 way = np.clip(around - grid[z, y, x], -rule.edge, rule.edge).sum(axis=0)
                 if not empty[tuple(int(c / (size - 1) * cells + 1e-9) for c in (z, y, x))]:
-                    new[x] = np.clip(grid[z, y, x] + rule.share * way, 0.0, [DENSEST, 1.0, 1.0, 1.0])
+                    new[x] = np.clip(grid[z, y, x] + rule.share * way, 0.0, [MAX_DENSITY, 1.0, 1.0, 1.0])
             grid[z, y] = new
     return grid
 
 
 @pytest.mark.parametrize(
-    ("size", "cells", "empty", "turns"),
+    ("size", "cells", "empty", "phases"),
     [(9, 8, 0.0, 4), (9, 8, 0.3, 2), (10, 8, 0.3, 4), (9, 4, 0.5, 4), (9, 12, 0.5, 4), (4, 16, 0.3, 3),
      (9, 8, 1.0, 4)],
 )  # fmt: skip
 def test_diffusion_is_that_of_numpy_and_leaves_empty_cells_alone(
-    size: int, cells: int, empty: float, turns: int
+    size: int, cells: int, empty: float, phases: int
 ) -> None:
     voxels = _grid(size, 2)
-    away = (np.random.default_rng(9).random(cells**3) < empty).astype(np.uint8)
+    clearance = (np.random.default_rng(9).random(cells**3) < empty).astype(np.uint8)
     rule = DiffusionRule(np.float32([0.3, 0.05, 0.1, 1e9]), np.float32(1 / 6))
-    got = _diffused(voxels, away, cells, rule, turns)
-    np.testing.assert_allclose(got, _diffused_by_numpy(voxels, away, cells, rule, turns), atol=2e-6)
+    got = _diffused(voxels, clearance, cells, rule, phases)
+    np.testing.assert_allclose(got, _diffused_by_numpy(voxels, clearance, cells, rule, phases), atol=2e-6)
     assert (got != voxels.table[: size**3].reshape(got.shape)).any() == (empty < 1.0)
 
 
 def test_diffusion_keeps_what_is_even_and_what_is_steep() -> None:
     """A ramp has no curvature. A step many times ``edge`` high moves by ``edge`` at most."""
-    ramp, away = _voxels(), np.zeros(CELLS**3, np.uint8)
+    ramp, clearance = _voxels(), np.zeros(CELLS**3, np.uint8)
     x = np.arange(SIZE**3) % SIZE
     ramp.table[: SIZE**3] = 0.1 * x[:, None]
     rule = DiffusionRule(np.full(4, 0.2, np.float32), np.float32(1 / 6))
     kept = ramp.table[: SIZE**3].reshape(SIZE, SIZE, SIZE, 4)
-    np.testing.assert_allclose(_diffused(ramp, away, CELLS, rule), kept, atol=1e-6)
+    np.testing.assert_allclose(_diffused(ramp, clearance, CELLS, rule), kept, atol=1e-6)
     step = Voxels(SIZE, ramp.table.copy())
     step.table[: SIZE**3] = np.where(x[:, None] < 4, 0.0, 1.0)
     rule = DiffusionRule(np.full(4, 0.02, np.float32), np.float32(1 / 6))
-    moved = np.abs(_diffused(step, away, CELLS, rule) - step.table[: SIZE**3].reshape(kept.shape))
+    moved = np.abs(_diffused(step, clearance, CELLS, rule) - step.table[: SIZE**3].reshape(kept.shape))
     assert 0.0 < moved.max() <= 0.02
 
 
 def test_what_is_not_finite_does_not_spread_by_diffusion() -> None:
-    voxels, away = _voxels(), np.zeros(CELLS**3, np.uint8)
+    voxels, clearance = _voxels(), np.zeros(CELLS**3, np.uint8)
     middle = 4 + SIZE * (4 + SIZE * 4)
     voxels.table[middle] = (np.nan, np.inf, -np.inf, np.nan)
     rule = DiffusionRule(np.float32([0.1, 0.025, 0.025, 0.025]), np.float32(1 / 6))
-    got = _diffused(voxels, away, CELLS, rule).reshape(-1, 4)
+    got = _diffused(voxels, clearance, CELLS, rule).reshape(-1, 4)
     assert np.isfinite(np.delete(got, middle, axis=0)).all()
     assert got[middle, 1] == 1.0 and got[middle, 2] == 0.0
 
@@ -388,7 +399,7 @@ def test_what_is_not_finite_does_not_spread_by_diffusion() -> None:
 def test_a_finer_grid_has_the_same_values_between_its_vertices() -> None:
     coarse, size = _voxels(), 2 * SIZE - 1
     fine = np.zeros((size**3, 4), np.float32)
-    CallerPool().run(refine, coarse.table, SIZE, fine, size)
+    CallerPool().run(upsample_grid, coarse.table, SIZE, fine, size)
     old, new = coarse.table[: SIZE**3].reshape(SIZE, SIZE, SIZE, 4), fine.reshape(size, size, size, 4)
     np.testing.assert_allclose(new[::2, ::2, ::2], old, atol=1e-6)
     np.testing.assert_allclose(new[1::2, ::2, ::2], (old[1:] + old[:-1]) / 2, atol=1e-6)
@@ -403,8 +414,10 @@ def test_the_densest_vertex_that_reaches_into_a_cell_is_found() -> None:
     seen = np.full(CELLS**3, 2, np.uint16)
     seen[100] = 1
     for phase in range(phases):
-        CallerPool().run(densest, phase, phases, np.float32(0.5), voxels, np.float32(3.0), CELLS, seen, 2,
-                         density)  # fmt: skip
+        CallerPool().run(
+            update_cell_density, phase, phases, np.float32(0.5), voxels, np.float32(3.0), CELLS, seen, 2,
+            density,
+        )  # fmt: skip
     cells = density.reshape(CELLS, CELLS, CELLS)
     assert density[100] == 0.0 and cells[0, 0, 7] == 3000.0  # not a number: looked at again, not left out
     for k, j, i in ((1, 1, 1), (4, 0, 6), (7, 7, 7), (3, 5, 2)):
@@ -417,11 +430,11 @@ def test_the_densest_vertex_that_reaches_into_a_cell_is_found() -> None:
 def test_distances_to_occupied_cells_are_those_of_brute_force(share: float) -> None:
     n = 12
     occupied = (np.random.default_rng(8).random(n**3) < share).astype(np.uint8)
-    away = np.zeros(n**3, np.uint8)
-    clear(occupied, n, away)
+    clearance = np.zeros(n**3, np.uint8)
+    distance_transform(occupied, n, clearance)
     at = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     full = at[occupied > 0]
-    expected = np.full(n**3, FARTHEST)
+    expected = np.full(n**3, MAX_CLEARANCE)
     if len(full):
         expected = np.abs(at[:, None] - full[None]).max(axis=-1).min(axis=1)
-    np.testing.assert_array_equal(away, expected)
+    np.testing.assert_array_equal(clearance, expected)
