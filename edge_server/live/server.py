@@ -20,7 +20,7 @@ from edge_server.config import EdgeConfig, embedding_for
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer, open_listed_perceptual
 from edge_server.fields import View, checkpoint
-from edge_server.fields.common.kernels.thread_pool import SERVER_NICE
+from edge_server.fields.common.threads.thread_pool import SERVER_NICE
 from edge_server.fields.registry import make_field
 from edge_server.live.field_updater import open_updater
 from edge_server.live.grpc_services import GrpcThread

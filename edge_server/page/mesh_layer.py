@@ -66,7 +66,7 @@ class MeshLayer:
         import numpy as np
         import trimesh
 
-        from edge_server.fields.common.kernels.thread_pool import SERVER_NICE, shared_pool
+        from edge_server.fields.common.threads.thread_pool import SERVER_NICE, shared_pool
         from edge_server.surface import SurfaceError
         from edge_server.surface.reconstruct import MeshSettings, grid_for, maps_of, mesh_of_maps
 

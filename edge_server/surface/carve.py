@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields import Budget, Renderer, View
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface.depth import DepthMap
 
 STEPS = 600  # of 8192 rays

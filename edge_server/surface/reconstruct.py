@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge_server.fields import Renderer, View
-from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.carve import STEPS, box_of, carved, completed
 from edge_server.surface.depth import SOLID, STEEPEST_DEG, DepthMap, rendered

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
 from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.sweep import Others, sweep

@@ -91,7 +91,7 @@ def test_a_million_equal_maps_would_not_overflow():
     volume = fused(GRID, one)
     heavy = volume.blocks._replace(weight=volume.blocks.weight * 1e6)
     before = heavy.distance.copy()
-    from edge_server.fields.common.kernels.thread_pool import shared_pool
+    from edge_server.fields.common.threads.thread_pool import shared_pool
     from edge_server.surface.kernels.fuse import fuse
     from edge_server.surface.volume import as_look
 

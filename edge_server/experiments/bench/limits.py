@@ -35,7 +35,7 @@ from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, FitReport, View
 from edge_server.fields.common.kernels.hash_grid import FEATURES
-from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import active_levels
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings

@@ -23,7 +23,7 @@ from edge_server.experiments.common.machine_probe import (
     random_reads,
 )
 from edge_server.fields.common.kernels.hash_grid import FEATURES
-from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool
 
 MEGABYTES = 4  # of the table that is read from: more than a core's own cache holds
 REPEATS = 3

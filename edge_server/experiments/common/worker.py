@@ -9,7 +9,7 @@ import threading
 
 import cv2
 
-from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE
+from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
 
 
 def init_worker(threads: int) -> None:

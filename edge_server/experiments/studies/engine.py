@@ -28,7 +28,7 @@ from edge_server.experiments.common.result_store import ResultStore
 from edge_server.experiments.common.result_store import content_key as key_of
 from edge_server.experiments.common.worker import init_worker
 from edge_server.experiments.studies.trial import Folders, Row, Trial, run_trial
-from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE
+from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
 from edge_server.report.machine import versions
 
 # Trials of one task: enough to share pictures, few enough that little is lost by Ctrl-C.

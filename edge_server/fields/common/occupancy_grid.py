@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.occupancy import CELLS_A_TASK, count_views, sample_density, threshold
 from edge_server.fields.common.kernels.rays import COARSE, Space
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.kernels.train import CHUNK
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import pack_cameras
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trainer_settings import TrainerSettings
 from edge_server.fields.common.view_store import ViewStore
 

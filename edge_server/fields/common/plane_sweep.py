@@ -21,9 +21,9 @@ from edge_server.fields.common.kernels.plane_sweep import (
     sweep_rays,
 )
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox, plain_background
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
+from edge_server.fields.common.threads.thread_pool import Pool
 
 TOLERANCE = 0.08  # of a color, summed over channels: with more, walls are found where there are none
 GUIDE_CELLS = 96  # a side: finer cells hardly guide better, and cost their cube

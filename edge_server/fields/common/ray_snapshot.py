@@ -13,9 +13,9 @@ from edge_server.fields import Rendering, View
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space
 from edge_server.fields.common.kernels.render import ROUND, TILE, render_tiles
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import PixelRenderer
 from freshfield.geometry import Pinhole
 

@@ -24,9 +24,7 @@ from edge_server.fields.common.fair_lock import FairLock
 from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
 from edge_server.fields.common.kernels.adam import PART, Rule, adam
 from edge_server.fields.common.kernels.mlp import Net
-from edge_server.fields.common.kernels.precompile import compile_ahead
 from edge_server.fields.common.kernels.rays import Space, Views
-from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
 from edge_server.fields.common.kernels.train import (
     CHUNK,
     CHUNK_RAYS,
@@ -40,6 +38,8 @@ from edge_server.fields.common.occupancy_grid import EVERY, OccupancyGrid
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
 from edge_server.fields.common.supervision import supervising_views
+from edge_server.fields.common.threads.precompile import compile_ahead
+from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.common.trainer_settings import BATCH
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,

@@ -16,12 +16,12 @@ from edge_server.fields import Field
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.rays import Space, Views
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, RaySampling
 from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
 from edge_server.fields.nerfacto.appearance import CameraAppearance

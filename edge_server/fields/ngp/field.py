@@ -13,8 +13,8 @@ import numpy as np
 from edge_server.fields import Field
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter, smooth_grid
 from edge_server.fields.common.kernels.mlp import Net
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.model_layout import init_net, make_grid
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
 from edge_server.fields.common.training_schedule import active_levels, smoothing
 from edge_server.fields.ngp.settings import STATE_SHAPE, NgpSettings, make_settings

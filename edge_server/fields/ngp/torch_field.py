@@ -23,11 +23,11 @@ from edge_server.fields.common.field_state import all_or_nothing, load_arrays, p
 from edge_server.fields.common.kernels.adam import GRADIENT_LIMIT, PARAMETER_LIMIT
 from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.rays import HORIZON, Views
-from edge_server.fields.common.kernels.thread_pool import shared_pool
 from edge_server.fields.common.model_layout import init_net, make_grid
 from edge_server.fields.common.occupancy_grid import EVERY, FADE, OccupancyGrid
 from edge_server.fields.common.ray_snapshot import surface_points
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
+from edge_server.fields.common.threads.thread_pool import shared_pool
 from edge_server.fields.common.training_schedule import (
     BETA1_FIELD,
     BETA2,

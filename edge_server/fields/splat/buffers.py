@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import SIZE
-from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.bin_tiles import TileLists, bin_tiles
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SUMS
 from edge_server.fields.splat.kernels.project import FOOTPRINT, PROJECTED, TILE, Gaussians, project

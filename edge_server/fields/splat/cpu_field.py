@@ -22,10 +22,10 @@ from edge_server.fields import Budget, FitReport, Rendering, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.fair_lock import FairLock
 from edge_server.fields.common.field_state import all_or_nothing, pack_state, unpack_meta
-from edge_server.fields.common.kernels.precompile import compile_ahead
-from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.supervision import supervising_views, without_views
+from edge_server.fields.common.threads.precompile import compile_ahead
+from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.common.training_schedule import BETA1, BETA2, StepBudget, StepTimer, step_key
 from edge_server.fields.common.view_store import Arrays, ViewStore, same_views
 from edge_server.fields.splat.buffers import RasterBuffers

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from edge_server.fields import View
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, TIME
-from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.training_schedule import step_key
 from edge_server.fields.ngp.torch_model import harmonics as harmonics_of
 from edge_server.fields.splat.cpu_field import SplatField

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, prune_least_sensitive
 from edge_server.fields.splat.kernels.optimizer_step import position_gradients

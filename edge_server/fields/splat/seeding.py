@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.plane_sweep import empty_color, foreground_mask, score_grid, sweep_depths
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.settings import SplatSettings

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.camera_rows import camera_rows, ray_lengths
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.project import TILE, Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_points, render_tiles

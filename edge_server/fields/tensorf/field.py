@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Field
 from edge_server.fields.common.kernels.mlp import Net
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.model_layout import FIRST_DENSITY, init_net
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.trained_field import DIRTY, TrainedField
 from edge_server.fields.tensorf.kernels.vector_matrix import (
     CHANNELS,

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from edge_server.fields import Budget, Field, FitReport, Rendering, View
 from edge_server.fields.common.fair_lock import FairLock
 from edge_server.fields.common.field_state import all_or_nothing, load_arrays, pack_state, unpack_meta
-from edge_server.fields.common.kernels.precompile import compile_ahead
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.kernels.thread_pool import Pool, shared_pool
 from edge_server.fields.common.kernels.train import RaySampling
 from edge_server.fields.common.occupancy_grid import EMPTY, OccupancyGrid
 from edge_server.fields.common.scene_box import PLAIN, UNIT_BOX
+from edge_server.fields.common.threads.precompile import compile_ahead
+from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer, step_key
 from edge_server.fields.common.view_store import Arrays, ViewStore
 from edge_server.fields.voxel.kernels.rays import SEGMENT, SkipGrid, Voxels, train_rays

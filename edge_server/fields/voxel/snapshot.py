@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.ray_snapshot import surface_points
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.voxel.kernels.rays import MAX_SAMPLES, RayScratch, SkipGrid, Voxels, render_rays
 from freshfield.geometry import Pinhole
 

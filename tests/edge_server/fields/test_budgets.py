@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.kernels.thread_pool import CallerPool
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import CLASSES, SMALL, every_field

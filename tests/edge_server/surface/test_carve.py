@@ -9,8 +9,8 @@ import pytest
 
 from edge_server.experiments.scenes.tile_scan import exact_depth, scan
 from edge_server.fields import View
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError, reconstruct
 from edge_server.surface.carve import KNOWN, LEAST_VIEWS, REST, box_of, carved, completed
 from edge_server.surface.depth import depth_map

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.sweep import NONE, REACH, Others, agreement

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_server.fields.common.kernels.thread_pool import Pool
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
 from edge_server.surface.kernels.fuse import SIDE
 from edge_server.surface.volume import BYTES, Grid, bounds_of, fused

@@ -29,7 +29,7 @@ def _digest(fields: Path) -> str:
     """Of the kernel sources of all representations. Kernels elsewhere (``surface.kernels``) call
     parts of these only, and numba's own stamp covers the file that they stand in."""
     total = hashlib.sha256()
-    for path in sorted(fields.glob("*/kernels/*.py")):
+    for path in sorted([*fields.glob("*/kernels/*.py"), *fields.glob("*/threads/*.py")]):
         total.update(path.relative_to(fields).as_posix().encode() + path.read_bytes())
     return total.hexdigest()
 

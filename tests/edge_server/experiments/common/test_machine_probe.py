@@ -7,7 +7,7 @@ import pytest
 
 from edge_server.experiments.common.machine_probe import CHAINED, CHAINS, TASKS, arithmetic
 from edge_server.fields.common.kernels.jit import kernel
-from edge_server.fields.common.kernels.thread_pool import CallerPool
+from edge_server.fields.common.threads.thread_pool import CallerPool
 
 
 @pytest.mark.parametrize("n", range(len(CHAINS)))

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.hash_grid import Grid
-from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.supervision import lens_row
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.nerfacto.field import NerfactoField, NerfactoSnapshot
 from edge_server.fields.nerfacto.kernels.render import SAMPLE_BATCH, TILE, render_with_proposal
 from edge_server.fields.nerfacto.settings import NerfactoSettings

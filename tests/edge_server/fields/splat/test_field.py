@@ -13,9 +13,9 @@ import pytest
 from edge_server.fields import Budget, View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN, SEES, UNMARKED, score_cells
-from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_cameras
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.densification import GaussianCloud, opacity, prune_least_sensitive
 from edge_server.fields.splat.field import SplatField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.rays import Views, interval
-from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.kernels.train import RaySampling
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import pack_views
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.voxel.kernels.rays import (
     SEGMENT,
     SkipGrid,

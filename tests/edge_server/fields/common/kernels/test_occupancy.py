@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.occupancy import cell_centre, count_views, sample_density, threshold
 from edge_server.fields.common.kernels.rays import COARSE
-from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
 from edge_server.fields.common.supervision import pack_cameras
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings
 from edge_server.fields.ngp.torch_model import encode, mlp, to_torch

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from edge_server.fields import Budget
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.kernels.thread_pool import CallerPool
 from edge_server.fields.common.kernels.train import RaySampling, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, Weights
 from edge_server.fields.common.supervision import pack_views
+from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.common.training_schedule import step_length
 from edge_server.fields.ngp.field import NgpField
 from edge_server.fields.ngp.settings import NgpSettings

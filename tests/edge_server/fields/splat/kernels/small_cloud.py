@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.thread_pool import CallerPool, Pool
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, Gaussians
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.kernels.thread_pool import CallerPool, Pool
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.composite import SUMS
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step

@@ -11,7 +11,7 @@ import torch
 from edge_server.fields import View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.kernels.thread_pool import CallerPool, Pool
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat import buffers
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.optimizer_step import (

@@ -8,8 +8,8 @@ import pytest
 from edge_server.fields import Budget
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.camera import ORIGIN
-from edge_server.fields.common.kernels.thread_pool import Pool
 from edge_server.fields.common.scene_box import SceneBox
+from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.field import SplatField

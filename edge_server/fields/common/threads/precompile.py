@@ -22,13 +22,13 @@ import numpy as np
 from numba import typeof
 from numba.core.dispatcher import Dispatcher
 
-from edge_server.fields.common.kernels import work_queue
 from edge_server.fields.common.kernels.jit import is_stored
-from edge_server.fields.common.kernels.thread_pool import CallerPool, Pool, cores
+from edge_server.fields.common.threads import work_queue
+from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, cores
 
 HELPERS = 3  # at most: the largest kernel takes as long as a quarter of all
 PATIENCE_S = 60.0  # with a helper, after everything else is compiled; then its kernel is compiled here
-_HELPER = "from edge_server.fields.common.kernels.precompile import _serve; _serve()"
+_HELPER = "from edge_server.fields.common.threads.precompile import _serve; _serve()"
 
 log = logging.getLogger(__name__)
 

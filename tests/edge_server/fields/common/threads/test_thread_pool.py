@@ -16,8 +16,8 @@ from numba import njit
 from edge_server.fields.common.kernels.jit import FAST, SOURCES
 from edge_server.fields.common.kernels.mlp import forward
 from edge_server.fields.common.kernels.simd import COUNTER, draw, exp32, fetch_add, log32, uniform
-from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
-from edge_server.fields.common.kernels.work_queue import WAKE_CALLER, poll_for_job
+from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool, shared_pool
+from edge_server.fields.common.threads.work_queue import WAKE_CALLER, poll_for_job
 
 
 @njit(nogil=True)
@@ -204,7 +204,7 @@ def test_each_task_is_drawn_once_each_worker_s_own_ones_first(workers: int, task
 @pytest.mark.parametrize("threads", [2, 3, 7])
 def test_no_job_is_lost_however_long_it_lets_the_others_wait(threads, nice, monkeypatch) -> None:
     """Breaks about as long as workers look for work before they sleep, and several who ask at once."""
-    monkeypatch.setattr("edge_server.fields.common.kernels.thread_pool._own_cores", lambda: 8)
+    monkeypatch.setattr("edge_server.fields.common.threads.thread_pool._own_cores", lambda: 8)
     pool, failed = Pool(threads, nice), []
 
     def call(seed: int) -> None:
@@ -229,7 +229,7 @@ def test_no_job_is_lost_however_long_it_lets_the_others_wait(threads, nice, monk
 
 @pytest.fixture
 def many_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("edge_server.fields.common.kernels.thread_pool._own_cores", lambda: 8)
+    monkeypatch.setattr("edge_server.fields.common.threads.thread_pool._own_cores", lambda: 8)
 
 
 def _interrupted_after(seconds: float, run: Callable[[], None]) -> None:
@@ -252,7 +252,7 @@ def _interrupted_after(seconds: float, run: Callable[[], None]) -> None:
 @pytest.mark.parametrize("nice", [0, 5])
 def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice, cores, monkeypatch) -> None:
     """With cores for all workers, and without; else others would write to arrays that are the caller's."""
-    monkeypatch.setattr("edge_server.fields.common.kernels.thread_pool._own_cores", lambda: cores)
+    monkeypatch.setattr("edge_server.fields.common.threads.thread_pool._own_cores", lambda: cores)
     pool, seen = Pool(3, nice), []
 
     def slow(counter, worker):
@@ -272,7 +272,7 @@ def test_a_caller_that_is_interrupted_waits_for_what_it_has_begun(nice, cores, m
 
 @pytest.mark.parametrize("cores", [1, 8])
 def test_who_is_interrupted_twice_leaves_it_to_the_next_job(cores, monkeypatch) -> None:
-    monkeypatch.setattr("edge_server.fields.common.kernels.thread_pool._own_cores", lambda: cores)
+    monkeypatch.setattr("edge_server.fields.common.threads.thread_pool._own_cores", lambda: cores)
     pool, seen = Pool(2, nice=0), []
 
     def slow(counter, worker):
@@ -321,7 +321,7 @@ def test_a_job_that_was_never_told_of_is_not_done(many_cores, monkeypatch) -> No
 
     for _ in range(2):  # the first job and a later one
         with monkeypatch.context() as patch:
-            patch.setattr("edge_server.fields.common.kernels.thread_pool.post_job", interrupted)
+            patch.setattr("edge_server.fields.common.threads.thread_pool.post_job", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 pool.run(lambda counter, worker: seen.append("lost"))
         pool.run(lambda counter, worker: seen.append(worker))
@@ -350,7 +350,7 @@ def test_a_worker_that_wakes_a_caller_late_wakes_no_other(many_cores, monkeypatc
 
     pool.run(lambda counter, worker: None)
     with monkeypatch.context() as patch:
-        patch.setattr("edge_server.fields.common.kernels.thread_pool.poll_for_job", attend_and_wait)
+        patch.setattr("edge_server.fields.common.threads.thread_pool.poll_for_job", attend_and_wait)
         _interrupted_after(0.1, lambda: pool.run(slow))
         assert late.wait(1.0)
         for k in range(1, 3):
@@ -363,7 +363,7 @@ def test_a_worker_that_wakes_a_caller_late_wakes_no_other(many_cores, monkeypatc
 @pytest.mark.parametrize("cores", [1, 8])
 def test_a_pool_that_rests_keeps_no_arrays(nice, cores, monkeypatch) -> None:
     """Not those of a worker either that was done long before the others."""
-    monkeypatch.setattr("edge_server.fields.common.kernels.thread_pool._own_cores", lambda: cores)
+    monkeypatch.setattr("edge_server.fields.common.threads.thread_pool._own_cores", lambda: cores)
     pool = Pool(3, nice)
 
     def unequal(counter, worker, array):
@@ -388,7 +388,7 @@ def test_what_a_pool_itself_needs_fails_where_it_is_asked_for(many_cores, monkey
     for nice in (0, 5):
         pool, done = Pool(2, nice), np.zeros(8, np.int64)
         with monkeypatch.context() as patch:
-            patch.setattr("edge_server.fields.common.kernels.thread_pool.polls_before_sleep", full)
+            patch.setattr("edge_server.fields.common.threads.thread_pool.polls_before_sleep", full)
             with pytest.raises(OSError, match="no space"):
                 pool.run(_count, done)
         pool.run(_count, done)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.kernels.jit import kernel, part
-from edge_server.fields.common.kernels.precompile import _RecordingPool, _size, compile_ahead
-from edge_server.fields.common.kernels.thread_pool import THREADS_VARIABLE, CallerPool, Pool
+from edge_server.fields.common.threads.precompile import _RecordingPool, _size, compile_ahead
+from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE, CallerPool, Pool
 from edge_server.fields.registry import field_names, make_field
 
 
@@ -52,9 +52,9 @@ def run_kernels(pool: Pool) -> None:
 # Who compiled what, told by numba's own count: a kernel compiled by a helper is a hit in the cache here.
 TOLD = """
 import sys
-from edge_server.fields.common.kernels import precompile
-from edge_server.fields.common.kernels.precompile import compile_ahead
-from tests.edge_server.fields.common.kernels.test_precompile import double, only_after, total, run_kernels
+from edge_server.fields.common.threads import precompile
+from edge_server.fields.common.threads.precompile import compile_ahead
+from tests.edge_server.fields.common.threads.test_precompile import double, only_after, total, run_kernels
 if sys.argv[1:]:
     sys.executable = sys.argv[1]
     precompile.PATIENCE_S = 1.0

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.fields.common.kernels.simd import COUNTER
-from edge_server.fields.common.kernels.work_queue import (
+from edge_server.fields.common.threads.work_queue import (
     ASLEEP,
     COUNTERS,
     DONE,
