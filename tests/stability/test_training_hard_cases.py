@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.training.scheduler.choices import choices, named
-from edge_server.experiments.training.scheduler.evaluation import hold, rivals, rows
+from edge_server.experiments.training.scheduler.evaluation import evaluate_policies, rivals, rows
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.trainer import Course, TrainingError, read_log, train
-from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig, TrainingError, read_log, train
+from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import StateLayout
@@ -25,13 +25,13 @@ WAIT = Spec("wait", StateLayout(("age",)), (0.0, 50.0, 150.0), hidden=8)
 NEVER = {"faults": {"loss": {"probability": 1.0}}}
 
 
-def course(spec: Spec = SELECT, reward: Reward = REWARD, **more) -> Course:
-    return Course(spec, reward, **{"episodes": 6, "batch": 3, **more})
+def config(spec: Spec = SELECT, reward: Reward = REWARD, **more) -> TrainingConfig:
+    return TrainingConfig(spec, reward, **{"episodes": 6, "batch": 3, **more})
 
 
-def weights_after(what: Setting, taught: Course, out: Path) -> dict[str, np.ndarray]:
-    with Crew(NOTHING) as crew:
-        found = train(what, taught, crew, out, lambda line: None).actor.weights
+def weights_after(what: Setting, taught: TrainingConfig, out: Path) -> dict[str, np.ndarray]:
+    with WorkerPool(NOTHING) as pool:
+        found = train(what, taught, pool, out, lambda line: None).actor.weights
     assert all(np.isfinite(w).all() for w in found.values())
     return found
 
@@ -40,11 +40,13 @@ def weights_after(what: Setting, taught: Course, out: Path) -> dict[str, np.ndar
 def test_where_nothing_ever_arrives_training_says_so_instead_of_learning_nothing(spec, scratch, tmp_path):
     silent = setting(NEVER, scratch=scratch)
     with pytest.raises(TrainingError, match="nothing had arrived"):
-        weights_after(silent, course(spec), tmp_path)
+        weights_after(silent, config(spec), tmp_path)
     assert not (tmp_path / "policy.npz").exists()
-    with Crew(NOTHING) as crew:
-        contest = hold(silent, crew, seeds(0, "test", 2), rivals((50.0,), ["threshold"], ("random",)), REWARD)
-    assert all(np.isnan(row["reward"]) for row in rows(contest))
+    with WorkerPool(NOTHING) as pool:
+        evaluation = evaluate_policies(
+            silent, pool, seeds(0, "test", 2), rivals((50.0,), ["threshold"], ("random",)), REWARD
+        )
+    assert all(np.isnan(row["reward"]) for row in rows(evaluation))
 
 
 def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
@@ -52,21 +54,21 @@ def test_a_still_scene_has_no_moving_pixels_and_training_says_so(tmp_path):
     source = {**still.scenario.source, "speed_m_per_s": 0.0}
     still = dataclasses.replace(still, scenario=dataclasses.replace(still.scenario, source=source))
     with pytest.raises(TrainingError, match=r"psnr_moving: nothing moves.*--on whole"):
-        weights_after(still, course(reward=make_reward("set", fidelity="moving", distance=0.0)), tmp_path)
-    weights_after(still, course(), tmp_path / "whole")
+        weights_after(still, config(reward=make_reward("set", fidelity="moving", distance=0.0)), tmp_path)
+    weights_after(still, config(), tmp_path / "whole")
     assert all(row["reward"] is not None for row in read_log(tmp_path / "whole"))
 
 
 def test_a_later_batch_without_rewards_teaches_nothing_and_harms_nothing(tmp_path):
     """A blackout from some episodes on: what was learnt before it stays as it was."""
-    with Crew(NOTHING) as crew:
-        learner = train(setting(), course(), crew, tmp_path, lambda line: None)
+    with WorkerPool(NOTHING) as pool:
+        learner = train(setting(), config(), pool, tmp_path, lambda line: None)
         before = learner.actor.weights
-        moments = crew.draw(setting(NEVER), [1])[0]
+        moments = pool.draw(setting(NEVER), [1])[0]
     states = [m.state for m in moments]
     actions, logps = learner.act(states)
-    told = learner.update(learner.batch(states, actions, logps, [None] * len(states)))
-    assert told.dropped == len(states)
+    text = learner.update(learner.batch(states, actions, logps, [None] * len(states)))
+    assert text.dropped == len(states)
     assert all(np.array_equal(w, learner.actor.weights[name]) for name, w in before.items())
 
 
@@ -76,7 +78,7 @@ def test_damaged_late_and_doubled_frames(tmp_path):
         "faults": {"corruption": {"probability": 0.3}, "duplication": {"probability": 0.3},
                    "blackout": {"windows_ms": [[0.0, 1000.0]]}},
     }  # fmt: skip
-    weights_after(setting(channel), course(WAIT), tmp_path)
+    weights_after(setting(channel), config(WAIT), tmp_path)
     assert all(row["reward"] is not None for row in read_log(tmp_path))
 
 
@@ -88,23 +90,23 @@ def test_one_camera_that_reports_and_one_that_rewards(tmp_path):
         lead_ms=800.0,
         span_ms=400.0,
     )
-    weights_after(alone, course(tries=2), tmp_path)
+    weights_after(alone, config(tries=2), tmp_path)
     # There is one set, so that no try is better than another.
     assert all(row["views"] == 1.0 for row in read_log(tmp_path))
 
 
 def test_a_constant_reward_teaches_nothing_and_harms_nothing(tmp_path):
     constant = Reward("constant", 0.0, 0.0, 0.0, age=1e-300)
-    before = weights_after(setting(), course(reward=constant, episodes=3), tmp_path / "a")
-    after = weights_after(setting(), course(reward=constant, episodes=12), tmp_path / "b")
+    before = weights_after(setting(), config(reward=constant, episodes=3), tmp_path / "a")
+    after = weights_after(setting(), config(reward=constant, episodes=12), tmp_path / "b")
     assert max(np.abs(after[n] - w).max() for n, w in before.items()) < 0.1
 
 
 def test_a_decision_of_nobody_is_an_outcome_without_scores():
-    with Crew(NOTHING) as crew:
+    with WorkerPool(NOTHING) as pool:
         silent = setting(NEVER)
-        moments = crew.draw(silent, [3])[0]
+        moments = pool.draw(silent, [3])[0]
         for name in ("all", "threshold:50", "wait:50", "random", "freshen"):
             chosen = choices(named(name), moments)
-            found = crew.evaluate(silent, [(m.seed, m.number, c) for m, c in zip(moments, chosen)])
+            found = pool.evaluate(silent, [(m.seed, m.number, c) for m, c in zip(moments, chosen)])
             assert all(o.psnr_db is None and o.views == 0.0 and np.isfinite(o.wait_ms) for o in found)

@@ -12,7 +12,7 @@ from camera_node.synthetic import make_scene
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.drawing import draw_pictures
 from edge_server.experiments.studies.statistics import interval, negated, paired
-from edge_server.experiments.studies.study import Ask, Point, Table, Verdict, by_bool, tell
+from edge_server.experiments.studies.study import Ask, Point, Table, Verdict, by_bool, number
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import ssim
@@ -91,7 +91,7 @@ class Metrics:
         draw_pictures(ask.out / "metrics.png", [("room", shown)])
         rows = []
         for case, found in scores.items():
-            psnr_db, ssim_, lpips_ = (tell(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips"))
+            psnr_db, ssim_, lpips_ = (number(interval(found[m]).mean, 4) for m in ("psnr", "ssim", "lpips"))
             rows.append({"case": case, "psnr_db": psnr_db, "ssim": ssim_, "lpips": lpips_,
                          "seeds": len(found["psnr"])})  # fmt: skip
         write_csv(ask.out / "metrics.csv", rows)
@@ -106,12 +106,12 @@ class Metrics:
         order = [scores[c]["lpips"] for c in ("brightness shift", "local ghosting", "Gaussian blur")]
         steps = [paired(dict(enumerate(b)), dict(enumerate(a))).above(0.0) for a, b in pairwise(order)]
         rising = False if False in steps else None if None in steps else True
-        told = ", ".join(f"{interval(values).mean:.3f}" for values in order)
+        text = ", ".join(f"{interval(values).mean:.3f}" for values in order)
         verdicts.append(
             Verdict(
                 "LPIPS",
                 "brightness shift < ghosting < blur (figure 3.6's table).",
-                told + ".",
+                text + ".",
                 by_bool(rising),
             )
         )
@@ -123,5 +123,5 @@ class Metrics:
         gaps = [paired(dict(enumerate(other)), dict(enumerate(mine))) for other in others]
         answers = [g.above(0.0) if lowest else negated(g.above(0.0)) for g in gaps]
         answer = False if False in answers else None if None in answers else True
-        told = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
-        return Verdict(metric.upper(), f"{claim} (figure 3.6's table).", told + ".", by_bool(answer))
+        text = ", ".join(f"{c} {interval(v[metric]).mean:.3f}" for c, v in scores.items())
+        return Verdict(metric.upper(), f"{claim} (figure 3.6's table).", text + ".", by_bool(answer))

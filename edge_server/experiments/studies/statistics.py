@@ -198,7 +198,7 @@ def move_of_optimum(
         grids.append(np.array(xs))
         tables.append(sign * np.array([[curve[x][s] for x in xs] for s in seeds], float))
 
-    def told(picks: NDArray[np.int64]) -> tuple[float, float]:
+    def text(picks: NDArray[np.int64]) -> tuple[float, float]:
         best = [grid[table[picks].mean(0).argmax()] for grid, table in zip(grids, tables)]
         # A level line has a slope of 1e-16 or so, of either sign.
         line = round(float(np.polyfit(parameters, best, 1)[0]), 9) if len(parameters) > 1 else np.nan
@@ -207,10 +207,10 @@ def move_of_optimum(
     if not seeds:
         nothing = Interval(np.nan, np.nan, np.nan, 0)
         return nothing, nothing
-    means = told(np.arange(len(seeds)))
+    means = text(np.arange(len(seeds)))
     lows = highs = np.full(2, np.nan)
     if len(seeds) >= FEWEST:
-        lows, highs = np.percentile([told(p) for p in _picks(len(seeds))], [2.5, 97.5], axis=0)
+        lows, highs = np.percentile([text(p) for p in _picks(len(seeds))], [2.5, 97.5], axis=0)
     line, move = (Interval(m, float(a), float(b), len(seeds)) for m, a, b in zip(means, lows, highs))
     return line, move
 

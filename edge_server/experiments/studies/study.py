@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from edge_server.experiments.common.tables import number as tell
-from edge_server.experiments.common.tables import write_csv
+from edge_server.experiments.common.tables import number, write_csv
 from edge_server.experiments.studies.engine import Engine, StudyError
 from edge_server.experiments.studies.statistics import Interval, interval, paired
 from edge_server.experiments.studies.trial import Folders, Row, Trial
@@ -58,8 +57,8 @@ class Ask:
             )
         return [case for case in cases if any(word in case for word in self.cases)]
 
-    def taught(self, episodes: Mapping[bool, int]) -> int:
-        """Episodes of one training. episodes: the study's own, by whether it is a quick pass."""
+    def training_episodes(self, episodes: Mapping[bool, int]) -> int:
+        """Number of episodes of one training. episodes: the study's default, keyed by ``quick``."""
         return self.episodes or episodes[self.quick]
 
     def repeats(self, quick: int, full: int) -> range:
@@ -151,19 +150,19 @@ def run_study(study: Study, ask: Ask, engine: Engine) -> list[Verdict]:
     return verdicts
 
 
-def to_win(table: Table, metric: str, **labels: Any) -> str:
-    """How much better no delay at all is than using everything, in words: what any scheduler could win."""
+def no_delay_gain(table: Table, metric: str, **labels: Any) -> str:
+    """Describe how much better no delay is than using all views: the limit of any scheduler's gain."""
     kept = {k: v for k, v in labels.items() if k in ("scene", "field")}
     use_all = table.values(metric, policy="all", **labels)
     limit = table.values(metric, policy="no delay", **kept)
     _, lower, digits = METRICS[metric]
     gap = paired(use_all, limit) if lower else paired(limit, use_all)
     if metric == "aaoi_ms":
-        return f"with no delay it is {tell(interval(list(limit.values())).mean, digits)}"
+        return f"with no delay it is {number(interval(list(limit.values())).mean, digits)}"
     nothing = " (nothing to win)" if gap.above(LEAST[metric]) is False else ""
     return (
-        f"no delay at all is {tell(gap.mean, digits)} [{tell(gap.low, digits)}, {tell(gap.high, digits)}] "
-        f"better than use-all{nothing}"
+        f"no delay at all is {number(gap.mean, digits)} [{number(gap.low, digits)}, "
+        f"{number(gap.high, digits)}] better than use-all{nothing}"
     )
 
 
@@ -173,7 +172,7 @@ def mean_curve(curve: Curve) -> tuple[list[float], list[Interval]]:
 
 
 def by_bool(answer: bool | None) -> str:
-    """A verdict from yes, no, cannot be told."""
+    """The verdict for true, false and unknown (None)."""
     return UNDECIDED if answer is None else HOLDS if answer else DOES_NOT_HOLD
 
 

@@ -16,7 +16,7 @@ from edge_server.experiments.studies.study import (
     Table,
     Verdict,
     by_bool,
-    to_win,
+    no_delay_gain,
     with_data,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
@@ -67,13 +67,13 @@ class Weighing:
                         found = [optimum(curve, True).x for curve in curves.values()]
                         best[f"{policy}, {where}", label] = found
                         _, move = move_of_optimum(curves, lower_is_better=True)
-                        told = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
+                        text = ", ".join(f"{w:g}: {x:g}" for w, x in zip(LAMBDAS, found))
                         verdicts.append(
                             Verdict(
                                 f"{scene}, {policy}, {where}, ages of {label}",
                                 CLAIM,
-                                f"best omega in ms by lambda {told}; it moves by {move} ms; "
-                                f"{to_win(table, metric, scene=scene)}.",
+                                f"best omega in ms by lambda {text}; it moves by {move} ms; "
+                                f"{no_delay_gain(table, metric, scene=scene)}.",
                                 by_bool(_falls(move)),
                             )
                         )

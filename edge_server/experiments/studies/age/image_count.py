@@ -14,8 +14,8 @@ from edge_server.experiments.studies.study import (
     Table,
     Verdict,
     by_bool,
-    tell,
-    to_win,
+    no_delay_gain,
+    number,
     with_data,
 )
 
@@ -74,9 +74,10 @@ class Images:
                     Verdict(
                         f"{scene}, {name}",
                         f"more images: {'higher' if rises else 'lower'} (thesis: {thesis}).",
-                        f"from {xs[0]:g} to {xs[-1]:g} images {tell(first, digits)} to {tell(last, digits)}, "
-                        f"change {tell(change.mean, digits)} [{tell(change.low, digits)}, "
-                        f"{tell(change.high, digits)}]; {to_win(table, metric, scene=scene)}.",
+                        f"from {xs[0]:g} to {xs[-1]:g} images {number(first, digits)} "
+                        f"to {number(last, digits)}, "
+                        f"change {number(change.mean, digits)} [{number(change.low, digits)}, "
+                        f"{number(change.high, digits)}]; {no_delay_gain(table, metric, scene=scene)}.",
                         by_bool(change.above(0.0) if rises else negated(change.above(0.0))),
                     )
                 )

@@ -15,8 +15,8 @@ from edge_server.experiments.studies.study import (
     Table,
     Verdict,
     by_bool,
-    tell,
-    to_win,
+    no_delay_gain,
+    number,
     with_data,
 )
 from edge_server.experiments.studies.trial import Trial, picture
@@ -97,9 +97,9 @@ class Mat:
                     f"{scene}, {discipline}, {name}",
                     CLAIM,
                     f"best at {best.x:g} ms{best.spread} with {views.mean:.1f} views; "
-                    f"{tell(best.over_last.mean, digits)} [{tell(best.over_last.low, digits)}, "
-                    f"{tell(best.over_last.high, digits)}] better than the largest threshold; "
-                    f"{to_win(table, metric, **labels)}.",
+                    f"{number(best.over_last.mean, digits)} [{number(best.over_last.low, digits)}, "
+                    f"{number(best.over_last.high, digits)}] better than the largest threshold; "
+                    f"{no_delay_gain(table, metric, **labels)}.",
                     by_bool(best.interior(LEAST[metric])),
                 )
             )

@@ -16,7 +16,7 @@ from edge_server.experiments.studies.study import (
     Table,
     Verdict,
     by_bool,
-    to_win,
+    no_delay_gain,
     with_data,
 )
 from edge_server.report.style import CYCLE, figure, label_lines
@@ -73,15 +73,15 @@ class MatDelay:
         slope, _ = move_of_optimum(curves, METRICS[metric][1])
         inside = {d: o.interior(LEAST[metric]) for d, o in best.items()}
         without = [f"{d:g}" for d, yes in inside.items() if yes is not True]
-        told = ", ".join(f"{d:g} ms: {o.x:g}{o.spread}" for d, o in best.items())
+        text = ", ".join(f"{d:g} ms: {o.x:g}{o.spread}" for d, o in best.items())
         # On one grid for all delays, fidelity that only rises or only falls has its best at the same end of
         # it at every delay: no slope, no claim.
         none = f"; that it falls on both sides is not shown at {', '.join(without)} ms" if without else ""
         return Verdict(
             f"{scene}, {METRICS[metric][0]}",
             CLAIM,
-            f"by mean delay {told}{none}; {slope} ms of threshold a ms of delay; "
-            f"{to_win(table, metric, scene=scene, delay_ms=max(best))} at {max(best):g} ms.",
+            f"by mean delay {text}{none}; {slope} ms of threshold a ms of delay; "
+            f"{no_delay_gain(table, metric, scene=scene, delay_ms=max(best))} at {max(best):g} ms.",
             by_bool(slope.above(0.0)),
         )
 

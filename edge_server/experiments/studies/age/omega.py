@@ -22,8 +22,8 @@ from edge_server.experiments.studies.study import (
     Table,
     Verdict,
     by_bool,
-    tell,
-    to_win,
+    no_delay_gain,
+    number,
     with_data,
 )
 from edge_server.experiments.studies.trial import picture
@@ -92,9 +92,9 @@ class Omega:
             Verdict(
                 f"{scene}, {state} traffic, threshold, {name}",
                 f"there is an optimum between few and stale views, at {STATES[state][1]:g} ms (6.5.1).",
-                f"best at {best.x:g} ms{best.spread}, {tell(loss.mean, digits)} "
-                f"[{tell(loss.low, digits)}, {tell(loss.high, digits)}] better than the largest omega; "
-                f"{to_win(table, metric, scene=scene, state=state)}.",
+                f"best at {best.x:g} ms{best.spread}, {number(loss.mean, digits)} "
+                f"[{number(loss.low, digits)}, {number(loss.high, digits)}] better than the largest omega; "
+                f"{no_delay_gain(table, metric, scene=scene, state=state)}.",
                 by_bool(best.interior(LEAST[metric])),
             )
         ]
@@ -127,16 +127,16 @@ class Omega:
             Verdict(
                 about,
                 claim,
-                f"best at {best.x:g} ms{best.spread}, {tell(loss.mean, digits)} "
-                f"[{tell(loss.low, digits)}, {tell(loss.high, digits)}] better than the largest omega; "
+                f"best at {best.x:g} ms{best.spread}, {number(loss.mean, digits)} "
+                f"[{number(loss.low, digits)}, {number(loss.high, digits)}] better than the largest omega; "
                 f"within {_NEAR[metric]:g} of the best from {plateau:g} ms on.",
                 by_bool(answer),
             ),
             Verdict(
                 about,
                 "better than threshold, each at its own best omega (6.5.2).",
-                f"difference {tell(over.mean, digits)} "
-                f"[{tell(over.low, digits)}, {tell(over.high, digits)}].",
+                f"difference {number(over.mean, digits)} "
+                f"[{number(over.low, digits)}, {number(over.high, digits)}].",
                 by_bool(better),
             ),
         ]

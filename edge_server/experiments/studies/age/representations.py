@@ -15,8 +15,8 @@ from edge_server.experiments.studies.study import (
     Table,
     Verdict,
     by_bool,
-    tell,
-    to_win,
+    no_delay_gain,
+    number,
 )
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
@@ -66,24 +66,24 @@ class Representations:
 
     def _judge(self, table: Table, scene: str, policy: str, metric: str) -> list[Verdict]:
         name, lower, _ = METRICS[metric]
-        answers, told = [], []
+        answers, text = [], []
         for field in table.distinct("field"):
             curve = table.curve("omega_ms", metric, scene=scene, field=field, policy=policy)
             if curve:
                 best = optimum(curve, lower)
                 answers.append(best.interior(LEAST[metric]))
-                told.append(
-                    f"{field} {tell(best.x, 0)} ms{best.spread} ("
-                    f"{to_win(table, metric, scene=scene, field=field)})"
+                text.append(
+                    f"{field} {number(best.x, 0)} ms{best.spread} ("
+                    f"{no_delay_gain(table, metric, scene=scene, field=field)})"
                 )
-        if not told:
+        if not text:
             return []
         same = all(answers) if None not in answers else False if False in answers else None
         return [
             Verdict(
                 f"{scene}, {policy}, {name}",
                 "the trade shows with every representation (6.5.2).",
-                f"best omega: {', '.join(told)}; an optimum inside for "
+                f"best omega: {', '.join(text)}; an optimum inside for "
                 f"{sum(a is True for a in answers)} of {len(answers)}.",
                 by_bool(same),
             )

@@ -24,7 +24,7 @@ from edge_server.experiments.studies.study import (
     Point,
     Table,
     Verdict,
-    tell,
+    number,
     with_data,
 )
 from edge_server.report.style import figure
@@ -60,7 +60,7 @@ class Cell:
         }  # fmt: skip
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         speed = "" if self.speed is None else f" at {self.speed:g} m/s"
         return f"{self.scene}{speed}, mean delay {self.delay_ms:g} ms, {self.memory}, compute {self.compute}"
 
@@ -153,17 +153,17 @@ class Phase:
         if not gap.count:
             return []
         nothing = " (nothing to win)" if gap.above(LEAST_DB) is False else ""
-        told = [f"no delay is {gap} dB above use-all{nothing}"]
+        text = [f"no delay is {gap} dB above use-all{nothing}"]
         answers = []
         for policy, (omega, values) in best.items():
             gain = paired(values, use_all)
             answers.append(gain.above(LEAST_DB))
-            told.append(f"best {policy} ({omega:g} ms) {gain}")
+            text.append(f"best {policy} ({omega:g} ms) {gain}")
         verdict = HOLDS if True in answers else DOES_NOT_HOLD if set(answers) == {False} else UNDECIDED
-        about = f"{cell.told}; {name}"
+        about = f"{cell.text}; {name}"
         found = [
             Verdict(about, "giving up stale views (threshold, wait) beats using everything.",
-                    "; ".join(told) + " dB.", verdict)
+                    "; ".join(text) + " dB.", verdict)
         ]  # fmt: skip
         for policy in OWN:
             treated = table.values(metric, policy=policy, **cell.labels)
@@ -227,5 +227,5 @@ def _best(table: Table, cell: Cell, metric: str, policy: str) -> tuple[float, di
 def _percent(share: Interval | None) -> str:
     if share is None or not np.isfinite(share.mean):
         return "and no gap to close is shown"
-    low, high = tell(100 * share.low, 0), tell(100 * share.high, 0)
+    low, high = number(100 * share.low, 0), number(100 * share.high, 0)
     return f"{100 * share.mean:.0f} % [{low}, {high}] of the gap closed"

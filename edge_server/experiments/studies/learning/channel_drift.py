@@ -10,15 +10,22 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.common.tables import write_csv
-from edge_server.experiments.studies.learning.setup import RUNS, Lesson, School, Taught, better, room
+from edge_server.experiments.studies.learning.setup import (
+    RUNS,
+    StudyTrainer,
+    TrainingRun,
+    TrainingStudy,
+    better,
+    room,
+)
 from edge_server.experiments.studies.study import Ask, Table, Verdict
 from edge_server.experiments.training.scheduler.choices import choose, named
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.episode import Moment
+from edge_server.experiments.training.scheduler.episode import DecisionPoint
 from edge_server.experiments.training.scheduler.evaluation import PerSeed, rivals
 from edge_server.experiments.training.scheduler.report import smoothed
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler import Policy
 from edge_server.scheduler.learned.bandit import BanditPolicy
@@ -58,14 +65,14 @@ class Change:
         """What decisions are made in, before and after."""
         return room(self.before), room(self.after, silent=(self.gone,) if self.gone else ())
 
-    def course(self, school: School, episodes: int, training: int) -> Course:
+    def config(self, trainer: StudyTrainer, episodes: int, training: int) -> TrainingConfig:
         """What is learnt of either."""
         parts = StateLayout(("age", "pose"))
         if self.price:
-            reward = dataclasses.replace(school.reward("set"), views=-self.price)
-            return Course(Spec("select", parts), reward, episodes, seed=training)
-        reward = dataclasses.replace(school.reward("corrected"), age=AGE)
-        return Course(
+            reward = dataclasses.replace(trainer.reward("set"), views=-self.price)
+            return TrainingConfig(Spec("select", parts), reward, episodes, seed=training)
+        reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
+        return TrainingConfig(
             Spec("threshold", parts, OMEGAS_MS["threshold"]), reward, episodes, tries=3, seed=training
         )
 
@@ -83,7 +90,7 @@ def changes() -> dict[str, Change]:
     }
 
 
-class Drift(Taught):
+class Drift(TrainingStudy):
     name = "drift"
     title = "The channel changes during use: fixed, learnt, and still learning"
 
@@ -91,13 +98,13 @@ class Drift(Taught):
         del table
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
-        with School(ask) as school:
+        with StudyTrainer(ask) as trainer:
             known = changes()
             for name in ask.chosen(list(known), list(known)[:1]):
                 trainings = RUNS[ask.quick]
                 each = max(1, len(ask.repeats(3, 9)) // trainings)
                 runs = [
-                    [_one_run(school, name, known[name], training, training * each + k) for k in range(each)]
+                    [_one_run(trainer, name, known[name], training, training * each + k) for k in range(each)]
                     for training in range(trainings)
                 ]  # fmt: skip
                 found += judge(f"room, {name}", runs)
@@ -112,15 +119,15 @@ class Drift(Taught):
         return found
 
 
-def _one_run(school: School, name: str, change: Change, training: int, run: int) -> Rewards:
+def _one_run(trainer: StudyTrainer, name: str, change: Change, training: int, run: int) -> Rewards:
     """Rewards of every decision as the reporting cameras have them, by policy: the same decisions for all."""
     before, after = change.settings()
-    course = change.course(school, school.ask.taught(EPISODES), training)
-    reward, priced = course.reward, "priced-" * bool(change.price)
-    home = school.teach(Lesson(f"drift-before-{priced}{training}", before, course))
-    there = school.teach(Lesson(f"drift-{name.replace(' ', '-')}-{training}", after, course))
+    config = change.config(trainer, trainer.ask.training_episodes(EPISODES), training)
+    reward, priced = config.reward, "priced-" * bool(change.price)
+    home = trainer.train_one(TrainingRun(f"drift-before-{priced}{training}", before, config))
+    there = trainer.train_one(TrainingRun(f"drift-{name.replace(' ', '-')}-{training}", after, config))
     thresholds = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random",))
-    chosen = school.contest(before, thresholds, reward, 6, seed=7)
+    chosen = trainer.evaluate(before, thresholds, reward, 6, seed=7)
     fixed = named(chosen.best_fixed("threshold")[1])
     rng = np.random.default_rng([run, 7])
     policies: dict[str, Policy] = {
@@ -141,22 +148,27 @@ def _one_run(school: School, name: str, change: Change, training: int, run: int)
         numbers = seeds(run + 1, "test", count, first)
         for start in range(0, count, _TOGETHER):
             part = numbers[start : start + _TOGETHER]
-            moments = [m for episode in school.crew.draw(setting, part) for m in episode]
+            moments = [m for episode in trainer.pool.draw(setting, part) for m in episode]
             for policy in POLICIES:
-                rewards[policy] += _decide(school, setting, policies[policy], moments, reward, number)
+                rewards[policy] += _decide(trainer, setting, policies[policy], moments, reward, number)
             number += len(moments)
     return rewards
 
 
 def _decide(
-    school: School, setting: Setting, policy: Policy, moments: list[Moment], reward: Reward, first: int
+    trainer: StudyTrainer,
+    setting: Setting,
+    policy: Policy,
+    moments: list[DecisionPoint],
+    reward: Reward,
+    first: int,
 ) -> list[float]:
     """Rewards of decisions that are numbered from ``first`` on, as the reporting cameras have them; one that
     learns learns from those of the rewarding ones."""
     asked = [(m.seed, m.number, choose(policy, m, first + k)) for k, m in enumerate(moments)]
 
     def totals(of: Setting) -> list[float | None]:
-        found = [reward.of(outcome) for outcome in school.crew.evaluate(of, asked)]
+        found = [reward.of(outcome) for outcome in trainer.pool.evaluate(of, asked)]
         return [r.total if r.complete else None for r in found]
 
     if isinstance(policy, OnlinePolicy):
@@ -175,11 +187,11 @@ def judge(about: str, runs: Sequence[Sequence[Rewards]]) -> list[Verdict]:
                  for r, run in enumerate(of)} for of in runs]  # fmt: skip
 
     recovered = [recovery(run) for of in runs for run in of]
-    told = ", ".join(r if isinstance(r, str) else f"{r} decisions" for r in recovered)
+    text = ", ".join(r if isinstance(r, str) else f"{r} decisions" for r in recovered)
     return [
         better(about, "one that goes on learning is better than what was learnt before the change.",
                late("still learning"), late("learnt"),
-               f"half of what the change cost is made up after: {told} (a run each); "),
+               f"half of what the change cost is made up after: {text} (a run each); "),
         better(about, "and better than the fixed policy that was best before.", late("still learning"),
                late("fixed")),
         better(about, "what is learnt on the new channel is better than what was learnt on the old.",

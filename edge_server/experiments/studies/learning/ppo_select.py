@@ -9,15 +9,15 @@ from typing import Any
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
-    Learnt,
     Nearest,
     Runs,
-    School,
-    Taught,
+    StudyTrainer,
+    TrainedPolicy,
+    TrainingStudy,
     better,
     mean_of,
     named_runs,
-    over,
+    paired_difference,
     room,
     runs_of,
 )
@@ -27,14 +27,14 @@ from edge_server.experiments.training.scheduler.choices import Maker
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
 from edge_server.experiments.training.scheduler.evaluation import (
     HINDSIGHT,
-    Contest,
+    Evaluation,
     PerSeed,
     rivals,
     rows,
 )
 from edge_server.experiments.training.scheduler.report import draw_curve, percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -60,7 +60,7 @@ NEAREST = (6, 9, 12)
 EPISODES = {True: 120, False: 600}
 
 
-class PpoSelect(Taught):
+class PpoSelect(TrainingStudy):
     name = "ppo-select"
     title = "A scheduler that learns which views to use (figure 5.9)"
 
@@ -69,28 +69,30 @@ class PpoSelect(Taught):
         verdicts: list[Verdict] = []
         written: list[dict[str, Any]] = []
         count = len(ask.repeats(10, 100))
-        with School(ask) as school:
+        with StudyTrainer(ask) as trainer:
             cases = {_called(*case): case for case in CASES}
             for case in ask.chosen(list(cases), list(cases)):
                 on, viewpoints, scratch, price = cases[case]
                 held_out = VIEWPOINTS[viewpoints]
                 field = FIELDS[scratch]
                 setting = room("ch5", held_out=held_out, scratch=scratch)
-                reward, spec = school.reward("set", on), Spec("select", StateLayout(("age", "pose")))
+                reward, spec = trainer.reward("set", on), Spec("select", StateLayout(("age", "pose")))
                 reward = dataclasses.replace(reward, views=-price)
                 name = f"{self.name}-{on}-{len(held_out)}-{field.replace(' ', '-')}{'-priced' * bool(price)}"
-                learnt = school.teach_all(name, setting, Course(spec, reward, ask.taught(EPISODES)))
-                mine, about = named_runs("learnt", learnt), f"room, ch5, {case}"
-                contest = school.contest(setting, {**_rivals(setting), **mine}, reward, count)
-                verdicts += [*judge(about, contest), _time(about, learnt)]
+                trained = trainer.train_repeats(
+                    name, setting, TrainingConfig(spec, reward, ask.training_episodes(EPISODES))
+                )
+                mine, about = named_runs("learnt", trained), f"room, ch5, {case}"
+                evaluation = trainer.evaluate(setting, {**_rivals(setting), **mine}, reward, count)
+                verdicts += [*judge(about, evaluation), _time(about, trained)]
                 labels = {"fidelity": on, "reward_from": viewpoints, "field": field, "price": price}
-                written += rows(contest, **labels, judged_from=", ".join(setting.judged.scoring))
+                written += rows(evaluation, **labels, judged_from=", ".join(setting.judged.scoring))
                 few = rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all"))
-                same = school.contest_as_rewarded(setting, {**few, **mine}, reward, count)
+                same = trainer.evaluate_as_rewarded(setting, {**few, **mine}, reward, count)
                 verdicts += _as_rewarded(about, same)
                 written += rows(same, **labels, judged_from="the same")
                 level = {n: interval(list(same.rewards(n).values())).mean for n in ("random", "learnt-0")}
-                draw_curve(ask.out / f"{learnt[0].lesson.name}.png", learnt[0].rows, level)
+                draw_curve(ask.out / f"{trained[0].run.name}.png", trained[0].rows, level)
         write_csv(ask.out / f"{self.name}.csv", written)
         return verdicts
 
@@ -110,21 +112,23 @@ def _nearest(setting: Setting, k: int) -> Maker:
     return lambda rng: policy
 
 
-def judge(about: str, contest: Contest) -> list[Verdict]:
+def judge(about: str, evaluation: Evaluation) -> list[Verdict]:
     """What the contest says of the thesis's claims and ours."""
-    mine, random = runs_of(contest, "learnt"), contest.rewards("random")
-    best, best_name = contest.best_fixed("threshold")
-    varies = contest.varies("threshold")
+    mine, random = runs_of(evaluation, "learnt"), evaluation.rewards("random")
+    best, best_name = evaluation.best_fixed("threshold")
+    varies = evaluation.varies("threshold")
+    over_named = paired_difference(mine, evaluation.rewards(best_name))
     return [
         better(about, f"better than random; the thesis has {THESIS_PERCENT:+.1f} % over its first episodes "
                "(5.6.2).", mine, random, f"over a uniformly random set: {percent(mean_of(mine), random)}; "),
         better(about, "better than every fixed threshold (5.6.2).", mine, best,
-               f"the best is {best_name}, over which it has {span(over(mine, contest.rewards(best_name)))} "
+               f"the best is {best_name}, over which it has {span(over_named)} "
                "where that is known from the very seeds it is tested on; over the best as the other half of "
                "the seeds chose it, "),
-        *(better(about, f"better than {name}.", mine, contest.rewards(name)) for name in others(contest)),
-        _viewpoint(about, contest, mine),
-        _share(about, contest, mine, best),
+        *(better(about, f"better than {name}.", mine, evaluation.rewards(name))
+          for name in others(evaluation)),
+        _viewpoint(about, evaluation, mine),
+        _share(about, evaluation, mine, best),
         Verdict(about, "the best threshold differs between decisions: who knew it beforehand would win.",
                 f"as one fit has it, it is {quartiles(varies)}; to know it would be worth "
                 f"{span(varies['gain'])} over the best fixed one, as another fit has it; "
@@ -133,25 +137,25 @@ def judge(about: str, contest: Contest) -> list[Verdict]:
     ]  # fmt: skip
 
 
-def others(contest: Contest) -> list[str]:
+def others(evaluation: Evaluation) -> list[str]:
     """Policies without learning, thresholds and random aside."""
     known = ("learnt", "threshold:", "nearest:")
-    return [n for n in contest.outcomes if not n.startswith(known) and n != "random"]
+    return [n for n in evaluation.outcomes if not n.startswith(known) and n != "random"]
 
 
-def _viewpoint(about: str, contest: Contest, mine: Runs) -> Verdict:
-    best, name = contest.best_fixed("nearest")
+def _viewpoint(about: str, evaluation: Evaluation, mine: Runs) -> Verdict:
+    best, name = evaluation.best_fixed("nearest")
     return better(
         about, "more is learnt than from where the reward comes: better than the cameras nearest to those "
         "that reward.", mine, best, f"the best number of them is {name}; ",
     )  # fmt: skip
 
 
-def _as_rewarded(about: str, contest: Contest) -> list[Verdict]:
+def _as_rewarded(about: str, evaluation: Evaluation) -> list[Verdict]:
     """What was learnt from a viewpoint's reward, judged from the same viewpoint: what training itself could
     see, beside what was asked for."""
-    mine, (best, name) = runs_of(contest, "learnt"), contest.best_fixed("threshold")
-    random = contest.rewards("random")
+    mine, (best, name) = runs_of(evaluation, "learnt"), evaluation.best_fixed("threshold")
+    random = evaluation.rewards("random")
     about = f"{about}, judged from the cameras that rewarded"
     return [
         better(
@@ -161,19 +165,19 @@ def _as_rewarded(about: str, contest: Contest) -> list[Verdict]:
             random,
             f"{percent(mean_of(mine), random)}; ",
         ),
-        better(about, "better than using all there.", mine, contest.rewards("all")),
+        better(about, "better than using all there.", mine, evaluation.rewards("all")),
         better(about, "better than every fixed threshold there.", mine, best, f"the best is {name}; "),
     ]
 
 
-def _share(about: str, contest: Contest, mine: Runs, best: PerSeed) -> Verdict:
-    share, theirs = contest.share(mean_of(mine)), contest.share(best)
-    random, limit = contest.rewards("random"), contest.rewards(HINDSIGHT)
+def _share(about: str, evaluation: Evaluation, mine: Runs, best: PerSeed) -> Verdict:
+    share, theirs = evaluation.share(mean_of(mine)), evaluation.share(best)
+    random, limit = evaluation.rewards("random"), evaluation.rewards(HINDSIGHT)
     half: PerSeed = {}
     for seed, value in random.items():
         best_there = limit.get(seed)
         half[seed] = None if value is None or best_there is None else (value + best_there) / 2
-    above, top = over(mine, half), interval(list(limit.values())).mean
+    above, top = paired_difference(mine, half), interval(list(limit.values())).mean
     alone = " (the intervals are over seeds alone, not over trainings)" if len(mine) > 1 else ""
     return Verdict(
         about, "most of what could be won is won: (r - random) / (hindsight - random) above a half.",
@@ -186,12 +190,12 @@ def _share(about: str, contest: Contest, mine: Runs, best: PerSeed) -> Verdict:
     )  # fmt: skip
 
 
-def _time(about: str, learnt: Sequence[Learnt]) -> Verdict:
-    one = learnt[0]
+def _time(about: str, trained: Sequence[TrainedPolicy]) -> Verdict:
+    one = trained[0]
     fits, carried_out = (sum(row[n] for row in one.rows) for n in ("fits", "carried_out"))
     if one.jobs != 2:
-        told = f"trained with {one.jobs} process{'es' if one.jobs > 1 else ''}: --jobs 2 tells of two cores."
-        return Verdict(about, "training is quick on 2 cores.", told, by_bool(None))
+        text = f"trained with {one.jobs} process{'es' if one.jobs > 1 else ''}: --jobs 2 tells of two cores."
+        return Verdict(about, "training is quick on 2 cores.", text, by_bool(None))
     if carried_out < fits / 2:  # known from another training: how long it would have taken is not measured
         return Verdict(about, "training is quick.", "most of its fits were known already.", by_bool(None))
     a_fit, a_decision = one.seconds / carried_out, fits / sum(row["decisions"] for row in one.rows)

@@ -8,23 +8,23 @@ from typing import Any
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.predictability import by_ages
 from edge_server.experiments.studies.learning.setup import (
-    School,
-    Taught,
+    StudyTrainer,
+    TrainingStudy,
     better,
     mean_of,
     named_runs,
     no_worse,
-    over,
+    paired_difference,
     room,
     runs_of,
 )
 from edge_server.experiments.studies.statistics import Interval, crossed
 from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
 from edge_server.experiments.training.scheduler.report import percent, quartiles, span
 from edge_server.experiments.training.scheduler.setting import seeds
-from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Action, Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -45,7 +45,7 @@ THESIS_PERCENT = 6
 EPISODES = {True: 90, False: 600}
 
 
-class PpoWait(Taught):
+class PpoWait(TrainingStudy):
     name = "ppo-wait"
     title = "A scheduler that learns how long to wait, or how old is too old (figure 6.8)"
 
@@ -53,25 +53,27 @@ class PpoWait(Taught):
         del table
         verdicts: list[Verdict] = []
         written: list[dict[str, Any]] = []
-        with School(ask) as school:
+        with StudyTrainer(ask) as trainer:
             cases = {named(*case): case for case in CASES}
             for case in ask.chosen(list(cases), list(cases)[: len(QUICK_CASES)]):
                 channel, age, pixels = cases[case]
                 setting, mark = room(channel), "-moving" if pixels == "moving" else ""
-                reward = dataclasses.replace(school.reward("corrected", pixels), age=age)
+                reward = dataclasses.replace(trainer.reward("corrected", pixels), age=age)
                 everybody: dict[str, Any] = {}
                 for kind in KINDS:
                     spec = Spec(kind, StateLayout(("age", "pose")), OMEGAS_MS[kind])
-                    course = Course(spec, reward, ask.taught(EPISODES), tries=3)
-                    learnt = school.teach_all(f"{self.name}-{channel}{age:g}{mark}-{kind}", setting, course)
+                    config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
+                    trained = trainer.train_repeats(
+                        f"{self.name}-{channel}{age:g}{mark}-{kind}", setting, config
+                    )
                     everybody |= rivals(OMEGAS_MS[kind], [kind], ("random", "all"))
-                    everybody |= named_runs(f"learnt-{kind}", learnt)
+                    everybody |= named_runs(f"learnt-{kind}", trained)
                 count = len(ask.repeats(16, 100))
-                contest = school.contest(setting, everybody, reward, count)
-                moments = [m for e in school.crew.draw(setting.judged, seeds(0, "test", count)) for m in e]
-                verdicts += judge(case, channel, contest)
-                verdicts += [foreseen(case, kind, by_ages(contest, kind, moments)) for kind in KINDS]
-                written += rows(contest, channel=channel, age_weight=age, pixels=pixels)
+                evaluation = trainer.evaluate(setting, everybody, reward, count)
+                moments = [m for e in trainer.pool.draw(setting.judged, seeds(0, "test", count)) for m in e]
+                verdicts += judge(case, channel, evaluation)
+                verdicts += [foreseen(case, kind, by_ages(evaluation, kind, moments)) for kind in KINDS]
+                written += rows(evaluation, channel=channel, age_weight=age, pixels=pixels)
         write_csv(ask.out / f"{self.name}.csv", written)
         return verdicts
 
@@ -82,28 +84,28 @@ def named(channel: str, age: float, pixels: str) -> str:
     return f"{channel}{where}, age {age:g}/ms"
 
 
-def judge(case: str, channel: str, contest: Contest) -> list[Verdict]:
+def judge(case: str, channel: str, evaluation: Evaluation) -> list[Verdict]:
     """What a case's contest says of the thesis's claims and ours."""
     found = []
-    learnt = {kind: runs_of(contest, f"learnt-{kind}") for kind in KINDS}
+    trained = {kind: runs_of(evaluation, f"learnt-{kind}") for kind in KINDS}
     for kind in KINDS:
-        about, mine = f"room, {case}, {kind}", learnt[kind]
-        best, name = contest.best_fixed(kind)
-        varies = contest.varies(kind)
-        same = over(mine, contest.rewards(name))
-        told = (
+        about, mine = f"room, {case}, {kind}", trained[kind]
+        best, name = evaluation.best_fixed(kind)
+        varies = evaluation.varies(kind)
+        same = paired_difference(mine, evaluation.rewards(name))
+        text = (
             f"the best is {name}, over which it has {span(same)} where that is known from the very seeds it "
             "is tested on; over the best as the other half of the seeds chose it, "
         )
         if channel != "ch6":
             claim = "better than its best fixed omega, where a traffic state lasts long enough to be used."
-            found.append(better(about, claim, mine, best, told))
+            found.append(better(about, claim, mine, best, text))
         else:
             claim = "no worse than its best fixed omega by 1 %, where nothing can be foreseen."
-            found.append(no_worse(about, claim, mine, best, contest))
+            found.append(no_worse(about, claim, mine, best, evaluation))
         found.append(
-            better(about, "better than a uniformly random set.", mine, contest.rewards("random"),
-                   f"{percent(mean_of(mine), contest.rewards('random'))}; ")
+            better(about, "better than a uniformly random set.", mine, evaluation.rewards("random"),
+                   f"{percent(mean_of(mine), evaluation.rewards('random'))}; ")
         )  # fmt: skip
         found.append(
             Verdict(about, "the best omega differs between decisions: who knew it beforehand would win.",
@@ -112,7 +114,7 @@ def judge(case: str, channel: str, contest: Contest) -> list[Verdict]:
                     f"{span(crossed(mine))}.",
                     by_bool(varies["gain"].above(0.0)))
         )  # fmt: skip
-    wait, threshold = learnt["wait"], learnt["threshold"]
+    wait, threshold = trained["wait"], trained["threshold"]
     found.append(
         better(f"room, {case}", f"waiting beats thresholds, both learnt (6.5.3: by {THESIS_PERCENT} %).",
                wait, threshold, f"{percent(mean_of(wait), mean_of(threshold))}; ")

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments.studies.statistics import Interval, interval
-from edge_server.experiments.training.scheduler.episode import Moment
-from edge_server.experiments.training.scheduler.evaluation import Contest
+from edge_server.experiments.training.scheduler.episode import DecisionPoint
+from edge_server.experiments.training.scheduler.evaluation import Evaluation
 
 # Of the cameras' ages, as a state has them: what a rule sees.
 _QUANTILES = (0, 10, 25, 50, 75, 90, 100)
@@ -22,12 +22,12 @@ _SCALE_MS = 100.0
 _RIDGE = 30.0
 
 
-def by_ages(contest: Contest, kind: str, moments: Sequence[Moment]) -> Interval:
+def by_ages(evaluation: Evaluation, kind: str, moments: Sequence[DecisionPoint]) -> Interval:
     """Reward of a rule that chooses the value of ``kind`` (wait, threshold) by the ages, minus that of the
     best fixed value, paired over seeds. Rule and fixed value are fitted to all seeds but the one that they
     are measured on, to all rewards at every decision: many more than a learner is ever told of."""
-    names = [name for name in contest.outcomes if name.startswith(f"{kind}:")]
-    values = {name: contest.decisions(name) for name in names}
+    names = [name for name in evaluation.outcomes if name.startswith(f"{kind}:")]
+    values = {name: evaluation.decisions(name) for name in names}
     known = [
         m for m in moments
         if m.state.reported.any() and all(values[n].get((m.seed, m.number)) is not None for n in names)
@@ -46,7 +46,7 @@ def by_ages(contest: Contest, kind: str, moments: Sequence[Moment]) -> Interval:
     return interval(found)
 
 
-def _features(moments: Sequence[Moment]) -> NDArray[np.float64]:
+def _features(moments: Sequence[DecisionPoint]) -> NDArray[np.float64]:
     """(n, features): quantiles of the logarithms of a decision's ages, standardised, and their squares."""
     ages = [np.maximum(m.state.ages_ms[m.state.reported], 0.0) for m in moments]
     x = np.array([np.percentile(np.log1p(a / _SCALE_MS), _QUANTILES) for a in ages])

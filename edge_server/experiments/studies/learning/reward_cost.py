@@ -10,13 +10,13 @@ from typing import Any
 
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
-    Learnt,
-    School,
-    Taught,
+    StudyTrainer,
+    TrainedPolicy,
+    TrainingStudy,
     better,
     embeddings_missing,
     named_runs,
-    over,
+    paired_difference,
     room,
     runs_of,
 )
@@ -24,9 +24,9 @@ from edge_server.experiments.studies.learning.workshop import PARTS, priced, wor
 from edge_server.experiments.studies.statistics import crossed
 from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
 from edge_server.experiments.training.scheduler.report import span
-from edge_server.experiments.training.scheduler.trainer import Course, Row, stage_file
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, stage_file
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -44,7 +44,7 @@ DIMS = (0, 4, 32)  # the first: without semantics
 EPISODES_BY_DIM = {True: 300, False: 1200}
 
 
-class RewardCost(Taught):
+class RewardCost(TrainingStudy):
     name = "reward-cost"
     title = "Reward against the time of training, by the effort of a fit; and against embedding size"
 
@@ -53,35 +53,37 @@ class RewardCost(Taught):
         parts = {"fit budget": _by_budget, "embedding size": _by_dim}
         written: list[dict[str, Any]] = []
         found: list[Verdict] = []
-        with School(ask) as school:
+        with StudyTrainer(ask) as trainer:
             for part in ask.chosen(list(parts), list(parts)):
-                more, verdicts = parts[part](school, ask)
+                more, verdicts = parts[part](trainer, ask)
                 written, found = written + more, found + verdicts
         write_csv(ask.out / f"{self.name}.csv", written)
         return found
 
 
-def _by_budget(school: School, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
+def _by_budget(trainer: StudyTrainer, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
     """Reward against the time of training, by the steps of a fit."""
     budgets = QUICK_BUDGETS if ask.quick else BUDGETS
-    reward = school.reward("set")
-    course = Course(Spec("select", StateLayout(("age", "pose"))), reward, ask.taught(EPISODES))
-    course = dataclasses.replace(course, stages=stages(course.batches))
-    learnt = {steps: school.teach_all(f"reward-cost-{steps}", room("ch5", steps=steps), course)
+    reward = trainer.reward("set")
+    config = TrainingConfig(
+        Spec("select", StateLayout(("age", "pose"))), reward, ask.training_episodes(EPISODES)
+    )
+    config = dataclasses.replace(config, stages=stages(config.batches))
+    trained = {steps: trainer.train_repeats(f"reward-cost-{steps}", room("ch5", steps=steps), config)
               for steps in budgets}  # fmt: skip
     everybody: dict[str, Any] = {
         **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")),
     }
-    for steps, stage in itertools.product(budgets, course.stages):
-        then = [_then(one, stage) for one in learnt[steps]]
+    for steps, stage in itertools.product(budgets, config.stages):
+        then = [_then(one, stage) for one in trained[steps]]
         everybody |= named_runs(_called(steps, stage), then)
     # Everything at every stage of every training, by dear fits: fewer seeds than elsewhere.
     judged = room("ch5", steps=JUDGED_STEPS)
-    contest = school.contest(judged, everybody, reward, len(ask.repeats(8, 40)))
-    spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in course.stages]
-             for steps, runs in learnt.items()}  # fmt: skip
-    _draw(ask, contest, course.stages, spent)
-    return rows(contest, what="fit budget"), judge(contest, course.stages, spent)
+    evaluation = trainer.evaluate(judged, everybody, reward, len(ask.repeats(8, 40)))
+    spent = {steps: [spent_s([o.rows for o in runs], stage) for stage in config.stages]
+             for steps, runs in trained.items()}  # fmt: skip
+    _draw(ask, evaluation, config.stages, spent)
+    return rows(evaluation, what="fit budget"), judge(evaluation, config.stages, spent)
 
 
 def stages(batches: int) -> tuple[int, ...]:
@@ -96,22 +98,22 @@ def spent_s(logs: Sequence[Sequence[Row]], batches: int) -> float:
     return sum(row["processor_seconds"] for rows in logs for row in rows[:batches]) / len(logs)
 
 
-def judge(contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]) -> list[Verdict]:
+def judge(evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[float]]) -> list[Verdict]:
     """Whether a cheap reward has taught more when a dear one has had as much time, all judged by the
     contest's fits. spent: budget -> seconds of processor time at each of the stages."""
     about = f"room, ch5, judged by fits of {JUDGED_STEPS} steps"
     cheap, dear = min(spent), max(spent)
-    curves = {steps: [runs_of(contest, _called(steps, stage)) for stage in stages] for steps in spent}
-    told = "; ".join(
+    curves = {steps: [runs_of(evaluation, _called(steps, stage)) for stage in stages] for steps in spent}
+    text = "; ".join(
         f"{steps} steps a fit " + ", ".join(f"{span(crossed(runs))} after {at:.1f} s"
                                             for runs, at in zip(curves[steps], spent[steps]))
         for steps in spent
     )  # fmt: skip
-    same = over(curves[cheap][-1], curves[dear][-1])
+    same = paired_difference(curves[cheap][-1], curves[dear][-1])
     number = Verdict(
         about,
         "for the same number of decisions a cheap reward teaches as much as a dear one (no worse by 0.01).",
-        f"{cheap} less {dear} steps: {span(same)}; {told}.",
+        f"{cheap} less {dear} steps: {span(same)}; {text}.",
         by_bool(same.above(-0.01)),
     )
     claim = f"in the same time {cheap} steps a fit teach more than {dear}."
@@ -133,53 +135,53 @@ def _called(steps: int, stage: int) -> str:
     return f"{steps} steps, {stage} batches"
 
 
-def _then(learnt: Learnt, batches: int) -> Actor:
+def _then(trained: TrainedPolicy, batches: int) -> Actor:
     """What it had learnt after so many batches."""
-    return Actor.load(stage_file(learnt.folder, batches))
+    return Actor.load(stage_file(trained.folder, batches))
 
 
-def _by_dim(school: School, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
+def _by_dim(trainer: StudyTrainer, ask: Ask) -> tuple[list[dict[str, Any]], list[Verdict]]:
     """Reward against the width of the embedding; nothing where there are no embeddings."""
     if missing := embeddings_missing():
         print(f"  embedding sizes are left out: {missing}")
         return [], []
     usual = workshop(1.0)
-    contests: dict[str, Contest] = {}
+    contests: dict[str, Evaluation] = {}
     for dim in DIMS:
         edge = {**usual.scenario.edge, "embedding": {"dim": dim or DIMS[-1]}}
         setting = dataclasses.replace(usual, scenario=dataclasses.replace(usual.scenario, edge=edge))
         layout = layout_of(setting, PARTS if dim else PARTS[1:])
-        reward = priced(school, "moving")
-        course = Course(Spec("select", layout), reward, ask.taught(EPISODES_BY_DIM))
-        learnt = school.teach_all(f"reward-cost-d{dim}", setting, course)
-        everybody: dict[str, Any] = {**rivals((), (), ("random",)), **named_runs(f"d = {dim}", learnt)}
-        contests[f"d = {dim}"] = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
+        reward = priced(trainer, "moving")
+        config = TrainingConfig(Spec("select", layout), reward, ask.training_episodes(EPISODES_BY_DIM))
+        trained = trainer.train_repeats(f"reward-cost-d{dim}", setting, config)
+        everybody: dict[str, Any] = {**rivals((), (), ("random",)), **named_runs(f"d = {dim}", trained)}
+        contests[f"d = {dim}"] = trainer.evaluate(setting, everybody, reward, len(ask.repeats(10, 100)))
     _draw_dims(ask, contests)
     return [row for name, c in contests.items() for row in rows(c, what=name)], judge_dims(contests)
 
 
-def judge_dims(contests: dict[str, Contest]) -> list[Verdict]:
+def judge_dims(contests: dict[str, Evaluation]) -> list[Verdict]:
     """Whether each embedding is worth more than none, ``d = 0``."""
-    runs = {name: runs_of(contest, name) for name, contest in contests.items()}
+    runs = {name: runs_of(evaluation, name) for name, evaluation in contests.items()}
     return [better("tower, ch5, somebody moves", f"{name} is better than none.", values, runs["d = 0"])
             for name, values in runs.items() if name != "d = 0"]  # fmt: skip
 
 
-def _draw(ask: Ask, contest: Contest, stages: Sequence[int], spent: dict[int, list[float]]) -> None:
+def _draw(ask: Ask, evaluation: Evaluation, stages: Sequence[int], spent: dict[int, list[float]]) -> None:
     with figure(ask.out / "reward-cost.png", 1, height_inch=3.0) as (_, axes):
         for k, (steps, seconds) in enumerate(spent.items()):
-            means = [crossed(runs_of(contest, _called(steps, stage))).mean for stage in stages]
+            means = [crossed(runs_of(evaluation, _called(steps, stage))).mean for stage in stages]
             axes[0, 0].plot(seconds, means, marker="o", markersize=4, color=CYCLE[k % len(CYCLE)],
                             label=f"{steps} steps a fit")  # fmt: skip
         label_lines(axes[0, 0], f"reward by {JUDGED_STEPS} steps", "seconds of processor time",
                     "What a reward costs")  # fmt: skip
 
 
-def _draw_dims(ask: Ask, contests: dict[str, Contest]) -> None:
+def _draw_dims(ask: Ask, contests: dict[str, Evaluation]) -> None:
     """What is learnt over what is learnt without, against the width of the embedding: paired differences with
     their intervals."""
-    runs = [runs_of(contest, name) for name, contest in contests.items()]
-    found = [over(mine, runs[0]) for mine in runs[1:]]
+    runs = [runs_of(evaluation, name) for name, evaluation in contests.items()]
+    found = [paired_difference(mine, runs[0]) for mine in runs[1:]]
     off = [[one.mean - one.low for one in found], [one.high - one.mean for one in found]]
     with figure(ask.out / "reward-cost-dims.png", 1, height_inch=3.0) as (_, axes):
         axes[0, 0].axhline(0.0, color=GREY, linewidth=1.0)

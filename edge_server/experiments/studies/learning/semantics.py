@@ -10,8 +10,8 @@ from typing import Any
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.engine import StudyError
 from edge_server.experiments.studies.learning.setup import (
-    School,
-    Taught,
+    StudyTrainer,
+    TrainingStudy,
     better,
     embeddings_missing,
     mean_of,
@@ -24,10 +24,10 @@ from edge_server.experiments.studies.learning.workshop import PARTS, priced, wor
 from edge_server.experiments.studies.statistics import interval
 from edge_server.experiments.studies.study import Ask, Table, Verdict, by_bool
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import RIVALS, Contest, rivals, rows
+from edge_server.experiments.training.scheduler.evaluation import RIVALS, Evaluation, rivals, rows
 from edge_server.experiments.training.scheduler.report import span
 from edge_server.experiments.training.scheduler.setting import seeds
-from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.report.style import CYCLE, figure, label_lines
 from edge_server.scheduler.learned.learner_spec import Spec
 
@@ -45,7 +45,7 @@ FAMILIES = {
 }  # fmt: skip
 
 
-class Semantics(Taught):
+class Semantics(TrainingStudy):
     name = "semantics"
     title = "Where semantics help, and whether they cost anything where they do not (6.31-6.33)"
 
@@ -55,19 +55,19 @@ class Semantics(Taught):
             raise StudyError(f"{self.name}: {missing}")
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
-        with School(ask) as school:
+        with StudyTrainer(ask) as trainer:
             for scene in ask.chosen(list(SCENES), list(SCENES)):
                 speed, on = SCENES[scene]
                 setting = workshop(speed)
-                reward = priced(school, on)
+                reward = priced(trainer, on)
                 mine: dict[str, Any] = {}
                 for name, layout in (
                     ("with", layout_of(setting, PARTS)),
                     ("without", layout_of(setting, PARTS[1:])),
                 ):
-                    course = Course(Spec("select", layout), reward, ask.taught(EPISODES))
+                    config = TrainingConfig(Spec("select", layout), reward, ask.training_episodes(EPISODES))
                     lesson = f"{self.name}-{scene.replace(' ', '-')}-{name}"
-                    mine |= named_runs(name, school.teach_all(lesson, setting, course))
+                    mine |= named_runs(name, trainer.train_repeats(lesson, setting, config))
                 everybody: dict[str, Any] = {
                     **rivals(OMEGAS_MS["threshold"], ["threshold"], RIVALS), **mine
                 }  # fmt: skip
@@ -75,52 +75,52 @@ class Semantics(Taught):
                 sight = Sight(setting)
                 if speed:
                     everybody |= {f"sees:{k}": Sees(sight, k) for k in KNOWING}
-                contest = school.contest(setting, everybody, reward, count)
-                written += rows(contest, scene=scene)
-                found += judge(scene, contest, on == "moving")
+                evaluation = trainer.evaluate(setting, everybody, reward, count)
+                written += rows(evaluation, scene=scene)
+                found += judge(scene, evaluation, on == "moving")
                 if speed:
-                    moments = [m for e in school.crew.draw(setting, seeds(0, "test", count)) for m in e]
-                    found += why(scene, contest, telling(sight, moments))
+                    moments = [m for e in trainer.pool.draw(setting, seeds(0, "test", count)) for m in e]
+                    found += why(scene, evaluation, telling(sight, moments))
         write_csv(ask.out / f"{self.name}.csv", written)
         draw(ask.out / f"{self.name}.png", written)
         return found
 
 
-def judge(scene: str, contest: Contest, moves: bool) -> list[Verdict]:
+def judge(scene: str, evaluation: Evaluation, moves: bool) -> list[Verdict]:
     """Whether who looks at the pictures does better than who does not; or, where nothing moves, no worse.
     And whether either is better than the best of what does not learn."""
-    about, seeing, blind = f"tower, ch5, {scene}", runs_of(contest, "with"), runs_of(contest, "without")
-    told = ""
+    about, seeing, blind = f"tower, ch5, {scene}", runs_of(evaluation, "with"), runs_of(evaluation, "without")
+    text = ""
     for name, runs in (("with", seeing), ("without", blind)):
-        views, won = contest.term(f"{name}-0", "views").mean, contest.share(mean_of(runs))
-        told += f"{name}: {views:.1f} views, {span(won, 2)} of the way from random to hindsight; "
+        views, won = evaluation.term(f"{name}-0", "views").mean, evaluation.share(mean_of(runs))
+        text += f"{name}: {views:.1f} views, {span(won, 2)} of the way from random to hindsight; "
     if moves:
         claim = "semantics help where something important moves."
-        found = [better(about, claim, seeing, blind, told)]
+        found = [better(about, claim, seeing, blind, text)]
     else:
         claim = "semantics cost no more than 1 % where nothing moves."
-        found = [no_worse(about, claim, seeing, blind, contest)]
-    fixed = [n for n in contest.outcomes if not n.startswith(("with", "random", "sees"))]
-    best = max(fixed, key=lambda n: interval(list(contest.rewards(n).values())).mean)
+        found = [no_worse(about, claim, seeing, blind, evaluation)]
+    fixed = [n for n in evaluation.outcomes if not n.startswith(("with", "random", "sees"))]
+    best = max(fixed, key=lambda n: interval(list(evaluation.rewards(n).values())).mean)
     return found + [
         better(f"{about}, {name} semantics", "better than the best of all that does not learn.", runs,
-               contest.rewards(best), f"{best}, known from the very seeds; ")
+               evaluation.rewards(best), f"{best}, known from the very seeds; ")
         for name, runs in (("with", seeing), ("without", blind))
     ]  # fmt: skip
 
 
-def why(scene: str, contest: Contest, told: tuple[float, float]) -> list[Verdict]:
+def why(scene: str, evaluation: Evaluation, text: tuple[float, float]) -> list[Verdict]:
     """Whether the embedding tells what is to be known, and whether who knows it could use it. told: as
     ``telling`` has it."""
-    about, (embedding, camera) = f"tower, ch5, {scene}", told
-    knowing = [n for n in contest.outcomes if n.startswith("sees")]
-    best = max(knowing, key=lambda n: interval(list(contest.rewards(n).values())).mean)
+    about, (embedding, camera) = f"tower, ch5, {scene}", text
+    knowing = [n for n in evaluation.outcomes if n.startswith("sees")]
+    best = max(knowing, key=lambda n: interval(list(evaluation.rewards(n).values())).mean)
     return [
         Verdict(about, "the embedding tells which cameras see what moves (better than which camera it is).",
                 f"area under the curve {embedding:.2f}, by a linear rule on episodes that it was not fitted "
                 f"to; {camera:.2f} from which camera it is.", by_bool(embedding > camera)),
         better(about, "who knows which cameras see what moves does better than what is learnt blindly.",
-               contest.rewards(best), runs_of(contest, "without"),
+               evaluation.rewards(best), runs_of(evaluation, "without"),
                f"{best}, the best number of them known from the very seeds; "),
     ]  # fmt: skip
 

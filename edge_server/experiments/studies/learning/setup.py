@@ -1,8 +1,7 @@
-"""What studies of schedulers that learn share: settings of the room, trainings that are kept, contests.
+"""Shared by the studies of learned schedulers: settings, resumable trainings, evaluations and verdicts.
 
-A training is a chain, not a heap of trials, so it does not go through the engine: it is kept with its
-checkpoints below OUT/training, evaluations in OUT/training/evaluations.jsonl by content, and the same command
-goes on with either.
+The batches of a training depend on each other, so it does not go through the engine. Its checkpoints are kept
+below OUT/training and evaluations by content in OUT/training/evaluations.jsonl; the same command resumes.
 """
 
 from __future__ import annotations
@@ -23,11 +22,17 @@ from edge_server.experiments.studies.statistics import Interval, crossed, interv
 from edge_server.experiments.studies.study import Ask, Point, Verdict, by_bool
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.scheduler.command import reward_of
-from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Contest, PerSeed, Rival, hold
+from edge_server.experiments.training.scheduler.evaluation import (
+    HINDSIGHT,
+    Candidate,
+    Evaluation,
+    PerSeed,
+    evaluate_policies,
+)
 from edge_server.experiments.training.scheduler.report import draw_curve, span
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.trainer import Course, Row, read_log, train
-from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.training.scheduler.trainer import Row, TrainingConfig, read_log, train
+from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.scheduler import Epoch, Policy, SelectionWindow
 from edge_server.scheduler.learned.actor import Actor
@@ -47,29 +52,29 @@ Runs = Sequence[PerSeed]
 """Rewards by seed of each of several trainings of the same lesson."""
 
 
-class Taught:
-    """A study that trains: what it does is no heap of trials."""
+class TrainingStudy:
+    """Base of studies that train policies; they have no independent trials."""
 
     def points(self, ask: Ask) -> list[Point]:
-        """None."""
+        """An empty list."""
         return []
 
 
 @dataclass(frozen=True)
-class Lesson:
+class TrainingRun:
     """One training of a study. name: of its folder and in its tables."""
 
     name: str
     setting: Setting
-    course: Course
+    config: TrainingConfig
 
 
 @dataclass(frozen=True)
-class Learnt:
+class TrainedPolicy:
     """actor: what was learnt. rows: of its log. seconds: of training, wall clock, when it was trained, by
     ``jobs`` processes. folder: with its policy.npz."""
 
-    lesson: Lesson
+    run: TrainingRun
     actor: Actor
     rows: list[Row]
     seconds: float
@@ -127,23 +132,23 @@ class Nearest(Policy):
 
 
 @dataclass
-class School:
-    """Trains and compares for one study; use as a context."""
+class StudyTrainer:
+    """Trains and evaluates policies for one study; a context manager that owns the worker pool."""
 
     ask: Ask
-    crew: Crew = field(init=False)
+    pool: WorkerPool = field(init=False)
     _told: bool = False
 
     def __post_init__(self) -> None:
         self.folder = self.ask.out / "training"
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.crew = Crew(self.ask.folders, self.ask.jobs, self.folder / "evaluations.jsonl")
+        self.pool = WorkerPool(self.ask.folders, self.ask.jobs, self.folder / "evaluations.jsonl")
 
-    def __enter__(self) -> School:
+    def __enter__(self) -> StudyTrainer:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.crew.__exit__(*error)
+        self.pool.__exit__(*error)
 
     def reward(self, name: str, on: str = "whole") -> Reward:
         """A reward of the presets; said once where its LPIPS term has to be left out."""
@@ -153,52 +158,52 @@ class School:
             self._told = True
         return reward
 
-    def teach(self, lesson: Lesson) -> Learnt:
+    def train_one(self, run: TrainingRun) -> TrainedPolicy:
         """The lesson's learner, trained now or kept; its curve is drawn to OUT/LESSON.png."""
-        folder = self.folder / f"{lesson.name}-{_digest(lesson)}"
+        folder = self.folder / f"{run.name}-{_digest(run)}"
         by = folder / "jobs.json"
         learner = train(
-            lesson.setting, lesson.course, self.crew, folder,
-            lambda line: print(f"  {lesson.name}: {line}", flush=True),
+            run.setting, run.config, self.pool, folder,
+            lambda line: print(f"  {run.name}: {line}", flush=True),
         )  # fmt: skip
         rows = read_log(folder)
-        draw_curve(self.ask.out / f"{lesson.name}.png", rows)
+        draw_curve(self.ask.out / f"{run.name}.png", rows)
         if not by.exists():
             write_json(by, self.ask.jobs)
         seconds = sum(row["seconds"] for row in rows)
-        return Learnt(lesson, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
+        return TrainedPolicy(run, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
 
-    def teach_all(self, name: str, setting: Setting, course: Course) -> list[Learnt]:
+    def train_repeats(self, name: str, setting: Setting, config: TrainingConfig) -> list[TrainedPolicy]:
         """The lesson, taught as many times as is asked for: each time other episodes, another beginning."""
         runs = range(RUNS[self.ask.quick])
         return [
-            self.teach(Lesson(f"{name}-{run}", setting, dataclasses.replace(course, seed=run)))
+            self.train_one(TrainingRun(f"{name}-{run}", setting, dataclasses.replace(config, seed=run)))
             for run in runs
         ]  # fmt: skip
 
-    def contest(
+    def evaluate(
         self,
         setting: Setting,
-        everybody: Mapping[str, Rival],
+        everybody: Mapping[str, Candidate],
         reward: Reward,
         count: int,
         seed: int = 0,
-    ) -> Contest:
+    ) -> Evaluation:
         """All of ``everybody`` on ``count`` seeds that nobody trained on, judged by the cameras that report:
         none of what they are asked is what was rewarded."""
-        return self.contest_as_rewarded(setting.judged, everybody, reward, count, seed)
+        return self.evaluate_as_rewarded(setting.judged, everybody, reward, count, seed)
 
-    def contest_as_rewarded(
+    def evaluate_as_rewarded(
         self,
         setting: Setting,
-        everybody: Mapping[str, Rival],
+        everybody: Mapping[str, Candidate],
         reward: Reward,
         count: int,
         seed: int = 0,
-    ) -> Contest:
+    ) -> Evaluation:
         """The same judged by the cameras that rewarded, too: beside the other, never instead of it."""
-        return hold(
-            setting, self.crew, seeds(seed, "test", count), everybody, reward,
+        return evaluate_policies(
+            setting, self.pool, seeds(seed, "test", count), everybody, reward,
             lambda line: print(f"  contest: {line}", flush=True),
         )  # fmt: skip
 
@@ -214,9 +219,9 @@ def embeddings_missing() -> str | None:
     return None
 
 
-def fixed_of(contest: Contest, kind: str) -> str:
+def fixed_of(evaluation: Evaluation, kind: str) -> str:
     """The best fixed policy of a kind, in words."""
-    values, name = contest.best_fixed(kind)
+    values, name = evaluation.best_fixed(kind)
     return f"{name} {span(interval(list(values.values())))}"
 
 
@@ -230,18 +235,21 @@ def mean_of(runs: Runs) -> PerSeed:
     return found
 
 
-def named_runs(name: str, learnt: Sequence[Learnt | Actor]) -> dict[str, Actor]:
+def named_runs(name: str, trained: Sequence[TrainedPolicy | Actor]) -> dict[str, Actor]:
     """The actors of several trainings of one lesson as a contest takes them."""
-    return {f"{name}-{run}": one.actor if isinstance(one, Learnt) else one for run, one in enumerate(learnt)}
+    return {
+        f"{name}-{run}": one.actor if isinstance(one, TrainedPolicy) else one
+        for run, one in enumerate(trained)
+    }
 
 
-def runs_of(contest: Contest, name: str) -> Runs:
+def runs_of(evaluation: Evaluation, name: str) -> Runs:
     """Rewards of each of the trainings that ``named_runs`` called ``name``."""
-    of = [n for n in contest.outcomes if n.startswith(f"{name}-") and n[len(name) + 1 :].isdigit()]
-    return [contest.rewards(n) for n in of]
+    of = [n for n in evaluation.outcomes if n.startswith(f"{name}-") and n[len(name) + 1 :].isdigit()]
+    return [evaluation.rewards(n) for n in of]
 
 
-def over(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
+def paired_difference(mine: PerSeed | Runs, other: PerSeed | Runs) -> Interval:
     """Paired difference, over seeds and, where they are of several trainings, over those: run r of the one
     with run r of the other, which saw the same episodes."""
     ours, theirs = _runs(mine), _runs(other)
@@ -260,7 +268,7 @@ def _runs(values: PerSeed | Runs) -> Runs:
     return [values] if isinstance(values, dict) else values
 
 
-def _told_of(found: Interval, runs: int) -> str:
+def _describe_difference(found: Interval, runs: int) -> str:
     """The difference for people, and what its interval is over."""
     trainings = f"{runs} trainings and " if runs > 1 else ""
     alone = "" if runs > 1 else " of a single training"
@@ -269,32 +277,37 @@ def _told_of(found: Interval, runs: int) -> str:
 
 def better(about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, found: str = "") -> Verdict:
     """Whether ``mine`` is better than ``other``: the paired interval says."""
-    difference = over(mine, other)
-    told = _told_of(difference, len(_runs(mine)))
+    difference = paired_difference(mine, other)
+    text = _describe_difference(difference, len(_runs(mine)))
     if difference.low == difference.high == 0.0:
-        return Verdict(about, claim, f"{found}{told}: it does the very same.", by_bool(False))
-    return Verdict(about, claim, f"{found}{told}.", by_bool(difference.above(0.0)))
+        return Verdict(about, claim, f"{found}{text}: it does the very same.", by_bool(False))
+    return Verdict(about, claim, f"{found}{text}.", by_bool(difference.above(0.0)))
 
 
 def no_worse(
-    about: str, claim: str, mine: PerSeed | Runs, other: PerSeed | Runs, contest: Contest, share: float = 0.01
+    about: str,
+    claim: str,
+    mine: PerSeed | Runs,
+    other: PerSeed | Runs,
+    evaluation: Evaluation,
+    share: float = 0.01,
 ) -> Verdict:
     """Whether ``mine`` loses no more than ``share`` of the size of ``other``'s mean reward, and what part
     that is of all that could be won in the contest: a reward's zero is arbitrary, its differences are not.
     No answer where the reward is too near its zero for a percentage."""
-    difference, base = over(mine, other), crossed(_runs(other))
-    told = f"{_told_of(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
+    difference, base = paired_difference(mine, other), crossed(_runs(other))
+    text = f"{_describe_difference(difference, len(_runs(mine)))} at {base.mean:.4f}, that is "
     if base.low <= 0.0 <= base.high:
-        return Verdict(about, claim, f"{told}no percentage: too near zero.", by_bool(None))
-    told += f"{100 * difference.mean / abs(base.mean):+.2f} %"
-    limit = over(contest.rewards(HINDSIGHT), contest.rewards("random"))
+        return Verdict(about, claim, f"{text}no percentage: too near zero.", by_bool(None))
+    text += f"{100 * difference.mean / abs(base.mean):+.2f} %"
+    limit = paired_difference(evaluation.rewards(HINDSIGHT), evaluation.rewards("random"))
     if limit.above(0.0):
-        told += f", and {100 * difference.mean / limit.mean:+.0f} % of the way from random to hindsight"
-    return Verdict(about, claim, f"{told}.", by_bool(difference.above(-share * abs(base.mean))))
+        text += f", and {100 * difference.mean / limit.mean:+.0f} % of the way from random to hindsight"
+    return Verdict(about, claim, f"{text}.", by_bool(difference.above(-share * abs(base.mean))))
 
 
-def _digest(lesson: Lesson) -> str:
+def _digest(run: TrainingRun) -> str:
     """Lessons of one name and other settings stand beside each other, and so do those of other code: what
     an earlier learner learnt must not pass for what this one does."""
-    text = source_digest() + lesson.setting.key + repr(dataclasses.asdict(lesson.course))
+    text = source_digest() + run.setting.key + repr(dataclasses.asdict(run.config))
     return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -8,8 +8,8 @@ from typing import Any
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
     FOUR_VIEWPOINTS,
-    School,
-    Taught,
+    StudyTrainer,
+    TrainingStudy,
     better,
     embeddings_missing,
     fixed_of,
@@ -19,8 +19,8 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.study import Ask, Table, Verdict
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS, layout_of
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
-from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 
 EPISODES = {True: 100, False: 600}
@@ -31,7 +31,7 @@ VARIANTS = {
 }  # fmt: skip
 
 
-class Ablation(Taught):
+class Ablation(TrainingStudy):
     name = "ablation"
     title = "What each part of the state is worth: age, pose, semantics (6.33)"
 
@@ -44,33 +44,33 @@ class Ablation(Taught):
         # All see the same decisions, drawn with all that any of them looks at.
         parts = tuple(dict.fromkeys(part for v in variants.values() for part in v))
         setting = room("ch5", held_out=FOUR_VIEWPOINTS, parts=parts)
-        with School(ask) as school:
-            reward = school.reward("set", "moving")
+        with StudyTrainer(ask) as trainer:
+            reward = trainer.reward("set", "moving")
             mine: dict[str, Any] = {}
             for name, used in variants.items():
                 spec = Spec("select", layout_of(setting, used))
-                course = Course(spec, reward, ask.taught(EPISODES))
-                learnt = school.teach_all(f"{self.name}-{name}", setting, course)
-                mine |= named_runs(f"learnt {name}", learnt)
+                config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES))
+                trained = trainer.train_repeats(f"{self.name}-{name}", setting, config)
+                mine |= named_runs(f"learnt {name}", trained)
             everybody: dict[str, Any] = {
                 **rivals(OMEGAS_MS["threshold"], ["threshold"], ("random", "all")), **mine
             }  # fmt: skip
-            contest = school.contest(setting, everybody, reward, len(ask.repeats(10, 100)))
-        write_csv(ask.out / f"{self.name}.csv", rows(contest))
-        return judge(contest, list(variants))
+            evaluation = trainer.evaluate(setting, everybody, reward, len(ask.repeats(10, 100)))
+        write_csv(ask.out / f"{self.name}.csv", rows(evaluation))
+        return judge(evaluation, list(variants))
 
 
-def judge(contest: Contest, variants: Sequence[str]) -> list[Verdict]:
+def judge(evaluation: Evaluation, variants: Sequence[str]) -> list[Verdict]:
     """What each variant of the state is worth, by the contest of what was learnt with them."""
-    about, learnt = (
+    about, trained = (
         "room, ch5, moving, four viewpoints",
-        {n: runs_of(contest, f"learnt {n}") for n in variants},
+        {n: runs_of(evaluation, f"learnt {n}") for n in variants},
     )
-    best, told = contest.best_fixed("threshold")[0], fixed_of(contest, "threshold")
+    best, text = evaluation.best_fixed("threshold")[0], fixed_of(evaluation, "threshold")
     found = [better(f"{about}, {name}", "better than the best fixed threshold.", runs, best,
-                    f"against {told}; ") for name, runs in learnt.items()]  # fmt: skip
-    found += [better(f"{about}, {name}", "better than age alone.", runs, learnt["age"])
-              for name, runs in learnt.items() if name != "age"]  # fmt: skip
-    if "all" in learnt:
-        found.append(better(about, "semantics add to age and pose.", learnt["all"], learnt["age+pose"]))
+                    f"against {text}; ") for name, runs in trained.items()]  # fmt: skip
+    found += [better(f"{about}, {name}", "better than age alone.", runs, trained["age"])
+              for name, runs in trained.items() if name != "age"]  # fmt: skip
+    if "all" in trained:
+        found.append(better(about, "semantics add to age and pose.", trained["all"], trained["age+pose"]))
     return found

@@ -7,8 +7,8 @@ from typing import Any
 
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.learning.setup import (
-    School,
-    Taught,
+    StudyTrainer,
+    TrainingStudy,
     better,
     fixed_of,
     named_runs,
@@ -18,9 +18,9 @@ from edge_server.experiments.studies.learning.setup import (
 )
 from edge_server.experiments.studies.study import Ask, Table, Verdict
 from edge_server.experiments.training.scheduler.command import OMEGAS_MS
-from edge_server.experiments.training.scheduler.evaluation import Contest, rivals, rows
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, rivals, rows
 from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.trainer import Course
+from edge_server.experiments.training.scheduler.trainer import TrainingConfig
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import StateLayout
 
@@ -36,7 +36,7 @@ def settings(quick: bool) -> dict[str, Setting]:
     return found if quick else found | more
 
 
-class Transfer(Taught):
+class Transfer(TrainingStudy):
     name = "transfer"
     title = "Trained on one scene and channel, used on another"
 
@@ -45,36 +45,37 @@ class Transfer(Taught):
         found: list[Verdict] = []
         written: list[dict[str, Any]] = []
         spec = Spec("wait", StateLayout(("age", "pose")), OMEGAS_MS["wait"])
-        with School(ask) as school:
-            reward = dataclasses.replace(school.reward("corrected"), age=AGE)
+        with StudyTrainer(ask) as trainer:
+            reward = dataclasses.replace(trainer.reward("corrected"), age=AGE)
             places = settings(ask.quick)
-            course = Course(spec, reward, ask.taught(EPISODES), tries=3)
-            learnt = {
-                place: school.teach_all(
+            config = TrainingConfig(spec, reward, ask.training_episodes(EPISODES), tries=3)
+            trained = {
+                place: trainer.train_repeats(
                     f"{self.name}-{place.replace(', ', '-').replace(' ', '-').replace('/', '')}",
-                    setting, course,
+                    setting, config,
                 )
                 for place, setting in places.items()
             }  # fmt: skip
             for place, setting in places.items():
                 everybody: dict[str, Any] = {
                     **rivals(OMEGAS_MS["wait"], ["wait"], ("random", "all")),
-                    **named_runs("learnt at home", learnt[HOME]), **named_runs("learnt here", learnt[place]),
+                    **named_runs("learnt at home", trained[HOME]),
+                    **named_runs("learnt here", trained[place]),
                 }  # fmt: skip
-                contest = school.contest(setting, everybody, reward, len(ask.repeats(8, 100)))
-                written += rows(contest, place=place)
-                found += judge(place, contest)
+                evaluation = trainer.evaluate(setting, everybody, reward, len(ask.repeats(8, 100)))
+                written += rows(evaluation, place=place)
+                found += judge(place, evaluation)
         write_csv(ask.out / f"{self.name}.csv", written)
         return found
 
 
-def judge(place: str, contest: Contest) -> list[Verdict]:
+def judge(place: str, evaluation: Evaluation) -> list[Verdict]:
     """How what was learnt at home does at a place, beside what was learnt there."""
-    home, here = runs_of(contest, "learnt at home"), runs_of(contest, "learnt here")
-    best, told = contest.best_fixed("wait")[0], fixed_of(contest, "wait")
+    home, here = runs_of(evaluation, "learnt at home"), runs_of(evaluation, "learnt here")
+    best, text = evaluation.best_fixed("wait")[0], fixed_of(evaluation, "wait")
     found = [better(place, f"learnt in {HOME}, better than the best fixed wait here.", home, best,
-                    f"against {told}; ")]  # fmt: skip
+                    f"against {text}; ")]  # fmt: skip
     if place != HOME:
         claim = f"learnt in {HOME}, it loses no more than 5 % to what is learnt here."
-        found.append(no_worse(place, claim, home, here, contest, 0.05))
+        found.append(no_worse(place, claim, home, here, evaluation, 0.05))
     return found

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.config import WorldConfig, source_config
-from edge_server.experiments.training.scheduler.episode import Choice, Moment
+from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.experiments.virtual.from_scenario import exact_scene
 
@@ -34,7 +34,7 @@ class Sight:
         self._setting = setting
         self._known: dict[tuple[int, int], dict[str, float]] = {}
 
-    def shares(self, moment: Moment) -> dict[str, float]:
+    def shares(self, moment: DecisionPoint) -> dict[str, float]:
         """Camera -> the share of its newest frame at a decision that shows something that moves, of those
         that have one."""
         at = moment.seed, moment.number
@@ -42,7 +42,7 @@ class Sight:
             self._known[at] = self._look(moment)
         return self._known[at]
 
-    def _look(self, moment: Moment) -> dict[str, float]:
+    def _look(self, moment: DecisionPoint) -> dict[str, float]:
         scenario = self._setting.seeded(moment.seed, moves=True)
         scene, _ = exact_scene(scenario, cast(WorldConfig, source_config(scenario)))
         still = scene.with_world(dataclasses.replace(scene.world, movers=()), scene.period_s, False)
@@ -60,7 +60,7 @@ class Sees:
     def __init__(self, sight: Sight, k: int) -> None:
         self._sight, self._k = sight, k
 
-    def choice(self, moment: Moment) -> Choice:
+    def choice(self, moment: DecisionPoint) -> Choice:
         """At the instant of the decision; of none that has reported, nothing."""
         shares, newest = self._sight.shares(moment), moment.newest(moment.now_ns)
         age_ms = {c: (moment.now_ns - a.generated_ns) / 1e6 for c, a in newest.items()}
@@ -69,7 +69,7 @@ class Sees:
         return Choice(tuple(c for c in newest if c in best), moment.now_ns)
 
 
-def telling(sight: Sight, moments: Sequence[Moment]) -> tuple[float, float]:
+def telling(sight: Sight, moments: Sequence[DecisionPoint]) -> tuple[float, float]:
     """How well embeddings tell a camera that sees something move from one that does not, and how well it is
     told by which camera it is: areas under the curve of linear rules, fitted to every other episode and
     measured on the rest. NaN where all see it, or none."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from edge_server.experiments.studies.learning.setup import School, room
+from edge_server.experiments.studies.learning.setup import StudyTrainer, room
 from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.scheduler.learned.rewards import Reward
 
@@ -18,10 +18,10 @@ PRICE = 0.002
 STEPS, REFRESH_MS = 40, 900.0
 
 
-def priced(school: School, on: str) -> Reward:
+def priced(trainer: StudyTrainer, on: str) -> Reward:
     """Of ``moving`` pixels, PSNR alone: SSIM and the distance are of the whole image, which hardly shows who
     walks in a corner of it, so that with them whatever serves the rest of the scene is rewarded."""
-    reward = dataclasses.replace(school.reward("set", on), views=-PRICE)
+    reward = dataclasses.replace(trainer.reward("set", on), views=-PRICE)
     return dataclasses.replace(reward, ssim=0.0, distance=0.0) if on == "moving" else reward
 
 

@@ -1,6 +1,6 @@
 """Training of schedulers: decisions drawn from virtual deployments, rewarded by real field fits.
 
-``setting`` says where decisions come from and what an evaluation is; ``episode`` draws decisions and carries
-out what was chosen; ``crew`` does so in processes; ``choosing`` asks policies; ``trainer`` lets a learner
-learn from it; ``contest`` compares what was learnt with everything else on seeds that were never trained on.
+``setting`` configures episodes and fits; ``episode`` draws decisions and carries out choices; ``workers``
+does so in several processes; ``choices`` asks policies; ``trainer`` updates a learner from the rewards;
+``evaluation`` compares the trained policy with all others on seeds that were never trained on.
 """

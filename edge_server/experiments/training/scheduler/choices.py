@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.training.scheduler.episode import Choice, Moment
+from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint
 from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy
 from edge_server.scheduler.learned.learner_spec import Spec
 
@@ -15,7 +15,7 @@ Maker = Callable[[np.random.Generator], Policy]
 """Makes a policy as new, from its stream of random numbers."""
 
 
-def choose(policy: Policy, moment: Moment, number: int | None = None) -> Choice:
+def choose(policy: Policy, moment: DecisionPoint, number: int | None = None) -> Choice:
     """What ``policy`` does at a decision: it plans, waits for as long as it likes and selects, as the live
     loop has it. One that would wait longer than is known of the channel uses all that there is then. number:
     of the decision, for policies that go on from one to the next; None takes the moment's own."""
@@ -35,7 +35,7 @@ def choose(policy: Policy, moment: Moment, number: int | None = None) -> Choice:
     return Choice(tuple(cameras), at_ns, treatment.name if treatment else "")
 
 
-def of_action(spec: Spec, action: Any, moment: Moment) -> Choice:
+def choice_of_action(spec: Spec, action: Any, moment: DecisionPoint) -> Choice:
     """What a learner's action means at a decision: action (N,) bool, or an index of the specification's
     omegas."""
     if spec.action != "select":
@@ -46,7 +46,7 @@ def of_action(spec: Spec, action: Any, moment: Moment) -> Choice:
     return Choice(cameras, moment.now_ns) if cameras else choose(_use_all(), moment)
 
 
-def choices(make: Maker, moments: Sequence[Moment], purpose: int = 0) -> list[Choice]:
+def choices(make: Maker, moments: Sequence[DecisionPoint], purpose: int = 0) -> list[Choice]:
     """What a policy does at the decisions of one episode, in their order, from its beginning. purpose: keeps
     the random numbers of several policies apart."""
     policy = make(np.random.default_rng([moments[0].seed, purpose]))
@@ -63,7 +63,7 @@ def _use_all() -> Policy:
     return make_policy("all", None, np.random.default_rng(0))
 
 
-def _epoch(moment: Moment, at_ns: int, number: int) -> Epoch:
+def _epoch(moment: DecisionPoint, at_ns: int, number: int) -> Epoch:
     generated = {c: arrival.generated_ns for c, arrival in moment.newest(at_ns).items()}
     # What is seen besides ages is known of the instant of the decision, at which policies look.
     state = (lambda parts=(): moment.state) if at_ns == moment.now_ns else None

@@ -16,12 +16,18 @@ from edge_server.config import open_embedder, read_config
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.choices import Maker
-from edge_server.experiments.training.scheduler.evaluation import Contest, hold, rivals
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, evaluate_policies, rivals
 from edge_server.experiments.training.scheduler.evaluation import rows as rows_of
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.trainer import REPORTS, Course, TrainingError, read_log, train
-from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.training.scheduler.trainer import (
+    REPORTS,
+    TrainingConfig,
+    TrainingError,
+    read_log,
+    train,
+)
+from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import field_names
 from edge_server.scheduler import STATE_PARTS
@@ -75,14 +81,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     folders = Folders(base, weights_folder(args.lpips, base))
     try:
         setting = setting_of(args, load(args.scenario))
-        course = _course(args, setting, folders)
-        _check(args, course)
+        config = _course(args, setting, folders)
+        _check(args, config)
     except (ScenarioError, DatasetError, ValueError) as error:
         print(f"edge-server train-scheduler: {error}", file=sys.stderr)
         return 2
     try:
-        with Crew(folders, args.jobs, _made(args.out) / "evaluations.jsonl") as crew:
-            _go(args, setting, course, crew)
+        with WorkerPool(folders, args.jobs, _made(args.out) / "evaluations.jsonl") as pool:
+            _go(args, setting, config, pool)
     except (ScenarioError, DatasetError, TrainingError) as error:
         print(f"edge-server train-scheduler: {error}", file=sys.stderr)
         return 2
@@ -92,51 +98,51 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _go(args: argparse.Namespace, setting: Setting, course: Course, crew: Crew) -> None:
+def _go(args: argparse.Namespace, setting: Setting, config: TrainingConfig, pool: WorkerPool) -> None:
     print(f"  rewarded from {', '.join(setting.rewarding)}; judged from {', '.join(setting.judged.scoring)}")
-    if course.reward.fidelity == "whole" and not course.reward.age:
+    if config.reward.fidelity == "whole" and not config.reward.age:
         print("  the reward is of the whole image and has no term of age: where little moves it teaches to "
               "ignore how old views are (--on moving)")  # fmt: skip
     if not setting.draws_motions:
         print("  every episode has the same motion: it is tested on unseen channels and instants alone")
-    learner = train(setting, course, crew, args.out, lambda line: print(f"  {line}", flush=True))
+    learner = train(setting, config, pool, args.out, lambda line: print(f"  {line}", flush=True))
     # They are about an earlier call; one that was refused has left them alone.
     for name in REPORTS:
         (args.out / name).unlink(missing_ok=True)
     rows = read_log(args.out)
     spent = sum(row["seconds"] for row in rows)
     write_csv(args.out / "training.csv", rows)
-    print(f"  {course.episodes} episodes; trained for {spent:.0f} s in all", flush=True)
+    print(f"  {config.episodes} episodes; trained for {spent:.0f} s in all", flush=True)
     if not args.test:
         draw_curve(args.out / "training.png", rows)
         return
-    kinds = ["threshold"] if course.spec.action == "select" else [course.spec.action]
-    omegas = course.spec.omegas_ms or OMEGAS_MS["threshold"]
+    kinds = ["threshold"] if config.spec.action == "select" else [config.spec.action]
+    omegas = config.spec.omegas_ms or OMEGAS_MS["threshold"]
     everybody: dict[str, Maker | Actor] = {**rivals(omegas, kinds), LEARNT: learner.actor}
-    contest = hold(
-        setting.judged, crew, seeds(course.seed, "test", args.test), everybody, course.reward,
+    evaluation = evaluate_policies(
+        setting.judged, pool, seeds(config.seed, "test", args.test), everybody, config.reward,
         lambda line: print(f"  on unseen seeds: {line}", flush=True),
     )  # fmt: skip
     about = {
-        "reward_name": course.reward.name, "on": course.reward.fidelity, "seconds": round(spent, 1),
+        "reward_name": config.reward.name, "on": config.reward.fidelity, "seconds": round(spent, 1),
         "rewarded_from": setting.rewarding, "judged_from": setting.judged.scoring,
         "motions": setting.draws_motions,
     }  # fmt: skip
-    _report(args.out, contest, kinds[0], rows, about)
+    _report(args.out, evaluation, kinds[0], rows, about)
 
 
 def _report(
-    out: Path, contest: Contest, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]
+    out: Path, evaluation: Evaluation, fixed: str, rows: list[dict[str, Any]], about: dict[str, Any]
 ) -> None:
-    write_csv(out / "contest.csv", rows_of(contest))
-    found = summary(contest, LEARNT, fixed)
+    write_csv(out / "contest.csv", rows_of(evaluation))
+    found = summary(evaluation, LEARNT, fixed)
     names = {"random": "random", f"best fixed ({found['best_fixed']})": found["best_fixed"], LEARNT: LEARNT}
     levels = {label: found["rewards"][name][0] for label, name in names.items()}
     # From another camera a reward has another zero, which the course of the training does not share.
-    told = {} if about["rewarded_from"] != about["judged_from"] else levels
-    draw_curve(out / "training.png", rows, {k: v for k, v in told.items() if v is not None})
+    shown = {} if about["rewarded_from"] != about["judged_from"] else levels
+    draw_curve(out / "training.png", rows, {k: v for k, v in shown.items() if v is not None})
     write_json(out / "summary.json", {**found, **about}, indent=1)
-    for line in lines(contest, LEARNT, fixed):
+    for line in lines(evaluation, LEARNT, fixed):
         print(f"  {line}")
     print(f"  {out / 'policy.npz'}: edge-server run SCENARIO --policy bandit:{out / 'policy.npz'}")
 
@@ -222,7 +228,7 @@ def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
     return StateLayout(parts, embedder.dim, embedding=embedder.name)
 
 
-def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Course:
+def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> TrainingConfig:
     name = args.reward or ("set" if args.kind == "select" else "corrected")
     network = read_config(setting.scenario).lpips
     reward, missing = reward_of(name, args.on, folders.lpips, network, args.distance)
@@ -240,7 +246,7 @@ def _course(args: argparse.Namespace, setting: Setting, folders: Folders) -> Cou
         network=args.network,
         cameras=len(setting.scenario.training) if args.network == "flat" else None,
     )
-    return Course(spec, reward, args.episodes, args.batch, args.tries, args.seed)
+    return TrainingConfig(spec, reward, args.episodes, args.batch, args.tries, args.seed)
 
 
 def _omegas(args: argparse.Namespace) -> tuple[float, ...] | None:
@@ -263,12 +269,12 @@ def _parts(text: str) -> tuple[str, ...]:
     return tuple(part for part in STATE_PARTS if part in asked)
 
 
-def _check(args: argparse.Namespace, course: Course) -> None:
+def _check(args: argparse.Namespace, config: TrainingConfig) -> None:
     if args.jobs < 1:
         raise TrainingError(f"--jobs: expected at least 1, got {args.jobs}")
     if not 0 <= args.test <= 10_000:
         raise TrainingError(f"--test: expected 0 to 10000 seeds, got {args.test}")
-    seeds(course.seed, "train", course.episodes)
+    seeds(config.seed, "train", config.episodes)
 
 
 def _made(out: Path) -> Path:

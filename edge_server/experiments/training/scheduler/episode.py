@@ -91,7 +91,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Moment:
+class DecisionPoint:
     """A decision: everything that a policy may look at, and what arrives while it waits, in plain values.
 
     state: at ``now_ns`` (6.33). arrivals: in order of reception; of those before ``now_ns`` each camera's two
@@ -165,7 +165,7 @@ class Stage:
     cameras: list[Camera]
 
 
-class Ground:
+class EpisodeFactory:
     """What the episodes of a setting share in one process: a scorer, a field, an embedder, and the pictures
     where all have the same motion."""
 
@@ -242,19 +242,19 @@ class Ground:
 class Episode:
     """One seed's deployment: its decisions, and the field fits of what is chosen there."""
 
-    def __init__(self, ground: Ground, seed: int) -> None:
+    def __init__(self, factory: EpisodeFactory, seed: int) -> None:
         began_s = time.process_time()
-        self._ground, setting = ground, ground.setting
-        scenario = replace(ground.scenario(seed), edge={**setting.scenario.edge, "policy": {"name": "all"}})
-        stage = ground.stage(seed)
+        self._factory, setting = factory, factory.setting
+        scenario = replace(factory.scenario(seed), edge={**setting.scenario.edge, "policy": {"name": "all"}})
+        stage = factory.stage(seed)
         self._truth = stage.truth
         heard = tuple(c for c in scenario.cameras if c not in setting.silent)
         self._deployment: VirtualDeployment = build_deployment(
             replace(scenario, cameras=heard),
             RunSettings(steps=1, epoch_ms=1.0, first_ms=_NEVER_MS, score_every_ms=None),
-            field=ground.field(seed),
+            field=factory.field(seed),
             cameras=[camera for camera in stage.cameras if camera.name in heard],
-            data=ground.folders.data,
+            data=factory.folders.data,
             truth=stage.truth,
         )
         recorder = _Recorder([c for c in scenario.training if c in heard])
@@ -272,7 +272,7 @@ class Episode:
         self._views: dict[tuple[str, int], View | None] = {}
         self._warm: list[dict[str, NDArray[Any]]] = []
         self.seed = seed
-        self._embeddings = ground.embeddings()
+        self._embeddings = factory.embeddings()
         self.moments = tuple(self._moment(number) for number in range(setting.decisions))
         self.spent_s = 0.0
         """Processor time of all that was evaluated so far; the first one bears that of the episode itself."""
@@ -288,7 +288,7 @@ class Episode:
         return found
 
     def _carried_out(self, number: int, choice: Choice) -> Outcome:
-        setting, moment = self._ground.setting, self.moments[number]
+        setting, moment = self._factory.setting, self.moments[number]
         newest = moment.newest(choice.at_ns)
         chosen = [newest[c] for c in choice.cameras]
         views = self._decoded(chosen)
@@ -305,7 +305,7 @@ class Episode:
             treatment = make_policy(choice.treatment, None, np.random.default_rng(0)).treatment
             assert treatment is not None
             shown = treatment.treat(views, by_camera, published_ns)
-        field = self._ground.field(self.seed)
+        field = self._factory.field(self.seed)
         warm = None if setting.scratch else self._warm_state(number)
         if warm is None:
             field.reset()
@@ -323,7 +323,7 @@ class Episode:
             views_used, wait_ms,
         )  # fmt: skip
 
-    def _moment(self, number: int) -> Moment:
+    def _moment(self, number: int) -> DecisionPoint:
         now_ns = self.instants_ns[number]
         before: dict[str, list[Arrival]] = {}
         after: list[Arrival] = []
@@ -336,10 +336,10 @@ class Episode:
         known = sorted((a for kept in before.values() for a in kept), key=lambda a: a.received_ns)
         reported = [max(kept, key=lambda a: a.generated_ns) for kept in before.values()]
         newest = {item.frame.camera: item for item in self._exposed(reported)}
-        setting = self._ground.setting
+        setting = self._factory.setting
         cameras = setting.scenario.training
         state = observe(cameras, newest, now_ns, self._embeddings, setting.parts)
-        return Moment(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)
+        return DecisionPoint(self.seed, number, now_ns, self._until_ns, cameras, (*known, *after), state)
 
     def _exposed(self, arrivals: Sequence[Arrival]) -> tuple[BufferedFrame, ...]:
         return self._deployment.with_images([self._frames[a.camera, a.sequence] for a in arrivals])
@@ -355,7 +355,7 @@ class Episode:
 
     def _warm_state(self, number: int) -> dict[str, NDArray[Any]]:
         """The field before a decision; nothing that is chosen at any decision changes it."""
-        setting, field = self._ground.setting, self._ground.field(self.seed)
+        setting, field = self._factory.setting, self._factory.field(self.seed)
         while len(self._warm) <= number:
             moment = self.moments[len(self._warm)]
             # What was delivered by then is all in the record of the deployment, not of the moment.

@@ -14,10 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from edge_server.experiments.studies.statistics import Interval, at_its_best, interval, paired, share_closed
-from edge_server.experiments.training.scheduler.choices import Maker, choices, named, of_action
-from edge_server.experiments.training.scheduler.episode import Choice, Moment, Outcome
+from edge_server.experiments.training.scheduler.choices import Maker, choice_of_action, choices, named
+from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
-from edge_server.experiments.training.scheduler.workers import Asked, Crew
+from edge_server.experiments.training.scheduler.workers import Asked, WorkerPool
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
 
@@ -35,7 +35,7 @@ _ASKED_AT_ONCE = 400
 
 
 @dataclass
-class Contest:
+class Evaluation:
     """Outcomes by policy and decision. reward: by which they are judged; another one costs nothing. again:
     the same choices carried out once more, with other luck: what looked best at a decision is measured where
     it was not chosen, since the best of many lucky fits is better than any of them."""
@@ -132,52 +132,52 @@ class Contest:
         return found, best
 
 
-class Knowing(Protocol):
+class OracleCandidate(Protocol):
     """A rival that may look at more of a decision than a policy sees."""
 
-    def choice(self, moment: Moment) -> Choice: ...
+    def choice(self, moment: DecisionPoint) -> Choice: ...
 
 
-Rival = Maker | Actor | Knowing
+Candidate = Maker | Actor | OracleCandidate
 
 
-def hold(
+def evaluate_policies(
     setting: Setting,
-    crew: Crew,
+    pool: WorkerPool,
     seeds: Sequence[int],
-    rivals: Mapping[str, Rival],
+    rivals: Mapping[str, Candidate],
     reward: Reward,
     say: Any = None,
-) -> Contest:
+) -> Evaluation:
     """Carry out what each of ``rivals`` chooses at every decision of every seed, twice, with fields of other
     seeds. Give it ``Setting.judged``: what rewarded does not judge."""
-    contest = Contest(reward, {name: {} for name in rivals}, {name: {} for name in rivals})
-    episodes = crew.draw(setting, seeds)
+    evaluation = Evaluation(reward, {name: {} for name in rivals}, {name: {} for name in rivals})
+    episodes = pool.draw(setting, seeds)
     asked: list[tuple[str, Asked]] = []
     # All that is asked of one episode stands together: its pictures and its field are at hand once.
     for moments in episodes:
         for place, (name, rival) in enumerate(rivals.items()):
             if isinstance(rival, Actor):
                 acts, _ = rival.act([m.state for m in moments])
-                chosen = [of_action(rival.spec, a, m) for a, m in zip(acts, moments)]
+                chosen = [choice_of_action(rival.spec, a, m) for a, m in zip(acts, moments)]
             elif callable(rival):
                 chosen = choices(rival, moments, place)
             else:
                 chosen = [rival.choice(m) for m in moments]
             asked += [(name, (m.seed, m.number, c)) for m, c in zip(moments, chosen)]
     fits = [
-        (contest.outcomes, setting),
-        (contest.again, dataclasses.replace(setting, repeat=setting.repeat + 1)),
+        (evaluation.outcomes, setting),
+        (evaluation.again, dataclasses.replace(setting, repeat=setting.repeat + 1)),
     ]
     for turn, (into, where) in enumerate(fits):
         for first in range(0, len(asked), _ASKED_AT_ONCE):
             part = asked[first : first + _ASKED_AT_ONCE]
-            found = crew.evaluate(where, [a for _, a in part])
+            found = pool.evaluate(where, [a for _, a in part])
             for (name, (seed, number, _)), outcome in zip(part, found):
                 into[name][seed, number] = outcome
             if say is not None:
                 say(f"{turn * len(asked) + first + len(part)}/{2 * len(asked)} evaluations")
-    return contest
+    return evaluation
 
 
 def rivals(
@@ -188,23 +188,23 @@ def rivals(
     return {name: named(name) for name in (*others, *fixed)}
 
 
-def rows(contest: Contest, **labels: Any) -> list[dict[str, Any]]:
+def rows(evaluation: Evaluation, **labels: Any) -> list[dict[str, Any]]:
     """A row for each policy: its reward, how much that is over random, its share, and the outcomes' terms;
     intervals over seeds. labels: put before all of them."""
     terms = [f.name for f in fields(Outcome)]
     found = []
-    for name in [*contest.outcomes, HINDSIGHT]:
-        mine = contest.rewards(name)
+    for name in [*evaluation.outcomes, HINDSIGHT]:
+        mine = evaluation.rewards(name)
         intervals = {
             "reward": interval(list(mine.values())),
-            "over_random": paired(mine, contest.rewards("random")),
-            "share": contest.share(mine),
+            "over_random": paired(mine, evaluation.rewards("random")),
+            "share": evaluation.share(mine),
         }
         row = {**labels, "policy": name}
         for what, i in intervals.items():
             row |= {what: i.mean, f"{what}_low": i.low, f"{what}_high": i.high}
         if name != HINDSIGHT:
-            row |= {term: contest.term(name, term).mean for term in terms}
+            row |= {term: evaluation.term(name, term).mean for term in terms}
         found.append(row)
     return found
 

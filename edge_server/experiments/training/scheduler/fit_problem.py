@@ -12,10 +12,10 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from edge_server.experiments.training.scheduler.choices import of_action
-from edge_server.experiments.training.scheduler.episode import Moment
+from edge_server.experiments.training.scheduler.choices import choice_of_action
+from edge_server.experiments.training.scheduler.episode import DecisionPoint
 from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE, Setting, seeds
-from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.state import State
@@ -32,7 +32,7 @@ class FitProblem:
     setting: Setting
     spec: Spec
     reward: Reward
-    crew: Crew
+    pool: WorkerPool
     run: int = 0
     _drawn: deque[int] = field(
         default_factory=lambda: deque(maxlen=KEPT), init=False, repr=False, compare=False
@@ -43,9 +43,9 @@ class FitProblem:
         (of,) = seeds(self.run, "train", 1, episode % SEEDS_A_PURPOSE)
         if of not in self._drawn:
             if len(self._drawn) == KEPT:
-                self.crew.forget(self.setting, [self._drawn[0]])
+                self.pool.forget(self.setting, [self._drawn[0]])
             self._drawn.append(of)
-        return FitDecision(self, self.crew.draw(self.setting, [of])[0][number])
+        return FitDecision(self, self.pool.draw(self.setting, [of])[0][number])
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class FitDecision:
     """``scheduler.learned.problem.Round``."""
 
     problem: FitProblem
-    moment: Moment
+    moment: DecisionPoint
 
     @property
     def state(self) -> State:
@@ -62,8 +62,8 @@ class FitDecision:
     def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
         """The reward of a real fit, NaN where a term of it is missing, and its terms."""
         of, moment = self.problem, self.moment
-        choice = of_action(of.spec, action, moment)
-        (outcome,) = of.crew.evaluate(of.setting, [(moment.seed, moment.number, choice)])
+        choice = choice_of_action(of.spec, action, moment)
+        (outcome,) = of.pool.evaluate(of.setting, [(moment.seed, moment.number, choice)])
         found = of.reward.of(outcome)
         total = found.total if found.complete else None
         return (math.nan if total is None else total), found.terms

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.studies.statistics import Interval, interval, paired
-from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Contest, PerSeed
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Evaluation, PerSeed
 from edge_server.report.style import CYCLE, GREY, figure, label_lines
 
 # Batches that a point of the smoothed curve is the mean of.
@@ -42,41 +42,41 @@ def smoothed(values: np.ndarray, count: int = _SMOOTH) -> np.ndarray:
     return np.array([np.nan if np.isnan(p).all() else np.nanmean(p) for p in parts])
 
 
-def summary(contest: Contest, learnt: str, fixed: str) -> dict[str, Any]:
+def summary(evaluation: Evaluation, trained: str, fixed: str) -> dict[str, Any]:
     """Figures of a contest as JSON takes them: rewards, paired differences and shares, each with its 95 %
     interval over seeds. fixed: the kind whose best value is the one to beat, threshold or wait."""
-    mine = contest.rewards(learnt)
-    best, name = contest.best_fixed(fixed)
-    varies = contest.varies(fixed)
+    mine = evaluation.rewards(trained)
+    best, name = evaluation.best_fixed(fixed)
+    varies = evaluation.varies(fixed)
     return {
-        "seeds": contest.seeds(learnt)[1],
-        "seeds_without_value": contest.seeds(learnt)[0] - contest.seeds(learnt)[1],
+        "seeds": evaluation.seeds(trained)[1],
+        "seeds_without_value": evaluation.seeds(trained)[0] - evaluation.seeds(trained)[1],
         "reward": _told(interval(list(mine.values()))),
-        "rewards": {n: _told(interval(list(contest.rewards(n).values())))
-                    for n in (*contest.outcomes, HINDSIGHT)},
-        "over_random": _told(paired(mine, contest.rewards("random"))),
+        "rewards": {n: _told(interval(list(evaluation.rewards(n).values())))
+                    for n in (*evaluation.outcomes, HINDSIGHT)},
+        "over_random": _told(paired(mine, evaluation.rewards("random"))),
         "over_best_fixed": _told(paired(mine, best)),
         "best_fixed": name,
-        "share": _told(contest.share(mine)),
-        "best_fixed_share": _told(contest.share(best)),
+        "share": _told(evaluation.share(mine)),
+        "best_fixed_share": _told(evaluation.share(best)),
         "best_value_by_decision": varies["quartiles"],
         "knowing_it_is_worth": _told(varies["gain"]),
     }  # fmt: skip
 
 
-def lines(contest: Contest, learnt: str, fixed: str) -> list[str]:
+def lines(evaluation: Evaluation, trained: str, fixed: str) -> list[str]:
     """The same for people."""
-    mine, random = contest.rewards(learnt), contest.rewards("random")
-    best, name = contest.best_fixed(fixed)
-    varies = contest.varies(fixed)
-    drawn, known = contest.seeds(learnt)
+    mine, random = evaluation.rewards(trained), evaluation.rewards("random")
+    best, name = evaluation.best_fixed(fixed)
+    varies = evaluation.varies(fixed)
+    drawn, known = evaluation.seeds(trained)
     lacking = "" if known == drawn else f"; {drawn - known} more have a decision without a reward"
     return [
         f"reward {span(interval(list(mine.values())))} on {known} unseen seeds{lacking}",
         f"over random {span(paired(mine, random))}, over the best fixed {fixed} ({name}) "
         f"{span(paired(mine, best))}",
-        f"share of what could be won: {span(contest.share(mine), 2)}; the best fixed {fixed} has "
-        f"{span(contest.share(best), 2)}",
+        f"share of what could be won: {span(evaluation.share(mine), 2)}; the best fixed {fixed} has "
+        f"{span(evaluation.share(best), 2)}",
         f"the best {fixed} of a decision is {quartiles(varies)}; to know it would be worth "
         f"{span(varies['gain'])} over the best fixed one",
     ]

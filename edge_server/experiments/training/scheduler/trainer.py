@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.experiments.training.scheduler.choices import of_action
-from edge_server.experiments.training.scheduler.episode import Moment, Outcome
+from edge_server.experiments.training.scheduler.choices import choice_of_action
+from edge_server.experiments.training.scheduler.episode import DecisionPoint, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting, seeds
-from edge_server.experiments.training.scheduler.workers import Crew, Progress
+from edge_server.experiments.training.scheduler.workers import Progress, WorkerPool
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward, RewardTerms
 from freshfield.files import write_json, write_text
@@ -41,7 +41,7 @@ class TrainingError(ValueError):
 
 
 @dataclass(frozen=True)
-class Course:
+class TrainingConfig:
     """How a learner is taught. episodes: in all; batch: of one update of the weights. tries: actions drawn
     and carried out at every decision. Of more than one, each is rewarded by how much better it did than the
     others of the same decision: their mean is an estimate of V(s) (5.24) that knows this very scene and
@@ -74,34 +74,36 @@ class Course:
         return seeds(self.seed, "train", min(self.batch, self.episodes - first), first)
 
 
-def train(setting: Setting, course: Course, crew: Crew, out: Path, say: Callable[[str], None]) -> Learner:
+def train(
+    setting: Setting, config: TrainingConfig, pool: WorkerPool, out: Path, say: Callable[[str], None]
+) -> Learner:
     """Teach until the course is over; what is in ``out`` of the same course is gone on with. Writes
     OUT/training.jsonl (a line a batch), OUT/training.json, ``stage_file`` of each of the course's stages and,
     at its end, OUT/policy.npz. TrainingError where ``out`` holds another course, or where no reward can be
     had; KeyboardInterrupt leaves the last checkpoint there."""
     out.mkdir(parents=True, exist_ok=True)
-    kept = _Kept(out, _key(setting, course))
+    kept = _Checkpoint(out, _key(setting, config))
     learner, rows = kept.load()
     began, first = time.monotonic(), len(rows)
-    if first and first < course.batches:
-        say(f"going on after {first} of {course.batches} batches")
+    if first and first < config.batches:
+        say(f"going on after {first} of {config.batches} batches")
     if learner is None:
         # What an earlier course left must not pass for what this one teaches.
         for name in ("policy.npz", *REPORTS):
             (out / name).unlink(missing_ok=True)
-        learner = _new_learner(setting, course, crew)
-    learner.reward_fields = dataclasses.asdict(course.reward)
-    for number in range(first, course.batches):
+        learner = _new_learner(setting, config, pool)
+    learner.reward_fields = dataclasses.asdict(config.reward)
+    for number in range(first, config.batches):
         at = time.monotonic()
-        row = _one_batch(setting, course, crew, learner, number, say)
+        row = _one_batch(setting, config, pool, learner, number, say)
         rows.append({**row, "seconds": round(time.monotonic() - at, 3)})
-        if (number + 1) % course.checkpoint_every == 0 or number + 1 == course.batches:
+        if (number + 1) % config.checkpoint_every == 0 or number + 1 == config.batches:
             kept.save(learner, rows)
-        if number + 1 in course.stages:
+        if number + 1 in config.stages:
             learner.save(stage_file(out, number + 1))
         spent = time.monotonic() - began
-        left = spent / (number + 1 - first) * (course.batches - number - 1)
-        say(f"{_told(course, row)}; {left:.0f} s left")
+        left = spent / (number + 1 - first) * (config.batches - number - 1)
+        say(f"{_told(config, row)}; {left:.0f} s left")
     learner.save(out / "policy.npz")
     return learner
 
@@ -117,48 +119,53 @@ def read_log(out: Path) -> list[Row]:
 
 
 def _one_batch(
-    setting: Setting, course: Course, crew: Crew, learner: Learner, number: int, say: Callable[[str], None]
+    setting: Setting,
+    config: TrainingConfig,
+    pool: WorkerPool,
+    learner: Learner,
+    number: int,
+    say: Callable[[str], None],
 ) -> Row:
     """Draw, act, carry out, learn. TrainingError where the first batch has not a single reward."""
-    chosen = course.seeds(number)
-    moments = [m for episode in crew.draw(setting, chosen) for m in episode]
-    crew.forget(setting, chosen)
+    chosen = config.seeds(number)
+    moments = [m for episode in pool.draw(setting, chosen) for m in episode]
+    pool.forget(setting, chosen)
     # The tries of one decision stand together.
-    each = [m for m in moments for _ in range(course.tries)]
+    each = [m for m in moments for _ in range(config.tries)]
     states = [m.state for m in each]
     actions, logps = learner.act(states)
-    asked = [(m.seed, m.number, of_action(course.spec, a, m)) for m, a in zip(each, actions)]
-    before = crew.evaluated
-    outcomes = crew.evaluate(setting, asked, told_now_and_then(say, f"fits of batch {number + 1}"))
-    found = [course.reward.of(outcome) for outcome in outcomes]
+    asked = [(m.seed, m.number, choice_of_action(config.spec, a, m)) for m, a in zip(each, actions)]
+    before = pool.evaluated
+    outcomes = pool.evaluate(setting, asked, periodic_progress(say, f"fits of batch {number + 1}"))
+    found = [config.reward.of(outcome) for outcome in outcomes]
     # A reward that lacks a term is not comparable with one that does not.
     rewards = np.array([r.total if r.complete and r.total is not None else np.nan for r in found])
     if number == 0 and not np.isfinite(rewards).any():
         raise TrainingError(_why_not(outcomes, found))
-    told = learner.update(learner.batch(states, actions, logps, compared(rewards, course.tries)))
+    update = learner.update(learner.batch(states, actions, logps, baseline_rewards(rewards, config.tries)))
     row: Row = {
-        "batch": number, "episodes": chosen[-1] + 1 - course.seeds(0)[0], "reward": _mean(rewards),
-        "decisions": len(moments), "fits": len(each), "carried_out": crew.evaluated - before,
-        "processor_seconds": crew.cost_s(setting, asked),
+        "batch": number, "episodes": chosen[-1] + 1 - config.seeds(0)[0], "reward": _mean(rewards),
+        "decisions": len(moments), "fits": len(each), "carried_out": pool.evaluated - before,
+        "processor_seconds": pool.cost_s(setting, asked),
     }  # fmt: skip
     row |= {f"term_{name}": _mean([r.terms[name] for r in found]) for name in found[0].terms}
     row |= {f.name: _mean([getattr(o, f.name) for o in outcomes]) for f in dataclasses.fields(Outcome)}
-    if course.spec.action != "select":
-        row["omega_ms"] = _mean([course.spec.omegas_ms[int(a)] for a in actions])
-    return row | {k: v for k, v in dataclasses.asdict(told).items() if k != "reward"}
+    if config.spec.action != "select":
+        row["omega_ms"] = _mean([config.spec.omegas_ms[int(a)] for a in actions])
+    return row | {k: v for k, v in dataclasses.asdict(update).items() if k != "reward"}
 
 
-def told_now_and_then(say: Callable[[str], None], what: str) -> Progress:
+def periodic_progress(say: Callable[[str], None], what: str) -> Progress:
     """Progress for people, where it takes long."""
     last_s = time.monotonic()
 
-    def told(done: int, count: int) -> None:
+    def progress(done: int, count: int) -> None:
         nonlocal last_s
         if time.monotonic() - last_s >= _TELL_EVERY_S:
             last_s = time.monotonic()
             say(f"{done}/{count} {what}")
 
-    return told
+    return progress
 
 
 def _why_not(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
@@ -176,7 +183,7 @@ def _why_not(outcomes: list[Outcome], found: list[RewardTerms]) -> str:
     )
 
 
-def compared(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
+def baseline_rewards(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
     """Rewards (B,) as they are learnt from, ``tries`` of every decision together: each less the mean of the
     others of its decision, so that it does not count itself; of a single try, as it is. NaN where it, or
     all others, are NaN."""
@@ -191,18 +198,18 @@ def compared(rewards: NDArray[np.float64], tries: int) -> NDArray[np.float64]:
     return np.where(known, table - others, np.nan).reshape(-1)
 
 
-def _new_learner(setting: Setting, course: Course, crew: Crew) -> Learner:
+def _new_learner(setting: Setting, config: TrainingConfig, pool: WorkerPool) -> Learner:
     from edge_server.scheduler.learned.ppo import Learner
 
-    spec = course.spec
+    spec = config.spec
     if "semantics" in spec.layout.parts and not spec.layout.centre:
-        first: list[Moment] = [m for e in crew.draw(setting, course.seeds(0)) for m in e]
+        first: list[DecisionPoint] = [m for e in pool.draw(setting, config.seeds(0)) for m in e]
         spec = dataclasses.replace(spec, layout=spec.layout.standardized([m.state for m in first]))
-    return Learner(spec, course.seed)
+    return Learner(spec, config.seed)
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Checkpoint:
     """A course's checkpoint: weights under a name of their own, then the file that names them, so that
     what stands there is whole whenever it is stopped."""
 
@@ -243,17 +250,17 @@ class _Kept:
                 old.unlink(missing_ok=True)
 
 
-def _key(setting: Setting, course: Course) -> str:
-    taught = dataclasses.asdict(course)
+def _key(setting: Setting, config: TrainingConfig) -> str:
+    taught = dataclasses.asdict(config)
     taught.pop("checkpoint_every")  # decides when the disk is written, not what is learnt
     text = json.dumps([setting.key, taught], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def _told(course: Course, row: Row) -> str:
+def _told(config: TrainingConfig, row: Row) -> str:
     omega = f", omega {row['omega_ms']:.0f} ms" if row.get("omega_ms") is not None else ""
     reward = "-" if row["reward"] is None else f"{row['reward']:.4f}"
-    return f"{row['episodes']}/{course.episodes} episodes: reward {reward}, {row['views']:.1f} views{omega}"
+    return f"{row['episodes']}/{config.episodes} episodes: reward {reward}, {row['views']:.1f} views{omega}"
 
 
 def _mean(values: Any) -> float | None:

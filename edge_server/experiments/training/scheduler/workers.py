@@ -19,7 +19,7 @@ from edge_server.experiments.common.result_store import ResultStore, content_key
 from edge_server.experiments.common.worker import init_worker
 from edge_server.experiments.studies.engine import source_digest
 from edge_server.experiments.studies.trial import Folders
-from edge_server.experiments.training.scheduler.episode import Choice, Ground, Moment, Outcome
+from edge_server.experiments.training.scheduler.episode import Choice, DecisionPoint, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
 
 Asked = tuple[int, int, Choice]
@@ -31,28 +31,28 @@ _Task = tuple[list[str], list[Asked]]
 _ASKED_A_TASK = 8
 # Settings whose pictures a process keeps.
 _GROUNDS_KEPT = 3
-_GROUNDS: dict[tuple[str, Folders], Ground] = {}
+_FACTORIES: dict[tuple[str, Folders], EpisodeFactory] = {}
 
 
-def _ground(setting: Setting, folders: Folders) -> Ground:
+def _factory(setting: Setting, folders: Folders) -> EpisodeFactory:
     at = (setting.key, folders)
-    if at not in _GROUNDS:
-        while len(_GROUNDS) >= _GROUNDS_KEPT:
-            _GROUNDS.pop(next(iter(_GROUNDS)))
-        _GROUNDS[at] = Ground(setting, folders)
-    return _GROUNDS[at]
+    if at not in _FACTORIES:
+        while len(_FACTORIES) >= _GROUNDS_KEPT:
+            _FACTORIES.pop(next(iter(_FACTORIES)))
+        _FACTORIES[at] = EpisodeFactory(setting, folders)
+    return _FACTORIES[at]
 
 
-def _draw(setting: Setting, folders: Folders, seeds: Sequence[int]) -> list[tuple[Moment, ...]]:
-    ground = _ground(setting, folders)
-    return [ground.episode(seed).moments for seed in seeds]
+def _draw(setting: Setting, folders: Folders, seeds: Sequence[int]) -> list[tuple[DecisionPoint, ...]]:
+    factory = _factory(setting, folders)
+    return [factory.episode(seed).moments for seed in seeds]
 
 
 def _evaluate(setting: Setting, folders: Folders, asked: Sequence[Asked]) -> list[tuple[Outcome, float]]:
     """Outcomes, and the milliseconds of processor time that each took."""
-    ground, found = _ground(setting, folders), []
+    factory, found = _factory(setting, folders), []
     for seed, number, choice in asked:
-        episode = ground.episode(seed)
+        episode = factory.episode(seed)
         before_s = episode.spent_s
         outcome = episode.evaluate(number, choice)
         found.append((outcome, round((episode.spent_s - before_s) * 1e3, 3)))
@@ -68,7 +68,7 @@ def _begin() -> None:
     torch.set_num_threads(1)
 
 
-class Crew:
+class WorkerPool:
     """jobs: processes; 1 does everything in this one. known: file of evaluations that is read and added to;
     None keeps them in memory only. Use as a context, or ``close`` at the end."""
 
@@ -77,7 +77,7 @@ class Crew:
         self.evaluated = 0
         """Evaluations that were carried out, not found."""
         self._pools: list[ProcessPoolExecutor] = []
-        self._moments: dict[tuple[str, int], tuple[Moment, ...]] = {}
+        self._moments: dict[tuple[str, int], tuple[DecisionPoint, ...]] = {}
         self._store = ResultStore() if known is None else ResultStore.in_lines(known)
         self._known: dict[str, Outcome] = {}
         self._cost_ms: dict[str, float] = {}
@@ -89,7 +89,7 @@ class Crew:
             except (ValueError, KeyError, TypeError):
                 continue  # of another version
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> WorkerPool:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -105,7 +105,7 @@ class Crew:
             pool.shutdown(wait=not at_once, cancel_futures=at_once)
         self._store.close()
 
-    def draw(self, setting: Setting, seeds: Sequence[int]) -> list[tuple[Moment, ...]]:
+    def draw(self, setting: Setting, seeds: Sequence[int]) -> list[tuple[DecisionPoint, ...]]:
         """The decisions of each episode, in the order of the seeds."""
         found = [self._moments.get((setting.key, seed)) for seed in seeds]
         for seed, moments in zip(*self._drawn(setting, [s for s, m in zip(seeds, found) if m is None])):
@@ -157,7 +157,9 @@ class Crew:
         for result in as_completed(sent):
             yield sent[result], result.result()
 
-    def _drawn(self, setting: Setting, seeds: Sequence[int]) -> tuple[list[int], list[tuple[Moment, ...]]]:
+    def _drawn(
+        self, setting: Setting, seeds: Sequence[int]
+    ) -> tuple[list[int], list[tuple[DecisionPoint, ...]]]:
         parts = [[s for s in seeds if s % self.jobs == place] for place in range(self.jobs)]
         sent = [(part, self._send(part[0], _draw, setting, part)) for part in parts if part]
         order = [seed for part, _ in sent for seed in part]

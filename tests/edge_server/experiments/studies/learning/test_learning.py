@@ -28,10 +28,10 @@ from edge_server.experiments.studies.study import DOES_NOT_HOLD, HOLDS, UNDECIDE
 from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.choices import named
 from edge_server.experiments.training.scheduler.episode import Outcome
-from edge_server.experiments.training.scheduler.evaluation import Contest, hold
+from edge_server.experiments.training.scheduler.evaluation import Evaluation, evaluate_policies
 from edge_server.experiments.training.scheduler.report import percent
 from edge_server.experiments.training.scheduler.setting import seeds
-from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from tests.edge_server.experiments.training.scheduler.small import FIELD, reported
 
@@ -94,8 +94,8 @@ def test_one_case_of_a_study_is_run_with_as_many_episodes_as_asked_for(small, tm
 def test_a_case_that_there_is_not_is_refused_with_those_there_are(tmp_path: Path, capsys):
     words = ["ppo-wait", "--quick", "--out", str(tmp_path), "--case", "ch7"]
     assert command.main(words) == 2
-    told = capsys.readouterr().err
-    assert "none has 'ch7' in its name" in told and "ch6-slow, age -0.015/ms" in told
+    text = capsys.readouterr().err
+    assert "none has 'ch7' in its name" in text and "ch6-slow, age -0.015/ms" in text
     assert command.main(["mat", "--quick", "--out", str(tmp_path), "--case", "room"]) == 2
     assert "--case is for ppo-select" in capsys.readouterr().err
     assert command.main(["mat", "--quick", "--out", str(tmp_path), "--episodes", "3"]) == 2
@@ -104,12 +104,12 @@ def test_a_case_that_there_is_not_is_refused_with_those_there_are(tmp_path: Path
     assert "--episodes: expected 1" in capsys.readouterr().err
 
 
-def contest_of(levels: dict[str, float], seeds: int = 12) -> Contest:
+def contest_of(levels: dict[str, float], seeds: int = 12) -> Evaluation:
     """Every policy earns its level at every decision, but for what the seed does to all and a little luck."""
     rng = np.random.default_rng(1)
     asked = [(seed, n) for seed in range(seeds) for n in range(2)]
     shared = {seed: rng.normal() for seed in range(seeds)}
-    found = Contest(Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0))
+    found = Evaluation(Reward("psnr", psnr=1.0, ssim=0.0, distance=0.0))
     for into in (found.outcomes, found.again):
         for name, level in levels.items():
             psnr = {at: level + shared[at[0]] + 0.01 * rng.normal() for at in asked}
@@ -275,12 +275,12 @@ def test_where_a_camera_dies_the_policy_learnt_afterwards_is_another_one():
 
 
 def test_what_is_learnt_of_a_change_is_a_set_of_views_where_they_cost_something(tmp_path: Path):
-    with setup.School(Ask(True, tmp_path, Folders())) as school:
-        courses = {name: change.course(school, 7, 2) for name, change in channel_drift.changes().items()}
-    priced = [name for name, course in courses.items() if course.reward.views < 0]
+    with setup.StudyTrainer(Ask(True, tmp_path, Folders())) as trainer:
+        courses = {name: change.config(trainer, 7, 2) for name, change in channel_drift.changes().items()}
+    priced = [name for name, config in courses.items() if config.reward.views < 0]
     assert [courses[name].spec.action for name in priced] == ["select"]
-    assert {course.spec.action for name, course in courses.items() if name not in priced} == {"threshold"}
-    assert {(course.episodes, course.seed) for course in courses.values()} == {(7, 2)}
+    assert {config.spec.action for name, config in courses.items() if name not in priced} == {"threshold"}
+    assert {(config.episodes, config.seed) for config in courses.values()} == {(7, 2)}
 
 
 def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Path):
@@ -289,11 +289,11 @@ def test_a_study_is_judged_by_cameras_that_neither_reward_nor_train(tmp_path: Pa
     assert set(usual.report).isdisjoint(usual.scenario.training)
     assert set(setup.FOUR_VIEWPOINTS).isdisjoint(setup.REPORT)
     reward, everybody = make_reward("set", distance=0.0), {"all": named("all"), "random": named("random")}
-    with setup.School(Ask(True, tmp_path, Folders())) as school:
-        found = school.contest(reported(), everybody, reward, 2)
-        same = school.contest_as_rewarded(reported(), everybody, reward, 2)
-    with Crew(Folders()) as crew:
-        expected = hold(reported().judged, crew, seeds(0, "test", 2), everybody, reward)
+    with setup.StudyTrainer(Ask(True, tmp_path, Folders())) as trainer:
+        found = trainer.evaluate(reported(), everybody, reward, 2)
+        same = trainer.evaluate_as_rewarded(reported(), everybody, reward, 2)
+    with WorkerPool(Folders()) as pool:
+        expected = evaluate_policies(reported().judged, pool, seeds(0, "test", 2), everybody, reward)
     assert found.outcomes == expected.outcomes and found.again == expected.again
     assert found.outcomes["all"] != same.outcomes["all"]
 
@@ -308,7 +308,7 @@ def test_how_differently_the_same_lesson_is_learnt_is_part_of_an_interval():
     assert better("a", "b", setup.mean_of(unlike), base).verdict == HOLDS
     assert "3 trainings and 40 seeds" in better("a", "b", alike, base).found
     assert "of a single training" in better("a", "b", alike[0], base).found
-    assert setup.over(unlike, unlike).mean == 0.0
+    assert setup.paired_difference(unlike, unlike).mean == 0.0
     assert setup.RUNS[False] >= 3
 
 
@@ -319,14 +319,14 @@ def test_verdicts_follow_from_the_paired_differences():
     assert [better("a", "b", x, base).verdict for x in (up, down, same)] == [
         "holds", "does not hold", "undecided"
     ]  # fmt: skip
-    contest = contest_of({"random": 0.5, "all": 1.5})
-    assert [no_worse("a", "b", x, base, contest).verdict for x in (up, down, same)] == [
+    evaluation = contest_of({"random": 0.5, "all": 1.5})
+    assert [no_worse("a", "b", x, base, evaluation).verdict for x in (up, down, same)] == [
         "holds", "does not hold", "holds"
     ]  # fmt: skip
-    assert "-20 % of the way from random to hindsight" in no_worse("a", "b", down, base, contest).found
+    assert "-20 % of the way from random to hindsight" in no_worse("a", "b", down, base, evaluation).found
     # A hundredth of next to nothing is no limit.
     near_zero = {s: 0.01 * (-1) ** s for s in base}
-    found = no_worse("a", "b", near_zero, near_zero, contest)
+    found = no_worse("a", "b", near_zero, near_zero, evaluation)
     assert found.verdict == UNDECIDED and "too near zero" in found.found
     # Who does the same at every decision is no better, and that is known.
     alike = better("a", "b", [base, base], base)
@@ -343,13 +343,13 @@ def test_verdicts_follow_from_the_paired_differences():
         (0.1, -1.7, "no percentage"),
     ],
 )
-def test_a_percentage_is_told_only_where_the_rewards_zero_is_far_away(mine, base, told):
+def test_a_percentage_is_told_only_where_the_rewards_zero_is_far_away(mine, base, text):
     values = {s: base + 0.01 * (-1) ** s for s in range(10)}
-    assert percent(dict.fromkeys(values, mine), values).startswith(told)
+    assert percent(dict.fromkeys(values, mine), values).startswith(text)
 
 
 @pytest.mark.parametrize(("jobs", "said"), [(1, UNDECIDED), (2, HOLDS), (8, UNDECIDED)])
 def test_only_two_processes_tell_how_long_two_cores_take(jobs, said, tmp_path: Path):
     rows = [{"fits": 100, "carried_out": 100, "decisions": 50}]
-    found = ppo_select._time("x", [setup.Learnt(None, None, rows, 10.0, jobs, tmp_path)])  # type: ignore[arg-type]
+    found = ppo_select._time("x", [setup.TrainedPolicy(None, None, rows, 10.0, jobs, tmp_path)])  # type: ignore[arg-type]
     assert found.verdict == said

@@ -11,7 +11,7 @@ from edge_server.experiments.studies.learning.visibility import SEES, Sees, Sigh
 from edge_server.experiments.studies.learning.workshop import workshop
 from edge_server.experiments.studies.trial import Folders
 from edge_server.experiments.training.scheduler.setting import seeds
-from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler.learned.state import State
 
 SIDES = {
@@ -31,8 +31,8 @@ def test_the_area_is_the_share_of_pairs_in_the_right_order():
 @pytest.fixture(scope="module")
 def moments():
     setting = dataclasses.replace(workshop(1.0), parts=("age", "pose"))
-    with Crew(Folders()) as crew:
-        return Sight(setting), [m for e in crew.draw(setting, seeds(3, "test", 6)[2:]) for m in e]
+    with WorkerPool(Folders()) as pool:
+        return Sight(setting), [m for e in pool.draw(setting, seeds(3, "test", 6)[2:]) for m in e]
 
 
 @pytest.mark.slow

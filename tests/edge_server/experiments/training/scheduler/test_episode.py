@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from edge_server.experiments.training.scheduler.choices import choices, choose, named, of_action
-from edge_server.experiments.training.scheduler.episode import Choice, Ground
+from edge_server.experiments.training.scheduler.choices import choice_of_action, choices, choose, named
+from edge_server.experiments.training.scheduler.episode import Choice, EpisodeFactory
 from edge_server.experiments.training.scheduler.setting import GRID_MS, PURPOSES, seeds
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.virtual_deployment import Compute, RunSettings, VirtualDeployment
@@ -24,8 +24,8 @@ FAULTS = {"preset": "ch6", "faults": {"loss": {"probability": 0.1}, "duplication
 
 
 @pytest.fixture(scope="module")
-def ground() -> Ground:
-    return Ground(setting(), NOTHING)
+def factory() -> EpisodeFactory:
+    return EpisodeFactory(setting(), NOTHING)
 
 
 def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) -> VirtualDeployment:
@@ -39,8 +39,8 @@ def deployed(policy: str, value: float | None, seed: int, at_ns: int, **more) ->
 
 @pytest.mark.parametrize("channel", [{"preset": "ch5"}, FAULTS], ids=["ch5", "faults"])
 def test_the_buffer_at_any_instant_is_the_one_of_the_deployment(channel):
-    ground = Ground(setting(channel), NOTHING)
-    for moment in ground.episode(11).moments:
+    factory = EpisodeFactory(setting(channel), NOTHING)
+    for moment in factory.episode(11).moments:
         for wait_ms in (0, 35, 180):
             at_ns = moment.now_ns + wait_ms * 10**6
             live = deployed("all", None, 11, 10**13, channel=channel)
@@ -62,10 +62,10 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
         learner = Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), seed=4)
         learner.save(tmp_path / "policy.npz")
         policy = f"bandit:{tmp_path / 'policy.npz'}"
-    ground = Ground(setting(compute=Compute(5.0)), NOTHING)
-    moment = ground.episode(5).moments[0]
+    factory = EpisodeFactory(setting(compute=Compute(5.0)), NOTHING)
+    moment = factory.episode(5).moments[0]
     choice = choose(named(policy)(np.random.default_rng(0)), moment)
-    found = ground.episode(5).evaluate(0, choice)
+    found = factory.episode(5).evaluate(0, choice)
     name, _, value = (policy, "", "") if policy.startswith("bandit:") else policy.partition(":")
     live = deployed(name, float(value) if value else None, 5, moment.now_ns)
     live.run(moment.now_ns / 1e9 + 1.0)
@@ -80,12 +80,12 @@ def test_a_choice_comes_to_what_it_comes_to_in_the_deployment(policy, tmp_path):
 
 @pytest.mark.parametrize("scratch", [True, False])
 def test_every_action_starts_from_the_same_field_whatever_was_evaluated_before(scratch):
-    ground = Ground(setting(scratch=scratch), NOTHING)
-    episode = ground.episode(2)
+    factory = EpisodeFactory(setting(scratch=scratch), NOTHING)
+    episode = factory.episode(2)
     asked = [(k, Choice(moment.cameras[:n], moment.now_ns)) for k, moment in enumerate(episode.moments)
              for n in (1, 2, 4)]  # fmt: skip
     forwards = [episode.evaluate(*a) for a in asked]
-    fresh = Ground(setting(scratch=scratch), NOTHING).episode(2)
+    fresh = EpisodeFactory(setting(scratch=scratch), NOTHING).episode(2)
     backwards = [fresh.evaluate(*a) for a in reversed(asked)][::-1]
     assert forwards == backwards
     assert len({o.psnr_db for o in forwards}) == len(forwards)
@@ -95,25 +95,25 @@ def test_a_warm_field_remembers_what_a_new_one_cannot_know():
     one = Choice(("cam01",), 0)
     found = {}
     for scratch in (True, False):
-        ground = Ground(setting(scratch=scratch, warm_steps=60, steps=2), NOTHING)
+        factory = EpisodeFactory(setting(scratch=scratch, warm_steps=60, steps=2), NOTHING)
         for seed in range(3):
-            for moment in ground.episode(seed).moments:
+            for moment in factory.episode(seed).moments:
                 choice = dataclasses.replace(one, at_ns=moment.now_ns)
-                outcome = ground.episode(seed).evaluate(moment.number, choice)
+                outcome = factory.episode(seed).evaluate(moment.number, choice)
                 found.setdefault(scratch, []).append(outcome.psnr_db)
     assert np.mean(found[False]) > np.mean(found[True]) + 1.0
 
 
-def test_instants_lie_on_the_grid_within_the_span_and_differ_between_seeds(ground):
-    of = {seed: ground.episode(seed).instants_ns for seed in range(6)}
+def test_instants_lie_on_the_grid_within_the_span_and_differ_between_seeds(factory):
+    of = {seed: factory.episode(seed).instants_ns for seed in range(6)}
     for instants in of.values():
         assert all(ns % (GRID_MS * 10**6) == 0 and 0.8 <= ns / 1e9 < 1.4 for ns in instants)
         assert instants == sorted(instants)
     assert len({tuple(v) for v in of.values()}) == 6
 
 
-def test_a_state_has_ages_and_poses_of_who_reported(ground):
-    moment = ground.episode(0).moments[1]
+def test_a_state_has_ages_and_poses_of_who_reported(factory):
+    moment = factory.episode(0).moments[1]
     newest = moment.newest(moment.now_ns)
     assert list(moment.state.reported) == [c in newest for c in moment.cameras]
     for row, camera in enumerate(moment.cameras):
@@ -124,26 +124,28 @@ def test_a_state_has_ages_and_poses_of_who_reported(ground):
     assert moment.state.embeddings is None
 
 
-def test_actions_of_a_learner_mean_what_the_live_policies_do(ground):
-    moment = ground.episode(4).moments[0]
+def test_actions_of_a_learner_mean_what_the_live_policies_do(factory):
+    moment = factory.episode(4).moments[0]
     spec = Spec("threshold", omegas_ms=(40.0, 90.0))
-    assert of_action(spec, 1, moment) == choose(named("threshold:90")(np.random.default_rng(0)), moment)
-    wait = of_action(Spec("wait", omegas_ms=(0.0, 50.0)), 1, moment)
+    assert choice_of_action(spec, 1, moment) == choose(
+        named("threshold:90")(np.random.default_rng(0)), moment
+    )
+    wait = choice_of_action(Spec("wait", omegas_ms=(0.0, 50.0)), 1, moment)
     assert wait.at_ns >= moment.now_ns + 50 * 10**6
-    picked = of_action(Spec("select"), np.array([True, False, True, False]), moment)
+    picked = choice_of_action(Spec("select"), np.array([True, False, True, False]), moment)
     assert picked.cameras == (moment.cameras[0], moment.cameras[2]) and picked.at_ns == moment.now_ns
 
 
-def test_where_nothing_arrives_all_there_is_is_used_at_the_end(ground):
-    moment = ground.episode(4).moments[0]
+def test_where_nothing_arrives_all_there_is_is_used_at_the_end(factory):
+    moment = factory.episode(4).moments[0]
     late = choose(make_policy("wait", 1e6, np.random.default_rng(0)), moment)
     assert late.at_ns == moment.until_ns and late.cameras
 
 
-def test_a_policy_starts_afresh_in_every_episode(ground):
-    first, second = (choices(named("random"), ground.episode(1).moments) for _ in range(2))
+def test_a_policy_starts_afresh_in_every_episode(factory):
+    first, second = (choices(named("random"), factory.episode(1).moments) for _ in range(2))
     assert first == second
-    assert first != choices(named("random"), ground.episode(1).moments, purpose=1)
+    assert first != choices(named("random"), factory.episode(1).moments, purpose=1)
 
 
 def test_seeds_of_two_purposes_or_runs_never_meet():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.training.scheduler.episode import Outcome
-from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Contest
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, Evaluation
 from edge_server.experiments.training.scheduler.report import lines, percent, summary
 from edge_server.scheduler.learned.rewards import Reward
 
@@ -20,10 +20,10 @@ def outcome(psnr_db: float | None) -> Outcome:
     return Outcome(psnr_db, None, None, None, None, None, 1.0, 0.0)
 
 
-def contest_of(rng: np.random.Generator, matters: float, twice: bool = True) -> Contest:
+def contest_of(rng: np.random.Generator, matters: float, twice: bool = True) -> Evaluation:
     """Twenty seeds of four decisions, at each of which one omega is better than the others by ``matters``
     spreads of a fit's luck."""
-    found = Contest(BY_PSNR)
+    found = Evaluation(BY_PSNR)
     best = rng.integers(len(OMEGAS), size=(20, 4))
     for into in (found.outcomes, found.again)[: 2 if twice else 1]:
         for k, omega in enumerate(OMEGAS):
@@ -59,8 +59,8 @@ def test_what_was_carried_out_once_tells_nothing_of_hindsight():
     assert set(found.rewards(HINDSIGHT).values()) == {None}
     varies = found.varies("threshold")
     assert varies["quartiles"] == [None] * 3 and varies["gain"].above(0.0) is None
-    told = " ".join(lines(found, "random", "threshold"))
-    assert "not known" in told
+    text = " ".join(lines(found, "random", "threshold"))
+    assert "not known" in text
     json.dumps(summary(found, "random", "threshold"), allow_nan=False)
 
 
@@ -99,7 +99,7 @@ def test_where_no_decision_has_a_value_the_summary_is_still_json():
 
 
 def test_the_best_of_several_is_chosen_by_one_fit_and_measured_by_the_other():
-    found = Contest(BY_PSNR)
+    found = Evaluation(BY_PSNR)
     found.outcomes = {"a": {(0, 0): outcome(3.0)}, "b": {(0, 0): outcome(1.0)}, "c": {(0, 0): outcome(None)}}
     found.again = {"a": {(0, 0): outcome(0.5)}, "b": {(0, 0): outcome(2.0)}, "c": {(0, 0): outcome(9.0)}}
     # The first fit prefers a, which the second has at 0.5; the second prefers b, which the first has at 1.
@@ -108,7 +108,7 @@ def test_the_best_of_several_is_chosen_by_one_fit_and_measured_by_the_other():
 
 
 def test_the_best_fixed_value_is_chosen_on_seeds_that_it_is_not_measured_on():
-    found = Contest(BY_PSNR)
+    found = Evaluation(BY_PSNR)
     found.outcomes = {
         "threshold:1": {(s, 0): outcome(10.0 if s % 2 else 0.0) for s in range(6)},
         "threshold:2": {(s, 0): outcome(0.0 if s % 2 else 10.0) for s in range(6)},

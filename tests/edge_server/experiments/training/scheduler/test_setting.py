@@ -9,14 +9,14 @@ import pytest
 
 from camera_node.synthetic import make_scene
 from edge_server.experiments.studies.learning.setup import room
-from edge_server.experiments.training.scheduler.episode import Choice, Ground, Outcome
+from edge_server.experiments.training.scheduler.episode import Choice, EpisodeFactory, Outcome
 from edge_server.experiments.training.scheduler.setting import Setting
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, reported, scenario, setting
 
 
 def one_of(what: Setting, seed: int = 5) -> Outcome:
     """What using everything comes to at the first decision of an episode."""
-    episode = Ground(what, NOTHING).episode(seed)
+    episode = EpisodeFactory(what, NOTHING).episode(seed)
     moment = episode.moments[0]
     return episode.evaluate(0, Choice(tuple(moment.newest(moment.now_ns)), moment.now_ns))
 
@@ -25,7 +25,7 @@ def test_the_camera_that_reports_neither_rewards_nor_is_trained_on():
     what = reported()
     assert what.rewarding == ("cam00",) and what.judged.scoring == ("cam04",)
     assert what.judged.key != what.key and what.judged.rewarding == what.rewarding
-    moment = Ground(what, NOTHING).episode(5).moments[0]
+    moment = EpisodeFactory(what, NOTHING).episode(5).moments[0]
     assert moment.cameras == ("cam01", "cam02", "cam03")
     rewarded, judged = one_of(what), one_of(what.judged)
     turned = dataclasses.replace(what, report=("cam00",))
@@ -41,10 +41,10 @@ def test_where_nobody_reports_it_is_judged_by_who_rewards():
 
 
 def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one():
-    ground = Ground(setting(motions=True), NOTHING)
+    factory = EpisodeFactory(setting(motions=True), NOTHING)
     images = {}
     for seed in (1, 2, 2_000_001):
-        stage = ground.stage(seed)
+        stage = factory.stage(seed)
         params = {"count": 5, "width": 24, "height": 24, "supersample": 1, "speed_m_per_s": 2.0}
         scene = make_scene("room", {**params, "motion_seed": seed})
         images[seed] = stage.truth.view("cam00", 10**9)[0]
@@ -53,7 +53,7 @@ def test_every_episode_has_a_motion_of_its_own_and_its_cameras_see_the_same_one(
         assert np.array_equal(frames.scene.render("cam01", 1.0), scene.render("cam01", 1.0))
     assert len({image.tobytes() for image in images.values()}) == 3
     # What it was: one walk for all seeds, of training and of testing.
-    same = Ground(setting(motions=False), NOTHING)
+    same = EpisodeFactory(setting(motions=False), NOTHING)
     assert same.stage(1) is same.stage(2_000_001)
 
 
@@ -62,26 +62,26 @@ def test_motions_are_drawn_where_something_moves_and_nowhere_else():
     tile = {"kind": "world", "scene": "tile", "width": 24, "height": 24, "params": {"supersample": 1}}
     for source in (still, tile):
         what = dataclasses.replace(setting(motions=True), scenario=scenario(source=source))
-        assert "motion_seed" not in Ground(what, NOTHING).scenario(3).source
-    assert Ground(setting(motions=True), NOTHING).scenario(3).source["motion_seed"] == 3
+        assert "motion_seed" not in EpisodeFactory(what, NOTHING).scenario(3).source
+    assert EpisodeFactory(setting(motions=True), NOTHING).scenario(3).source["motion_seed"] == 3
 
 
 def test_an_outcome_with_a_drawn_motion_is_the_same_whoever_asks():
     what = setting(motions=True)
-    ground = Ground(what, NOTHING)
+    factory = EpisodeFactory(what, NOTHING)
     for seed in (1, 2):
-        ground.episode(seed)
-    moment = ground.episode(5).moments[0]
+        factory.episode(seed)
+    moment = factory.episode(5).moments[0]
     choice = Choice(tuple(moment.newest(moment.now_ns)), moment.now_ns)
-    assert ground.episode(5).evaluate(0, choice) == one_of(what)
+    assert factory.episode(5).evaluate(0, choice) == one_of(what)
 
 
 def test_pictures_of_one_episode_are_not_taken_for_those_of_another():
     """Frames of two episodes have the same numbers."""
     what = setting(motions=True, parts=("semantics", "age"), decisions=1)
-    ground = Ground(what, NOTHING)
-    after_others = [ground.episode(seed).moments[0].state.embeddings for seed in (1, 2)][1]
-    alone = Ground(what, NOTHING).episode(2).moments[0].state.embeddings
+    factory = EpisodeFactory(what, NOTHING)
+    after_others = [factory.episode(seed).moments[0].state.embeddings for seed in (1, 2)][1]
+    alone = EpisodeFactory(what, NOTHING).episode(2).moments[0].state.embeddings
     assert after_others.any() and np.array_equal(after_others, alone)
 
 
@@ -103,9 +103,9 @@ def test_the_scenarios_seed_and_the_repeat_decide_the_fields_luck_and_so_does_th
 def test_a_silent_camera_never_reports_and_is_another_setting():
     what = setting(silent=("cam02",))
     assert what.key != setting().key
-    ground = Ground(what, NOTHING)
+    factory = EpisodeFactory(what, NOTHING)
     for seed in range(3):
-        for moment in ground.episode(seed).moments:
+        for moment in factory.episode(seed).moments:
             assert moment.cameras == ("cam01", "cam02", "cam03", "cam04")
             assert not any(a.camera == "cam02" for a in moment.arrivals)
             assert not moment.state.reported[1] and np.isnan(moment.state.ages_ms[1])
@@ -119,9 +119,9 @@ def test_what_an_evaluation_costs_is_all_that_it_takes_and_not_its_fit_alone(mon
     monkeypatch.setattr(
         "edge_server.experiments.training.scheduler.episode.time.process_time", lambda: clock[0]
     )
-    episode = Ground(setting(scratch=False), NOTHING).episode(5)
+    episode = EpisodeFactory(setting(scratch=False), NOTHING).episode(5)
     clock[0] += 1000.0  # between two evaluations: somebody else's
-    field, truth = episode._ground.field(5), episode._truth
+    field, truth = episode._factory.field(5), episode._truth
     fit, score = field.fit, type(truth).score
 
     def costly_fit(*args):

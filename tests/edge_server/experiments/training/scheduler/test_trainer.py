@@ -14,19 +14,19 @@ import yaml
 from edge_server.experiments.common.tables import write_csv
 from edge_server.experiments.training.scheduler.choices import choices, named
 from edge_server.experiments.training.scheduler.command import main, reward_of
-from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, hold, rivals, rows
+from edge_server.experiments.training.scheduler.evaluation import HINDSIGHT, evaluate_policies, rivals, rows
 from edge_server.experiments.training.scheduler.fit_problem import KEPT, FitProblem
 from edge_server.experiments.training.scheduler.report import draw_curve, lines, summary
 from edge_server.experiments.training.scheduler.setting import seeds
 from edge_server.experiments.training.scheduler.trainer import (
-    Course,
+    TrainingConfig,
     TrainingError,
-    compared,
+    baseline_rewards,
     read_log,
     stage_file,
     train,
 )
-from edge_server.experiments.training.scheduler.workers import Crew
+from edge_server.experiments.training.scheduler.workers import WorkerPool
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
@@ -37,7 +37,7 @@ from edge_server.scheduler.online.online_trainer import choose_reward
 from tests.edge_server.experiments.training.scheduler.small import NOTHING, RAW, setting
 
 REWARD = make_reward("set", distance=0.0)
-COURSE = Course(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2,
+COURSE = TrainingConfig(Spec("select", StateLayout(("age", "pose")), hidden=16), REWARD, episodes=6, batch=2,
                 checkpoint_every=1)  # fmt: skip
 
 
@@ -54,15 +54,15 @@ def quiet(line: str) -> None:
 
 
 def test_the_same_weights_from_one_process_and_from_two(tmp_path: Path):
-    with Crew(NOTHING) as one, Crew(NOTHING, jobs=2) as two:
+    with WorkerPool(NOTHING) as one, WorkerPool(NOTHING, jobs=2) as two:
         alone = train(setting(), COURSE, one, tmp_path / "one", quiet)
         both = train(setting(), COURSE, two, tmp_path / "two", quiet)
     assert same(alone, both) and not same(alone, Learner(COURSE.spec, COURSE.seed))
     timeless = [[{k: v for k, v in row.items() if "seconds" not in k} for row in read_log(tmp_path / name)]
                 for name in ("one", "two")]  # fmt: skip
     assert timeless[0] == timeless[1]
-    with Crew(NOTHING) as crew:
-        other = train(setting(), dataclasses.replace(COURSE, seed=1), crew, tmp_path / "other", quiet)
+    with WorkerPool(NOTHING) as pool:
+        other = train(setting(), dataclasses.replace(COURSE, seed=1), pool, tmp_path / "other", quiet)
     assert not same(alone, other)
 
 
@@ -71,108 +71,111 @@ def test_a_stopped_course_goes_on_bit_for_bit(tmp_path: Path):
         if line.startswith("4/6"):
             raise KeyboardInterrupt
 
-    with Crew(NOTHING) as crew:
-        whole = train(setting(), COURSE, crew, tmp_path / "whole", quiet)
-    with Crew(NOTHING) as crew, pytest.raises(KeyboardInterrupt):
-        train(setting(), COURSE, crew, tmp_path / "parts", stop)
+    with WorkerPool(NOTHING) as pool:
+        whole = train(setting(), COURSE, pool, tmp_path / "whole", quiet)
+    with WorkerPool(NOTHING) as pool, pytest.raises(KeyboardInterrupt):
+        train(setting(), COURSE, pool, tmp_path / "parts", stop)
     assert len(read_log(tmp_path / "parts")) == 2 and not (tmp_path / "parts/policy.npz").exists()
-    with Crew(NOTHING) as crew:
-        parts = train(setting(), COURSE, crew, tmp_path / "parts", quiet)
+    with WorkerPool(NOTHING) as pool:
+        parts = train(setting(), COURSE, pool, tmp_path / "parts", quiet)
     assert same(whole, parts) and (tmp_path / "parts/policy.npz").exists()
     assert len(list((tmp_path / "parts").glob("weights-*.npz"))) == 1
-    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match="other settings"):
-        train(setting(steps=5), COURSE, crew, tmp_path / "parts", quiet)
+    with WorkerPool(NOTHING) as pool, pytest.raises(TrainingError, match="other settings"):
+        train(setting(steps=5), COURSE, pool, tmp_path / "parts", quiet)
 
 
 @pytest.mark.parametrize("damage", ["weights-*.npz", "training.jsonl"])
 @pytest.mark.parametrize("what", ["gone", "half"])
 def test_a_course_whose_files_are_damaged_is_refused_in_one_line(damage: str, what: str, tmp_path: Path):
-    with Crew(NOTHING) as crew:
-        train(setting(), COURSE, crew, tmp_path, quiet)
+    with WorkerPool(NOTHING) as pool:
+        train(setting(), COURSE, pool, tmp_path, quiet)
     (path,) = tmp_path.glob(damage)
     if what == "gone":
         path.unlink()
     else:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match="choose another --out, or delete it"):
-        train(setting(), COURSE, crew, tmp_path, quiet)
+    with (
+        WorkerPool(NOTHING) as pool,
+        pytest.raises(TrainingError, match="choose another --out, or delete it"),
+    ):
+        train(setting(), COURSE, pool, tmp_path, quiet)
 
 
 def test_it_learns_to_use_fresh_views_where_only_age_counts(tmp_path: Path):
     omegas = (30.0, 100.0, 400.0)
     spec = Spec("threshold", StateLayout(("age",)), omegas, hidden=16, learning_rate=1e-2)
-    course = Course(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
-    with Crew(NOTHING) as crew:
-        learner = train(setting(steps=1), course, crew, tmp_path, quiet)
+    config = TrainingConfig(spec, Reward("age", 0.0, 0.0, 0.0, age=-0.01), episodes=60, batch=6)
+    with WorkerPool(NOTHING) as pool:
+        learner = train(setting(steps=1), config, pool, tmp_path, quiet)
         everybody = {**rivals(omegas, ["threshold"]), "learnt": learner.actor}
-        contest = hold(setting(steps=1), crew, seeds(0, "test", 6), everybody, course.reward)
-    assert contest.term("learnt", "aaoi_ms").mean < contest.term("threshold:100", "aaoi_ms").mean
-    assert contest.against("learnt", contest.rewards("random")).low > 0.0
+        evaluation = evaluate_policies(setting(steps=1), pool, seeds(0, "test", 6), everybody, config.reward)
+    assert evaluation.term("learnt", "aaoi_ms").mean < evaluation.term("threshold:100", "aaoi_ms").mean
+    assert evaluation.against("learnt", evaluation.rewards("random")).low > 0.0
     found = read_log(tmp_path)
     assert found[-1]["omega_ms"] < 60.0 < found[0]["omega_ms"]
 
 
 def test_evaluations_are_kept_in_a_file_and_a_torn_line_costs_only_itself(tmp_path: Path):
     known = tmp_path / "known.jsonl"
-    with Crew(NOTHING, known=known) as crew:
-        moments = crew.draw(setting(), [7])[0]
+    with WorkerPool(NOTHING, known=known) as pool:
+        moments = pool.draw(setting(), [7])[0]
         asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
-        first = crew.evaluate(setting(), asked * 2)
-        assert crew.evaluated == len(asked) and first[: len(asked)] == first[len(asked) :]
-        assert crew.evaluate(setting(steps=5), asked) != first[: len(asked)]
+        first = pool.evaluate(setting(), asked * 2)
+        assert pool.evaluated == len(asked) and first[: len(asked)] == first[len(asked) :]
+        assert pool.evaluate(setting(steps=5), asked) != first[: len(asked)]
     text = known.read_text()
     known.write_text(text + text.splitlines()[0][:20])
-    with Crew(NOTHING, known=known) as crew:
-        assert crew.evaluate(setting(), asked) == first[: len(asked)] and crew.evaluated == 0
+    with WorkerPool(NOTHING, known=known) as pool:
+        assert pool.evaluate(setting(), asked) == first[: len(asked)] and pool.evaluated == 0
 
 
 def test_tries_are_compared_with_the_others_of_their_decision():
-    found = compared(np.array([1.0, 2.0, 6.0, 5.0, np.nan, 1.0]), 3)
+    found = baseline_rewards(np.array([1.0, 2.0, 6.0, 5.0, np.nan, 1.0]), 3)
     assert np.allclose(found, [1 - 4, 2 - 3.5, 6 - 1.5, 4.0, np.nan, -4.0], equal_nan=True)
-    alone = compared(np.array([3.0, np.nan]), 2)
+    alone = baseline_rewards(np.array([3.0, np.nan]), 2)
     assert np.isnan(alone).all()  # nothing to compare with
-    assert compared(np.array([3.0, 4.0]), 1).tolist() == [3.0, 4.0]
+    assert baseline_rewards(np.array([3.0, 4.0]), 1).tolist() == [3.0, 4.0]
 
 
 @pytest.fixture(scope="module")
-def contest(tmp_path_factory):
+def evaluation(tmp_path_factory):
     names = rivals((40.0, 120.0), ["threshold"], ("random", "all", "freshen"))
-    with Crew(NOTHING) as crew:
+    with WorkerPool(NOTHING) as pool:
         actor = Learner(COURSE.spec, 0).actor
-        return hold(setting(), crew, seeds(0, "test", 6), {**names, "learnt": actor}, REWARD)
+        return evaluate_policies(setting(), pool, seeds(0, "test", 6), {**names, "learnt": actor}, REWARD)
 
 
-def test_hindsight_and_the_best_fixed_are_measured_where_they_were_not_chosen(contest):
-    best = contest.rewards(HINDSIGHT)
-    values, name = contest.best_fixed("threshold")
-    assert name in contest.outcomes
+def test_hindsight_and_the_best_fixed_are_measured_where_they_were_not_chosen(evaluation):
+    best = evaluation.rewards(HINDSIGHT)
+    values, name = evaluation.best_fixed("threshold")
+    assert name in evaluation.outcomes
     for seed, value in values.items():
-        assert value in (contest.rewards("threshold:40")[seed], contest.rewards("threshold:120")[seed])
-    assert contest.share(contest.rewards("random")).mean == 0.0
-    assert contest.share(best).mean == 1.0
-    for at in contest.outcomes["all"]:
-        first, second = ({n: contest.value(found[n][at]) for n in contest.outcomes}
-                         for found in (contest.outcomes, contest.again))  # fmt: skip
+        assert value in (evaluation.rewards("threshold:40")[seed], evaluation.rewards("threshold:120")[seed])
+    assert evaluation.share(evaluation.rewards("random")).mean == 0.0
+    assert evaluation.share(best).mean == 1.0
+    for at in evaluation.outcomes["all"]:
+        first, second = ({n: evaluation.value(found[n][at]) for n in evaluation.outcomes}
+                         for found in (evaluation.outcomes, evaluation.again))  # fmt: skip
         crossed = (second[max(first, key=first.get)] + first[max(second, key=second.get)]) / 2
-        assert contest._top(list(contest.outcomes))[0][at] == pytest.approx(crossed)
-    assert set(best) == {seed for seed, _ in contest.outcomes["all"]}
+        assert evaluation._top(list(evaluation.outcomes))[0][at] == pytest.approx(crossed)
+    assert set(best) == {seed for seed, _ in evaluation.outcomes["all"]}
 
 
-def test_a_contest_is_told_in_a_table_and_in_words(contest, tmp_path: Path):
-    write_csv(tmp_path / "contest.csv", rows(contest))
+def test_a_contest_is_told_in_a_table_and_in_words(evaluation, tmp_path: Path):
+    write_csv(tmp_path / "contest.csv", rows(evaluation))
     found = {row["policy"]: row for row in csv.DictReader((tmp_path / "contest.csv").open())}
-    assert found.keys() == {*contest.outcomes, HINDSIGHT}
+    assert found.keys() == {*evaluation.outcomes, HINDSIGHT}
     assert float(found["all"]["views"]) >= 3.0 and float(found["random"]["share"]) == 0.0
-    told = " ".join(lines(contest, "learnt", "threshold"))
-    assert "over random" in told and "threshold:" in told
-    kept = json.loads(json.dumps(summary(contest, "learnt", "threshold")))
+    text = " ".join(lines(evaluation, "learnt", "threshold"))
+    assert "over random" in text and "threshold:" in text
+    kept = json.loads(json.dumps(summary(evaluation, "learnt", "threshold")))
     assert kept["seeds"] == 6 and len(kept["over_best_fixed"]) == 3
 
 
 def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
-    course = [{"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
+    config = [{"episodes": 10 * k, "reward": None if k == 2 else 0.1 * k, "term_psnr": 0.3, "term_age": None}
             for k in range(5)]  # fmt: skip
-    draw_curve(tmp_path / "curve.png", course, {"random": 0.1})
+    draw_curve(tmp_path / "curve.png", config, {"random": 0.1})
     assert (tmp_path / "curve.png").stat().st_size > 5_000
 
 
@@ -196,14 +199,14 @@ def test_the_curve_is_drawn_with_gaps(tmp_path: Path):
 )
 def test_what_cannot_be_trained_is_refused_in_one_line(words, said, tmp_path: Path, capsys):
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert said in told and told.count("\n") == 1
+    text = capsys.readouterr().err
+    assert said in text and text.count("\n") == 1
 
 
 def test_other_learners_see_the_same_decisions_as_a_problem():
-    with Crew(NOTHING) as crew:
-        problem = FitProblem(setting(), COURSE.spec, REWARD, crew)
-        moments = crew.draw(setting(), [4])[0]
+    with WorkerPool(NOTHING) as pool:
+        problem = FitProblem(setting(), COURSE.spec, REWARD, pool)
+        moments = pool.draw(setting(), [4])[0]
         decision = problem.draw(4 * setting().decisions + 1)
         assert decision.moment == moments[1] and decision.state is moments[1].state
         action = np.array([True, False, True, True])
@@ -221,9 +224,9 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
              "--decisions", "1", "--fit-steps", "2", "--size", "24", "--test", "2", "--jobs", "1",
              "--out", str(out)]  # fmt: skip
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert "2/2 episodes" in told and "over random" in told and "bandit:" in told
-    assert "rewarded from cam00; judged from cam03" in told
+    text = capsys.readouterr().out
+    assert "2/2 episodes" in text and "over random" in text and "bandit:" in text
+    assert "rewarded from cam00; judged from cam03" in text
     kept = json.loads((out / "summary.json").read_text())
     assert kept["reward_name"] == "corrected" and kept["best_fixed"].startswith("threshold:")
     assert (kept["rewarded_from"], kept["judged_from"], kept["motions"]) == (["cam00"], ["cam03"], True)
@@ -233,8 +236,8 @@ def test_the_command_from_a_scenario_to_a_policy_that_decides(tmp_path: Path, ca
     for name in ("training.csv", "training.png", "contest.csv", "policy.npz"):
         assert (out / name).stat().st_size > 0
     policy = make_policy(f"bandit:{out / 'policy.npz'}", None, np.random.default_rng(0))
-    with Crew(NOTHING) as crew:
-        chosen = choices(lambda rng: policy, crew.draw(setting(), [1])[0])
+    with WorkerPool(NOTHING) as pool:
+        chosen = choices(lambda rng: policy, pool.draw(setting(), [1])[0])
     assert all(choice.cameras for choice in chosen)
     lines_before = (out / "evaluations.jsonl").read_text()
     assert main(words) == 0  # finished: nothing is left to be evaluated
@@ -255,12 +258,12 @@ def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Pa
     def stop(line: str) -> None:
         raise KeyboardInterrupt
 
-    with Crew(NOTHING) as crew:
+    with WorkerPool(NOTHING) as pool:
         with pytest.raises(KeyboardInterrupt):
-            train(setting(), COURSE, crew, tmp_path, stop)
+            train(setting(), COURSE, pool, tmp_path, stop)
         assert not (tmp_path / "policy.npz").exists()
         Learner(COURSE.spec, 77).save(tmp_path / "policy.npz")
-        learner = train(setting(), COURSE, crew, tmp_path, quiet)
+        learner = train(setting(), COURSE, pool, tmp_path, quiet)
     assert same(Learner.load(tmp_path / "policy.npz"), learner)
 
 
@@ -272,9 +275,9 @@ def test_a_policy_of_an_earlier_training_never_passes_for_this_ones(tmp_path: Pa
     ],
 )
 def test_a_reward_that_cannot_be_had_is_refused_after_the_first_batch(reward, missing, tmp_path: Path):
-    course = dataclasses.replace(COURSE, reward=reward)
-    with Crew(NOTHING) as crew, pytest.raises(TrainingError, match=missing):
-        train(setting(), course, crew, tmp_path, quiet)
+    config = dataclasses.replace(COURSE, reward=reward)
+    with WorkerPool(NOTHING) as pool, pytest.raises(TrainingError, match=missing):
+        train(setting(), config, pool, tmp_path, quiet)
     assert not (tmp_path / "training.json").exists()
 
 
@@ -316,53 +319,53 @@ def test_what_is_finished_is_kept_and_told_while_more_is_carried_out(tmp_path: P
         seen.append((done, count))
         raise KeyboardInterrupt
 
-    with Crew(NOTHING, known=known) as crew:
-        moments = [m for e in crew.draw(setting(), range(12)) for m in e]
+    with WorkerPool(NOTHING, known=known) as pool:
+        moments = [m for e in pool.draw(setting(), range(12)) for m in e]
         asked = [(m.seed, m.number, c) for m in moments for c in choices(named("all"), [m])]
         with pytest.raises(KeyboardInterrupt):
-            crew.evaluate(setting(), asked, stop)
+            pool.evaluate(setting(), asked, stop)
     ((done, count),) = seen
     assert count == len(asked) == 24 and 0 < done <= 8
     assert len(known.read_text().splitlines()) == done
-    with Crew(NOTHING, known=known) as crew:
-        crew.evaluate(setting(), asked)
-        assert crew.evaluated == count - done
+    with WorkerPool(NOTHING, known=known) as pool:
+        pool.evaluate(setting(), asked)
+        assert pool.evaluated == count - done
 
 
 def test_progress_is_told_before_the_first_batch_is_over(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("edge_server.experiments.training.scheduler.trainer._TELL_EVERY_S", 0.0)
-    told: list[str] = []
-    course = dataclasses.replace(COURSE, episodes=6, batch=6)
-    with Crew(NOTHING) as crew:
-        train(setting(), course, crew, tmp_path, told.append)
-    assert len(told) >= 3 and told[0].endswith("fits of batch 1") and told[-1].startswith("6/6 episodes")
+    text: list[str] = []
+    config = dataclasses.replace(COURSE, episodes=6, batch=6)
+    with WorkerPool(NOTHING) as pool:
+        train(setting(), config, pool, tmp_path, text.append)
+    assert len(text) >= 3 and text[0].endswith("fits of batch 1") and text[-1].startswith("6/6 episodes")
 
 
 def test_the_time_of_evaluations_is_that_of_when_they_were_carried_out(tmp_path: Path):
     known = tmp_path / "known.jsonl"
-    with Crew(NOTHING, known=known) as crew:
-        moments = crew.draw(setting(), [7])[0]
+    with WorkerPool(NOTHING, known=known) as pool:
+        moments = pool.draw(setting(), [7])[0]
         asked = [(m.seed, m.number, c) for m, c in zip(moments, choices(named("all"), moments))]
-        crew.evaluate(setting(), asked)
-        spent = crew.cost_s(setting(), asked)
+        pool.evaluate(setting(), asked)
+        spent = pool.cost_s(setting(), asked)
     assert spent > 0.0
-    with Crew(NOTHING, known=known) as crew:
-        crew.evaluate(setting(), asked)
-        assert crew.evaluated == 0 and crew.cost_s(setting(), asked * 2) == spent
+    with WorkerPool(NOTHING, known=known) as pool:
+        pool.evaluate(setting(), asked)
+        assert pool.evaluated == 0 and pool.cost_s(setting(), asked * 2) == spent
     # What an older version kept has no time, so that it is carried out again.
     rows = [json.loads(line) for line in known.read_text().splitlines()]
     known.write_text("".join(json.dumps({k: v for k, v in r.items() if k != "cost_ms"}) + "\n" for r in rows))
-    with Crew(NOTHING, known=known) as crew:
-        crew.evaluate(setting(), asked)
-        assert crew.evaluated == len(asked)
+    with WorkerPool(NOTHING, known=known) as pool:
+        pool.evaluate(setting(), asked)
+        assert pool.evaluated == len(asked)
 
 
 def test_what_had_been_learnt_on_the_way_is_kept_at_the_stages(tmp_path: Path):
-    course = dataclasses.replace(COURSE, stages=(1, 3))
-    with Crew(NOTHING) as crew:
-        learner = train(setting(), course, crew, tmp_path / "a", quiet)
+    config = dataclasses.replace(COURSE, stages=(1, 3))
+    with WorkerPool(NOTHING) as pool:
+        learner = train(setting(), config, pool, tmp_path / "a", quiet)
         shorter = dataclasses.replace(COURSE, episodes=2)
-        first = train(setting(), shorter, crew, tmp_path / "b", quiet)
+        first = train(setting(), shorter, pool, tmp_path / "b", quiet)
     assert same(Learner.load(stage_file(tmp_path / "a", 1)), first)
     assert same(Learner.load(stage_file(tmp_path / "a", 3)), learner) and not same(first, learner)
     with pytest.raises(TrainingError, match="stages"):
@@ -372,7 +375,7 @@ def test_what_had_been_learnt_on_the_way_is_kept_at_the_stages(tmp_path: Path):
 def test_other_learners_are_never_given_an_episode_that_policies_are_tested_on():
     problem = FitProblem(setting(), COURSE.spec, REWARD, None)
     drawn = []
-    problem = dataclasses.replace(problem, crew=SeenSeeds(drawn))
+    problem = dataclasses.replace(problem, pool=SeenSeeds(drawn))
     for seed in (0, 5, 2**31 - 1, 2 * 10**6 * 2 + 1, 123_456_789):
         problem.draw(seed)
     tested = {s // 10**6 for s in (seeds(0, "test", 1)[0], seeds(0, "choose", 1)[0])}
@@ -399,10 +402,10 @@ class SeenSeeds:
 
 
 def test_other_learners_do_not_fill_the_memory_with_episodes():
-    crew = SeenSeeds([])
-    problem = FitProblem(setting(), COURSE.spec, REWARD, crew)
+    pool = SeenSeeds([])
+    problem = FitProblem(setting(), COURSE.spec, REWARD, pool)
     for number in (*range(2 * (KEPT + 3)), 0):
         problem.draw(number)
-    kept = [seed for seed in dict.fromkeys(crew.drawn) if seed not in crew.forgotten]
-    assert len(dict.fromkeys(crew.drawn)) == KEPT + 3 and len(crew.forgotten) == 4 and len(kept) == KEPT - 1
-    assert seeds(0, "train", 1, 0)[0] == crew.drawn[-1] == crew.forgotten[0], "drawn, forgotten, drawn again"
+    kept = [seed for seed in dict.fromkeys(pool.drawn) if seed not in pool.forgotten]
+    assert len(dict.fromkeys(pool.drawn)) == KEPT + 3 and len(pool.forgotten) == 4 and len(kept) == KEPT - 1
+    assert seeds(0, "train", 1, 0)[0] == pool.drawn[-1] == pool.forgotten[0], "drawn, forgotten, drawn again"
