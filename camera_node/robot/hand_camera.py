@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.config import ArmConfig
 from camera_node.pose.providers import Closable, PoseGapError, PoseProvider
-from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, hand_eyes
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, load_hand_eyes
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
@@ -31,27 +31,27 @@ from freshfield.scenario import Scenario, ScenarioError
 
 Array = NDArray[np.float64]
 
-_ANSWER_S = 1.0
-_STRAY_NS = 2 * round(STEP_S * 1e9)  # between what is asked for and what the arm answers for
+_TIMEOUT_S = 1.0
+_MAX_OFFSET_NS = 2 * round(STEP_S * 1e9)  # between what is asked for and what the arm answers for
 
 
-class Truth:
+class TruthClient:
     """Where a simulated arm's joints really were at an instant; connects when asked, and anew when lost."""
 
     def __init__(self, host: str) -> None:
         self.host = host
-        self._link: socket.socket | None = None
+        self._socket: socket.socket | None = None
 
     def joints(self, t_ns: int) -> Array:
         """Joint angles (6,) at ``t_ns``. Raises PoseGapError where nobody knows: no answer, or one for
         another instant."""
         try:
-            if self._link is None:
-                self._link = socket.create_connection((self.host, TRUTH_PORT), _ANSWER_S)
-            self._link.sendall(b"%d\n" % t_ns)
+            if self._socket is None:
+                self._socket = socket.create_connection((self.host, TRUTH_PORT), _TIMEOUT_S)
+            self._socket.sendall(b"%d\n" % t_ns)
             answer = b""
             while not answer.endswith(b"\n"):
-                part = self._link.recv(4096)
+                part = self._socket.recv(4096)
                 if not part:
                     raise OSError("it closed the connection")
                 answer += part
@@ -61,19 +61,19 @@ class Truth:
                 f"simulated arm at {self.host}: {error}: is camera-node simulate-arm running there?"
             ) from None
         known = json.loads(answer)
-        away_ns = abs(known["t_ns"] - t_ns)
-        if away_ns > _STRAY_NS:
+        offset_ns = abs(known["t_ns"] - t_ns)
+        if offset_ns > _MAX_OFFSET_NS:
             raise PoseGapError(
-                f"simulated arm at {self.host}: what it knows nearest is {away_ns / 1e6:.0f} ms away: is "
+                f"simulated arm at {self.host}: what it knows nearest is {offset_ns / 1e6:.0f} ms away: is "
                 "this machine too busy to simulate it?"
             )
         return np.array(known["q"])
 
     def close(self) -> None:
-        if self._link is not None:
+        if self._socket is not None:
             with contextlib.suppress(OSError):
-                self._link.close()
-        self._link = None
+                self._socket.close()
+        self._socket = None
 
 
 class HandCamera(Source):
@@ -87,7 +87,7 @@ class HandCamera(Source):
         lens: Pinhole,
         effects: Effects,
         poses: PoseProvider,
-        truth: Truth,
+        truth: TruthClient,
         arm: ArmModel,
         base: Array,
         mount: Array,
@@ -135,9 +135,9 @@ def open_hand_cameras(
                 f"{scenario.path}: source.effects: {names}: not for a camera that an arm carries ({camera}): "
                 "they take the camera to stand still while it exposes"
             )
-    mounts = hand_eyes(scenario, config, frames)
+    mounts = load_hand_eyes(scenario, config, frames)
     poses = camera_poses(scenario, config, frames)
-    truth, arm, base = Truth(config.host), arm_model(scenario, config), base_matrix(config)
+    truth, arm, base = TruthClient(config.host), arm_model(scenario, config), base_matrix(config)
     return {
         camera: HandCamera(
             camera, each.fps, each.scene, each.scene.cameras[each.camera_id][0],

@@ -18,7 +18,7 @@ from camera_node.robot.arm.hand_eye_mount import (
     HandEyeError,
     read_hand_eye,
 )
-from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, calibrated
+from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, apply_calibration
 from freshfield.clock import Clock, WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
@@ -32,7 +32,7 @@ def arm_model(scenario: Scenario, config: ArmConfig) -> ArmModel:
     if config.calibration is None:
         return model
     try:
-        return calibrated(model, beside(scenario, config.calibration))
+        return apply_calibration(model, resolve_path(scenario, config.calibration))
     except KinematicsError as error:
         raise ScenarioError(f"{scenario.path}: source.arm.calibration: {error}") from None
 
@@ -46,7 +46,7 @@ def base_matrix(config: ArmConfig) -> NDArray[np.float64]:
     return out
 
 
-def hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> dict[str, HandEye]:
+def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> dict[str, HandEye]:
     """The hand-eye calibration of those of ``cameras`` that the arm has to do with. Raises ScenarioError."""
     where = f"{scenario.path}: source.arm.cameras"
     for camera in config.cameras:
@@ -61,7 +61,7 @@ def hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> 
             found[camera] = HandEye(EYE_IN_HAND, np.eye(4))
             continue
         try:
-            found[camera] = read_hand_eye(beside(scenario, file))
+            found[camera] = read_hand_eye(resolve_path(scenario, file))
         except HandEyeError as error:
             raise ScenarioError(f"{where}.{camera}: {error}") from None
     return found
@@ -76,7 +76,7 @@ def camera_poses(
     """
     if config is None:
         return {}
-    mounts = hand_eyes(scenario, config, cameras)
+    mounts = load_hand_eyes(scenario, config, cameras)
     model, base = arm_model(scenario, config), base_matrix(config)
     moving = [camera for camera, mount in mounts.items() if mount.setup != EYE_TO_HAND]
     poses: dict[str, PoseProvider] = {
@@ -98,7 +98,7 @@ def camera_poses(
     return poses
 
 
-def beside(scenario: Scenario, name: str) -> Path:
+def resolve_path(scenario: Scenario, name: str) -> Path:
     """A file that a scenario names, relative to the scenario."""
     path = Path(name).expanduser()
     return path if path.is_absolute() else scenario.path.parent / path

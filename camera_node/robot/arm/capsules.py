@@ -1,6 +1,6 @@
-"""The arm as capsules: how near its parts come to each other and to the floor, many postures at once.
+"""The arm as capsules: clearances between its parts and to the floor, for many postures at once.
 
-The upper arm and the forearm stand beside the lines that the Denavit-Hartenberg parameters connect; their
+The upper arm and the forearm are offset from the lines that the Denavit-Hartenberg parameters connect; their
 offsets along the elbow's axis are those of the manufacturer's description (ur_description, ur3e). Radii are
 read off the data sheet's drawing and rounded up. Parts that share a joint, and those whose distance no joint
 changes, are not compared.
@@ -31,7 +31,7 @@ _RADII_M = (0.064, 0.055, 0.046, 0.04, 0.036, 0.036, 0.033)
 
 
 @dataclass(frozen=True)
-class Shape:
+class CapsuleModel:
     """Capsules of one arm with its tool. tool_m, tool_radius_m: along the flange's axis, from the flange."""
 
     arm: ArmModel
@@ -40,15 +40,15 @@ class Shape:
 
     def flange(self, joints: Array) -> Array:
         """Positions (T, 3) of the flange for joints (T, 6), in base axes, metres."""
-        return links(self.arm, joints)[:, 6, :3, 3]
+        return link_frames(self.arm, joints)[:, 6, :3, 3]
 
     def segments(self, frames: Array) -> tuple[Array, Array]:
-        """Ends (T, 8, 3), (T, 8, 3) of the parts' axes for ``links`` (T, 7, 4, 4) of the arm's ``body``, in
-        the order of PARTS."""
+        """Ends (T, 8, 3), (T, 8, 3) of the parts' axes, in the order of PARTS, from the ``link_frames``
+        (T, 7, 4, 4) of the arm's ``nominal_model``."""
         at, z = frames[:, :, :3, 3], frames[:, :, :3, 2]
         upper, fore = _UPPER_ARM_M * z[:, 1], _FOREARM_M * z[:, 1]
         zero = np.zeros_like(at[:, 0])
-        # A capsule's round end reaches a radius beyond its axis: the tool's begins at the flange, not before.
+        # A capsule extends one radius beyond each end of its axis; the tool's must begin at the flange.
         near = at[:, 6] + self.tool_radius_m * z[:, 6]
         far = at[:, 6] + max(self.tool_m - self.tool_radius_m, self.tool_radius_m) * z[:, 6]
         a = [zero, at[:, 1], at[:, 1] + upper, at[:, 2] + fore, at[:, 3] + fore, at[:, 4], at[:, 5], near]
@@ -61,19 +61,20 @@ class Shape:
         return np.array([*_RADII_M, self.tool_radius_m])
 
     def clearance(self, frames: Array) -> tuple[Array, Array]:
-        """Of ``links`` of the arm's ``body``: (T, pairs) metres between the surfaces of PAIRS, negative where
-        they overlap, and (T,) the height of the lowest point of what lies beyond the upper arm."""
+        """Clearances from the ``link_frames`` (T, 7, 4, 4) of the arm's ``nominal_model``: (T, pairs) metres
+        between the surfaces of PAIRS, negative where they overlap, and (T,) the height of the lowest point
+        beyond the upper arm."""
         a, b = self.segments(frames)
         first, second = np.array(PAIRS).T
         radii = self.radii
-        apart = distance(a[:, first], b[:, first], a[:, second], b[:, second])
+        apart = segment_distance(a[:, first], b[:, first], a[:, second], b[:, second])
         beyond = list(ABOVE_FLOOR)
         lowest = np.minimum(a[:, beyond, 2], b[:, beyond, 2]) - radii[beyond]
         return apart - (radii[first] + radii[second]), lowest.min(axis=1)
 
 
-def links(arm: ArmModel, joints: Array) -> Array:
-    """``ArmModel.links`` of many postures: (T, 7, 4, 4) for joints (T, 6)."""
+def link_frames(arm: ArmModel, joints: Array) -> Array:
+    """``ArmModel.link_frames`` of many postures: (T, 7, 4, 4) for joints (T, 6)."""
     count = len(joints)
     theta = joints + np.array(arm.theta_rad)
     cos, sin = np.cos(theta), np.sin(theta)
@@ -91,7 +92,7 @@ def links(arm: ArmModel, joints: Array) -> Array:
     return out
 
 
-def distance(a: Array, b: Array, c: Array, d: Array) -> Array:
+def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
     """Distances (...) between segments a-b and c-d, each end (..., 3); either may be a point.
 
     Ericson, Real-Time Collision Detection, 5.1.9.
@@ -101,7 +102,7 @@ def distance(a: Array, b: Array, c: Array, d: Array) -> Array:
     ur, vr = _dot(u, r), _dot(v, r)
     tiny = 1e-18
     denominator = uu * vv - uv * uv
-    # Of parallel segments any point of one will do; the other's nearest is then found and clamped.
+    # For parallel segments any point of one will do: the nearest point of the other is found and clamped.
     s = np.where(
         denominator > 1e-12 * uu * vv, (uv * vr - ur * vv) / np.maximum(denominator, tiny), 0.0
     ).clip(0.0, 1.0)

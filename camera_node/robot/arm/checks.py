@@ -7,10 +7,10 @@ import time
 import numpy as np
 
 from camera_node.config import ArmConfig, PathConfig
-from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
 from camera_node.robot.arm.joint_states import ArmStream
-from camera_node.robot.arm.viewpoint_tour import tour, viewpoints
+from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 
@@ -21,7 +21,7 @@ _LEAST_REACHED = 0.6  # of a tour's viewpoints; with fewer, a side of the target
 def hand_eye(scenario: Scenario, arm: ArmConfig) -> str:
     """The hand-eye calibration of each camera."""
     model = arm_model(scenario, arm)
-    mounts = hand_eyes(scenario, arm, arm.cameras)
+    mounts = load_hand_eyes(scenario, arm, arm.cameras)
     for camera, mount in mounts.items():
         if mount.details.get("example") and not arm.simulated:
             raise ValueError(
@@ -60,11 +60,11 @@ def joint_states(arm: ArmConfig) -> str:
 
 def path(scenario: Scenario, arm: ArmConfig, tour_path: PathConfig) -> str:
     """Whether the arm reaches most viewpoints of its tour."""
-    carried = [m for m in hand_eyes(scenario, arm, arm.cameras).values() if m.setup != EYE_TO_HAND]
+    carried = [m for m in load_hand_eyes(scenario, arm, arm.cameras).values() if m.setup != EYE_TO_HAND]
     if not carried:
         raise ValueError("no camera is on the hand: there is nothing to drive")
     model, base, mount = arm_model(scenario, arm), base_matrix(arm), carried[0].transform
-    found = tour(model, base, mount, tour_path)
+    found = plan_tour(model, base, mount, tour_path)
     count = len(viewpoints(tour_path))
     said = f"the arm reaches {found.reached} of {count} viewpoints"
     if found.reached >= _LEAST_REACHED * count:

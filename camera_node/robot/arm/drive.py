@@ -1,8 +1,8 @@
-"""``camera-node drive-arm``: takes the camera on an arm round its target, viewpoint by viewpoint, for ever.
+"""``camera-node drive-arm``: moves the camera on an arm around its target, viewpoint by viewpoint, endlessly.
 
-Moves are started and then watched, never waited for inside the library: Ctrl-C, SIGTERM, a closed terminal,
-an arm or a state that stands still, and a program that was stopped at the pendant end the drive, and the arm
-comes to rest. Should this process itself vanish, the controller's own watchdog stops the arm.
+Moves are started and then polled, never waited for inside the library: Ctrl-C, SIGTERM, a closed terminal,
+a stalled arm or state, and a program that was stopped at the pendant end the drive, and the arm
+comes to rest. If this process dies, the controller's own watchdog stops the arm.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ import numpy as np
 
 from camera_node.config import ArmConfig, PathConfig
 from camera_node.pose.providers import PoseGapError
-from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND
 from camera_node.robot.arm.joint_states import STALE_S, ArmError, ArmStream, probe
 from camera_node.robot.arm.roadmap import FARTHEST_RAD
-from camera_node.robot.arm.viewpoint_tour import PathError, Tour, tour
-from camera_node.robot.simulated_controller.command import arm_of, read_joints
+from camera_node.robot.arm.viewpoint_tour import PathError, Tour, plan_tour
+from camera_node.robot.simulated_controller.command import read_joints, require_arm
 from freshfield.clock import WallClock
 from freshfield.scenario import ScenarioError, load
 
@@ -37,8 +37,8 @@ CONTROL_S = 8
 STOPPING_S = 5.0
 _SIMULATED_STALE_S = 10.0
 _ARRIVED_RAD = 1e-3
-# Over so long a slow arm has turned farther than its encoders tremble.
-_STILL_S, _STILL_RAD = 5.0, 1e-3
+# In this time even a slow arm turns farther than its encoder noise.
+_STALLED_S, _STALLED_RAD = 5.0, 1e-3
 _POLL_S = 0.05
 _STOP_RAD_S2 = 2.0
 _MOVED_RAD = 0.01
@@ -52,19 +52,19 @@ def run(args: argparse.Namespace) -> int:
     if args.joints is not None and not args.show:
         raise ScenarioError("--joints: goes with --show: a drive begins where the arm stands")
     scenario = load(args.scenario)
-    config = arm_of(scenario)
+    config = require_arm(scenario)
     if config.path is None:
         raise ScenarioError(f"{scenario.path}: source.arm.path: missing: it says where the arm is to go")
-    mounts = hand_eyes(scenario, config, config.cameras)
+    mounts = load_hand_eyes(scenario, config, config.cameras)
     carried = [mount for mount in mounts.values() if mount.setup != EYE_TO_HAND]
     if not carried:
         raise ScenarioError(f"{scenario.path}: source.arm.cameras: none of them is on the hand")
     model, base = arm_model(scenario, config), base_matrix(config)
-    stream = watch(config)
+    stream = open_stream(config)
     try:
         start = _start(args, stream)
         try:
-            found = tour(model, base, carried[0].transform, config.path, start)
+            found = plan_tour(model, base, carried[0].transform, config.path, start)
         except PathError as error:
             raise ScenarioError(f"{scenario.path}: source.arm.path: {error}") from None
         stops = found.stops
@@ -79,18 +79,18 @@ def run(args: argparse.Namespace) -> int:
                 f"degrees, more than {np.rad2deg(FARTHEST_RAD):.0f}: bring it nearer to the first viewpoint "
                 "with the pendant"
             )
-        if not (args.yes or config.simulated or agreed(config.host)):
+        if not (args.yes or config.simulated or confirm_motion(config.host)):
             return 2
         if np.abs(stream.at(WallClock().now_ns(), 0.0)[0] - start).max() > _MOVED_RAD:
             raise ArmError(f"arm at {config.host}: it has been moved since the tour was printed: start again")
-        return _drive(stream, stops, Pace.of(config, config.path), args.rounds)
+        return _drive(stream, stops, DriveLimits.of(config, config.path), args.rounds)
     finally:
         stream.stop()
 
 
 def _start(args: argparse.Namespace, stream: ArmStream) -> np.ndarray | None:
-    """Where the tour begins: --joints, or where the arm stands; None where it is only to be shown and does
-    not say. Raises ArmError."""
+    """Joints (6,) where the tour begins: --joints, or those of the arm; None for --show without an arm.
+    Raises ArmError."""
     if args.joints is not None:
         return read_joints(args.joints)
     try:
@@ -120,8 +120,8 @@ def _print_tour(found: Tour, start: np.ndarray | None) -> None:
     sys.stdout.flush()
 
 
-def agreed(host: str, will: str = "move") -> bool:
-    """Ask whether the arm may. Raises ArmError where nobody can be asked."""
+def confirm_motion(host: str, will: str = "move") -> bool:
+    """Ask the operator whether the arm may move. Raises ArmError where standard input is no terminal."""
     if not sys.stdin.isatty():
         raise ArmError(f"the arm at {host} would move: say that its space is clear with --yes")
     # Not on standard output, which may be for a program.
@@ -131,76 +131,86 @@ def agreed(host: str, will: str = "move") -> bool:
 
 
 @dataclass(frozen=True)
-class Pace:
-    """How fast, and how long a controller and this process may hear nothing of each other."""
+class DriveLimits:
+    """Speeds, and how long controller and process may go without hearing from each other."""
 
     speed_rad_s: float
     acceleration_rad_s2: float
     patience_s: float
 
     @classmethod
-    def of(cls, config: ArmConfig, path: PathConfig) -> Pace:
-        return cls(path.speed_rad_s, path.acceleration_rad_s2, _patience_s(config))
+    def of(cls, config: ArmConfig, path: PathConfig) -> DriveLimits:
+        return cls(path.speed_rad_s, path.acceleration_rad_s2, patience_s(config))
 
 
-def watch(config: ArmConfig) -> ArmStream:
-    """The joint states of the arm that is to be driven, not started yet."""
-    patience_s = _patience_s(config)
-    return ArmStream(config.host, WallClock(), 50.0, max_gap_ms=1e3 * patience_s, stale_s=patience_s)
+def open_stream(config: ArmConfig) -> ArmStream:
+    """Joint-state stream of the arm to drive, not started yet."""
+    stale_s = patience_s(config)
+    return ArmStream(config.host, WallClock(), 50.0, max_gap_ms=1e3 * stale_s, stale_s=stale_s)
 
 
-def _patience_s(config: ArmConfig) -> float:
-    """Where nothing can be hit, a machine too busy to simulate is no reason to stop."""
+def patience_s(config: ArmConfig) -> float:
+    """Seconds without a new joint state before a stop. A simulated arm hits nothing, so it may lag longer."""
     return _SIMULATED_STALE_S if config.simulated else STALE_S
 
 
-def _drive(stream: ArmStream, stops: list[np.ndarray], pace: Pace, rounds: int) -> int:
+def _drive(stream: ArmStream, stops: list[np.ndarray], limits: DriveLimits, rounds: int) -> int:
     control = connect_control(stream.host)
-    asked = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
-            signal.signal(number, lambda *_: asked.set())
-    # There and back, so that the end of a round is the beginning of the next.
+    stop_requested = stop_event()
+    # There and back, so that each round begins where the last one ended.
     each = itertools.count() if rounds == 0 else range(rounds)
     there_and_back = (joints for k in each for joints in (stops if k % 2 == 0 else stops[::-1]))
     try:
-        visit(control, stream, there_and_back, pace, asked)
+        visit_stops(control, stream, there_and_back, limits, stop_requested)
     except ArmError as error:
         print(f"camera-node: {error}", file=sys.stderr, flush=True)
         os._exit(1)  # the library's destructor would wait for an arm that may be gone
     return 0
 
 
-def visit(
-    control: Any, stream: ArmStream, stops: Iterable[np.ndarray], pace: Pace, asked: threading.Event
+def stop_event() -> threading.Event:
+    """Event that SIGINT, SIGTERM and SIGHUP (unless ignored, as under nohup) set from now on."""
+    requested = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, lambda *_: requested.set())
+    return requested
+
+
+def visit_stops(
+    control: Any,
+    stream: ArmStream,
+    stops: Iterable[np.ndarray],
+    limits: DriveLimits,
+    stop_requested: threading.Event,
 ) -> None:
-    """Take the arm to each of ``stops`` in turn until ``asked``, and bring it to rest whatever happens.
+    """Move the arm to each of ``stops`` in turn until ``stop_requested``; always bring it to rest at the end.
     Raises ArmError."""
     try:
-        if not control.setWatchdog(1.0 / pace.patience_s):
-            raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_why(stream)}")
+        if not control.setWatchdog(1.0 / limits.patience_s):
+            raise ArmError(f"arm at {stream.host}: it takes no watchdog: {_reason(stream)}")
         for joints in stops:
-            if asked.is_set():
+            if stop_requested.is_set():
                 return
-            if not control.moveJ(joints.tolist(), pace.speed_rad_s, pace.acceleration_rad_s2, True):
-                raise ArmError(f"arm at {stream.host}: it refuses to move: {_why(stream)}")
-            if not _arrive(stream, control, joints, asked, pace.patience_s):
+            if not control.moveJ(joints.tolist(), limits.speed_rad_s, limits.acceleration_rad_s2, True):
+                raise ArmError(f"arm at {stream.host}: it refuses to move: {_reason(stream)}")
+            if not _wait_until_arrived(stream, control, joints, stop_requested, limits.patience_s):
                 return
     finally:
-        within_reason(lambda: _stop(control))
+        stop_within_timeout(lambda: _stop_arm(control))
 
 
-def _why(stream: ArmStream) -> str:
+def _reason(stream: ArmStream) -> str:
     return stream.trouble or "see the pendant"
 
 
-def _stop(control: Any) -> None:
+def _stop_arm(control: Any) -> None:
     control.stopJ(_STOP_RAD_S2)
     control.stopScript()
 
 
-def within_reason(ask: Callable[[], None]) -> None:
-    """Ask an arm to come to rest, as far as it still listens: the library waits for answers without end."""
+def stop_within_timeout(ask: Callable[[], None]) -> None:
+    """Call ``ask`` to stop an arm, but give up after ``STOPPING_S``: the library waits without a timeout."""
     # The default action ends this process even if the library holds Python's lock.
     signal.setitimer(signal.ITIMER_REAL, 2 * STOPPING_S)
     asking = threading.Thread(target=ask, daemon=True)
@@ -209,15 +219,15 @@ def within_reason(ask: Callable[[], None]) -> None:
     signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def _arrive(
-    stream: ArmStream, control: Any, goal: np.ndarray, asked: threading.Event, patience_s: float
+def _wait_until_arrived(
+    stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event, patience_s: float
 ) -> bool:
-    """Wait until the joints are there; False if asked to stop. Raises ArmError for one that says nothing,
-    stands still on the way, or whose program has ended."""
+    """Wait until the joints reach ``goal``; False if asked to stop. Raises ArmError if the arm is silent,
+    stalls on the way, or whose program has ended."""
     clock = WallClock()
-    still_ns = round(max(_STILL_S, patience_s) * 1e9)
+    still_ns = round(max(_STALLED_S, patience_s) * 1e9)
     at, since_ns = np.full(6, np.inf), 0
-    while not asked.wait(_POLL_S):
+    while not stop_requested.wait(_POLL_S):
         now_ns = clock.now_ns()
         try:
             joints, _ = stream.at(now_ns)
@@ -234,7 +244,7 @@ def _arrive(
                 f"arm at {stream.host}: its program was ended {where}: at the pendant, by a fault, or by "
                 "leaving remote control"
             )
-        if np.abs(joints - at).max() > _STILL_RAD:
+        if np.abs(joints - at).max() > _STALLED_RAD:
             at, since_ns = joints, now_ns
         elif now_ns - since_ns > still_ns:
             raise ArmError(

@@ -45,10 +45,10 @@ class HandEye:
         """Poses of the camera in the base's axes, given those of the hand."""
         if self.setup == EYE_TO_HAND:
             return FixedPose(Pose.from_matrix(self.transform))
-        return Mounted(hand, self)
+        return MountedCameraPoses(hand, self)
 
 
-class Mounted:
+class MountedCameraPoses:
     """Eye-in-hand: T_W^C(t) = T_W^EE(t) T_EE^C (4.7), with t on the arm's clock."""
 
     def __init__(self, hand: PoseProvider, calibration: HandEye) -> None:

@@ -41,11 +41,11 @@ RTDE_PORT = 30004
 PROBE_S = 2.0
 STALE_S = 0.5
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
-_MODES = {
+_ROBOT_MODES = {
     -1: "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "powered off",
     4: "powered on, brakes engaged", 5: "idle: brakes engaged", 6: "backdrive", 7: "running",
 }  # fmt: skip
-_SAFETY = {
+_SAFETY_MODES = {
     1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop",
     6: "system emergency stop", 7: "robot emergency stop", 8: "safety violation", 9: "safety fault",
 }  # fmt: skip
@@ -107,10 +107,10 @@ class ArmStream:
         interpolate: bool = True,
         max_gap_ms: float = 20.0,
         stale_s: float = STALE_S,
-        each: Callable[[int, Joints], None] | None = None,
+        on_sample: Callable[[int, Joints], None] | None = None,
     ) -> None:
         self.host = host
-        self._stale_s, self._each = stale_s, each
+        self._stale_s, self._on_sample = stale_s, on_sample
         self.trouble = "not connected yet"
         self.connections = 0
         self._clock = clock
@@ -119,10 +119,10 @@ class ArmStream:
         self._samples = SampleBuffer[Joints](
             interpolate_joints if interpolate else None, round(max_gap_ms * 1e6)
         )
-        self._arrived = threading.Event()
+        self._first_sample = threading.Event()
         self._stop = threading.Event()
         self._child: subprocess.Popen[bytes] | None = None
-        self._thread = threading.Thread(target=self._main, name=f"arm {host}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"arm {host}", daemon=True)
 
     def start(self) -> None:
         """Connect, and return when the first sample is here. Raises ArmError, within three seconds where
@@ -132,7 +132,7 @@ class ArmStream:
         probe(self.host)
         atexit.register(self.stop)
         self._thread.start()
-        if not self._arrived.wait(CONNECT_S):
+        if not self._first_sample.wait(CONNECT_S):
             trouble = self.trouble
             self.stop()
             raise ArmError(f"arm at {self.host}: connected, but no joint states come: {trouble}")
@@ -169,7 +169,7 @@ class ArmStream:
             "refused": counts.refused,
         }
 
-    def _main(self) -> None:
+    def _run(self) -> None:
         failures = 0
         while not self._stop.is_set():
             try:
@@ -178,13 +178,13 @@ class ArmStream:
                 if self._read():
                     failures = 0
             except ArmError as error:
-                self._say(str(error))
+                self._set_trouble(str(error))
             pause_s = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
             failures += 1
             self._stop.wait(pause_s)
 
     def _read(self) -> bool:
-        """One connection, from start to end; whether it brought anything."""
+        """One connection, from start to end; whether it received anything."""
         command = [
             sys.executable,
             "-m",
@@ -195,51 +195,51 @@ class ArmStream:
         child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         self._child = child
         assert child.stdout is not None and child.stderr is not None
-        brought, patience_s = False, CONNECT_S
-        clock, last_s, waiting = ArrivalClock(), -1.0, b""
+        received, patience_s = False, CONNECT_S
+        clock, last_s, pending = ArrivalClock(), -1.0, b""
         try:
             while not self._stop.is_set():
                 if not select.select([child.stdout], [], [], patience_s)[0]:
-                    self._say(f"arm at {self.host}: its state has stood still for {patience_s:g} s")
-                    return brought
+                    self._set_trouble(f"arm at {self.host}: its state has stood still for {patience_s:g} s")
+                    return received
                 data = os.read(child.stdout.fileno(), 65536)
                 arrived_ns = self._clock.now_ns()
                 if not data:
                     said = child.stderr.read().decode(errors="replace").strip().split("\n")[-1]
-                    self._say(said or f"arm at {self.host}: the connection was lost")
-                    return brought
-                waiting += data
-                whole = len(waiting) - len(waiting) % SAMPLE.size
-                for stamp_s, *joints, mode, safety in SAMPLE.iter_unpack(waiting[:whole]):
+                    self._set_trouble(said or f"arm at {self.host}: the connection was lost")
+                    return received
+                pending += data
+                whole = len(pending) - len(pending) % SAMPLE.size
+                for stamp_s, *joints, mode, safety in SAMPLE.iter_unpack(pending[:whole]):
                     if stamp_s < last_s:
                         clock = ArrivalClock()  # the controller was started anew
                     last_s = stamp_s
                     t_ns, angles = clock.host_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints)
                     self._samples.add(t_ns, angles)
-                    if self._each is not None:
-                        self._each(t_ns, angles)
-                    self._judge(mode, safety)
-                if whole and not brought:
-                    brought, patience_s = True, self._stale_s
+                    if self._on_sample is not None:
+                        self._on_sample(t_ns, angles)
+                    self._check_modes(mode, safety)
+                if whole and not received:
+                    received, patience_s = True, self._stale_s
                     self.connections += 1
-                    self._arrived.set()
-                waiting = waiting[whole:]
-            return brought
+                    self._first_sample.set()
+                pending = pending[whole:]
+            return received
         finally:
             self._end_child()
             child.stdout.close()
             child.stderr.close()
 
-    def _judge(self, mode: int, safety: int) -> None:
+    def _check_modes(self, mode: int, safety: int) -> None:
         """Joint angles stay true in every mode; that nothing will move is worth a word."""
         wrong = []
         if mode != 7:
-            wrong.append(f"robot mode: {_MODES.get(mode, mode)}")
+            wrong.append(f"robot mode: {_ROBOT_MODES.get(mode, mode)}")
         if safety not in (1, 2):
-            wrong.append(f"safety: {_SAFETY.get(safety, safety)}")
-        self._say(f"arm at {self.host}: {', '.join(wrong)}" if wrong else "")
+            wrong.append(f"safety: {_SAFETY_MODES.get(safety, safety)}")
+        self._set_trouble(f"arm at {self.host}: {', '.join(wrong)}" if wrong else "")
 
-    def _say(self, trouble: str) -> None:
+    def _set_trouble(self, trouble: str) -> None:
         if trouble != self.trouble and not self._stop.is_set():
             if trouble:
                 log.warning("%s", trouble)

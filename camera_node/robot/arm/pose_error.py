@@ -27,8 +27,8 @@ import numpy as np
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix
 from camera_node.robot.arm.joint_states import ArmStream, HandPoses
-from camera_node.robot.hand_camera import Truth
-from camera_node.robot.simulated_controller.command import arm_of
+from camera_node.robot.hand_camera import TruthClient
+from camera_node.robot.simulated_controller.command import require_arm
 from freshfield.clock import WallClock
 from freshfield.geometry import so3_log
 from freshfield.scenario import load
@@ -37,16 +37,16 @@ RATES_HZ = (500.0, 125.0, 20.0)
 PAIRINGS = ("nearest", "interpolated")
 GAPS_MS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 SPEEDS_M_PER_S = (0.01, 0.05, 0.1, 0.2, 0.4, 1.6)
-LEAST_INSTANTS = 5  # of a median that is shown
-_LATER_S = 0.1  # by when the sample after an instant has come even at the lowest rate
+MIN_INSTANTS = 5  # of a median that is shown
+_SETTLE_S = 0.1  # by when the sample after an instant has come even at the lowest rate
 _SPEED_OVER_NS = 5_000_000
-_EACH_S, _INSTANTS = 0.2, 6  # so many instants are looked at together
+_WINDOW_S, _INSTANTS = 0.2, 6  # so many instants are looked at together
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Error:
+class PoseError:
     """One pose that joint states of one stream gave at one instant, held against the truth. gap_ms: to the
     nearest joint state. speed_m_per_s: of the hand, then."""
 
@@ -58,11 +58,16 @@ class Error:
     deg: float
 
 
-def measure(scenario: str, seconds: float, seed: int = 0) -> list[Error]:
+def measure(scenario: str, seconds: float, seed: int = 0) -> list[PoseError]:
     """Of every instant and stream. Raises ScenarioError, ArmError, PoseGapError."""
     plan = load(scenario)
-    config = arm_of(plan)
-    model, base, clock, truth = arm_model(plan, config), base_matrix(config), WallClock(), Truth(config.host)
+    config = require_arm(plan)
+    model, base, clock, truth = (
+        arm_model(plan, config),
+        base_matrix(config),
+        WallClock(),
+        TruthClient(config.host),
+    )
     streams = {
         (pairing, rate): ArmStream(config.host, clock, rate, pairing == "interpolated", max_gap_ms=200.0)
         for rate in RATES_HZ
@@ -76,8 +81,8 @@ def measure(scenario: str, seconds: float, seed: int = 0) -> list[Error]:
         until = time.monotonic() + seconds
         while time.monotonic() < until:
             begin_ns = clock.now_ns()
-            time.sleep(_EACH_S + _LATER_S)
-            for after_ns in np.sort(rng.uniform(0.0, _EACH_S * 1e9, _INSTANTS)):
+            time.sleep(_WINDOW_S + _SETTLE_S)
+            for after_ns in np.sort(rng.uniform(0.0, _WINDOW_S * 1e9, _INSTANTS)):
                 t_ns = begin_ns + int(after_ns)
                 true = base @ model.forward(truth.joints(t_ns))
                 before = base @ model.forward(truth.joints(t_ns - _SPEED_OVER_NS))
@@ -92,7 +97,7 @@ def measure(scenario: str, seconds: float, seed: int = 0) -> list[Error]:
                     turned_rad = float(np.linalg.norm(so3_log(true[:3, :3].T @ pose[:3, :3])))
                     gap_ms = claimed.gap_ns / 1e6
                     errors.append(
-                        Error(pairing, rate, gap_ms, speed, apart_mm, float(np.rad2deg(turned_rad)))
+                        PoseError(pairing, rate, gap_ms, speed, apart_mm, float(np.rad2deg(turned_rad)))
                     )
     finally:
         for stream in streams.values():
@@ -100,17 +105,17 @@ def measure(scenario: str, seconds: float, seed: int = 0) -> list[Error]:
     return errors
 
 
-def by_rate(errors: Sequence[Error]) -> list[Row]:
+def by_rate(errors: Sequence[PoseError]) -> list[Row]:
     """Errors by rate of joint states and pairing, at all speeds: median and 95th percentile."""
     rows = []
     for rate, pairing in itertools.product(RATES_HZ, PAIRINGS):
         chosen = [e for e in errors if e.rate_hz == rate and e.pairing == pairing]
         if chosen:
-            rows.append({"pairing": pairing, "rate_hz": rate, **_figures(chosen)})
+            rows.append({"pairing": pairing, "rate_hz": rate, **_statistics(chosen)})
     return rows
 
 
-def by_gap_and_speed(errors: Sequence[Error]) -> list[Row]:
+def by_gap_and_speed(errors: Sequence[PoseError]) -> list[Row]:
     """Errors by pairing, gap and speed, of all rates together; cells of fewer than five instants are left
     out."""
     rows = []
@@ -121,18 +126,18 @@ def by_gap_and_speed(errors: Sequence[Error]) -> list[Row]:
             for e in errors
             if e.pairing == pairing and gap[0] <= e.gap_ms < gap[1] and speed[0] <= e.speed_m_per_s < speed[1]
         ]
-        if len(chosen) >= LEAST_INSTANTS:
+        if len(chosen) >= MIN_INSTANTS:
             rows.append({
                 "pairing": pairing, "gap_ms_from": gap[0], "gap_ms_to": gap[1],
                 "m_per_s_from": speed[0], "m_per_s_to": speed[1],
                 "gap_ms": float(np.median([e.gap_ms for e in chosen])),
                 "m_per_s": float(np.median([e.speed_m_per_s for e in chosen])),
-                **_figures(chosen),
+                **_statistics(chosen),
             })  # fmt: skip
     return rows
 
 
-def _figures(errors: Sequence[Error]) -> dict[str, float]:
+def _statistics(errors: Sequence[PoseError]) -> dict[str, float]:
     mm, deg = [e.mm for e in errors], [e.deg for e in errors]
     return {
         "instants": float(len(errors)),
@@ -141,7 +146,7 @@ def _figures(errors: Sequence[Error]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def show_rates(rows: Sequence[Row]) -> str:
+def format_rates(rows: Sequence[Row]) -> str:
     """``by_rate`` as text."""
     lines = [f"{'':26} {'mm: median':>11} {'p95':>7} {'degrees: median':>16} {'p95':>7}"]
     lines += [
@@ -152,7 +157,7 @@ def show_rates(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def show_gaps(rows: Sequence[Row]) -> str:
+def format_gaps(rows: Sequence[Row]) -> str:
     """``by_gap_and_speed`` as text: medians in mm, a line a gap, a column a speed, nearest / interpolated."""
     cell = {(r["pairing"], r["gap_ms_from"], r["m_per_s_from"]): f"{r['median_mm']:.3f}" for r in rows}
     ranges = [f"{a:g} to {b:g} m/s" for a, b in itertools.pairwise(SPEEDS_M_PER_S)]
@@ -175,10 +180,10 @@ def write(rates: Sequence[Row], gaps: Sequence[Row], folder: Path) -> None:
             table.writeheader()
             table.writerows(rows)
     if gaps:
-        _draw(gaps, folder / "gaps.png")
+        _plot(gaps, folder / "gaps.png")
 
 
-def _draw(rows: Sequence[Row], path: Path) -> None:
+def _plot(rows: Sequence[Row], path: Path) -> None:
     try:
         import matplotlib
     except ImportError:
@@ -228,7 +233,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(
         f"the flange moves at {speed['median_m_per_s']:.3f} m/s (median), {speed['most_m_per_s']:.3f} at most"
     )
-    print(f"{show_rates(rates)}\n\n{show_gaps(gaps)}")
+    print(f"{format_rates(rates)}\n\n{format_gaps(gaps)}")
     return 0
 
 

@@ -1,5 +1,5 @@
-"""Ways of an arm from posture to posture that touch nothing: straight in joint space where that is free, else
-by way of others, the shortest there is (Dijkstra on a roadmap whose nodes are postures of use anyway).
+"""Collision-free paths between postures of an arm: straight in joint space where that is free, else the
+shortest path through other postures (Dijkstra on a roadmap whose nodes are the tour's own postures).
 
 It knows the arm (with a camera of usual size on its flange), one floor and no other obstacle.
 """
@@ -13,50 +13,51 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.robot.arm.capsules import Shape, links
+from camera_node.robot.arm.capsules import CapsuleModel, link_frames
 from camera_node.robot.arm.kinematics import ArmModel
 
 Array = NDArray[np.float64]
 
-_LOOKS = 24  # postures that are looked at on the way between two
+_CHECKED_POSTURES = 24  # postures tested between two
 _TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and what holds it
 _MARGIN_M = 0.01  # between parts of the arm, whose capsules are rounded up
-FARTHEST_RAD = 2.0  # that a joint turns in one go: beyond, the arm would be flung into another posture
-_SAME_RAD = 1e-6
+FARTHEST_RAD = 2.0  # of one move and joint: beyond, the arm would be flung into another posture
+_EQUAL_RAD = 1e-6
 
 
 class Roadmap:
     """Postures (P, 6) of an arm, each with the number of the place that it takes the hand to. base:
-    world-from-base (4, 4). floor_m: see ``clear``. What is free is remembered: asking again costs little."""
+    world-from-base (4, 4). floor_m: see ``is_free``. Results of ``is_free`` are
+    cached."""
 
     def __init__(
         self, arm: ArmModel, base: Array, postures: Sequence[Array], places: Sequence[int], floor_m: float
     ) -> None:
         self._arm, self._base, self._floor_m = arm, base, floor_m
         every = np.reshape(np.array(postures), (-1, 6))
-        free = clear(arm, base, every, every, floor_m)
+        free = is_free(arm, base, every, every, floor_m)
         self._postures, self._places = every[free], np.array(places, dtype=np.int64)[free]
         self._low, self._high = np.array(arm.lower_rad), np.array(arm.upper_rad)
         self._free: dict[tuple[bytes, bytes], bool] = {}
         self._known: set[bytes] = set()
 
-    def way(self, start: Array, wanted: Collection[int]) -> list[tuple[Array, int]] | None:
+    def shortest_path(self, start: Array, wanted: Collection[int]) -> list[tuple[Array, int]] | None:
         """Postures (6,) to take in turn from ``start`` to the nearest of the places ``wanted``, with their
         places; None if there is no way. Its length is what the fastest joint turns: the time it takes."""
-        order = itertools.count()  # of equally long ones the first
+        order = itertools.count()  # breaks ties: the first of equally long paths
         ends: list[tuple[float, int, Array, int, tuple[bytes, ...]]] = [(0.0, next(order), start, -1, ())]
         found: dict[bytes, tuple[Array, int]] = {}
         while ends:
             length, _, at, place, way = heapq.heappop(ends)
             key = _key(at)
-            # Whether the last step is free is asked now: of most that could be made nobody wants to know.
+            # Tested lazily: most steps are never needed.
             if key in found or (way and not self._is_free(found[way[-1]][0], at)):
                 continue
             found[key] = at, place
             self._known.add(key)
             if place in wanted:
                 return [found[each] for each in (*way[1:], key)]
-            near = self._near(at)
+            near = self._unwrap_near(at)
             steps = np.abs(near - at).max(axis=1, initial=0.0)
             inside = np.all((near >= self._low) & (near <= self._high), axis=1)
             for k in np.flatnonzero((steps <= FARTHEST_RAD) & inside):
@@ -66,39 +67,39 @@ class Roadmap:
 
     @property
     def reachable(self) -> int:
-        """How many places have a posture that is free."""
+        """Number of places with a free posture."""
         return len(set(self._places.tolist()))
 
-    def knows(self, joints: Array) -> bool:
-        """Whether a search has come to this posture."""
+    def has_visited(self, joints: Array) -> bool:
+        """Whether a search has reached this posture."""
         return _key(joints) in self._known
 
-    def _near(self, at: Array) -> Array:
-        """The postures, by whole turns as near to ``at`` as can be: otherwise they are too far for one go."""
+    def _unwrap_near(self, at: Array) -> Array:
+        """The postures, shifted by full turns towards ``at``: otherwise they are too far for one move."""
         turn = 2.0 * np.pi
         return self._postures + turn * np.round((at - self._postures) / turn)
 
     def _is_free(self, a: Array, b: Array) -> bool:
         ends = _key(a), _key(b)
         if ends not in self._free:
-            free = bool(clear(self._arm, self._base, a, b, self._floor_m)[0])
+            free = bool(is_free(self._arm, self._base, a, b, self._floor_m)[0])
             self._free[ends] = self._free[ends[::-1]] = free
         return self._free[ends]
 
 
-def clear(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> NDArray[np.bool_]:
-    """Whether on the straight ways from ``a`` to ``b``, (6,) or (N, 6), no part of the arm comes near
-    another, and the middle of no joint beyond the shoulder below ``floor_m`` in the world: (N,)."""
+def is_free(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> NDArray[np.bool_]:
+    """Whether the straight paths from ``a`` to ``b``, (6,) or (N, 6), are free (N,): the arm's parts keep
+    their distance, and every joint's center beyond the shoulder stays above ``floor_m`` in the world."""
     a, b = np.broadcast_arrays(np.atleast_2d(a), np.atleast_2d(b))
     if not len(b):
         return np.zeros(0, np.bool_)
-    share = np.linspace(0.0, 1.0, _LOOKS)[:, None, None]
-    frames = links(arm.body, (a + share * (b - a)).reshape(-1, 6))
+    share = np.linspace(0.0, 1.0, _CHECKED_POSTURES)[:, None, None]
+    frames = link_frames(arm.nominal_model, (a + share * (b - a)).reshape(-1, 6))
     lowest_m = (base @ frames)[:, 2:, 2, 3].min(axis=1)
-    apart_m = Shape(arm, _TOOL_M, _TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
+    apart_m = CapsuleModel(arm, _TOOL_M, _TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
     free = (lowest_m >= floor_m) & (apart_m >= _MARGIN_M)
-    return np.asarray(free.reshape(_LOOKS, -1).all(axis=0))
+    return np.asarray(free.reshape(_CHECKED_POSTURES, -1).all(axis=0))
 
 
 def _key(joints: Array) -> bytes:
-    return np.round(joints / _SAME_RAD).astype(np.int64).tobytes()
+    return np.round(joints / _EQUAL_RAD).astype(np.int64).tobytes()

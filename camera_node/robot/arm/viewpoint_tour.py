@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera_node.config import PathConfig
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.roadmap import Roadmap, clear
+from camera_node.robot.arm.roadmap import Roadmap, is_free
 from freshfield.geometry import look_at, se3_inverse
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ def _places(path: PathConfig) -> list[tuple[float, float]]:
     return [(e, float(a)) for k, a in enumerate(azimuths) for e in (down if k % 2 == 0 else down[::-1])]
 
 
-def _rolled(angle_deg: float) -> Array:
+def _roll(angle_deg: float) -> Array:
     """(4, 4): a turn about the camera's own line of sight."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     turn = np.eye(4)
@@ -76,7 +76,7 @@ class Tour:
         return [rings.count(elevation_deg) for elevation_deg in path.elevations_deg]
 
 
-def tour(
+def plan_tour(
     arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, start: ArrayLike | None = None
 ) -> Tour:
     """Through the viewpoints that the arm can visit: of those that are left always to the nearest, if need be
@@ -88,7 +88,7 @@ def tour(
     """
     camera_to_flange, base_inverse = se3_inverse(hand_eye), se3_inverse(base)
     goals = [
-        [base_inverse @ pose @ _rolled(turn) @ camera_to_flange for turn in path.rolls_deg]
+        [base_inverse @ pose @ _roll(turn) @ camera_to_flange for turn in path.rolls_deg]
         for pose in viewpoints(path)
     ]
     begin = None if start is None else np.asarray(start, dtype=np.float64)
@@ -108,10 +108,10 @@ def tour(
         # that an earlier search has come to from there.
         if best.reached == roadmap.reachable:
             break
-        if roadmap.knows(joints):
+        if roadmap.has_visited(joints):
             continue
-        if clear(arm, base, joints if begin is None else begin, joints, path.floor_m).all():
-            best = max(best, _follow(roadmap, len(goals), joints, k), key=lambda each: each.reached)
+        if is_free(arm, base, joints if begin is None else begin, joints, path.floor_m).all():
+            best = max(best, _extend_tour(roadmap, len(goals), joints, k), key=lambda each: each.reached)
     if best.reached < 3:
         raise PathError(
             f"the arm reaches {best.reached} of {len(goals)} viewpoints: change radius_m, elevations_deg, "
@@ -120,11 +120,11 @@ def tour(
     return best
 
 
-def _follow(roadmap: Roadmap, count: int, first: Array, place: int) -> Tour:
+def _extend_tour(roadmap: Roadmap, count: int, first: Array, place: int) -> Tour:
     """The tour of ``count`` viewpoints that begins with the posture ``first`` at ``place``."""
     stops, places = [first], [place]
     left = set(range(count)) - {place}
-    while left and (way := roadmap.way(stops[-1], left)) is not None:
+    while left and (way := roadmap.shortest_path(stops[-1], left)) is not None:
         for joints, where in way:
             stops.append(joints)
             places.append(where)

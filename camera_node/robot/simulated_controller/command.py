@@ -12,7 +12,7 @@ import numpy as np
 
 from camera_node.config import ArmConfig, source_config
 from camera_node.robot.arm.camera_poses import arm_model
-from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, calibrated
+from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, apply_calibration
 from camera_node.robot.simulated_controller.controller import HOME_RAD, Controller
 from camera_node.robot.simulated_controller.server import ControllerServer
 from freshfield.clock import WallClock
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def arm_of(scenario: Scenario) -> ArmConfig:
+def require_arm(scenario: Scenario) -> ArmConfig:
     """The arm of a scenario that has one. Raises ScenarioError."""
     arm = getattr(source_config(scenario), "arm", None)
     if arm is None:
@@ -73,11 +73,11 @@ def read_joints(text: str) -> np.ndarray:
 def _which(args: argparse.Namespace) -> tuple[str, ArmModel]:
     if args.scenario is not None:
         scenario = load(args.scenario)
-        config = arm_of(scenario)
+        config = require_arm(scenario)
         return args.host or config.host, arm_model(scenario, config)
     model = MODELS[args.robot]
     try:
-        model = model if args.calibration is None else calibrated(model, args.calibration)
+        model = model if args.calibration is None else apply_calibration(model, args.calibration)
     except KinematicsError as error:
         raise ScenarioError(f"--calibration: {error}") from None
     return args.host or "127.0.0.2", model

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.simulated_controller.joint_motion import STEP_S, Motion
+from camera_node.robot.simulated_controller.joint_motion import STEP_S, JointMotion
 from freshfield.geometry import so3_log
 
 log = logging.getLogger("camera-node.arm")
@@ -53,7 +53,7 @@ class Controller:
         seed: int = 0,
     ) -> None:
         self.arm = arm
-        self.motion = Motion(arm, joints)
+        self.motion = JointMotion(arm, joints)
         self.inputs: dict[str, Any] = {}
         self.output_int = [0] * 48
         self.output_double = [0.0] * 48
@@ -66,7 +66,7 @@ class Controller:
         self._rng = np.random.default_rng(seed)
         self._busy = False
         self._watchdog_steps: int | None = None
-        self._fed_at = 0
+        self._watchdog_reset_step = 0
         self._history = np.tile(self.motion.q, (_HISTORY_STEPS, 1))
 
     def advance_to(self, now_ns: int, on_step: Callable[[], None] | None = None) -> None:
@@ -82,7 +82,10 @@ class Controller:
             self._history[self.steps % _HISTORY_STEPS] = self.motion.q
             if self._busy and not self.motion.moving:
                 self._finish()
-            if self._watchdog_steps is not None and self.steps - self._fed_at > self._watchdog_steps:
+            if (
+                self._watchdog_steps is not None
+                and self.steps - self._watchdog_reset_step > self._watchdog_steps
+            ):
                 self.fault(f"its client has been silent for {self._watchdog_steps * STEP_S:g} s (watchdog)")
             if on_step is not None:
                 on_step()
@@ -133,14 +136,14 @@ class Controller:
         self.runtime_state, self._busy, self._watchdog_steps = STOPPED, False, None
         self.output_int[0] = 0
 
-    def take(self, given: dict[str, Any]) -> None:
+    def write_inputs(self, given: dict[str, Any]) -> None:
         """Input registers from a client, and what they ask for."""
         self.inputs.update(given)
         self._set_outputs(given)
         if "input_int_register_0" not in given or self.runtime_state != PLAYING:
             return
         command = int(given["input_int_register_0"])
-        self._fed_at = self.steps
+        self._watchdog_reset_step = self.steps
         if command == NO_COMMAND:
             self.output_int[0] = READY
         elif command == STOP_SCRIPT:

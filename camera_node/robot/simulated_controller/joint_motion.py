@@ -25,7 +25,7 @@ STOP_RAD_S2 = 10.0
 _SERVO_WITHOUT_COMMAND_S = 0.2
 
 
-class Motion:
+class JointMotion:
     """Joint positions (6,), velocities and accelerations in radians and seconds, stepped by ``step``."""
 
     def __init__(self, arm: ArmModel, joints: ArrayLike) -> None:
@@ -49,16 +49,16 @@ class Motion:
         return self.mode != "idle"
 
     @property
-    def still(self) -> bool:
+    def at_rest(self) -> bool:
         return not self.qd.any()
 
     def move(self, target: ArrayLike, speed_rad_s: float, acceleration_rad_s2: float) -> bool:
         """moveJ: all joints together, starting and ending at rest; an arm that is still moving comes to rest
         first. A target beyond the limits is refused (False)."""
         goal = np.array(target, dtype=np.float64)
-        if not self._allowed(goal) or not speed_rad_s > 0 or not acceleration_rad_s2 > 0:
+        if not self._within_limits(goal) or not speed_rad_s > 0 or not acceleration_rad_s2 > 0:
             return False
-        if not self.still:
+        if not self.at_rest:
             self.stop()
             self._next = (goal, speed_rad_s, acceleration_rad_s2)
             return True
@@ -81,7 +81,7 @@ class Motion:
         """servoJ: go after ``target``, which is replaced as often as the client likes; within the limits of
         speed and acceleration, so that a jump of the target is no jump of the arm."""
         goal = np.array(target, dtype=np.float64)
-        if not self._allowed(goal):
+        if not self._within_limits(goal):
             return False
         self.target, self.mode, self._elapsed_s, self._next = goal, "servo", 0.0, None
         return True
@@ -100,7 +100,7 @@ class Motion:
         """Come to rest as fast as this allows."""
         rate = deceleration_rad_s2 if deceleration_rad_s2 > 0 else STOP_RAD_S2
         self._deceleration = min(rate, MAX_ACCELERATION_RAD_S2)
-        self.mode = "stop" if not self.still else "idle"
+        self.mode = "stop" if not self.at_rest else "idle"
         self._next = None
 
     def step(self) -> None:
@@ -111,11 +111,11 @@ class Motion:
         if self.mode == "move":
             self._follow_ramp()
         else:
-            wanted, acceleration = self._wanted()
+            wanted, acceleration = self._target_velocity()
             change = np.clip(wanted - self.qd, -acceleration * STEP_S, acceleration * STEP_S)
             self.qd = np.clip(self.qd + change, -self._speed, self._speed)
             self.q = self.q + self.qd * STEP_S
-            if self.mode == "stop" and self.still:
+            if self.mode == "stop" and self.at_rest:
                 self.mode = "idle"
                 if self._next is not None:
                     self.move(*self._next)
@@ -131,23 +131,23 @@ class Motion:
         if s >= 1.0:
             self.q, self.qd, self.mode = self.target.copy(), np.zeros(6), "idle"
 
-    def _wanted(self) -> tuple[Array, float]:
+    def _target_velocity(self) -> tuple[Array, float]:
         """Joint speeds to aim for, and the acceleration that may be used."""
         if self.mode == "stop":
             return np.zeros(6), self._deceleration
         if self.mode == "speed":
             room = np.where(self._velocity > 0, self._high - self.q, self.q - self._low)
-            most = _stoppable(np.maximum(room, 0.0), self._deceleration)
+            most = _max_stoppable_speed(np.maximum(room, 0.0), self._deceleration)
             return np.clip(self._velocity, -most, most), self._deceleration
         self._elapsed_s += STEP_S
         if self._elapsed_s > _SERVO_WITHOUT_COMMAND_S:  # the client has gone quiet
             self.stop()
             return np.zeros(6), self._deceleration
         left = self.target - self.q
-        most = _stoppable(np.abs(left), MAX_ACCELERATION_RAD_S2)
+        most = _max_stoppable_speed(np.abs(left), MAX_ACCELERATION_RAD_S2)
         return np.sign(left) * np.minimum(most, self._speed), MAX_ACCELERATION_RAD_S2
 
-    def _allowed(self, goal: Array) -> bool:
+    def _within_limits(self, goal: Array) -> bool:
         return bool(
             goal.shape == (6,)
             and np.isfinite(goal).all()
@@ -156,7 +156,7 @@ class Motion:
         )
 
 
-def _stoppable(room: Array, deceleration: float) -> Array:
+def _max_stoppable_speed(room: Array, deceleration: float) -> Array:
     """The fastest from which a joint can still come to rest within ``room``, a step's way in hand."""
     lag = 0.5 * deceleration * STEP_S
     fastest: Array = np.minimum(np.sqrt(lag * lag + 2.0 * deceleration * room) - lag, room / STEP_S)

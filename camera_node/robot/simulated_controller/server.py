@@ -85,7 +85,7 @@ class ControllerServer:
         while True:
             self.controller.advance_to(self.clock.now_ns(), self._publish)
             # Nobody looks oftener than the fastest listener: steps between are made up for at once.
-            fastest = min((client.every for client in self.clients), default=_IDLE_STEPS)
+            fastest = min((client.every_steps for client in self.clients), default=_IDLE_STEPS)
             await asyncio.sleep(STEP_S * min(fastest, _IDLE_STEPS))
 
     def _publish(self) -> None:
@@ -129,27 +129,29 @@ class ControllerServer:
                     continue
                 if given:
                     self.controller.advance_to(self.clock.now_ns(), self._publish)
-                    self.controller.take(given)
+                    self.controller.write_inputs(given)
         finally:
             self.clients.discard(client)
 
     async def _serve_dashboard(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"Connected: Universal Robots Dashboard Server\n")
         while line := await reader.readline():
-            asked = line.decode(errors="replace").strip()
-            if asked == "quit":
+            request = line.decode(errors="replace").strip()
+            if request == "quit":
                 break
-            writer.write(f"{self._answer(asked)}\n".encode())
+            writer.write(f"{self._answer(request)}\n".encode())
 
-    def _answer(self, asked: str) -> str:
-        if asked == "stop":
+    def _answer(self, request: str) -> str:
+        if request == "stop":
             self.controller.stop_program()
             return "Stopped"
-        if asked in ("running", "programState"):
+        if request in ("running", "programState"):
             playing = self.controller.runtime_state == 2
             state = "PLAYING" if playing else "STOPPED"
-            return f"Program running: {str(playing).lower()}" if asked == "running" else f"{state} simulated"
-        return _DASHBOARD.get(asked.lower(), f"could not understand: '{asked}'")
+            return (
+                f"Program running: {str(playing).lower()}" if request == "running" else f"{state} simulated"
+            )
+        return _DASHBOARD.get(request.lower(), f"could not understand: '{request}'")
 
     async def _serve_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         # What the program says is not interpreted: a client's is known to listen to the registers.
@@ -170,12 +172,12 @@ class _Client:
     def __init__(self, writer: asyncio.StreamWriter) -> None:
         self._writer = writer
         self._output: rtde.Recipe | None = None
-        self.every = 1
+        self.every_steps = 1
         self._inputs: dict[int, rtde.Recipe] = {}
         self._started = False
 
     def due(self, step: int) -> bool:
-        return self._started and self._output is not None and step % self.every == 0
+        return self._started and self._output is not None and step % self.every_steps == 0
 
     def send(self, values: dict) -> None:
         assert self._output is not None
@@ -194,7 +196,7 @@ class _Client:
             recipe = rtde.Recipe.of(1, _names(payload[8:]))
             if recipe.valid:
                 self._output = recipe
-                self.every = max(1, round(1.0 / (STEP_S * max(frequency_hz, 1.0))))
+                self.every_steps = max(1, round(1.0 / (STEP_S * max(frequency_hz, 1.0))))
             self._reply(kind, bytes([1 if recipe.valid else 0]) + ",".join(recipe.types).encode())
         elif kind == rtde.SETUP_INPUTS:
             recipe = rtde.Recipe.of(len(self._inputs) + 1, _names(payload))

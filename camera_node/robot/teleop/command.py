@@ -1,4 +1,4 @@
-"""``camera-node teleop``: an operator moves the arm of a scenario, or a trajectory file in its place."""
+"""``camera-node teleop``: an operator moves the arm of a scenario, or writes a trajectory file instead."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import argparse
 import json
 import logging
 import os
-import signal
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -17,14 +15,14 @@ import numpy as np
 from camera_node.config import ArmConfig
 from camera_node.robot import stdout
 from camera_node.robot.arm.camera_poses import arm_model
-from camera_node.robot.arm.drive import agreed
-from camera_node.robot.arm.joint_states import STALE_S, ArmError, ArmStream
+from camera_node.robot.arm.drive import confirm_motion, patience_s, stop_event
+from camera_node.robot.arm.joint_states import ArmError, ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.simulated_controller.command import arm_of
+from camera_node.robot.simulated_controller.command import require_arm
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
-from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile, standing
+from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile, current_joints
 from camera_node.robot.teleop.stylus import Stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
 from freshfield.clock import Clock, WallClock
@@ -33,8 +31,6 @@ from freshfield.scenario import Scenario, load, read_section
 log = logging.getLogger("camera-node.teleop")
 
 _SHOW_S = 0.5
-# Where nothing can be hit, a machine too busy to simulate is no reason to stop.
-_SIMULATED_STALE_S = 10.0
 # No stop takes longer within the limits of a TeleopConfig.
 _LONGEST_STOP_S = 3.0
 
@@ -51,7 +47,7 @@ def _run(args: argparse.Namespace) -> int:
         level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
     )
     scenario = load(args.scenario)
-    arm_config = arm_of(scenario)
+    arm_config = require_arm(scenario)
     config = teleop_config(scenario, arm_config)
     model = arm_model(scenario, arm_config)
     if args.seconds is not None and not args.seconds > 0:
@@ -63,15 +59,15 @@ def _run(args: argparse.Namespace) -> int:
         joints = np.array(HOME_RAD)
         if args.dry_run is None:
             stream = _connect(arm_config, clock)
-            joints = standing(stream, clock)
+            joints = current_joints(stream, clock)
         operator = Teleoperator(model, config, joints)
         asks = stream is not None and not (args.yes or arm_config.simulated)
-        if asks and not agreed(arm_config.host, "follow the stylus"):
+        if asks and not confirm_motion(arm_config.host, "follow the stylus"):
             return 2
-        # After the question: a keyboard as a stylus takes the terminal's line mode away.
+        # After the question, because a keyboard stylus switches the terminal's line mode off.
         stylus = open_stylus(args.stylus)
         sink = _sink(args.dry_run, stream, model, clock, config)
-        status = _operate(operator, stylus, sink, clock, args.seconds, args.json)
+        status = _run_loop(operator, stylus, sink, clock, args.seconds, args.json)
     finally:
         if stylus is not None:
             stylus.close()
@@ -115,9 +111,9 @@ def open_stylus(text: str) -> Stylus:
 
 
 def _connect(config: ArmConfig, clock: Clock) -> ArmStream:
-    patience_s = _SIMULATED_STALE_S if config.simulated else STALE_S
+    stale_s = patience_s(config)
     stream = ArmStream(
-        config.host, clock, config.frequency_hz, False, max_gap_ms=1e3 * patience_s, stale_s=patience_s
+        config.host, clock, config.frequency_hz, False, max_gap_ms=1e3 * stale_s, stale_s=stale_s
     )
     stream.start()
     return stream
@@ -135,19 +131,16 @@ def _sink(
         raise TeleopError(f"--dry-run: {file}: {error.strerror}") from None
 
 
-def _operate(
+def _run_loop(
     operator: Teleoperator, stylus: Stylus, sink: Sink, clock: Clock, seconds: float | None, as_json: bool
 ) -> int:
     """Tick until asked to end, then come to rest within the limits."""
-    asked = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
-            signal.signal(number, lambda *_: asked.set())
+    stop_requested = stop_event()
     period_s = 1.0 / operator.config.rate_hz
     status, started_s = 0, time.monotonic()
     next_s, shown_s, late = started_s, started_s, 0
     try:
-        while not asked.is_set() and not stylus.ended:
+        while not stop_requested.is_set() and not stylus.ended:
             now_ns = clock.now_ns()
             command = operator.tick(now_ns, stylus.poll(now_ns))
             sink.send(operator.ticks * period_s, command)
@@ -156,13 +149,13 @@ def _operate(
                 break
             if now_s - shown_s >= _SHOW_S and sys.stderr.isatty():
                 shown_s = now_s
-                print(f"\r{_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
+                print(f"\r{_status_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
             next_s += period_s
             if next_s < now_s:
-                # Ticks that were missed are not made up for: the arm would be told to hurry.
+                # Missed ticks are not made up for: the arm would hurry.
                 next_s, late = now_s, late + 1
             else:
-                asked.wait(next_s - now_s)
+                stop_requested.wait(next_s - now_s)
     except (ArmError, OSError) as error:
         print(f"camera-node: {error}", file=sys.stderr)
         status = 1
@@ -174,7 +167,9 @@ def _operate(
     finally:
         sink.close()
     summary = {**operator.summary(), "late_ticks": late}
-    print(json.dumps(summary) if as_json else f"\n{_line(operator)}; {late} ticks late", file=sys.stdout)
+    print(
+        json.dumps(summary) if as_json else f"\n{_status_line(operator)}; {late} ticks late", file=sys.stdout
+    )
     return status
 
 
@@ -190,8 +185,7 @@ def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float, send: boo
         time.sleep(max(0.0, period_s - (time.monotonic() - begun_s)))
 
 
-def _line(operator: Teleoperator) -> str:
-    """The state in a line for people."""
+def _status_line(operator: Teleoperator) -> str:
     x, y, z = operator.arm.forward(operator.limiter.q)[:3, 3]
     counts = operator.mapping.counts
     refused = {name: n for name, n in vars(operator.limiter.refused).items() if n}

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.hand import Hand
+from camera_node.robot.teleop.pose_integrator import PoseIntegrator
 from camera_node.robot.teleop.stylus import StylusSample
 
 log = logging.getLogger("camera-node.teleop")
 
 SPEED_M_S, TURN_RAD_S = 0.15, 0.8
-_DEAD = 0.08
+_DEAD_ZONE = 0.08
 # linux/input-event-codes.h
 _EV_KEY, _EV_ABS = 1, 3
 _SOUTH, _LEFT_SHOULDER, _RIGHT_SHOULDER = 0x130, 0x136, 0x137
@@ -29,7 +29,7 @@ _TRIGGERS = (_Z, _RZ)
 
 
 @dataclass(frozen=True)
-class Span:
+class AxisRange:
     """What an axis reports at its ends, and around its middle without meaning anything."""
 
     low: int
@@ -37,15 +37,15 @@ class Span:
     flat: int = 0
 
 
-class Pad:
+class GamepadState:
     """State of a pad from its events: axes in [-1, 1] (triggers in [0, 1]) and buttons."""
 
-    def __init__(self, spans: dict[int, Span]) -> None:
+    def __init__(self, spans: dict[int, AxisRange]) -> None:
         self._spans = spans
         self._axes = dict.fromkeys((*_STICKS, *_TRIGGERS), 0.0)
         self._pressed: set[int] = set()
 
-    def take(self, kind: int, code: int, value: int) -> None:
+    def update(self, kind: int, code: int, value: int) -> None:
         """One event of the kernel's."""
         if kind == _EV_KEY:
             self._pressed.discard(code) if value == 0 else self._pressed.add(code)
@@ -56,7 +56,7 @@ class Pad:
             share = min(max((value - span.low) / (span.high - span.low), 0.0), 1.0)
             if code in _STICKS:
                 share = 2.0 * share - 1.0
-                dead = max(_DEAD, 2.0 * span.flat / (span.high - span.low))
+                dead = max(_DEAD_ZONE, 2.0 * span.flat / (span.high - span.low))
                 # From the edge of the dead zone on, so that a stick does not begin with a jerk.
                 share = np.sign(share) * max(abs(share) - dead, 0.0) / max(1.0 - dead, 1e-6)
             self._axes[code] = float(share)
@@ -78,8 +78,10 @@ class GamepadStylus:
 
     def __init__(self, path: str | None = None) -> None:
         self._device = _open(path)
-        spans = {code: Span(i.min, i.max, i.flat) for code, i in self._device.capabilities().get(_EV_ABS, [])}
-        self._pad, self._hand = Pad(spans), Hand()
+        spans = {
+            code: AxisRange(i.min, i.max, i.flat) for code, i in self._device.capabilities().get(_EV_ABS, [])
+        }
+        self._pad, self._hand = GamepadState(spans), PoseIntegrator()
         self.ended = False
         log.info("gamepad: %s (%s)", self._device.name, self._device.path)
 
@@ -87,14 +89,14 @@ class GamepadStylus:
         """See ``Stylus``; a pad that is pulled out says nothing more."""
         try:
             for event in self._device.read():
-                self._pad.take(event.type, event.code, event.value)
+                self._pad.update(event.type, event.code, event.value)
         except BlockingIOError:
             pass
         except OSError:
             log.error("gamepad: it is gone: the arm stops")
             self.ended = True
             return []
-        return [self._hand.moved(now_ns, *self._pad.speeds(), self._pad.clutch)]
+        return [self._hand.advance(now_ns, *self._pad.speeds(), self._pad.clutch)]
 
     def close(self) -> None:
         self._device.close()

@@ -1,7 +1,8 @@
-"""Joint speeds that bring the hand to a target: constraint-aware through pink, or by damped least squares.
+"""Differential inverse kinematics: joint speeds towards a target, by pink (constraint-aware) or damped least
+squares.
 
-Neither is what safety rests on: ``limits`` has the last word. What pink adds is that the arm slides along a
-wall, or past itself, where damped least squares would be stopped short of it.
+Safety rests on neither: ``limits`` checks every result. With pink the arm slides along a wall or past itself
+where damped least squares would be stopped.
 """
 
 from __future__ import annotations
@@ -13,24 +14,23 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.robot.arm.capsules import ABOVE_FLOOR, PAIRS, Shape
-from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.capsules import ABOVE_FLOOR, PAIRS, CapsuleModel
+from camera_node.robot.arm.kinematics import ArmModel, pose_difference
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
-from freshfield.geometry import so3_log
 
 log = logging.getLogger("camera-node.teleop")
 
 Array = NDArray[np.float64]
 
-# Damping turns the hand off its way, so there is none but near a singularity, where the Jacobian's least
-# singular value falls below _NEAR (Maciejewski and Klein 1988).
-_DAMPING, _NEAR = 0.05, 0.08
-# Barriers stand so far inside of the limits: what slides along them is not stopped by the limits' last word.
-_INSIDE_M = 0.003
-# The share of the way to a barrier that may be made in a second. From the speed_m_s of the defaults it takes
-# .5 m/s^2, which joints with their acceleration_rad_s2 have within the arm's reach.
-_APPROACH_PER_S = 2.0
+# Damping distorts the hand's direction, so it is applied only near a singularity, where the Jacobian's least
+# singular value falls below _DAMPING_THRESHOLD (Maciejewski and Klein 1988).
+_DAMPING, _DAMPING_THRESHOLD = 0.05, 0.08
+# Barriers lie this far inside the limits, so that an arm sliding along them is not stopped by the limits.
+_BARRIER_INSET_M = 0.003
+# Share of the distance to a barrier that may be covered in a second. At the default speed_m_s this needs
+# 0.5 m/s^2, which joints with the default acceleration_rad_s2 have within the arm's reach.
+_BARRIER_GAIN_PER_S = 2.0
 _PACKAGES = ("pink", "pinocchio", "coal", "daqp")
 
 
@@ -54,18 +54,12 @@ def make_solver(arm: ArmModel, config: TeleopConfig) -> Solver:
         raise TeleopError(
             f"solver: pink needs {', '.join(missing)}: pip install 'freshfield[teleop]', or set solver: dls"
         )
-    return Pink(arm, config)
+    return PinkSolver(arm, config)
 
 
-def twist(arm: ArmModel, q: Array, target: Array) -> Array:
-    """What is left to go (6,) in base axes: metres, then a rotation vector."""
-    now = arm.forward(q)
-    return np.concatenate([target[:3, 3] - now[:3, 3], so3_log(target[:3, :3] @ now[:3, :3].T)])
-
-
-def asked_twist(arm: ArmModel, q: Array, target: Array, config: TeleopConfig) -> Array:
+def commanded_twist(arm: ArmModel, q: Array, target: Array, config: TeleopConfig) -> Array:
     """Speed (6,) of the hand towards the target, no faster than its limit, so that its direction is kept."""
-    wanted = config.gain_per_s * twist(arm, q, target)
+    wanted = config.gain_per_s * pose_difference(arm.forward(q), target)
     fastest = float(np.linalg.norm(wanted[:3]))
     return wanted * min(1.0, config.speed_m_s / fastest) if fastest > 0.0 else wanted
 
@@ -82,15 +76,15 @@ class DampedLeastSquares:
     def speeds(self, q: Array, v: Array, target: Array) -> Array:
         """See ``Solver``."""
         del v
-        wanted = asked_twist(self._arm, q, target, self._config)
+        wanted = commanded_twist(self._arm, q, target, self._config)
         left, values, right = np.linalg.svd(self._arm.jacobian(q))
-        damping = _DAMPING * max(0.0, 1.0 - (float(values[-1]) / _NEAR) ** 2)
+        damping = _DAMPING * max(0.0, 1.0 - (float(values[-1]) / _DAMPING_THRESHOLD) ** 2)
         found: Array = right.T @ (values / (values**2 + damping**2) * (left.T @ wanted))
         fastest = float(np.abs(found).max())
         return found * min(1.0, self._config.speed_rad_s / fastest) if fastest > 0.0 else found
 
 
-class Pink:
+class PinkSolver:
     """A quadratic program each tick (pink, on pinocchio): the hand's task under limits of joints and speed,
     with barriers at the workspace's walls and between the arm's parts."""
 
@@ -113,18 +107,20 @@ class Pink:
         self._task = pink.tasks.FrameTask(
             "flange", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-3, gain=1.0
         )
-        # No limit of acceleration: together with a barrier that is already crossed by a hair it would leave
-        # no solution. ``limits`` sees to it, and the barriers' gain is one that it can follow.
+        # No acceleration limit: with a barrier that is already slightly crossed it would leave no solution.
+        # ``limits`` enforces acceleration, and the barriers' gain is low enough for it.
         self._limits = [ConfigurationLimit(self._model), VelocityLimit(self._model)]
         self._barriers = [
             PositionBarrier(
-                "flange", p_min=np.array(config.workspace_low_m) + _INSIDE_M,
-                p_max=np.array(config.workspace_high_m) - _INSIDE_M, gain=np.full(6, _APPROACH_PER_S),
+                "flange", p_min=np.array(config.workspace_low_m) + _BARRIER_INSET_M,
+                p_max=np.array(config.workspace_high_m) - _BARRIER_INSET_M,
+                gain=np.full(6, _BARRIER_GAIN_PER_S),
             ),
-            # Those nearest count: a barrier for each of the pairs would cost more than it gains. Without the
-            # gain of 0 it would hold the arm back far from everything, too.
+            # Only the nearest pairs: a barrier for every pair would cost more than it gains. A safe
+            # displacement gain above 0 would hold the arm back even far from everything.
             SelfCollisionBarrier(
-                8, gain=_APPROACH_PER_S, safe_displacement_gain=0.0, d_min=config.margin_m + _INSIDE_M
+                8, gain=_BARRIER_GAIN_PER_S, safe_displacement_gain=0.0,
+                d_min=config.margin_m + _BARRIER_INSET_M
             ),
         ]  # fmt: skip
         self.failed = 0
@@ -133,8 +129,8 @@ class Pink:
         """See ``Solver``; a stop where the program has no solution (counted)."""
         del v
         self._configuration.update(q)
-        # The task makes the whole way in one tick: what it is given is how far one tick should come.
-        step = asked_twist(self._arm, q, target, self._config) * self._dt_s
+        # The task tries to reach its target in one tick, so the target is one tick's step away.
+        step = commanded_twist(self._arm, q, target, self._config) * self._dt_s
         now = self._arm.forward(q)
         goal = self._pin.SE3(self._pin.exp3(step[3:]) @ now[:3, :3], now[:3, 3] + step[:3])
         self._task.set_target(goal)
@@ -170,11 +166,11 @@ def _model(arm: ArmModel, config: TeleopConfig) -> tuple[Any, Any]:
     flange = pin.Frame("flange", parent, offset, pin.FrameType.OP_FRAME)
     model.addFrame(flange)
 
-    shape = Shape(arm, config.tool_m, config.tool_radius_m)
+    shape = CapsuleModel(arm, config.tool_m, config.tool_radius_m)
     collisions = pin.GeometryModel()
     data, zero = model.createData(), np.zeros(6)
     pin.forwardKinematics(model, data, zero)
-    a, b = shape.segments(arm.body.links(zero)[None])
+    a, b = shape.segments(arm.nominal_model.link_frames(zero)[None])
     # The joint that moves each part, in the order of capsules.PARTS.
     moved_by = (0, 1, 2, 3, 4, 5, 6, 6)
     for k, (start, end, radius, joint) in enumerate(zip(a[0], b[0], shape.radii, moved_by)):
@@ -184,10 +180,10 @@ def _model(arm: ArmModel, config: TeleopConfig) -> tuple[Any, Any]:
             np.array([0.0, 0.0, 1.0]), along / length if length > 0 else np.array([0.0, 0.0, 1.0])
         )
         placed = data.oMi[joint].inverse() * pin.SE3(turn.matrix(), (start + end) / 2)
-        # coal takes no capsule without length.
+        # coal accepts no capsule of length 0.
         body = coal.Capsule(float(radius), max(length, 1e-6))
         collisions.addGeometryObject(pin.GeometryObject(f"part{k}", joint, placed, body))
-    # The barrier keeps margin_m from everything, the floor included; what is asked of the floor is floor_m.
+    # The barrier keeps margin_m from everything, so the floor is lowered by it to leave floor_m.
     ground = coal.Halfspace(np.array([0.0, 0.0, 1.0]), config.floor_m - config.margin_m)
     floor = collisions.addGeometryObject(pin.GeometryObject("floor", 0, pin.SE3.Identity(), ground))
     for first, second in (*PAIRS, *((part, floor) for part in ABOVE_FLOOR)):

@@ -16,7 +16,7 @@ import tty
 import numpy as np
 
 from camera_node.robot.teleop import TeleopError
-from camera_node.robot.teleop.hand import Hand
+from camera_node.robot.teleop.pose_integrator import PoseIntegrator
 from camera_node.robot.teleop.stylus import StylusSample
 
 KEYS = """\
@@ -30,7 +30,7 @@ _MOVES = {
     "w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1),
     "o": (3, 1), "u": (3, -1), "k": (4, 1), "i": (4, -1), "j": (5, 1), "l": (5, -1),
 }  # fmt: skip
-_ESCAPE, _END_OF_FILE, _MOST_BYTES = "\x1b", "\x04", 32
+_ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 
 
 class KeyboardStylus:
@@ -40,7 +40,7 @@ class KeyboardStylus:
     def __init__(self, fd: int | None = None) -> None:
         self._fd = sys.stdin.fileno() if fd is None else fd
         self.ended = False
-        self._hand, self._clutch = Hand(), False
+        self._hand, self._clutch = PoseIntegrator(), False
         try:
             self._before = termios.tcgetattr(self._fd)
             tty.setcbreak(self._fd)
@@ -61,7 +61,7 @@ class KeyboardStylus:
                 axis, sign = _MOVES[key]
                 shift[axis] += sign * (_STEP_M if axis < 3 else _STEP_RAD)
         self._hand.shift(shift[:3], shift[3:])
-        return [self._hand.moved(now_ns, np.zeros(3), np.zeros(3), self._clutch and not self.ended)]
+        return [self._hand.advance(now_ns, np.zeros(3), np.zeros(3), self._clutch and not self.ended)]
 
     def close(self) -> None:
         """Give the terminal back as it was."""
@@ -73,7 +73,7 @@ class KeyboardStylus:
         if not select.select([self._fd], [], [], 0.0)[0]:
             return ""
         try:
-            data = os.read(self._fd, _MOST_BYTES)
+            data = os.read(self._fd, _MAX_BYTES)
         except OSError:
             data = b""
         if not data:

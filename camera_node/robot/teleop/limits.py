@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from camera_node.robot.arm.capsules import PAIRS, PARTS, Shape, links
+from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel, link_frames
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 # Sums over a stop round differently from one tick to the next: limits are kept this much tighter than asked.
 _ROUNDING = 1e-9
-_TRIED = (1.0, 0.5, 0.2)
+_STEP_FRACTIONS = (1.0, 0.5, 0.2)
 
 
 class JointLimits:
@@ -45,10 +45,10 @@ class JointLimits:
         self._speed = speed * (1.0 - _ROUNDING)
         self._change = acceleration * dt_s * (1.0 - _ROUNDING)
 
-    def within(self, q: Array, v: Array, wanted: Array) -> Array:
+    def clamp(self, q: Array, v: Array, wanted: Array) -> Array:
         """Speeds (n,) that may be had next, as far towards ``wanted`` as they can be."""
-        up = np.minimum(self._speed, self._fastest(self.high - q))
-        down = np.maximum(-self._speed, -self._fastest(q - self.low))
+        up = np.minimum(self._speed, self._max_stoppable_speed(self.high - q))
+        down = np.maximum(-self._speed, -self._max_stoppable_speed(q - self.low))
         change = np.minimum(np.maximum(wanted, down), up) - v
         # All joints change alike, as far as the one that has most to change: the hand keeps its direction.
         most = float(np.abs(change).max())
@@ -69,7 +69,7 @@ class JointLimits:
         ways = np.cumsum(speeds[1:], axis=0) * self.dt_s
         return np.concatenate([q[None], q + ways]), speeds
 
-    def _fastest(self, room: Array) -> Array:
+    def _max_stoppable_speed(self, room: Array) -> Array:
         """The largest v with ``stop_way(v) <= room``. With n whole steps of deceleration in v, stop_way is
         ``dt ((n + 1) v - a dt n (n + 1) / 2)``, and at v = n a dt it is ``a dt^2 n (n + 1) / 2``."""
         room = np.maximum(room, 0.0)
@@ -101,7 +101,7 @@ class Limiter:
         low, high = np.array(arm.lower_rad) + margin, np.array(arm.upper_rad) - margin
         speed = min(config.speed_rad_s, *arm.speed_rad_s)
         self.joint_limits = JointLimits(low, high, speed, config.acceleration_rad_s2, self.dt_s)
-        self.shape = Shape(arm, config.tool_m, config.tool_radius_m)
+        self.shape = CapsuleModel(arm, config.tool_m, config.tool_radius_m)
         self.refused = Refusals()
         self._low_m = np.array(config.workspace_low_m) + _ROUNDING
         self._high_m = np.array(config.workspace_high_m) - _ROUNDING
@@ -116,24 +116,24 @@ class Limiter:
             self.refused.unsound += 1
             speeds = np.zeros(6)
         limits = self.joint_limits
-        asked, stopping = limits.within(self.q, self.v, speeds), limits.stopping(self.v)
+        asked, stopping = limits.clamp(self.q, self.v, speeds), limits.stopping(self.v)
         chosen = stopping
-        for k, share in enumerate(_TRIED):
+        for k, share in enumerate(_STEP_FRACTIONS):
             tried = stopping + share * (asked - stopping)
-            broken = self._broken(self.q + tried * self.dt_s, tried)
-            if broken is None:
+            violated = self._violated_limit(self.q + tried * self.dt_s, tried)
+            if violated is None:
                 chosen = tried
                 break
             if k == 0:
-                setattr(self.refused, broken, getattr(self.refused, broken) + 1)
+                setattr(self.refused, violated, getattr(self.refused, violated) + 1)
         self.q, self.v = self.q + chosen * self.dt_s, chosen
         return self.q.copy(), self.v.copy()
 
-    def _broken(self, q: Array, v: Array) -> str | None:
+    def _violated_limit(self, q: Array, v: Array) -> str | None:
         """The limit that stopping from (q, v) would break, if any."""
         path, _ = self.joint_limits.stop(q, v)
         arm = self.shape.arm
-        frames = links(arm, np.concatenate([self.q[None], path]))
+        frames = link_frames(arm, np.concatenate([self.q[None], path]))
         flange = frames[:, 6, :3, 3]
         if np.any(flange[1:] < self._low_m) or np.any(flange[1:] > self._high_m):
             return "box"
@@ -141,7 +141,9 @@ class Limiter:
         most = (self.config.speed_m_s * self.dt_s) ** 2 * (1.0 - _ROUNDING)
         if np.einsum("ij,ij->i", steps, steps).max() > most:
             return "speed"
-        apart, lowest = self.shape.clearance(frames[1:] if arm.body is arm else links(arm.body, path))
+        apart, lowest = self.shape.clearance(
+            frames[1:] if arm.nominal_model is arm else link_frames(arm.nominal_model, path)
+        )
         if lowest.min() < self.config.floor_m + _ROUNDING:
             return "floor"
         return "near" if apart.min() < self.config.margin_m + _ROUNDING else None
@@ -165,7 +167,7 @@ class Limiter:
                 f"{c.workspace_low_m} to {c.workspace_high_m}: move it inside, or change workspace_low_m and "
                 "workspace_high_m"
             )
-        apart, lowest = self.shape.clearance(links(self.shape.arm.body, q[None]))
+        apart, lowest = self.shape.clearance(link_frames(self.shape.arm.nominal_model, q[None]))
         if lowest[0] < c.floor_m + _ROUNDING:
             raise TeleopError(f"a part of the arm stands {lowest[0]:.3f} m high, below floor_m {c.floor_m:g}")
         if apart.min() < c.margin_m + _ROUNDING:

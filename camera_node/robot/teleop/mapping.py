@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass
-class Counts:
+class MessageCounts:
     """What happened to the messages."""
 
     taken: int = 0
@@ -34,7 +34,7 @@ class Counts:
 
 
 @dataclass
-class _Anchor:
+class _ClutchReference:
     """References of (4.1). hand: pose (4, 4) of the arm; the stylus's position and rotation."""
 
     hand: Array
@@ -48,7 +48,7 @@ class Mapping:
 
     config: TeleopConfig
     target: Array | None = None
-    counts: Counts = field(default_factory=Counts)
+    counts: MessageCounts = field(default_factory=MessageCounts)
 
     def __post_init__(self) -> None:
         yaw = math.radians(self.config.yaw_deg)
@@ -57,31 +57,31 @@ class Mapping:
         self._scale = np.array(self.config.scale)
         self._low, self._high = np.array(self.config.workspace_low_m), np.array(self.config.workspace_high_m)
         self._filter = OneEuro(self.config.filter_hz, self.config.filter_hz_s_m)
-        self._anchor: _Anchor | None = None
+        self._reference: _ClutchReference | None = None
         self._last: tuple[int, Array, Array] | None = None
         # A clutch that is held when the first message comes has not been pressed by anybody who saw the arm.
         self._released = False
 
-    def take(self, sample: StylusSample, hand: Array) -> bool:
+    def add_sample(self, sample: StylusSample, hand: Array) -> bool:
         """A message that came while the arm's commanded pose was ``hand`` (4, 4); whether it counts as one.
 
         What cannot be a pose, or is older than the last, is counted and changes nothing.
         """
-        if not sample.sound():
+        if not sample.is_valid():
             self.counts.unsound += 1
             return False
         if self._last is not None and sample.t_ns <= self._last[0]:
             self.counts.backwards += 1
             return False
         position, quaternion = sample.arrays()
-        jumped = self._last is not None and self._far(position, quaternion)
+        jumped = self._last is not None and self._jumped(position, quaternion)
         dt_s = 0.0 if self._last is None else (sample.t_ns - self._last[0]) / 1e9
         self._last = (sample.t_ns, position, quaternion)
         self.counts.taken += 1
         if jumped:
             self.counts.jumps += 1
         if jumped or not sample.clutch:
-            self._let_go()
+            self._release()
         if not sample.clutch:
             self._released = True
         elif self._released:
@@ -93,14 +93,14 @@ class Mapping:
         clock may begin anew."""
         if self._last is not None:
             self.counts.silences += 1
-        self._let_go()
+        self._release()
         self._last, self._released = None, False
 
-    def _let_go(self) -> None:
-        self._anchor = self.target = None
+    def _release(self) -> None:
+        self._reference = self.target = None
         self._filter.reset()
 
-    def _far(self, position: Array, quaternion: Array) -> bool:
+    def _jumped(self, position: Array, quaternion: Array) -> bool:
         assert self._last is not None
         _, before, turned = self._last
         angle = 2.0 * math.acos(min(1.0, abs(float(turned @ quaternion))))
@@ -109,16 +109,16 @@ class Mapping:
     def _follow(self, position: Array, quaternion: Array, dt_s: float, hand: Array) -> None:
         position, quaternion = self._filter(position, quaternion, dt_s)
         rotation = quaternion_to_matrix(quaternion)
-        if self._anchor is None:
-            self._anchor = _Anchor(hand.copy(), position.copy(), rotation)
+        if self._reference is None:
+            self._reference = _ClutchReference(hand.copy(), position.copy(), rotation)
             self.counts.engaged += 1
-        anchor = self._anchor
-        target = anchor.hand.copy()
-        moved = anchor.hand[:3, 3] + self._scale * (self._axes @ (position - anchor.position))
+        reference = self._reference
+        target = reference.hand.copy()
+        moved = reference.hand[:3, 3] + self._scale * (self._axes @ (position - reference.position))
         # Beyond the box nothing can follow: the target waits at its wall, and comes back with the stylus.
         target[:3, 3] = np.clip(moved, self._low, self._high)
         if self.config.orientation:
-            turn = self._axes @ rotation @ anchor.rotation.T @ self._axes.T
+            turn = self._axes @ rotation @ reference.rotation.T @ self._axes.T
             # Products of rotations drift; a quaternion between keeps them exactly rigid.
-            target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ anchor.hand[:3, :3]
+            target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ reference.hand[:3, :3]
         self.target = target

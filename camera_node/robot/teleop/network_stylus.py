@@ -26,19 +26,19 @@ log = logging.getLogger("camera-node.teleop")
 
 MAX_BYTES = 2048
 # Of one poll: a flood must not keep the arm waiting.
-_MOST = 64
+_MAX_MESSAGES = 64
 _OWNED_NS = 1_000_000_000
 
 
 class NetworkStylus:
     """Listens at ``host``:``port``; port 0 takes a free one (``port`` then says which). ``malformed``,
-    ``strangers``: datagrams that were no message, or another sender's. Raises TeleopError."""
+    ``from_other_senders``: datagrams that were no message, or another sender's. Raises TeleopError."""
 
     ended = False
 
     def __init__(self, host: str, port: int) -> None:
         self.malformed = 0
-        self.strangers = 0
+        self.from_other_senders = 0
         self._owner: tuple[str, int] | None = None
         self._heard_ns = 0
         try:
@@ -55,13 +55,13 @@ class NetworkStylus:
     def poll(self, now_ns: int) -> list[StylusSample]:
         """See ``Stylus``."""
         found = []
-        for _ in range(_MOST):
+        for _ in range(_MAX_MESSAGES):
             try:
                 data, sender = self._socket.recvfrom(MAX_BYTES + 1)
             except OSError:
                 break  # nothing there
             if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
-                self.strangers += 1
+                self.from_other_senders += 1
                 continue
             sample = parse(data)
             if sample is None:

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 _SPEED_HZ = 2.0  # cutoff of the speed that the cutoff follows
 # Stamps nearer or farther than these say more about a clock than about a hand.
-_LEAST_S, _MOST_S = 1e-4, 0.5
+_MIN_S, _MAX_S = 1e-4, 0.5
 
 
 class OneEuro:
@@ -34,19 +34,19 @@ class OneEuro:
         if self._position is None:
             self._position, self._quaternion, self._speeds = position.copy(), quaternion.copy(), np.zeros(2)
             return self._position, self._quaternion
-        dt = min(max(dt_s, _LEAST_S), _MOST_S)
+        dt = min(max(dt_s, _MIN_S), _MAX_S)
         step = position - self._position
         inverse = self._quaternion * np.array([1.0, -1.0, -1.0, -1.0])
         turn = so3_log(quaternion_to_matrix(quaternion_multiply(quaternion, inverse)))
         now = np.array([np.linalg.norm(step), np.linalg.norm(turn)]) / dt
-        self._speeds = self._speeds + _share(_SPEED_HZ, dt) * (now - self._speeds)
-        shares = [_share(self._hz + self._slope * speed, dt) for speed in self._speeds]
+        self._speeds = self._speeds + _smoothing_factor(_SPEED_HZ, dt) * (now - self._speeds)
+        shares = [_smoothing_factor(self._hz + self._slope * speed, dt) for speed in self._speeds]
         self._position = self._position + shares[0] * step
         self._quaternion = slerp(self._quaternion, quaternion, shares[1])
         return self._position, self._quaternion
 
 
-def _share(cutoff_hz: float, dt_s: float) -> float:
+def _smoothing_factor(cutoff_hz: float, dt_s: float) -> float:
     """How much of the way to a new value a first-order low-pass makes in ``dt_s``."""
     rate = 2.0 * math.pi * cutoff_hz * dt_s
     return rate / (rate + 1.0)

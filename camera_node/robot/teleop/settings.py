@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-Three = tuple[float, float, float]
+Vector3 = tuple[float, float, float]
 
 SOLVERS = ("auto", "pink", "dls")
 
@@ -29,7 +29,7 @@ class TeleopConfig:
     solver: pink (extra ``teleop``), dls (damped least squares, no extra), auto: pink where it is installed.
     """
 
-    scale: Three = (1.0, 1.0, 1.0)
+    scale: Vector3 = (1.0, 1.0, 1.0)
     yaw_deg: float = 0.0
     orientation: bool = True
     rate_hz: float = 125.0
@@ -39,8 +39,8 @@ class TeleopConfig:
     watchdog_ms: float = 200.0
     jump_m: float = 0.05
     jump_rad: float = 0.5
-    workspace_low_m: Three = (-0.45, -0.45, 0.05)
-    workspace_high_m: Three = (0.45, 0.45, 0.60)
+    workspace_low_m: Vector3 = (-0.45, -0.45, 0.05)
+    workspace_high_m: Vector3 = (0.45, 0.45, 0.60)
     joint_margin_rad: float = 0.05
     speed_rad_s: float = 0.8
     acceleration_rad_s2: float = 2.0

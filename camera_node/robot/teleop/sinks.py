@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.pose.providers import PoseGapError
-from camera_node.robot.arm.drive import connect_control, within_reason
+from camera_node.robot.arm.drive import connect_control, stop_within_timeout
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop.teleoperator import Command
@@ -18,9 +18,9 @@ from freshfield.clock import Clock
 
 # servoJ's own filter: how far ahead it looks and how hard it pulls (UR's script manual: 0.03 to 0.2 s, 100 to
 # 2000). The gentlest pull that still holds; smoothing is ours already.
-_LOOKAHEAD_S, _PULL = 0.1, 300.0
+_LOOKAHEAD_S, _SERVO_GAIN = 0.1, 300.0
 # An arm farther than this from where it was sent is being held, or has stopped.
-_BEHIND_RAD = 0.35
+_MAX_LAG_RAD = 0.35
 _STOP_RAD_S2 = 2.0
 HEADER = "t_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m,state"
 
@@ -69,17 +69,19 @@ class ServoSink:
         if self._stream.trouble:  # a program that is paused by a stop would go on by a leap when released
             raise ArmError(f"{self._stream.trouble}: stopped")
         behind = float(np.abs(actual - command.joints).max())
-        if behind > _BEHIND_RAD:
+        if behind > _MAX_LAG_RAD:
             raise ArmError(
                 f"arm at {self._stream.host}: {np.degrees(behind):.0f} degrees behind its target: stopped; "
                 "is something in its way, or is its speed slider down?"
             )
-        if not self._control.servoJ(command.joints.tolist(), 0.0, 0.0, self._period_s, _LOOKAHEAD_S, _PULL):
+        if not self._control.servoJ(
+            command.joints.tolist(), 0.0, 0.0, self._period_s, _LOOKAHEAD_S, _SERVO_GAIN
+        ):
             raise ArmError(f"arm at {self._stream.host}: it refuses to move: see the pendant")
 
     def close(self) -> None:
         """Stop the arm, and the program on its controller."""
-        within_reason(self._stop)
+        stop_within_timeout(self._stop)
 
     def _stop(self) -> None:
         with contextlib.suppress(RuntimeError):
@@ -87,7 +89,7 @@ class ServoSink:
             self._control.stopScript()
 
 
-def standing(stream: ArmStream, clock: Clock) -> NDArray[np.float64]:
+def current_joints(stream: ArmStream, clock: Clock) -> NDArray[np.float64]:
     """Joints (6,) of an arm now. Raises ArmError."""
     try:
         return stream.at(clock.now_ns(), 0.0)[0]

@@ -31,7 +31,7 @@ class StylusSample:
     quaternion: tuple[float, float, float, float]
     clutch: bool
 
-    def sound(self) -> bool:
+    def is_valid(self) -> bool:
         """Whether this can be a pose at all: finite, of a quaternion that is one, within reach of a desk."""
         values = (*self.position_m, *self.quaternion)
         if len(values) != 7 or not all(map(math.isfinite, values)):

@@ -57,7 +57,7 @@ class Teleoperator:
         if self._heard_ns is not None and now_ns < self._heard_ns:
             self._heard_ns = now_ns  # the clock was set back: silence is counted from here
         for sample in samples:
-            if self.mapping.take(sample, hand):
+            if self.mapping.add_sample(sample, hand):
                 self._heard_ns, self.state = now_ns, HOLDING
         if self._heard_ns is not None and now_ns - self._heard_ns > self._watchdog_ns:
             self.mapping.silence()

@@ -13,10 +13,10 @@ import pytest
 from camera_node.build import build_cameras
 from camera_node.config import source_config
 from camera_node.pose.providers import PoseGapError
-from camera_node.robot.arm.camera_poses import base_matrix, hand_eyes
+from camera_node.robot.arm.camera_poses import base_matrix, load_hand_eyes
 from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.hand_camera import Truth
+from camera_node.robot.hand_camera import TruthClient
 from freshfield import payload
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, ScenarioError, load
@@ -51,7 +51,7 @@ def test_what_it_sees_and_what_it_claims_agree_where_the_arm_stands():
         fixed, hand = build_cameras(scenario, source_config(scenario), scenario.cameras)
         shot = take(hand)
         config = source_config(scenario).arm
-        mount = hand_eyes(scenario, config, ["hand"])["hand"].transform
+        mount = load_hand_eyes(scenario, config, ["hand"])["hand"].transform
         place = base_matrix(config) @ UR3E.forward(np.deg2rad(LOOKING)) @ mount
         assert np.allclose(shot.pose.matrix(), place, atol=1e-12)
         scene = fixed.source._frames.scene
@@ -65,11 +65,11 @@ def test_the_truth_of_another_instant_is_not_taken():
     require_ur_rtde()
     host = own_address()
     with simulated_arm(host):
-        truth, clock = Truth(host), WallClock()
+        truth, clock = TruthClient(host), WallClock()
         assert truth.joints(clock.now_ns()).shape == (6,)
-        for away_ns in (-3600 * 10**9, 10**9):
+        for offset_ns in (-3600 * 10**9, 10**9):
             with pytest.raises(PoseGapError, match="ms away: is this machine too busy"):
-                truth.joints(clock.now_ns() + away_ns)
+                truth.joints(clock.now_ns() + offset_ns)
 
 
 def test_without_an_arm_one_line_says_what_to_start():

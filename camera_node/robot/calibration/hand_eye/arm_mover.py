@@ -15,7 +15,7 @@ import numpy as np
 from camera_node.config import ArmConfig, PathConfig
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix
-from camera_node.robot.arm.drive import Pace, agreed, connect_control, visit, watch
+from camera_node.robot.arm.drive import DriveLimits, confirm_motion, connect_control, open_stream, visit_stops
 from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.roadmap import Roadmap
 from camera_node.robot.arm.viewpoint_tour import PathError
@@ -33,12 +33,12 @@ class ArmMover:
     def __init__(self, scenario: Scenario, config: ArmConfig, agreed_to: bool) -> None:
         path = config.path or PathConfig()
         self._model, self._base = arm_model(scenario, config), base_matrix(config)
-        self._floor_m, self._pace = path.floor_m, Pace.of(config, path)
+        self._floor_m, self._pace = path.floor_m, DriveLimits.of(config, path)
         self._visited: list[Array] = []
-        self._stream = watch(config)
+        self._stream = open_stream(config)
         try:
             self._stream.start()
-            if not (agreed_to or config.simulated or agreed(config.host)):
+            if not (agreed_to or config.simulated or confirm_motion(config.host)):
                 raise CalibrationError("--drive: its space is not clear: nothing was moved")
         except BaseException:
             self._stream.stop()
@@ -54,7 +54,7 @@ class ArmMover:
             stops = self._route(at, hand)
             control = connect_control(self._stream.host)
             try:
-                visit(control, self._stream, stops, self._pace, threading.Event())
+                visit_stops(control, self._stream, stops, self._pace, threading.Event())
             except ArmError:
                 # Keep the library's object: its destructor would wait for an arm that may be gone.
                 ctypes.pythonapi.Py_IncRef(ctypes.py_object(control))
@@ -70,7 +70,7 @@ class ArmMover:
         there = [p.joints for p in self._model.inverse(hand, at) if not p.singular]
         places = [0] * len(there) + [1] * len(self._visited)
         roadmap = Roadmap(self._model, self._base, [*there, *self._visited], places, self._floor_m)
-        way = roadmap.way(np.asarray(at), {0})
+        way = roadmap.shortest_path(np.asarray(at), {0})
         if way is None:
             why = "without coming near itself or the floor" if there else "at all"
             raise PathError(f"the arm does not get there {why}: another pose will be proposed")

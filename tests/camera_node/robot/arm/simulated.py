@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from camera_node.robot.hand_camera import Truth
+from camera_node.robot.hand_camera import TruthClient
 from freshfield.clock import WallClock
 
 _numbers = itertools.count(1)
@@ -50,7 +50,7 @@ def simulated_arm(host: str, *options: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-def wait_until_moving(truth: Truth, process: subprocess.Popen[str]) -> None:
+def wait_until_moving(truth: TruthClient, process: subprocess.Popen[str]) -> None:
     """Until the arm has moved visibly; fails where ``process``, which is to move it, ends first."""
     clock = WallClock()
     start = truth.joints(clock.now_ns())

@@ -3,21 +3,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from camera_node.robot.arm.capsules import PAIRS, PARTS, Shape, distance, links
-from camera_node.robot.arm.kinematics import UR3E, calibrated
+from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel, link_frames, segment_distance
+from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.limits import Limiter
 from camera_node.robot.teleop.settings import TeleopConfig
 from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
 from tests.camera_node.robot.teleop.checks import HOME
 
-SHAPE = Shape(UR3E, 0.12, 0.04)
+SHAPE = CapsuleModel(UR3E, 0.12, 0.04)
 OPEN = TeleopConfig(workspace_low_m=(-1, -1, -1), workspace_high_m=(1, 1, 1), floor_m=-1.0)
 
 
 def test_links_of_many_postures_are_those_of_each():
     q = np.random.default_rng(1).uniform(-6, 6, (7, 6))
-    assert np.allclose(links(UR3E, q), [UR3E.links(each) for each in q], atol=1e-14)
+    assert np.allclose(link_frames(UR3E, q), [UR3E.link_frames(each) for each in q], atol=1e-14)
 
 
 def test_distance_of_segments_is_the_least_of_all_their_points():
@@ -29,7 +29,7 @@ def test_distance_of_segments_is_the_least_of_all_their_points():
     on_ab = a[:, None] + share[:, None] * (b - a)[:, None]
     on_cd = c[:, None] + share[:, None] * (d - c)[:, None]
     least = np.linalg.norm(on_ab[:, :, None] - on_cd[:, None], axis=-1).min(axis=(1, 2))
-    found = distance(a, b, c, d)
+    found = segment_distance(a, b, c, d)
     assert (found <= least + 1e-12).all()
     assert (least - found).max() < 0.01
 
@@ -47,7 +47,7 @@ def test_clearances_are_those_of_a_collision_library():
         assert np.allclose(data.oMf[model.getFrameId("flange")].homogeneous, UR3E.forward(q), atol=1e-12)
         pin.computeDistances(model, data, collisions, found, q)
         theirs = np.array([each.min_distance for each in found.distanceResults])
-        apart, lowest = SHAPE.clearance(links(UR3E, q[None]))
+        apart, lowest = SHAPE.clearance(link_frames(UR3E, q[None]))
         free = apart[0] > 0  # of parts that overlap the library gives a depth, we a distance of axes
         assert np.allclose(theirs[: len(PAIRS)][free], apart[0][free], atol=1e-5)
         floor = theirs[len(PAIRS) :].min() + config.floor_m - config.margin_m
@@ -58,11 +58,11 @@ def test_parts_of_a_calibrated_arm_stay_where_they_are(tmp_path):
     """Its link frames lie metres beside it: neither the limits nor pink may take them for the arm."""
     file = tmp_path / "calibration.conf"
     file.write_text(CALIBRATION)
-    arm = calibrated(UR3E, file)
-    assert np.abs(arm.links(HOME) - UR3E.links(HOME)).max() > 2.0
-    shape, met = Shape(UR3E, OPEN.tool_m, OPEN.tool_radius_m), 0
+    arm = apply_calibration(UR3E, file)
+    assert np.abs(arm.link_frames(HOME) - UR3E.link_frames(HOME)).max() > 2.0
+    shape, met = CapsuleModel(UR3E, OPEN.tool_m, OPEN.tool_radius_m), 0
     for q in np.random.default_rng(4).uniform(-3, 3, (60, 6)):
-        apart_m = shape.clearance(links(UR3E, q[None]))[0].min()
+        apart_m = shape.clearance(link_frames(UR3E, q[None]))[0].min()
         if apart_m > OPEN.margin_m + 0.01:
             Limiter(arm, OPEN, q)
         elif apart_m < OPEN.margin_m - 0.01:
@@ -86,10 +86,10 @@ def test_parts_of_a_calibrated_arm_stay_where_they_are(tmp_path):
 
 
 def test_a_folded_arm_meets_itself_and_home_does_not():
-    apart, _ = SHAPE.clearance(links(UR3E, HOME[None]))
+    apart, _ = SHAPE.clearance(link_frames(UR3E, HOME[None]))
     assert apart.min() > 0.02
     folded = HOME.copy()
     folded[2] = -np.pi + 0.05
-    apart, _ = SHAPE.clearance(links(UR3E, folded[None]))
+    apart, _ = SHAPE.clearance(link_frames(UR3E, folded[None]))
     met = {(PARTS[a], PARTS[b]) for (a, b), gap in zip(PAIRS, apart[0]) if gap < 0}
     assert ("upper arm", "wrist 1") in met

@@ -16,10 +16,10 @@ import yaml
 from camera_node.cli import main
 from camera_node.config import source_config
 from camera_node.robot.arm import drive as driving
-from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
-from camera_node.robot.arm.viewpoint_tour import tour
-from camera_node.robot.hand_camera import Truth
+from camera_node.robot.arm.viewpoint_tour import plan_tour
+from camera_node.robot.hand_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.clock import WallClock
 from freshfield.scenario import load
@@ -93,15 +93,15 @@ def drive(file, *options):
 def stops_of(file):
     scenario = load(file)
     config = source_config(scenario).arm
-    mount = hand_eyes(scenario, config, ["hand"])["hand"].transform
-    return tour(arm_model(scenario, config), base_matrix(config), mount, config.path, HOME_RAD).stops
+    mount = load_hand_eyes(scenario, config, ["hand"])["hand"].transform
+    return plan_tour(arm_model(scenario, config), base_matrix(config), mount, config.path, HOME_RAD).stops
 
 
 def test_a_round_visits_every_viewpoint_and_ends(cell):
     require_ur_rtde()
     file, host = cell
     with simulated_arm(host):
-        truth, clock = Truth(host), WallClock()
+        truth, clock = TruthClient(host), WallClock()
         process = drive(file, "--rounds", "1")
         seen = []
         while process.poll() is None:
@@ -121,7 +121,7 @@ def test_a_signal_stops_the_arm_where_it_is(cell, number):
     require_ur_rtde()
     file, host = cell
     with simulated_arm(host):
-        truth = Truth(host)
+        truth = TruthClient(host)
         process = drive(file)
         wait_until_moving(truth, process)
         process.send_signal(number)
@@ -135,7 +135,7 @@ def test_an_arm_that_vanishes_ends_the_drive_with_one_line(cell):
     file, host = cell
     with simulated_arm(host, near(file)) as arm:
         process = drive(real(file), "--yes")
-        wait_until_moving(Truth(host), process)
+        wait_until_moving(TruthClient(host), process)
         arm.kill()
         assert process.wait(30.0) == 1
         assert f"camera-node: arm at {host}" in process.communicate()[1]
@@ -149,7 +149,7 @@ def test_a_drive_that_is_killed_leaves_no_arm_moving(cell):
     data["source"]["arm"]["path"]["speed_rad_s"] = 0.1  # the first move takes many seconds
     file.write_text(yaml.safe_dump(data))
     with simulated_arm(host, near(file)):
-        truth = Truth(host)
+        truth = TruthClient(host)
         process = drive(real(file), "--yes")
         wait_until_moving(truth, process)
         process.kill()
@@ -162,7 +162,7 @@ def test_a_program_that_is_stopped_at_the_pendant_ends_the_drive(cell):
     require_ur_rtde()
     file, host = cell
     with simulated_arm(host):
-        truth = Truth(host)
+        truth = TruthClient(host)
         process = drive(file)
         wait_until_moving(truth, process)
         with socket.create_connection((host, 29999), 5.0) as dashboard:
@@ -174,7 +174,7 @@ def test_a_program_that_is_stopped_at_the_pendant_ends_the_drive(cell):
 
 def test_an_arm_that_stands_still_on_the_way_is_not_waited_for(monkeypatch):
     require_ur_rtde()
-    monkeypatch.setattr(driving, "_STILL_S", 0.3)
+    monkeypatch.setattr(driving, "_STALLED_S", 0.3)
     host = own_address()
     with simulated_arm(host):
         stream = ArmStream(host, WallClock(), 50.0, max_gap_ms=5000.0, stale_s=5.0)
@@ -219,7 +219,7 @@ def test_what_is_shown_is_what_would_be_driven(cell):
     with simulated_arm(host):
         process = drive(file, "--show")
         said = process.communicate(timeout=20)[0]
-        assert process.returncode == 0 and at_rest(Truth(host), 0.3)
+        assert process.returncode == 0 and at_rest(TruthClient(host), 0.3)
     np.testing.assert_allclose(shown(said), np.rad2deg(stops_of(file)), atol=0.006)
     assert "stands at     0.00   -90.00" in said
 

@@ -15,7 +15,7 @@ from camera_node.clocks import ArrivalClock
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm.joint_states import ArmError, ArmStream, HandPoses, probe
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.hand_camera import Truth
+from camera_node.robot.hand_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.clock import WallClock
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
@@ -149,7 +149,7 @@ def test_poses_follow_a_moving_arm_whose_clock_drifts():
 
     host, clock = own_address(), WallClock()
     with simulated_arm(host, "--drift-ppm", "300") as _, running(host, clock, max_gap_ms=500.0) as stream:
-        control, truth = RTDEControlInterface(host), Truth(host)
+        control, truth = RTDEControlInterface(host), TruthClient(host)
         goal = [2.0, *HOME_RAD[1:]]
         control.moveJ(goal, 1.0, 8.0, True)
         off_rad = []
@@ -196,5 +196,5 @@ def test_stamps_that_go_back_or_stand_still_break_nothing():
 )
 def test_an_arm_that_cannot_move_says_why(mode, safety, says):
     stream = ArmStream("127.0.0.1", WallClock())
-    stream._judge(mode, safety)
+    stream._check_modes(mode, safety)
     assert says in stream.trouble and bool(stream.trouble) == bool(says)

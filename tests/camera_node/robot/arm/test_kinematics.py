@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from camera_node.robot.arm.kinematics import UR3E, KinematicsError, calibrated
+from camera_node.robot.arm.kinematics import UR3E, KinematicsError, apply_calibration
 from freshfield.geometry import so3_exp
 
 POSTURES = np.random.default_rng(3).uniform(-math.pi, math.pi, (40, 6))
@@ -127,7 +127,7 @@ def test_singular_postures_are_named():
 
 
 def test_a_calibration_moves_the_hand_and_the_inverse_follows_it(factory):
-    arm = calibrated(UR3E, factory)
+    arm = apply_calibration(UR3E, factory)
     moved_m = []
     for q in POSTURES[:12]:
         target = arm.forward(q)
@@ -146,7 +146,7 @@ def test_a_calibration_of_zeros_changes_nothing(tmp_path):
         "[mounting]\n" + "".join(f"delta_{k} = [0, 0, 0, 0, 0, 0]\n" for k in ("theta", "a", "d"))
     )
     for q in POSTURES[:5]:
-        assert np.array_equal(calibrated(UR3E, file).forward(q), UR3E.forward(q))
+        assert np.array_equal(apply_calibration(UR3E, file).forward(q), UR3E.forward(q))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_a_wrong_calibration_is_refused_by_name(tmp_path, text, says):
     file = tmp_path / "calibration.conf"
     file.write_text(text)
     with pytest.raises(KinematicsError, match=says):
-        calibrated(UR3E, file)
+        apply_calibration(UR3E, file)
 
 
 @pytest.mark.parametrize("joints", [[0] * 5, [0] * 7, [0, 0, 0, 0, 0, math.nan], [math.inf] + [0] * 5])

@@ -13,8 +13,8 @@ import pytest
 import yaml
 
 from camera_node.robot.arm import pose_error as measuring
-from camera_node.robot.arm.pose_error import Error, by_gap_and_speed, by_rate, measure, show_gaps
-from camera_node.robot.hand_camera import Truth
+from camera_node.robot.arm.pose_error import PoseError, by_gap_and_speed, by_rate, format_gaps, measure
+from camera_node.robot.hand_camera import TruthClient
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import (
     own_address,
@@ -36,7 +36,7 @@ def cell(folder, host):
 def made():
     """Errors of a law that is known: nearest is off by gap times speed, interpolated by a tenth of it."""
     return [
-        Error(pairing, 20.0, gap, speed, share * gap * speed, 0.1 * share * gap * speed)
+        PoseError(pairing, 20.0, gap, speed, share * gap * speed, 0.1 * share * gap * speed)
         for gap, speed, _ in itertools.product((0.5, 3.0, 20.0), (0.03, 0.3), range(10))
         for pairing, share in (("nearest", 1.0), ("interpolated", 0.1))
     ]
@@ -51,11 +51,11 @@ def test_a_gap_and_a_speed_have_the_error_of_their_own(tmp_path):
         assert row["median_mm"] == pytest.approx(expected) == 10 * row["median_deg"]
         assert row["gap_ms_from"] <= row["gap_ms"] < row["gap_ms_to"]
         assert row["m_per_s_from"] <= row["m_per_s"] < row["m_per_s_to"]
-    told = show_gaps(rows).splitlines()
+    table = format_gaps(rows).splitlines()
     assert (
-        len(told) == 2 + 6
-        and "6.000 / 0.600" in told[-1]
-        and told[-1].split()[:4] == ["16", "to", "32", "ms"]
+        len(table) == 2 + 6
+        and "6.000 / 0.600" in table[-1]
+        and table[-1].split()[:4] == ["16", "to", "32", "ms"]
     )
     measuring.write(by_rate(errors), rows, tmp_path)
     with (tmp_path / "gaps.csv").open() as file:
@@ -64,8 +64,8 @@ def test_a_gap_and_a_speed_have_the_error_of_their_own(tmp_path):
 
 
 def test_a_cell_of_a_few_instants_is_not_shown():
-    few = [Error("nearest", 20.0, 5.0, 0.3, 1.0, 0.1)] * (measuring.LEAST_INSTANTS - 1)
-    assert by_gap_and_speed(few) == [] and "-" in show_gaps([])
+    few = [PoseError("nearest", 20.0, 5.0, 0.3, 1.0, 0.1)] * (measuring.MIN_INSTANTS - 1)
+    assert by_gap_and_speed(few) == [] and "-" in format_gaps([])
     assert len(by_gap_and_speed([*few, few[0]])) == 1
 
 
@@ -93,7 +93,7 @@ def test_a_moving_arms_nearest_pose_is_off_by_gap_times_speed(tmp_path):
         command = [sys.executable, "-m", "camera_node.cli", "drive-arm", file]
         driver = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
-            wait_until_moving(Truth(host), driver)
+            wait_until_moving(TruthClient(host), driver)
             rows = by_gap_and_speed(measure(file, 15.0))
         finally:
             driver.kill()

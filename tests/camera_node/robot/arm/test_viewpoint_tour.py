@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from camera_node.config import PathConfig, source_config
-from camera_node.robot.arm.camera_poses import arm_model, base_matrix, hand_eyes
-from camera_node.robot.arm.capsules import Shape, links
-from camera_node.robot.arm.kinematics import UR3E, calibrated
-from camera_node.robot.arm.roadmap import FARTHEST_RAD, Roadmap, clear
-from camera_node.robot.arm.viewpoint_tour import PathError, tour, viewpoints
+from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
+from camera_node.robot.arm.capsules import CapsuleModel, link_frames
+from camera_node.robot.arm.kinematics import UR3E, apply_calibration
+from camera_node.robot.arm.roadmap import FARTHEST_RAD, Roadmap, is_free
+from camera_node.robot.arm.viewpoint_tour import PathError, plan_tour, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from freshfield.scenario import ScenarioError, load, parse
 from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
@@ -16,7 +16,7 @@ from tests.camera_node.robot.arm.test_kinematics import CALIBRATION
 CELL = load("cell")
 ARM = source_config(CELL).arm
 BASE = base_matrix(ARM)
-MOUNT = hand_eyes(CELL, ARM, ["hand"])["hand"].transform
+MOUNT = load_hand_eyes(CELL, ARM, ["hand"])["hand"].transform
 
 
 def test_viewpoints_look_at_their_target_from_their_radius():
@@ -33,18 +33,18 @@ def test_viewpoints_look_at_their_target_from_their_radius():
 
 
 def test_the_cells_tour_sees_the_tile_from_all_sides_and_touches_nothing():
-    found = tour(UR3E, BASE, MOUNT, ARM.path)
+    found = plan_tour(UR3E, BASE, MOUNT, ARM.path)
     assert ARM.path.radius_m == 0.34 and found.reached >= 45
     reached = found.reached_by_ring(ARM.path)
     assert sum(reached) == found.reached and min(reached) >= 10
-    shape, poses = Shape(UR3E, 0.08, 0.04), viewpoints(ARM.path)
+    shape, poses = CapsuleModel(UR3E, 0.08, 0.04), viewpoints(ARM.path)
     eyes = []
     for before, joints, place in zip([found.stops[0], *found.stops], found.stops, found.places):
         camera = BASE @ UR3E.forward(joints) @ MOUNT
         np.testing.assert_allclose(camera[:3, 2:], poses[place][:3, 2:], atol=1e-6)  # whatever its roll
         assert not UR3E.singularities(joints)
         assert np.abs(joints - before).max() <= FARTHEST_RAD
-        on_the_way = links(UR3E, before + np.linspace(0, 1, 60)[:, None] * (joints - before))
+        on_the_way = link_frames(UR3E, before + np.linspace(0, 1, 60)[:, None] * (joints - before))
         assert (BASE @ on_the_way)[:, 2:, 2, 3].min() > 0.04
         assert shape.clearance(on_the_way)[0].min() > 0.0
         eyes.append(camera[:3, 3] - ARM.path.target_m)
@@ -60,12 +60,12 @@ def rolled(quarters):
 
 def test_what_no_straight_way_leads_to_is_reached_by_way_of_others():
     """All that the arm could stand at without touching anything."""
-    found = tour(UR3E, BASE, MOUNT, ARM.path)
+    found = plan_tour(UR3E, BASE, MOUNT, ARM.path)
     free = set()
     for place, pose in enumerate(viewpoints(ARM.path)):
         goals = [np.linalg.inv(BASE) @ pose @ rolled(turn) @ np.linalg.inv(MOUNT) for turn in (0, 1, 2, 3)]
         sound = [p.joints for goal in goals for p in UR3E.inverse(goal) if not p.singular]
-        if any(clear(UR3E, BASE, joints, joints, ARM.path.floor_m).all() for joints in sound):
+        if any(is_free(UR3E, BASE, joints, joints, ARM.path.floor_m).all() for joints in sound):
             free.add(place)
     assert set(found.places) == free and len(found.stops) > found.reached
 
@@ -74,19 +74,22 @@ def test_a_way_is_the_shortest_of_those_that_are_free():
     home = np.array(HOME_RAD)
     steps = [home + np.array([turn, 0, 0, 0, 0, 0]) for turn in (1.5, -1.5, 3.0, -2.8)]
     roadmap = Roadmap(UR3E, BASE, steps, [0, 1, 2, 2], -1.0)
-    way = roadmap.way(home, {2})
+    way = roadmap.shortest_path(home, {2})
     assert [place for _, place in way] == [1, 2]  # 2.8 rad are too far for one go, and shorter than 3
     np.testing.assert_allclose([joints for joints, _ in way], [steps[1], steps[3]])
-    assert roadmap.way(home, {7}) is None and Roadmap(UR3E, BASE, [], [], -1.0).way(home, {0}) is None
+    assert (
+        roadmap.shortest_path(home, {7}) is None
+        and Roadmap(UR3E, BASE, [], [], -1.0).shortest_path(home, {0}) is None
+    )
     # A whole turn is not gone round: the same posture from the other side is nearer.
-    assert roadmap.way(np.array([2 * np.pi - 2.0, *home[1:]]), {0})[0][0][0] > np.pi
+    assert roadmap.shortest_path(np.array([2 * np.pi - 2.0, *home[1:]]), {0})[0][0][0] > np.pi
     under = Roadmap(UR3E, BASE, steps, [0, 1, 2, 2], 5.0)
-    assert under.way(home, {0, 1, 2}) is None
+    assert under.shortest_path(home, {0, 1, 2}) is None
 
 
 def test_the_tour_begins_where_it_can_be_begun():
-    free = tour(UR3E, BASE, MOUNT, ARM.path).stops[0]
-    again = tour(UR3E, BASE, MOUNT, ARM.path, start=free).stops[0]
+    free = plan_tour(UR3E, BASE, MOUNT, ARM.path).stops[0]
+    again = plan_tour(UR3E, BASE, MOUNT, ARM.path, start=free).stops[0]
     assert np.allclose(again, free, atol=1e-9)
 
 
@@ -94,15 +97,15 @@ def test_a_calibrated_arm_is_kept_above_the_floor_too(tmp_path):
     """The height of its joints, not of the frames that its calibration puts metres beside them."""
     file = tmp_path / "calibration.conf"
     file.write_text(CALIBRATION)
-    arm = calibrated(UR3E, file)
-    shape, free = Shape(UR3E, 0.08, 0.04), 0
+    arm = apply_calibration(UR3E, file)
+    shape, free = CapsuleModel(UR3E, 0.08, 0.04), 0
     for joints in np.random.default_rng(6).uniform(-3, 3, (200, 6)):
-        if shape.clearance(links(UR3E, joints[None]))[0].min() < 0.03:
+        if shape.clearance(link_frames(UR3E, joints[None]))[0].min() < 0.03:
             continue
         free += 1
-        lowest_m = (BASE @ UR3E.links(joints))[2:, 2, 3].min()
+        lowest_m = (BASE @ UR3E.link_frames(joints))[2:, 2, 3].min()
         for floor_m in (lowest_m - 0.006, lowest_m + 0.006):
-            assert clear(arm, BASE, joints, joints, floor_m).all() == (floor_m < lowest_m)
+            assert is_free(arm, BASE, joints, joints, floor_m).all() == (floor_m < lowest_m)
     assert free > 50
 
 
@@ -113,14 +116,14 @@ def test_an_arm_is_not_driven_through_itself():
     other = np.array(HOME_RAD)
     other[2] = -2 * np.pi + np.pi / 2
     home = np.array(HOME_RAD)
-    assert clear(UR3E, BASE, home, home, -1.0) and clear(UR3E, BASE, other, other, -1.0)
-    assert not clear(UR3E, BASE, folded, folded, -1.0)
-    assert not clear(UR3E, BASE, home, other, -1.0)
+    assert is_free(UR3E, BASE, home, home, -1.0) and is_free(UR3E, BASE, other, other, -1.0)
+    assert not is_free(UR3E, BASE, folded, folded, -1.0)
+    assert not is_free(UR3E, BASE, home, other, -1.0)
 
 
 def test_a_tour_out_of_reach_says_what_to_change():
     with pytest.raises(PathError, match=r"reaches 0 of .* viewpoints: change radius_m"):
-        tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, radius_m=2.0))
+        plan_tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, radius_m=2.0))
 
 
 def cell(**changed):
@@ -134,7 +137,7 @@ def cell(**changed):
 
 def test_a_camera_that_is_not_calibrated_yet_has_the_hands_poses():
     scenario = cell()
-    mounts = hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+    mounts = load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
     assert list(mounts) == ["hand"] and np.array_equal(mounts["hand"].transform, np.eye(4))
 
 
@@ -173,7 +176,7 @@ def test_a_wrong_arm_is_refused_by_key(changed, says):
 def test_a_wrong_mount_is_refused_by_camera(changed, says):
     scenario = cell(**changed)
     with pytest.raises(ScenarioError, match=says):
-        hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
+        load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
 
 
 def test_a_wrong_calibration_of_the_robot_is_refused():
@@ -185,7 +188,7 @@ def test_a_wrong_calibration_of_the_robot_is_refused():
 def test_a_camera_that_may_roll_comes_to_more_viewpoints():
     """A camera beside the flange's axis has its arm on one side at one roll, on the other at another."""
     reached = [
-        tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, rolls_deg=rolls), HOME_RAD).reached
+        plan_tour(UR3E, BASE, MOUNT, dataclasses.replace(ARM.path, rolls_deg=rolls), HOME_RAD).reached
         for rolls in ((0.0,), ARM.path.rolls_deg)
     ]
     assert reached[1] > reached[0] + 5

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.simulated_controller.controller import HOME_RAD, STEP_NS, Controller
-from camera_node.robot.simulated_controller.joint_motion import MAX_ACCELERATION_RAD_S2, STEP_S, Motion
+from camera_node.robot.simulated_controller.joint_motion import MAX_ACCELERATION_RAD_S2, STEP_S, JointMotion
 
 SPEED = np.array(UR3E.speed_rad_s)
 angle = st.floats(-6.2, 6.2, allow_subnormal=False)
@@ -37,7 +37,7 @@ def until_idle(motion, most=10_000):
 @settings(max_examples=25)
 @given(six, rates, rates)
 def test_a_move_ends_exactly_at_its_target_within_its_limits(goal, speed, acceleration):
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     assert motion.move(goal, speed, acceleration)
     rows = until_idle(motion)
     assert np.array_equal(motion.q, goal) and not motion.qd.any()
@@ -50,7 +50,7 @@ def test_a_move_ends_exactly_at_its_target_within_its_limits(goal, speed, accele
 
 
 def test_a_move_that_interrupts_another_is_made_after_a_stop():
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     motion.move(np.array(HOME_RAD) + 1.0, 1.0, 2.0)
     run(motion, 200)
     goal = np.array(HOME_RAD) - 0.5
@@ -67,7 +67,7 @@ def test_a_move_that_interrupts_another_is_made_after_a_stop():
 
 
 def test_all_joints_of_a_move_end_together():
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     motion.move([1.0, -1.0, 0.0, -1.5, 1.0, 0.2], 0.7, 2.0)
     shares = [(q - HOME_RAD) / (motion.target - np.array(HOME_RAD)) for q, _ in until_idle(motion)]
     assert np.ptp(np.array(shares), axis=1).max() < 1e-9
@@ -76,7 +76,7 @@ def test_all_joints_of_a_move_end_together():
 @settings(max_examples=25)
 @given(st.lists(st.tuples(six, st.integers(1, 60)), min_size=1, max_size=6))
 def test_targets_that_jump_make_no_arm_that_jumps(targets):
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     for goal, steps in targets:
         assert motion.servo(goal)
         q, qd, qdd = run(motion, steps)
@@ -86,7 +86,7 @@ def test_targets_that_jump_make_no_arm_that_jumps(targets):
 
 
 def test_a_servo_target_is_reached_and_not_passed_by_much():
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     goal = np.array(HOME_RAD) + 0.5
     for _ in range(400):
         motion.servo(goal)
@@ -96,21 +96,21 @@ def test_a_servo_target_is_reached_and_not_passed_by_much():
 
 
 def test_an_arm_whose_client_goes_quiet_comes_to_rest():
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     motion.servo(np.array(HOME_RAD) + 3.0)
     _, qd, _ = run(motion, 600)
     assert np.abs(qd).max() > 1.0 and not qd[-1].any() and not motion.moving
 
 
 def test_speed_stops_short_of_the_joints_limits():
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     motion.speed([3.0, -3.0, 0.0, 0.0, 0.0, 6.0], 5.0)
     q, _, _ = run(motion, 4000)
     assert np.abs(q).max() <= 2 * math.pi + 1e-3 and np.abs(q).max() > 2 * math.pi - 0.1
 
 
 def test_stopping_takes_the_time_that_its_deceleration_allows():
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     motion.speed([1.0, 0, 0, 0, 0, 0], 20.0)
     run(motion, 200)
     motion.stop(2.0)
@@ -123,7 +123,7 @@ def test_stopping_takes_the_time_that_its_deceleration_allows():
     [([7.0] * 6, 1, 1), ([math.nan] * 6, 1, 1), ([0.0] * 5, 1, 1), ([0.0] * 6, 0, 1), ([0.0] * 6, 1, -1)],
 )
 def test_what_cannot_be_done_is_refused(goal, speed, acceleration):
-    motion = Motion(UR3E, HOME_RAD)
+    motion = JointMotion(UR3E, HOME_RAD)
     assert not motion.move(goal, speed, acceleration) and not motion.moving
 
 

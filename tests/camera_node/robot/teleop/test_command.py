@@ -17,7 +17,7 @@ import pytest
 from camera_node.cli import main
 from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.hand_camera import Truth
+from camera_node.robot.hand_camera import TruthClient
 from camera_node.robot.teleop import sinks
 from camera_node.robot.teleop.command import teleop_config
 from camera_node.robot.teleop.network_stylus import encode
@@ -125,7 +125,7 @@ def test_an_arm_that_goes_silent_ends_it_with_one_line(tmp_path):
     ]  # fmt: skip
     with simulated_arm(host) as arm, Sender(port):
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        wait_until_moving(Truth(host), process)
+        wait_until_moving(TruthClient(host), process)
         arm.send_signal(signal.SIGSTOP)
         try:
             assert process.wait(30.0) == 1
@@ -178,10 +178,10 @@ def test_wrong_settings_are_one_line(tmp_path, capsys, section, part):
 
 
 def test_the_settings_of_a_scenario_without_a_section_are_the_defaults():
-    from camera_node.robot.simulated_controller.command import arm_of
+    from camera_node.robot.simulated_controller.command import require_arm
 
     scenario = load("cell")
-    assert teleop_config(scenario, arm_of(scenario)).rate_hz == 125.0
+    assert teleop_config(scenario, require_arm(scenario)).rate_hz == 125.0
 
 
 def test_a_node_that_streams_imports_nothing_of_teleoperation():

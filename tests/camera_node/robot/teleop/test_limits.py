@@ -32,7 +32,7 @@ def stop_way(v: float, change: float, dt: float) -> float:
 def test_the_fastest_speed_stops_exactly_within_the_room(room, acceleration, rate_hz):
     dt = 1.0 / rate_hz
     limits = JointLimits([0.0], [1.0], 1e9, acceleration, dt)
-    (fastest,) = limits._fastest(np.array([room]))
+    (fastest,) = limits._max_stoppable_speed(np.array([room]))
     change = limits._change
     assert stop_way(fastest, change, dt) <= room * (1 + 1e-9) + 1e-12
     # And nothing faster does: the closed form is no bound but the value.
@@ -44,7 +44,7 @@ def test_a_joint_by_itself_never_breaks_a_limit(wanted):
     limits, dt = JointLimits([-0.02], [0.05], 0.7, 3.0, 0.01), 0.01
     q, v = np.zeros(1), np.zeros(1)
     for each in wanted:
-        after = limits.within(q, v, np.clip([each], -1e9, 1e9))
+        after = limits.clamp(q, v, np.clip([each], -1e9, 1e9))
         assert abs(after - v)[0] <= 3.0 * dt + 1e-12 and abs(after)[0] <= 0.7
         q, v = q + after * dt, after
         assert -0.02 <= q[0] <= 0.05
@@ -54,7 +54,7 @@ def test_a_joint_reaches_its_limit_and_rests_there():
     limits, dt = JointLimits([-1.0], [1.0], 0.7, 3.0, 0.01), 0.01
     q, v = np.zeros(1), np.zeros(1)
     for _ in range(400):
-        v = limits.within(q, v, np.array([5.0]))
+        v = limits.clamp(q, v, np.array([5.0]))
         q = q + v * dt
     assert q[0] == pytest.approx(1.0, abs=1e-6)
     assert abs(v[0]) < 1e-6
@@ -63,7 +63,7 @@ def test_a_joint_reaches_its_limit_and_rests_there():
 def test_all_joints_change_in_proportion_so_that_the_hand_keeps_its_direction():
     limits = JointLimits([-3.0] * 3, [3.0] * 3, 1.0, 2.0, 0.01)
     wanted = np.array([0.8, -0.4, 0.1])
-    first = limits.within(np.zeros(3), np.zeros(3), wanted)
+    first = limits.clamp(np.zeros(3), np.zeros(3), wanted)
     assert np.allclose(first / wanted, first[0] / wanted[0])
     assert first[0] == pytest.approx(0.02)
 

@@ -11,10 +11,10 @@ import pytest
 
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.command import open_stylus
-from camera_node.robot.teleop.gamepad import SPEED_M_S, TURN_RAD_S, Pad, Span
-from camera_node.robot.teleop.hand import Hand
+from camera_node.robot.teleop.gamepad import SPEED_M_S, TURN_RAD_S, AxisRange, GamepadState
 from camera_node.robot.teleop.keyboard import KeyboardStylus
 from camera_node.robot.teleop.network_stylus import MAX_BYTES, NetworkStylus, encode, parse
+from camera_node.robot.teleop.pose_integrator import PoseIntegrator
 from tests.camera_node.robot.teleop.checks import sample
 
 GOOD = {"t_ns": 5, "p": [0.1, 0.2, 0.3], "q": [1, 0, 0, 0], "clutch": True}
@@ -66,7 +66,7 @@ def test_what_is_no_message_is_none(data):
 
 def test_numbers_that_make_no_pose_are_left_to_the_mapping():
     message = parse(json.dumps({**GOOD, "p": [float("nan"), 0, 0]}).encode())
-    assert message is not None and not message.sound()
+    assert message is not None and not message.is_valid()
 
 
 def test_bad_datagrams_are_counted_and_a_second_sender_is_not_heard():
@@ -78,7 +78,7 @@ def test_bad_datagrams_are_counted_and_a_second_sender_is_not_heard():
     send(stylus, encode(sample(2)), sender=second)
     send(stylus, encode(sample(3)), sender=first)
     assert [s.t_ns for s in received(stylus, 10)] == [3]
-    assert stylus.strangers == 1
+    assert stylus.from_other_senders == 1
     send(stylus, encode(sample(4)), sender=second)
     assert [s.t_ns for s in received(stylus, 2_000_000_000)] == [4], "the first has been silent for long"
     for each in (first, second):
@@ -140,23 +140,23 @@ def test_a_terminal_that_is_gone_ends_it():
 
 
 def test_a_pad_gives_speeds_outside_its_dead_zone_only():
-    stick, trigger = Span(-32768, 32767, 1000), Span(0, 255)
-    pad = Pad({0: stick, 1: stick, 2: trigger, 3: stick, 4: stick, 5: trigger})
+    stick, trigger = AxisRange(-32768, 32767, 1000), AxisRange(0, 255)
+    pad = GamepadState({0: stick, 1: stick, 2: trigger, 3: stick, 4: stick, 5: trigger})
     for code in (0, 1, 3, 4):
-        pad.take(3, code, 1500)
+        pad.update(3, code, 1500)
     assert not np.any(np.concatenate(pad.speeds()))
-    pad.take(3, 1, -32768)
-    pad.take(3, 5, 255)
-    pad.take(3, 3, 32767)
+    pad.update(3, 1, -32768)
+    pad.update(3, 5, 255)
+    pad.update(3, 3, 32767)
     speed, turn = pad.speeds()
     assert speed == pytest.approx([SPEED_M_S, 0.0, SPEED_M_S])
     assert turn == pytest.approx([0.0, 0.0, -TURN_RAD_S])
     assert not pad.clutch
-    pad.take(1, 0x130, 1)
+    pad.update(1, 0x130, 1)
     assert pad.clutch
-    pad.take(1, 0x130, 0)
+    pad.update(1, 0x130, 0)
     assert not pad.clutch
-    pad.take(3, 1, 10**9)
+    pad.update(3, 1, 10**9)
     assert pad.speeds()[0][0] == pytest.approx(-SPEED_M_S)
 
 
@@ -182,8 +182,8 @@ def test_a_pad_through_the_kernel():
 
 
 def test_a_hand_moves_with_time_and_not_over_a_standstill():
-    hand = Hand()
-    hand.moved(0, (1.0, 0.0, 0.0), np.zeros(3), True)
-    assert hand.moved(10_000_000, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.01)
-    assert hand.moved(10**10, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.06)
-    assert hand.moved(0, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.06)
+    hand = PoseIntegrator()
+    hand.advance(0, (1.0, 0.0, 0.0), np.zeros(3), True)
+    assert hand.advance(10_000_000, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.01)
+    assert hand.advance(10**10, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.06)
+    assert hand.advance(0, (1.0, 0.0, 0.0), np.zeros(3), True).position_m[0] == pytest.approx(0.06)

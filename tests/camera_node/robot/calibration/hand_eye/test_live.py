@@ -22,7 +22,7 @@ from camera_node.config import source_config
 from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.arm.roadmap import clear
+from camera_node.robot.arm.roadmap import is_free
 from camera_node.robot.arm.viewpoint_tour import PathError
 from camera_node.robot.calibration import ArmStopped, live_camera
 from camera_node.robot.calibration.accuracy_study import streams
@@ -35,7 +35,7 @@ from camera_node.robot.calibration.hand_eye.samples import inverse
 from camera_node.robot.calibration.hand_eye.session import HandEyeSession
 from camera_node.robot.calibration.hand_eye.tracks import HAND_FILE, MIN_SECONDS, TARGET_FILE, StreamRecorder
 from camera_node.robot.calibration.targets import parse_target
-from camera_node.robot.hand_camera import Truth
+from camera_node.robot.hand_camera import TruthClient
 from camera_node.sources.base import Shot
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose
@@ -184,7 +184,7 @@ class OnArm:
     camera, fps, contents, intrinsics = "eye", Fraction(15), None, LENS
 
     def __init__(self, host, late_ns):
-        self._truth, self._late_ns, self._clock = Truth(host), late_ns, WallClock()
+        self._truth, self._late_ns, self._clock = TruthClient(host), late_ns, WallClock()
 
     def content(self, tick):
         return tick
@@ -213,7 +213,7 @@ def looking():
     """--joints of an arm whose camera sees the board."""
     hands = simulate.random_hands(60, np.random.default_rng(9), 30.0)
     postures = (p.joints for hand in hands for p in UR3E.inverse(hand) if not p.singular)
-    begin = next(joints for joints in postures if clear(UR3E, np.eye(4), joints, joints, 0.05).all())
+    begin = next(joints for joints in postures if is_free(UR3E, np.eye(4), joints, joints, 0.05).all())
     return begin, "--joints=" + ",".join(f"{a:.4f}" for a in np.rad2deg(begin))
 
 
@@ -266,11 +266,11 @@ def test_ctrl_c_on_the_way_brings_the_arm_to_rest(tmp_path):
     begin, joints = looking()
     goal = begin + np.array([0.8, 0, 0, 0, 0, 0])  # four seconds away
     with simulated_arm(host, joints):
-        truth, clock = Truth(host), WallClock()
+        truth, clock = TruthClient(host), WallClock()
         mover = ArmMover(plan, source_config(plan).arm, agreed_to=False)
 
         def press() -> None:
-            watched = Truth(host)
+            watched = TruthClient(host)
             while np.abs(watched.joints(clock.now_ns()) - begin).max() < 0.05:
                 time.sleep(0.01)
             _thread.interrupt_main()
@@ -306,7 +306,7 @@ def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, c
         assert main([*words, "--json"]) == 2
         said = capsys.readouterr()
         assert "Is its space clear" in said.err and "nothing was moved" in said.err and not said.out
-        np.testing.assert_allclose(Truth(host).joints(WallClock().now_ns()), begin, atol=1e-5)
+        np.testing.assert_allclose(TruthClient(host).joints(WallClock().now_ns()), begin, atol=1e-5)
 
 
 @pytest.mark.parametrize("more", [["--moving"], ["--eye-to-hand"], ["--hand", "hand.csv"]])

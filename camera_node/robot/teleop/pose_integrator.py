@@ -11,10 +11,10 @@ from freshfield.geometry import matrix_to_quaternion, quaternion_multiply, quate
 Array = NDArray[np.float64]
 
 # A machine that stood still longer must not make up for it.
-_MOST_S = 0.05
+_MAX_STEP_S = 0.05
 
 
-class Hand:
+class PoseIntegrator:
     """Position (3,) and orientation that speeds (m/s, rad/s) move. Begins at the origin."""
 
     def __init__(self) -> None:
@@ -22,9 +22,9 @@ class Hand:
         self.quaternion: Array = np.array([1.0, 0.0, 0.0, 0.0])
         self._now_ns: int | None = None
 
-    def moved(self, now_ns: int, speed: ArrayLike, turn: ArrayLike, clutch: bool) -> StylusSample:
+    def advance(self, now_ns: int, speed: ArrayLike, turn: ArrayLike, clutch: bool) -> StylusSample:
         """The sample at ``now_ns``, having moved at these speeds since the last one."""
-        dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / 1e9, 0.0), _MOST_S)
+        dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / 1e9, 0.0), _MAX_STEP_S)
         self._now_ns = now_ns
         self.shift(np.asarray(speed, dtype=np.float64) * dt_s, np.asarray(turn, dtype=np.float64) * dt_s)
         p, q = self.position.tolist(), self.quaternion.tolist()
