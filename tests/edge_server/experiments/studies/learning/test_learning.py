@@ -335,7 +335,7 @@ def test_verdicts_follow_from_the_paired_differences():
 
 
 @pytest.mark.parametrize(
-    ("mine", "base", "told"),
+    ("mine", "base", "text"),
     [
         (1.2, 1.0, "+20.0 %"),
         (-0.8, -1.0, "+20.0 %"),
