@@ -10,7 +10,7 @@ import pytest
 from camera_node.cli import main as camera_node
 from camera_node.config import source_config
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
-from camera_node.robot.arm.viewpoint_tour import tour, viewpoints
+from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
 from channel_emu.cli import main as channel_emu
 from channel_emu.model.config import channel_from_mapping
 from edge_server.cli import main as edge_server
@@ -38,7 +38,7 @@ def test_the_example_bench_is_a_scenario_whose_arm_reaches_its_tour() -> None:
     edge = read_config(scenario)
     make_field(edge.field, edge.field_options, seed=scenario.seed)
     mount = load_hand_eyes(scenario, config.arm, scenario.cameras)["hand"].transform
-    found = tour(arm_model(scenario, config.arm), base_matrix(config.arm), mount, config.arm.path)
+    found = plan_tour(arm_model(scenario, config.arm), base_matrix(config.arm), mount, config.arm.path)
     assert found.reached >= 0.8 * len(viewpoints(config.arm.path))
     assert not config.arm.simulated
 

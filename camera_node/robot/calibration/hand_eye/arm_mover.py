@@ -70,7 +70,7 @@ class Mover:
         there = [p.joints for p in self._model.inverse(hand, at) if not p.singular]
         places = [0] * len(there) + [1] * len(self._been)
         roadmap = Roadmap(self._model, self._base, [*there, *self._been], places, self._floor_m)
-        way = roadmap.way(np.asarray(at), {0})
+        way = roadmap.shortest_path(np.asarray(at), {0})
         if way is None:
             why = "without coming near itself or the floor" if there else "at all"
             raise PathError(f"the arm does not get there {why}: another pose will be proposed")

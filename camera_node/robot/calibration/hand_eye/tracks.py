@@ -97,7 +97,7 @@ def follow_arm(scenario: Scenario, config: ArmConfig, tracks: Tracks) -> ArmStre
     def each(t_ns: int, joints: Array) -> None:
         tracks.add_hand(t_ns, model.forward(joints))
 
-    stream = ArmStream(config.host, WallClock(), config.frequency_hz, each=each)
+    stream = ArmStream(config.host, WallClock(), config.frequency_hz, on_sample=each)
     stream.start()
     return stream
 

@@ -22,7 +22,7 @@ from camera_node.config import source_config
 from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.arm.roadmap import clear
+from camera_node.robot.arm.roadmap import is_free
 from camera_node.robot.arm.viewpoint_tour import PathError
 from camera_node.robot.calibration import ArmStopped
 from camera_node.robot.calibration.accuracy_cost import streams
@@ -213,7 +213,7 @@ def looking():
     """--joints of an arm whose camera sees the board."""
     hands = simulate.random_hands(60, np.random.default_rng(9), 30.0)
     postures = (p.joints for hand in hands for p in UR3E.inverse(hand) if not p.singular)
-    begin = next(joints for joints in postures if clear(UR3E, np.eye(4), joints, joints, 0.05).all())
+    begin = next(joints for joints in postures if is_free(UR3E, np.eye(4), joints, joints, 0.05).all())
     return begin, "--joints=" + ",".join(f"{a:.4f}" for a in np.rad2deg(begin))
 
 
