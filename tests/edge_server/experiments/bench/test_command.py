@@ -165,7 +165,7 @@ def test_limits(tmp_path):
     assert limits["reads_1mb_m_per_s"] > limits["reads_64mb_m_per_s"] > 0.0
     assert limits["gemm_g_per_s"] > 1.0
     assert limits["divisions_g_per_s"] < limits["multiply_adds_g_per_s"] <= limits["operations_g_per_s"]
-    of = {"ngp": ("train_chunks",), "splat": ("train_tiles", "project", "deal", "update")}
+    of = {"ngp": ("train_chunks",), "splat": ("train_tiles", "project", "bin_tiles", "adam_step")}
     table = (tmp_path / "bench.md").read_text()
     for field, scene in product(of, ("tile", "room")):
         about = found[f"{field} on {scene}"]
