@@ -1,4 +1,4 @@
-"""The table of costs is complete, and a frame is as fast as the design needs."""
+"""The cost table is complete, and a frame meets the design's time limit."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def test_a_size_that_is_none_is_refused(capsys):
 
 
 def test_a_frame_of_the_room_takes_milliseconds():
-    """The design needs 8 ms at 128 x 128 on an idle core. Processor time counts, and the best of several
-    medians, because what runs beside this test is not under test; sharing caches may still double it."""
+    """The design needs 8 ms at 128 x 128 on an idle core. The test takes the best of several medians of
+    processor time to exclude other load, but shared caches may still double it."""
     scene = make_scene("room", {"supersample": 1})
     render = scene.renderer("cam00").image
     best = min(effect_costs.measure_ms(lambda k: render(0.13 * k), frames=20)[0] for _ in range(5))

@@ -1,4 +1,4 @@
-"""A node's clock: exact in nanoseconds at any date."""
+"""The node clock is exact to the nanosecond at any date."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exposure wanders as a sine of the promised stops and period, each camera's by itself."""
+"""Exposure varies as a sine of the configured stops and period, independently for each camera."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_stop_doubles_and_white_is_the_end():
     assert drift.stops(peak_s) == pytest.approx(1.0)
     assert drift.apply(image, 0, peak_s).ravel().tolist() == [0, 2, 120, 200, 254, 255, 255, 255, 255]
     trough = drift.apply(image, 0, peak_s + 4.0).ravel().tolist()
-    assert trough == [0, 0, 30, 50, 64, 64, 100, 127, 128]  # halves, to the nearest even count
+    assert trough == [0, 0, 30, 50, 64, 64, 100, 127, 128]  # halves round to the nearest even count
 
 
 def test_it_is_a_sine_of_time_and_repeats():

@@ -1,4 +1,4 @@
-"""Damaged pixels stay where they are, hits are a Poisson process, and both have the means they promise."""
+"""Damaged pixels keep their positions, hits are a Poisson process, and both have the configured means."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_the_share_of_damaged_pixels_and_what_they_add():
     assert np.median(values) == pytest.approx(40 * np.log(2), rel=0.08)
     assert (values > 80).mean() == pytest.approx(np.exp(-80 / 40), rel=0.15)
     assert below.size > 0.98 * values.size
-    # One of a pixel's three values.
+    # Damage affects one of a pixel's three values.
     assert (np.count_nonzero(out, axis=2) <= 1).all()
     assert np.count_nonzero(out, axis=(0, 1)) == pytest.approx(out.astype(bool).sum() / 3, rel=0.1)
 
@@ -49,12 +49,12 @@ def test_the_damage_grows_with_the_hours_and_heals_nowhere():
         counts.append(np.count_nonzero(hit))
     for count, expected in zip(counts, (200, 920, 1640, 3800)):
         assert count == pytest.approx(expected, abs=4 * np.sqrt(expected))
-    # No growth gives the same damage as growth at its start.
+    # Without growth the damage equals that of growth at its start.
     assert np.array_equal(make(hot_ppm=1000.0).apply(BLACK, 0, 0.0), sensor.apply(BLACK, 0, 0.0))
 
 
 def test_hits_are_a_poisson_process_that_repeats_by_frame():
-    sensor = make(hits_per_megapixel=150.0, hit_counts=1e6)  # 30 a frame here, each seen
+    sensor = make(hits_per_megapixel=150.0, hit_counts=1e6)  # 30 a frame here, each visible
     numbers = np.array([np.count_nonzero(sensor.apply(BLACK, k, 0.0)) for k in range(400)])
     assert numbers.mean() == pytest.approx(30.0, abs=4 * np.sqrt(30 / 400))
     assert numbers.var() == pytest.approx(30.0, rel=0.3)

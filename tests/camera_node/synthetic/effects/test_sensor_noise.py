@@ -1,4 +1,4 @@
-"""Sensor noise has the variance it promises, and the stream and frame number alone decide it."""
+"""Sensor noise has the configured variance and depends only on the random stream and frame number."""
 
 from __future__ import annotations
 
@@ -51,4 +51,4 @@ def test_neighbours_and_channels_are_independent():
 def test_black_and_white_stay_in_range():
     for level in (0, 255):
         out = make(read_noise_counts=50.0).apply(np.full((64, 64, 3), level, np.uint8), 0)
-        assert out.dtype == np.uint8 and (out == level).mean() > 0.4  # clipped, not wrapped round
+        assert out.dtype == np.uint8 and (out == level).mean() > 0.4  # clipped, not wrapped around
