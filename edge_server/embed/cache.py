@@ -19,7 +19,7 @@ _Row = NDArray[np.float32] | None
 
 
 class EmbedderLike(Protocol):
-    """An Embedder, as far as the cache needs it."""
+    """The part of an Embedder that the cache uses."""
 
     @property
     def name(self) -> str: ...
@@ -38,7 +38,7 @@ class HasImage(Protocol):
 
 
 class HasFrame(Protocol):
-    """A frame with whatever its owner keeps beside it."""
+    """An object with a frame."""
 
     @property
     def frame(self) -> Frame: ...

@@ -1,4 +1,4 @@
-"""Images of any size into the fixed frame that a detector was trained on, as YOLO does it."""
+"""Scale and pad images to the fixed input size of a detector, as YOLO does."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError
 
-GREY = 114  # what YOLO pads with
+GREY = 114  # YOLO's padding
 
 
 def letterbox(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """``image`` (H, W, 3) scaled to fit, centred on grey: (height, width, 3). One side is never less than a
-    pixel, however extreme the aspect."""
+    """``image`` (H, W, 3) scaled to fit and centered on gray: (height, width, 3). Each side has at least one
+    pixel at any aspect ratio."""
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image
@@ -33,7 +33,7 @@ def letterbox(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.u
 
 
 def checked(image: NDArray, number: int) -> NDArray[np.uint8]:
-    """``image`` as uint8 (H, W, 3), straight alpha laid over grey. Raises EmbeddingError."""
+    """``image`` as uint8 (H, W, 3), straight alpha composited over gray. Raises EmbeddingError."""
     array = np.asarray(image)
     if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] not in (3, 4) or 0 in array.shape:
         raise EmbeddingError(

@@ -1,4 +1,4 @@
-"""What policies choose at a drawn decision: the ones that run live, and a learner's actions."""
+"""Choices of live policies, and of a learner's actions, at a drawn decision."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy
 from edge_server.scheduler.learned.learner_spec import Spec
 
 Maker = Callable[[np.random.Generator], Policy]
-"""Makes a policy as new, from its stream of random numbers."""
+"""Makes a new policy from a random generator."""
 
 
 def choose(policy: Policy, moment: DecisionPoint, number: int | None = None) -> Choice:
-    """What ``policy`` does at a decision: it plans, waits for as long as it likes and selects, as the live
-    loop has it. One that would wait longer than is known of the channel uses all that there is then. number:
-    of the decision, for policies that go on from one to the next; None takes the moment's own."""
+    """Plan, wait and select with ``policy`` at a decision, as in the live loop. A policy that would wait past
+    the channel's record uses all newest frames at its end. number: of the decision, for policies with state
+    across decisions; None takes the moment's own."""
     number = moment.number if number is None else number
     plan = policy.plan(_epoch(moment, moment.now_ns, number))
     at_ns = min(max(moment.now_ns, plan.wait_until_ns), moment.until_ns)
@@ -36,25 +36,24 @@ def choose(policy: Policy, moment: DecisionPoint, number: int | None = None) -> 
 
 
 def choice_of_action(spec: Spec, action: Any, moment: DecisionPoint) -> Choice:
-    """What a learner's action means at a decision: action (N,) bool, or an index of the specification's
-    omegas."""
+    """The choice of a learner's action: (N,) bool, or an index into the specification's omegas."""
     if spec.action != "select":
         omega_ms = spec.omegas_ms[int(action)]
         return choose(make_policy(spec.action, omega_ms, np.random.default_rng(0)), moment)
     cameras = tuple(c for c, chosen in zip(moment.cameras, action) if chosen)
-    # Where nothing has been reported there is nothing to choose: the first frame that comes is used.
+    # Without a reported frame there is nothing to select: use the first frame that arrives.
     return Choice(cameras, moment.now_ns) if cameras else choose(_use_all(), moment)
 
 
 def choices(make: Maker, moments: Sequence[DecisionPoint], purpose: int = 0) -> list[Choice]:
-    """What a policy does at the decisions of one episode, in their order, from its beginning. purpose: keeps
-    the random numbers of several policies apart."""
+    """Choices of a new policy at the decisions of one episode, in order. purpose: separates the random
+    numbers of several policies."""
     policy = make(np.random.default_rng([moments[0].seed, purpose]))
     return [choose(policy, moment) for moment in moments]
 
 
 def named(name: str) -> Maker:
-    """The policy of a name with a value, such as ``threshold:120``, as ``make_policy`` knows it."""
+    """Maker of a policy from ``make_policy``'s name and value, such as ``threshold:120``."""
     kind, _, value = (name, "", "") if name.startswith(BANDIT) else name.partition(":")
     return lambda rng: make_policy(kind, float(value) if value else None, rng)
 
@@ -65,6 +64,6 @@ def _use_all() -> Policy:
 
 def _epoch(moment: DecisionPoint, at_ns: int, number: int) -> Epoch:
     generated = {c: arrival.generated_ns for c, arrival in moment.newest(at_ns).items()}
-    # What is seen besides ages is known of the instant of the decision, at which policies look.
+    # Apart from ages, the state is known only at the instant of the decision, when policies read it.
     state = (lambda parts=(): moment.state) if at_ns == moment.now_ns else None
     return Epoch(at_ns, number, generated, state)

@@ -1,9 +1,9 @@
-"""Episodes: a virtual deployment is watched, decisions are drawn from it, and what was chosen is carried out.
+"""Episodes: run a virtual deployment, draw decisions from it, and evaluate choices with field fits.
 
-The channel does not depend on what the edge decides, so that one run of it serves every action at every
-decision: the deliveries are recorded, and the buffer at any instant follows from the record. Each choice is
-then rewarded by a field fit of its own, from nothing or from a copy of the same warm field, so that actions
-of one decision are comparable (thesis 5.4, algorithm 1; 6.3, algorithm 2).
+The channel does not depend on the edge's decisions, so one recorded run serves every action at every
+decision, and the record gives the buffer at any instant. Each choice gets its own field fit, from nothing or
+from a copy of the same warm field, so actions of one decision are comparable (thesis 5.4, algorithm 1; 6.3,
+algorithm 2).
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ if TYPE_CHECKING:
     from edge_server.embed import Embedder
 
 Image = Callable[[str, float], NDArray[np.uint8]]
-# Episodes whose pictures and warm fields a process keeps.
+# Number of episodes whose images and warm fields a process keeps.
 _EPISODES_KEPT = 32
 _TRUTHS_KEPT = 8192
-# The deployment's own edge never decides here.
+# The first decision of the deployment's own edge: never within an episode.
 _NEVER_MS = 1e11
 
 
@@ -67,8 +67,7 @@ class Arrival:
 
 @dataclass(frozen=True)
 class Choice:
-    """What a policy chose: these cameras' newest frames as of ``at_ns``, treated or not. omega_ms: as people
-    call it, no part of what is chosen."""
+    """A policy's choice: the newest frames of ``cameras`` at ``at_ns``. treatment: name, "" for none."""
 
     cameras: tuple[str, ...]
     at_ns: int
@@ -77,8 +76,8 @@ class Choice:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an update came to: fidelity on the scoring cameras (None where there is none), aaoi_ms (6.35: of
-    the used views at publication; None of none), views used, and wait_ms from the decision to publication."""
+    """Result of an update: fidelity on the scoring cameras (None without a score), aaoi_ms (6.35) of the used
+    views at publication (None without views), number of views used, wait_ms from decision to publication."""
 
     psnr_db: float | None
     psnr_moving_db: float | None
@@ -92,10 +91,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class DecisionPoint:
-    """A decision: everything that a policy may look at, and what arrives while it waits, in plain values.
+    """A decision as plain values: the policy's inputs and the frames that arrive while it waits.
 
-    state: at ``now_ns`` (6.33). arrivals: in order of reception; of those before ``now_ns`` each camera's two
-    youngest. until_ns: end of what is known of the channel.
+    state: at ``now_ns`` (6.33). arrivals: in order of reception; up to ``now_ns`` only each camera's two
+    youngest. until_ns: end of the channel's record.
     """
 
     seed: int
@@ -107,11 +106,11 @@ class DecisionPoint:
     state: State
 
     def newest(self, at_ns: int) -> dict[str, Arrival]:
-        """Omega(t) of (5.6) as the buffer holds it at ``at_ns``, in the cameras' order."""
+        """Omega(t) of (5.6): the newest arrival of each camera at ``at_ns``, in the cameras' order."""
         return _newest(self.arrivals, at_ns, self.cameras)
 
     def earlier(self, at_ns: int) -> dict[str, Arrival]:
-        """Of each camera, the youngest arrival that is older than its newest."""
+        """The second-youngest arrival of each camera at ``at_ns``."""
         newest = self.newest(at_ns)
         found: dict[str, Arrival] = {}
         for a in self.arrivals:
@@ -122,13 +121,13 @@ class DecisionPoint:
         return found
 
     def next_arrival_ns(self, after_ns: int) -> int | None:
-        """Instant of the first arrival after an instant; None: nothing more is known to come."""
+        """Instant of the first arrival after ``after_ns``; None if the record has none."""
         return next((a.received_ns for a in self.arrivals if a.received_ns > after_ns), None)
 
 
 def _newest(arrivals: Iterable[Arrival], at_ns: int, cameras: Sequence[str]) -> dict[str, Arrival]:
-    """Of each camera that has one, the youngest of what was received by ``at_ns``; in the cameras' order.
-    arrivals: in order of reception."""
+    """Youngest arrival of each camera received by ``at_ns``, in the cameras' order; cameras without one are
+    left out. arrivals: in order of reception."""
     found: dict[str, Arrival] = {}
     for arrival in arrivals:
         if arrival.received_ns > at_ns:
@@ -140,7 +139,7 @@ def _newest(arrivals: Iterable[Arrival], at_ns: int, cameras: Sequence[str]) -> 
 
 
 class _Recorder(FrameBuffer):
-    """A buffer that remembers all that was put into it."""
+    """A buffer that records every frame put into it."""
 
     def __init__(self, cameras: Sequence[str]) -> None:
         super().__init__(cameras)
@@ -152,22 +151,22 @@ class _Recorder(FrameBuffer):
 
 
 def _remembered(image: Image, period_ns: int | None) -> Image:
-    """``image``, rendered once for every instant of a round."""
+    """``image`` with a cache; with ``period_ns``, instants one period apart share a rendering."""
     known = lru_cache(_TRUTHS_KEPT)(lambda camera, at_ns: image(camera, at_ns / 1e9))
     return lambda camera, t_s: known(camera, round(t_s * 1e9) % period_ns if period_ns else round(t_s * 1e9))
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What is seen of one motion."""
+    """Truth and training cameras of one motion."""
 
     truth: Truth
     cameras: list[Camera]
 
 
 class EpisodeFactory:
-    """What the episodes of a setting share in one process: a scorer, a field, an embedder, and the pictures
-    where all have the same motion."""
+    """Objects that the episodes of a setting share in one process: scorer, field, embedder, and the images
+    where all episodes have the same motion."""
 
     def __init__(self, setting: Setting, folders: Folders) -> None:
         scenario = setting.scenario
@@ -186,7 +185,7 @@ class EpisodeFactory:
         self._field: tuple[int, Field] | None = None
         self._embedder: Embedder | None = None
         if "semantics" in setting.parts:
-            # Nothing of it is loaded where no policy looks at pictures.
+            # Loaded only where the state includes semantics.
             from edge_server.embed import EmbeddingConfig, make_embedder
 
             self._embedder = make_embedder(edge.embedding or EmbeddingConfig())
@@ -197,11 +196,11 @@ class EpisodeFactory:
         return self.setting.seeded(seed, self._moving)
 
     def stage(self, seed: int) -> Stage:
-        """The pictures of an episode."""
+        """Truth and training cameras of an episode."""
         return self._shared or self._stage(self.scenario(seed))
 
     def embeddings(self) -> FrameEmbeddings | None:
-        """Of one episode: frames of the same number are other pictures in the next."""
+        """A new cache for one episode: frame numbers repeat across episodes with different images."""
         if self._embedder is None:
             return None
         from edge_server.embed.cache import EmbeddingCache
@@ -209,7 +208,7 @@ class EpisodeFactory:
         return EmbeddingCache(self._embedder, ViewDecoder().view)
 
     def field(self, seed: int) -> Field:
-        """The field of an episode, in any state: whoever takes it resets or loads it."""
+        """The field of an episode, in any state: the caller must reset or load it."""
         seed = self.setting.field_seed(seed)
         if self._field is None or self._field[0] != seed:
             options = {**self._edge.field_options, "threads": 1}
@@ -220,7 +219,7 @@ class EpisodeFactory:
         return self._field[1]
 
     def _stage(self, scenario: Scenario) -> Stage:
-        # The truth is of who scores; none of the others that are held out is rendered.
+        # Render the truth of the scoring cameras only, not of the other held-out ones.
         scoring = replace(scenario, held_out=self.setting.scoring)
         truth = build_truth(scoring, source_config(scenario), self._edge, self._scorer, self.folders.data)
         assert truth is not None  # a setting has a camera held out
@@ -229,7 +228,7 @@ class EpisodeFactory:
         return Stage(truth, training_cameras(scenario, self.folders.data))
 
     def episode(self, seed: int) -> Episode:
-        """The episode of a seed: the same whether it is new or kept."""
+        """The episode of a seed, from the cache or new; both give the same results."""
         found = self._episodes.get(seed)
         if found is None:
             found = self._episodes[seed] = Episode(self, seed)
@@ -240,7 +239,7 @@ class EpisodeFactory:
 
 
 class Episode:
-    """One seed's deployment: its decisions, and the field fits of what is chosen there."""
+    """The deployment of one seed: its decisions and the field fits of choices."""
 
     def __init__(self, factory: EpisodeFactory, seed: int) -> None:
         began_s = time.process_time()
@@ -275,12 +274,12 @@ class Episode:
         self._embeddings = factory.embeddings()
         self.moments = tuple(self._moment(number) for number in range(setting.decisions))
         self.spent_s = 0.0
-        """Processor time of all that was evaluated so far; the first one bears that of the episode itself."""
+        """Processor time of all evaluations so far; the first includes the episode's construction."""
         self._owed_s = time.process_time() - began_s
 
     def evaluate(self, number: int, choice: Choice) -> Outcome:
-        """Fit what was chosen at a decision and score it at the instant of publication on the setting's
-        scoring cameras. Where nothing was chosen, or nothing of it can be decoded, there are no scores."""
+        """Fit the choice at a decision and score it at publication on the setting's scoring cameras. An empty
+        choice, or one without a decodable frame, has no scores."""
         began_s = time.process_time() - self._owed_s
         self._owed_s = 0.0
         found = self._carried_out(number, choice)
@@ -345,7 +344,7 @@ class Episode:
         return self._deployment.with_images([self._frames[a.camera, a.sequence] for a in arrivals])
 
     def _decoded(self, arrivals: Sequence[Arrival]) -> list[View]:
-        """Views in the order given, each decoded once, without those that cannot be."""
+        """Views in the given order, each decoded once; undecodable frames are left out."""
         missing = [a for a in arrivals if (a.camera, a.sequence) not in self._views]
         for item in self._exposed(missing):
             views = ViewDecoder().views([item])
@@ -354,11 +353,11 @@ class Episode:
         return [view for view in found if view is not None]
 
     def _warm_state(self, number: int) -> dict[str, NDArray[Any]]:
-        """The field before a decision; nothing that is chosen at any decision changes it."""
+        """Field state before a decision, independent of all choices."""
         setting, field = self._factory.setting, self._factory.field(self.seed)
         while len(self._warm) <= number:
             moment = self.moments[len(self._warm)]
-            # What was delivered by then is all in the record of the deployment, not of the moment.
+            # The deployment's record has every delivery by then; the decision's record does not.
             then_ns = moment.now_ns - round(setting.refresh_ms * 1e6)
             if self._warm:
                 field.load_state(self._warm[-1])

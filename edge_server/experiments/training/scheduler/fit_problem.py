@@ -1,7 +1,7 @@
-"""Decisions with real field fits as a ``Problem``, for learners that are not ours.
+"""Decisions with real field fits as a ``Problem``, for external learners.
 
-with Crew(folders) as crew:
-    problem = FitProblem(setting, Spec("select"), make_reward("set"), crew)
+with WorkerPool(folders) as pool:
+    problem = FitProblem(setting, Spec("select"), make_reward("set"), pool)
     environment = ...                      # scheduler.learned.gym_environment, with gymnasium's interface
 """
 
@@ -20,14 +20,14 @@ from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.state import State
 
-KEPT = 16  # episodes whose frames stay in memory, of those drawn last
+KEPT = 16  # number of last drawn episodes whose frames stay in memory
 
 
 @dataclass(frozen=True)
 class FitProblem:
-    """``scheduler.learned.problem.Problem``: seed s is decision s mod D of episode s div D of training, D
-    being the setting's decisions in an episode; whatever the seed, no episode is one that others are tested
-    on. spec: what an action means. run: whose episodes of training."""
+    """``scheduler.learned.problem.Problem``: seed s is decision s mod D of training episode s div D, with D
+    decisions per episode. No seed gives a test episode. spec: the meaning of an action. run: number of the
+    run whose training episodes are drawn."""
 
     setting: Setting
     spec: Spec
@@ -60,7 +60,7 @@ class FitDecision:
         return self.moment.state
 
     def reward(self, action: Any) -> tuple[float, dict[str, float | None]]:
-        """The reward of a real fit, NaN where a term of it is missing, and its terms."""
+        """Reward of a real fit, NaN if a term is missing, and its terms."""
         of, moment = self.problem, self.moment
         choice = choice_of_action(of.spec, action, moment)
         (outcome,) = of.pool.evaluate(of.setting, [(moment.seed, moment.number, choice)])

@@ -1,4 +1,4 @@
-"""Where decisions come from and what one evaluation is, as plain values: they travel to other processes."""
+"""Settings of decisions and evaluations, as plain values that can be sent to other processes."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 from edge_server.config import ComputeConfig
 from freshfield.scenario import Scenario, ScenarioError
 
-# A truth is rendered for every instant that is looked at, at ten times the price of a score: instants lie on
-# a grid, which the lags of moving pixels (60, 120, 200, 300 ms) lie on too, so that pictures are shared.
+# Rendering a truth costs ten times a score. Instants lie on a grid that contains the lags of moving pixels
+# (60, 120, 200, 300 ms), so that evaluations share renderings.
 GRID_MS = 10
-# Seeds of training, of choosing among what was tried and of testing: never the same in two of them.
+# Training, model selection and testing use disjoint seeds.
 PURPOSES = ("train", "choose", "test")
 SEEDS_A_PURPOSE = 10**6
 _SEEDS_A_RUN = 10**7
@@ -25,22 +25,20 @@ _SEEDS_A_RUN = 10**7
 
 @dataclass(frozen=True)
 class Setting:
-    """scenario: of the deployment; an episode's seed and policy replace its own. decisions: of one episode,
-    at random instants between ``lead_ms`` and ``lead_ms + span_ms`` of its virtual time. horizon_ms: how
-    long a decision may wait.
+    """scenario: the deployment; each episode replaces its seed and policy. decisions: number per episode, at
+    random instants between ``lead_ms`` and ``lead_ms + span_ms`` of virtual time. horizon_ms: longest wait.
 
-    report: those of the held-out cameras that only report; the others reward. None is trained on.
-    judging: outcomes are scored from the reporting cameras instead of the rewarding ones (``judged``).
-    motions: every episode has a motion of its own, drawn from its seed, where a world moves; False, and with
-    recordings, the same one everywhere, so that seeds differ in their channel and instants alone.
+    report: held-out cameras that only report; the other held-out cameras reward. Neither is trained on.
+    judging: score outcomes from the reporting cameras instead of the rewarding ones (``judged``).
+    motions: draw each episode's motion from its seed, where a world moves. If False, and with recordings,
+    all episodes share one motion and seeds differ only in channel and instants.
 
-    steps: of the optimiser for the update of a decision. scratch: every update begins with nothing, as in
-    the thesis (5.4, 6.3); else with a copy of the episode's warm field, which was trained for
-    ``warm_steps`` before the first decision and, with everything there was, for ``steps`` more
-    ``refresh_ms`` before each. repeat: number of the stream that fields draw from: fits that differ in
-    nothing else differ by their luck. compute: what virtual time charges an update. parts: of the state that
-    decisions are drawn with (6.33); only with semantics are frames embedded, as ``edge.embedding`` of the
-    scenario says. silent: cameras that never send anything.
+    steps: optimizer steps per update. scratch: start every update from nothing, as in the thesis (5.4, 6.3);
+    else from a copy of the episode's warm field, trained for ``warm_steps`` before the first decision and,
+    on the newest frames, for ``steps`` more before each later one, ``refresh_ms`` before the decision.
+    repeat: number of the fields' random stream, to measure the variance of repeated fits. compute: virtual
+    time charged per update. parts: of the state (6.33); only "semantics" embeds frames, as the scenario's
+    ``edge.embedding`` configures. silent: cameras that never send.
     """
 
     scenario: Scenario
@@ -82,7 +80,7 @@ class Setting:
 
     @property
     def draws_motions(self) -> bool:
-        """Whether episodes differ in their motion, too: a recording has only its own."""
+        """Whether each episode has its own motion; a recording has only one."""
         return self.motions and self.scenario.source.get("kind") == "world"
 
     @property
@@ -92,17 +90,17 @@ class Setting:
 
     @property
     def scoring(self) -> tuple[str, ...]:
-        """Held-out cameras that outcomes are scored from."""
+        """Held-out cameras that score outcomes."""
         return self.report if self.judging else self.rewarding
 
     @property
     def judged(self) -> Setting:
-        """The same decisions, scored by the cameras that report; itself where there is none."""
+        """The same setting scored by the reporting cameras; itself if there are none."""
         return dataclasses.replace(self, judging=True) if self.report else self
 
     @cached_property
     def key(self) -> str:
-        """Tells settings apart: a hash of everything that decides an evaluation, the episode's seed aside."""
+        """Hash of everything that determines an evaluation, except the episode's seed."""
         s = self.scenario
         own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "scenario"}
         own["compute"] = dataclasses.astuple(self.compute)
@@ -110,21 +108,21 @@ class Setting:
         return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:24]
 
     def seeded(self, seed: int, moves: bool = False) -> Scenario:
-        """The deployment of one episode. moves: its world does, so that its motion is drawn, too."""
+        """The deployment of one episode. moves: its world moves, so its motion is drawn from the seed."""
         source = self.scenario.source
         if moves and self.motions:
             source = {**source, "motion_seed": seed}
         return dataclasses.replace(self.scenario, seed=seed, source=source)
 
     def field_seed(self, seed: int) -> int:
-        """What the field of an episode is seeded with."""
+        """Seed of an episode's field."""
         words = np.random.SeedSequence([self.scenario.seed, seed, self.repeat]).generate_state(1)
-        return int(words[0] >> 1)  # fields take what fits 31 bits
+        return int(words[0] >> 1)  # fields take 31-bit seeds
 
 
 def seeds(run: int, purpose: str, count: int, first: int = 0) -> range:
-    """Seeds of ``count`` episodes from number ``first`` on, for one of ``PURPOSES`` of the run seeded
-    ``run``. ValueError where a range would reach into the next."""
+    """Seeds of ``count`` episodes from number ``first`` on, for one of ``PURPOSES`` of run ``run``.
+    ValueError if the range would overlap the next."""
     if not (0 <= run < 10**9 and first >= 0 and first + count <= SEEDS_A_PURPOSE):
         raise ValueError(f"seed: expected 0 to 999999999, and at most {SEEDS_A_PURPOSE} episodes")
     start = run * _SEEDS_A_RUN + PURPOSES.index(purpose) * SEEDS_A_PURPOSE + first
