@@ -1,8 +1,7 @@
 """Studies: the thesis's figures and a few it does not have, as commands with verdicts.
 
-A study names its points (``base.Study``), each a ``trial.Trial``; ``engine`` runs what is not known yet;
-``statistics`` says what the seeds tell. Adding a study is one file with a class and a line in
-``command.STUDIES``.
+A study (``study.Study``) defines points, each a ``trial.Trial``. ``engine`` runs the trials without stored
+results; ``statistics`` compares seeds. A new study needs one class file and a line in ``command.STUDIES``.
 """
 
 from __future__ import annotations

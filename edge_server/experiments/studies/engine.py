@@ -1,9 +1,8 @@
-"""Runs trials: one after the other, in processes of this machine, or on a Ray cluster; what is known is not
-run again.
+"""Runs trials without stored results: serially, in local processes, or on a Ray cluster.
 
-A trial's result depends on the trial and on nothing else, so who runs it and in which order makes no
-difference; a test compares the three. FOLDER/results.jsonl keeps results by content: the trial, the program's
-own source and the data set. After Ctrl-C the same command goes on where it stopped.
+A trial's result depends only on the trial, not on the backend or order; a test compares the three backends.
+FOLDER/results.jsonl stores results by content: the trial, the program's own source and the data set.
+After Ctrl-C the same command resumes.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ from edge_server.experiments.studies.trial import Folders, Row, Trial, run_trial
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
 from edge_server.report.machine import versions
 
-# Trials of one task: enough to share pictures, few enough that little is lost by Ctrl-C.
+# Trials per task: enough to share images, few enough that Ctrl-C loses little work.
 _TRIALS_A_TASK = 6
-# These do not decide a trial's result.
+# Sources that do not affect a trial's result.
 _BESIDE = ("edge_server/page", "edge_server/report", "edge_server/experiments/studies")
 _DECIDES = "edge_server/experiments/studies/trial.py"
 
@@ -43,15 +42,15 @@ class StudyError(RuntimeError):
 
 
 Task = list[dict[str, Any]]
-"""Trials of the same pictures, as mappings: what travels to a process or machine."""
+"""Trials with the same images, as mappings; sent to a process or machine."""
 
 
 def run_task(task: Task, folders: Folders) -> list[Row]:
-    """The results of a task's trials, in order. This very function runs wherever trials are run."""
+    """Return the results of a task's trials, in order. Every backend runs this function."""
     if folders.lpips is not None:
         import torch
 
-        # How many threads share a convolution decides its last bits.
+        # The thread count changes the last bits of a convolution.
         torch.set_num_threads(1)
     return [run_trial(Trial(**mapping), folders) for mapping in task]
 

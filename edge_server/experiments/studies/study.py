@@ -1,4 +1,4 @@
-"""What every study is made of: points (labels and a trial), their results as a table, and verdicts."""
+"""Parts of a study: points (labels and a trial), a results table, and verdicts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ METRICS: dict[str, tuple[str, bool, int]] = {
     "aaoi_ms": ("mean age of used views (ms)", True, 1),
     "f_w": ("F_w (6.37)", True, 3),
 }
-# Differences in PSNR below this are not worth a claim; nor are these of the other metrics.
+# Smallest differences that support a claim, in PSNR and in the other metrics.
 LEAST_DB = 0.1
 LEAST = {"psnr_db": LEAST_DB, "psnr_moving_db": LEAST_DB, "ssim": 0.002, "lpips": 0.002, "f_w": 0.01}
 
@@ -33,9 +33,9 @@ Curve = dict[float, dict[int, float | None]]
 
 @dataclass(frozen=True)
 class Ask:
-    """What was asked for; None, or no case, takes the study's own. seeds: repetitions of every point. scenes:
-    of those whose data are here. Of studies that train, jobs: processes; cases: words in the names of those
-    that are wanted; episodes: of one training."""
+    """Requested settings; None or no case selects the study's default. seeds: repetitions per point. scenes:
+    a subset of those with local data. For studies that train, jobs: processes; cases: words in the names of
+    selected cases; episodes: number per training."""
 
     quick: bool
     out: Path

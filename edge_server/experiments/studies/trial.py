@@ -1,8 +1,7 @@
 """One trial of a study: a deployment in virtual time under one policy, channel and seed.
 
-A trial is plain values, so that it can be hashed, sent to another process or machine, and repeated bit for
-bit: the seed is in it, and nothing else decides. Trials that differ in their policy only decide at the same
-instants on the same deliveries, so their differences are paired.
+A trial holds only plain values, including the seed. It can be hashed, sent to another process or machine,
+and repeated bit for bit. Trials that differ only in policy share decision instants and deliveries (paired).
 """
 
 from __future__ import annotations
@@ -27,11 +26,10 @@ from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.live.state import Publication
 from freshfield.scenario import Scenario, ScenarioError, load, parse
 
-# Scenes of ours are captured at the thesis's period of 30 ms.
+# Synthetic scenes use the thesis's capture period of 30 ms.
 WORLD_FPS = 100 / 3
 SCENARIOS = {"room": "room19", "tile": "tile", "tower": "tower", "kitchen": "kitchen", "people": "people"}
-# Decision instants of one seed come this much after those of the one before: not whole frames, so that seeds
-# meet the captures at every phase.
+# Offset of decision instants between successive seeds; not whole frames, so seeds sample all capture phases.
 _STAGGER_MS = 217.0
 _TRUTHS_KEPT = 4096
 _MOMENT_S = 1e-6
@@ -41,11 +39,11 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Trial:
-    """scene: a key of ``SCENARIOS``. size: width and height of a world's pictures; recordings are divided by
-    ``scale``. channel: the section of a scenario. steps: of the optimiser for one update. scratch: every
-    update begins with nothing (the thesis); else the field is warm: it keeps what it knows, and the first
-    update has ``first_steps``. compute: ms_per_step and ms_per_update charged; none as in the thesis.
-    decisions: how many are scored, every ``every_ms``; of a warm field the first ``settle`` are not."""
+    """scene: key of ``SCENARIOS``. size: image width and height of a world; recordings: divided by ``scale``.
+    channel: scenario section. steps: optimizer steps per update. scratch: restart the field at each update
+    (thesis); otherwise it stays warm, and the first update has ``first_steps``. compute: charged ms_per_step
+    and ms_per_update; empty in the thesis. decisions: number scored, every ``every_ms``; a warm field skips
+    the first ``settle``."""
 
     scene: str
     seed: int
@@ -69,7 +67,7 @@ class Trial:
 
     @property
     def stage(self) -> tuple[Any, ...]:
-        """What decides the pictures: trials of one stage share what was rendered and decoded."""
+        """Settings that determine the images. Trials of one stage share rendered and decoded images."""
         return (self.scene, self.size, self.scale, self.cameras, self.speed_m_per_s)
 
     @property
@@ -118,7 +116,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Folders:
-    """Where a machine has what is not in the repository. data: recorded data sets. lpips: weights."""
+    """Local folders for files outside the repository. data: recorded data sets. lpips: weights."""
 
     data: Path | None = None
     lpips: Path | None = None
@@ -126,7 +124,7 @@ class Folders:
 
 @dataclass
 class Stage:
-    """What trials of the same pictures share."""
+    """Data shared by trials with the same images."""
 
     cameras: list[Camera]
     truth: Truth | None

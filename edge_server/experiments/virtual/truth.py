@@ -1,4 +1,4 @@
-"""What a field is scored against in virtual time: the exact scene, or the nearest capture."""
+"""Reference images for scoring in virtual time: the exact scene, or the nearest capture."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from freshfield import payload
 from freshfield.geometry import Pinhole
 
-NOISE_FRAMES = 8  # that the noise of a camera is estimated from
+NOISE_FRAMES = 8  # frames used to estimate a camera's noise
 # Image uint8 (H, W, 3), intrinsics, camera-to-world (4, 4).
 Seen = tuple[NDArray[np.uint8], Pinhole, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class ExactTruth:
-    """A synthetic scene rendered at the very instant: the truth is never older or younger than the present.
+    """A synthetic scene rendered at the exact instant of scoring.
 
     cameras: held-out camera -> (intrinsics, camera-to-world).
     image: (camera, seconds) -> uint8 (H, W, 3).
@@ -34,12 +34,12 @@ class ExactTruth:
     image: Callable[[str, float], NDArray[np.uint8]]
 
     def view(self, camera: str, present_ns: int) -> Seen:
-        """What a held-out camera sees at an instant, its lens and its camera-to-world pose."""
+        """Image of a held-out camera at an instant, intrinsics and camera-to-world pose."""
         return self.image(camera, present_ns / 1e9), *self.cameras[camera]
 
     def score(self, field: Any, present_ns: int) -> Score:
-        """Mean score over the held-out cameras. Moving pixels come from the scene at earlier instants, which
-        an analytic scene has before the first frame, too."""
+        """Mean score over the held-out cameras. Earlier renders define the moving pixels; an
+        analytic scene has them before the first frame, too."""
         lags_ns = [round(lag * 1e6) for lag in LAGS_MS]
         scores = []
         for camera, (intrinsics, pose) in self.cameras.items():
@@ -53,7 +53,7 @@ class ExactTruth:
 class CapturedTruth:
     """The captures of held-out cameras: the one nearest to the present, at most half a period away.
 
-    noisy: real video, so that the bound of moving pixels follows its noise.
+    noisy: real video; its noise sets the moving-pixel bound.
     """
 
     def __init__(self, scorer: Scorer, cameras: Sequence[Camera], noisy: bool = False) -> None:
@@ -65,7 +65,7 @@ class CapturedTruth:
         }
 
     def view(self, camera: str, present_ns: int) -> Seen:
-        """What a held-out camera captured nearest to an instant, its lens and its camera-to-world pose."""
+        """Held-out capture nearest to an instant: image, intrinsics and camera-to-world pose."""
         source = next(c for c in self._cameras if c.name == camera)
         shot = source.capture(_nearest(source, present_ns))
         return _image(source, shot), shot.intrinsics, shot.pose.matrix()
@@ -104,8 +104,7 @@ def _image(camera: Camera, shot: EncodedShot) -> NDArray[np.uint8]:
 
 
 def noise_bound(images: Iterable[NDArray[np.uint8]]) -> float:
-    """By how much a pixel of real video differs at least where something moves: consecutive images of one
-    camera tell its noise."""
+    """Minimum difference of a moving pixel in real video, from the noise of consecutive camera images."""
     estimate = NoiseEstimate()
     for a, b in pairwise(images):
         estimate.add(a, b)

@@ -1,11 +1,9 @@
 """A whole deployment in virtual time: cameras -> links -> gate -> buffer -> updates -> publications.
 
-The parts are the live ones; only their clock differs. One seed decides everything, so a run is repeatable
-bit for bit, faults included. What an update costs is charged as ``Compute`` says: the present is the instant
-at which the charge is over.
-
-Pay late holds here too: a frame is captured, encoded and checksummed only when an update uses it or a fault
-damages it. That changes no result, because nothing reads a frame before.
+It uses the live parts with a virtual clock. One seed makes a run repeatable bit for bit, faults included.
+``Compute`` sets the cost of an update; the present is the instant at which that cost has elapsed.
+A frame is captured, encoded and checksummed only when an update uses it or a fault damages it. This changes
+no result, because nothing reads a frame before.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ SESSION = "virtual"
 _NO_POSE = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-# What an update costs in virtual time.
+# Cost of an update in virtual time.
 Compute = ComputeConfig
 _FREE = Compute()
 
@@ -53,7 +51,7 @@ _AT_ARRIVAL = WakeCondition(on_arrival=True)
 
 
 class Truth(Protocol):
-    """Scores what the field shows at the present. See ``experiments.virtual.truth``."""
+    """Scores renders of the field at the present. See ``experiments.virtual.truth``."""
 
     def score(self, field: Any, present_ns: int) -> Score | None: ...
 
@@ -74,7 +72,7 @@ class RunSettings:
     score_every_ms: publications nearer than this to the last scored one are not scored; None scores nothing.
     first_ms: no decision before this instant of the run, and later ones only at whole numbers of epochs after
         it, so that policies that take different times decide at the same instants.
-    scratch: every update begins with a field that knows nothing, as in the thesis.
+    scratch: every update starts with an empty field, as in the thesis.
     """
 
     steps: int

@@ -45,7 +45,7 @@ SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")
 # From here what was learnt is judged; no reward has come from here and no update has seen it.
 REPORT = ("cam05", "cam08")
-# Trainings of one lesson: how differently the same lesson may be learnt is part of an interval.
+# Trainings per lesson; their spread is part of the interval.
 RUNS = {True: 1, False: 3}
 
 Runs = Sequence[PerSeed]
@@ -108,8 +108,8 @@ def room(
 
 
 class Nearest(Policy):
-    """The k cameras that stand nearest to those that reward, whatever their age: what can be won by knowing
-    from where the reward comes, without looking at the state."""
+    """Select the k cameras nearest to the reward cameras, whatever their age. This baseline knows the
+    reward cameras but ignores the state."""
 
     name = "nearest"
     parameter = "k"
@@ -174,7 +174,7 @@ class StudyTrainer:
         return TrainedPolicy(run, learner.actor, rows, seconds, int(json.loads(by.read_text())), folder)
 
     def train_repeats(self, name: str, setting: Setting, config: TrainingConfig) -> list[TrainedPolicy]:
-        """The lesson, taught as many times as is asked for: each time other episodes, another beginning."""
+        """Train the lesson the requested number of times, with different episodes and initial values."""
         runs = range(RUNS[self.ask.quick])
         return [
             self.train_one(TrainingRun(f"{name}-{run}", setting, dataclasses.replace(config, seed=run)))
@@ -201,7 +201,7 @@ class StudyTrainer:
         count: int,
         seed: int = 0,
     ) -> Evaluation:
-        """The same judged by the cameras that rewarded, too: beside the other, never instead of it."""
+        """Also evaluate with the reward cameras; this supplements the other evaluation, never replaces it."""
         return evaluate_policies(
             setting, self.pool, seeds(seed, "test", count), everybody, reward,
             lambda line: print(f"  contest: {line}", flush=True),
@@ -209,7 +209,7 @@ class StudyTrainer:
 
 
 def embeddings_missing() -> str | None:
-    """Why no policy can look at pictures here, in one line; None: it can."""
+    """One-line reason why no policy can use images here; None if it can."""
     from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 
     try:

@@ -1,5 +1,5 @@
-"""Where it can matter to look at the pictures: a workshop in which a person walks on one of four sides, on
-which nobody knows without looking, and where a view costs something."""
+"""A workshop where images can help a policy: a person walks on one of four sides, only images show which,
+and each view has a cost."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from edge_server.experiments.training.scheduler.setting import Setting
 from edge_server.scheduler.learned.rewards import Reward
 
 PARTS = ("semantics", "age", "pose")
-# Cameras look outward: one for each side, of those that reward and of those that judge.
+# Cameras look outward: one per side for the reward and one per side for the evaluation.
 REWARDING, JUDGING = ("cam00", "cam08", "cam15", "cam16"), ("cam14", "cam11", "cam06", "cam07")
-# Of the reward, a view: with views for nothing there is nothing to choose, since no view ever harms.
+# Reward cost per view; with free views there is nothing to choose, since no view ever harms.
 PRICE = 0.002
-# An update a second: what has moved since the last one is worth a view.
+# One update per second, so motion since the last one is worth a view.
 STEPS, REFRESH_MS = 40, 900.0
 
 
