@@ -10,7 +10,7 @@ from edge_server.export.colmap import Cloud
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.sharpen import shows
 
-SAME = 0.01  # of the distance, within which a camera's depth shows the same point
+SAME = 0.01  # depth tolerance of the same point, share of the distance
 
 
 def cloud_of(maps: Sequence[DepthMap], count: int) -> Cloud:

@@ -1,4 +1,4 @@
-"""What there is to export: a field from a checkpoint, its cameras with their last pictures, its poses."""
+"""Data to export: a field from a checkpoint, its cameras with their last images, and poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.registry import make_field, option_help
 from freshfield.geometry import GeometryError, Pose
 
-# In this order: a run's last checkpoint, a fit's.
+# In order: a run's last checkpoint, a fit's checkpoint.
 NAMES = ("field.npz", "field")
 POSES = "poses.jsonl"
 
@@ -100,7 +100,7 @@ def poses_of(source: Source) -> dict[str, list[tuple[int, Pose]]]:
                 found.setdefault(str(row["camera"]), []).append((int(row["ns"]), pose))
             except (ValueError, KeyError, TypeError):
                 if number == len(lines):
-                    break  # a run that was killed leaves half a line
+                    break  # a killed run leaves a partial line
                 raise ExportError(f"{path}: line {number} is not a pose") from None
         return found
     for number, view in enumerate(source.views):
@@ -108,7 +108,7 @@ def poses_of(source: Source) -> dict[str, list[tuple[int, Pose]]]:
             pose = Pose.from_matrix(view.camera_to_world)
         except GeometryError as error:
             raise ExportError(f"camera {view.camera}: {error}") from None
-        # A recorded data set has no time: its views follow each other by a second.
+        # A recorded data set has no time: space its views by one second.
         found[view.camera] = [(view.generated_ns or number * 10**9, pose)]
     return found
 

@@ -1,10 +1,9 @@
-"""What the scene is about, cut out before the field sees it (thesis 4.4.3).
+"""Foreground segmentation of images before the field is trained (thesis 4.4.3).
 
-detector -> box -> segmentation -> alpha. A detector finds the object's box, a segmentation decides within
-it, and what is background becomes transparent: the view's RGBA then asks the field for empty space there.
-Poses are untouched. A scenario asks for it with ``edge.foreground``; without that key nothing here is
-imported.
-Held-out frames are not cut: fidelity goes on being taken on whole pictures, background included.
+detector -> box -> segmentation -> alpha. A detector finds the object's box, a segmenter labels the pixels
+in it, and the background becomes transparent, which supervises the field with empty space there. Poses do
+not change. The scenario key ``edge.foreground`` enables it; without that key this package is not imported.
+Held-out frames are not masked: fidelity is measured on whole images, background included.
 """
 
 from __future__ import annotations
@@ -23,23 +22,22 @@ Four = tuple[float, float, float, float]
 
 
 class ForegroundError(ValueError):
-    """A model or setting that cannot be used: one line saying what, where and what to do."""
+    """A model or setting is unusable; the one-line message says what, where and what to do."""
 
 
 @dataclass(frozen=True)
 class ForegroundConfig:
     """The section ``edge.foreground`` of a scenario.
 
-    detector: a YOLO detection ONNX (v8, v11), relative to the scenario, or ``default``, the small one that is
-    shipped and knows our own scenes. box: instead of a detector, [left, top, right, bottom] as shares of the
-    image; boxes: the same camera by camera. kinds: names of what may be detected; none: anything. confidence:
-    the least score. choose: of several detections the surest or the largest one. margin: added to each side
-    of a detected box, as a share of it. segment: ``grabcut``, ``box`` (all of the box), or an ONNX that gives
-    one map (n, 1, h, w) of the foreground. iterations: of grabcut. side: longest side in pixels that the
-    segmentation works at; the mask is then enlarged. threshold: of an ONNX's map. normalise: of what an ONNX
-    is given: imagenet (most of them) or unit (0 to 1). doubt: how much a pixel that is cut out within the box
-    supervises, 0 to 1, against 1 outside of it: a hole that segmentation leaves in the object contradicts all
-    other views, what it leaves unsaid does not. provider, threads: where models run.
+    detector: YOLO detection ONNX (v8, v11), relative to the scenario, or ``default``, the small one shipped
+    for our own scenes. box: [left, top, right, bottom] as shares of the image, instead of a detector; boxes:
+    one per camera. kinds: class names to detect; none: any. confidence: minimum score. choose: which of
+    several detections, surest or largest. margin: added to each side of a detected box, as a share of it.
+    segment: ``grabcut``, ``box`` (the whole box), or an ONNX with one foreground map (n, 1, h, w).
+    iterations: of grabcut. side: longest side, pixels, for grabcut; the mask is then enlarged.
+    threshold: of an ONNX's map. normalise: ONNX input, imagenet (most models) or unit (0 to 1).
+    doubt: supervision weight, 0 to 1, of background pixels within the box, against 1 outside: a false hole in
+    the object contradicts all other views, an unsupervised pixel does not. provider, threads: of the models.
     """
 
     detector: str | None = None
@@ -80,7 +78,7 @@ class ForegroundConfig:
 
 
 def read_foreground(mapping: Mapping[str, Any], scenario: Path) -> ForegroundConfig:
-    """The section ``edge.foreground`` of the file ``scenario``; raises freshfield.scenario.ScenarioError."""
+    """Read the section ``edge.foreground`` of file ``scenario``; raises freshfield.scenario.ScenarioError."""
     values = dict(mapping) if isinstance(mapping, Mapping) else mapping
     config = read_section(ForegroundConfig, values, f"{scenario}: edge.foreground")
     beside: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""A picture in, the same with its background transparent out; or the picture as it is, and counted."""
+"""Make the background of images transparent; images that cannot be masked pass unchanged and are counted."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Weight = NDArray[np.float32]
 
 @dataclass
 class Counts:
-    """Pictures by what became of them: masked, or passed through whole because nothing was detected, the box
-    or the mask had no area, the mask left nothing out, or a model failed."""
+    """Images per result: masked, or unchanged because nothing was detected, the box or the mask had no area,
+    the mask covered everything, or a model failed."""
 
     masked: int = 0
     not_detected: int = 0
@@ -32,8 +32,7 @@ class Counts:
 
 
 class Foreground:
-    """Applied to every decoded picture, once. ``seconds``: what it took so far (a measurement, no part of
-    what is decided)."""
+    """Applied once to every decoded image. ``seconds``: total run time, for reports only."""
 
     def __init__(self, config: ForegroundConfig, boxes: Boxes, segmenter: Segmenter) -> None:
         self.config = config
@@ -42,10 +41,9 @@ class Foreground:
         self._boxes, self._segmenter = boxes, segmenter
 
     def apply(self, camera: str, image: Image) -> tuple[Image, Weight | None]:
-        """RGBA (H, W, 4) with alpha 0 on the background (its colour black, so that what happens there is not
-        taken for motion), of uint8 ``image`` (H, W, 3 or 4), and how much each pixel supervises, float32
-        (H, W), None: all of them in full; ``image`` itself where there is nothing to cut out. An alpha that
-        it has already stays: what was transparent is not made opaque."""
+        """Mask uint8 ``image`` (H, W, 3 or 4). Return RGBA (H, W, 4) and each pixel's supervision weight,
+        float32 (H, W), None: all 1. The background gets alpha 0 and black, so that changes there do not count
+        as motion. Transparent pixels stay transparent. Without a mask, return ``image`` itself."""
         begun = time.perf_counter()
         try:
             found = self.mask(camera, image)
@@ -61,7 +59,7 @@ class Foreground:
         out[..., :3] = np.where(mask[..., None], image[..., :3], 0)
         out[..., 3] = np.where(mask, image[..., 3] if image.shape[2] == 4 else 255, 0)
         doubt = np.float32(self.config.doubt)
-        # Where nothing was decided within the box there is nothing to doubt.
+        # A whole-box mask labels no pixel within the box as background.
         if doubt == 1.0 or self.config.segment == BOX:
             return out, None
         weight: Weight = np.ones(mask.shape, np.float32)
@@ -70,7 +68,7 @@ class Foreground:
         return out, weight
 
     def mask(self, camera: str, image: Image) -> tuple[NDArray[np.bool_], Box] | None:
-        """(H, W), True on the object, and its box; None, counted, where the picture is to pass whole."""
+        """Object mask (H, W) and box; None, counted, if the image passes unchanged."""
         height, width = image.shape[:2]
         found = self._boxes.of(camera, image)
         if found is None:
@@ -90,13 +88,13 @@ class Foreground:
         return mask, box
 
     def status(self) -> dict[str, Any]:
-        """Counts, and milliseconds a picture."""
+        """Counts, and milliseconds per image."""
         pictures = sum(vars(self.counts).values())
         return {**vars(self.counts), "ms_per_image": 1e3 * self.seconds / pictures if pictures else None}
 
 
 class Boxes:
-    """Where the object is: fixed, or detected. Raises ForegroundError."""
+    """The object's box, fixed or detected. Raises ForegroundError."""
 
     def __init__(self, config: ForegroundConfig) -> None:
         self._config = config
@@ -113,7 +111,7 @@ class Boxes:
                 )
 
     def of(self, camera: str, image: Image) -> tuple[float, float, float, float] | None:
-        """Left, top, right, bottom in pixels, maybe beyond the image; None where nothing was detected."""
+        """Left, top, right, bottom, pixels, possibly beyond the image; None if nothing was detected."""
         c = self._config
         if self._detector is None:
             share = c.boxes.get(camera, c.box)
@@ -132,7 +130,7 @@ class Boxes:
 
 
 def clipped(box: tuple[float, float, float, float], width: int, height: int) -> Box | None:
-    """Whole pixels of ``box`` within the image; None where none are left."""
+    """Clip ``box`` to whole pixels of the image; None if it is empty."""
     if not all(map(math.isfinite, box)):
         return None
     left, top = max(0, math.floor(box[0])), max(0, math.floor(box[1]))
@@ -142,8 +140,7 @@ def clipped(box: tuple[float, float, float, float], width: int, height: int) -> 
 
 
 def make_foreground(config: ForegroundConfig) -> Foreground:
-    """What a section describes. Raises ForegroundError: a library that is not installed, a model that cannot
-    be used."""
+    """Create from a config. Raises ForegroundError: a library is not installed, or a model is unusable."""
     try:
         return Foreground(config, Boxes(config), make_segmenter(config))
     except ModuleNotFoundError as error:

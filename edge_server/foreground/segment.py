@@ -1,4 +1,4 @@
-"""What of a box is the object: GrabCut (Rother, Kolmogorov and Blake 2004), a given ONNX, or all of it."""
+"""Segmentation within a box: GrabCut (Rother, Kolmogorov and Blake 2004), an ONNX, or the whole box."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
 
 _SEED = 4403
-# Around the box, as a share of it: background for GrabCut to learn from, and context for a model.
+# Margin around the box, as a share of it: background for GrabCut to learn from, context for a model.
 _AROUND = 0.15
 _USUAL_SIDE = 320
 _MEAN, _SPREAD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
 
 class Segmenter(Protocol):
-    """Decides pixel by pixel within a box."""
+    """Labels each pixel within a box as object or background."""
 
     def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
-        """(H, W) of ``image`` (H, W, 3): True is the object. box: left, top, right, bottom, whole pixels
-        within the image and with area."""
+        """Object mask (H, W) of ``image`` (H, W, 3). box: left, top, right, bottom, whole pixels within the
+        image, not empty."""
         ...
 
 
@@ -40,7 +40,7 @@ def make_segmenter(config: ForegroundConfig) -> Segmenter:
 
 
 class WholeBox:
-    """No segmentation: what a box alone is worth."""
+    """No segmentation: the whole box is the object."""
 
     def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
         """See ``Segmenter``."""
@@ -50,14 +50,14 @@ class WholeBox:
 
 
 class GrabCut:
-    """Colours inside and outside of the box as two mixtures, and the cut between them. side: of the part that
-    is looked at, the longest in pixels; what is larger is shrunk, and the mask enlarged."""
+    """A graph cut between color mixtures of the box's inside and outside. side: longest side of the crop,
+    pixels; a larger crop is shrunk, and its mask enlarged."""
 
     def __init__(self, iterations: int, side: int) -> None:
         self._iterations, self._side = iterations, side
 
     def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
-        """See ``Segmenter``. Where the box leaves no background to learn from, all of it."""
+        """See ``Segmenter``. The mask covers everything if the box leaves no background to learn from."""
         part, (left, top, right, bottom) = _surroundings(image.shape, box)
         crop = image[part[1] : part[3], part[0] : part[2]]
         h, w = crop.shape[:2]
@@ -73,10 +73,10 @@ class GrabCut:
         if (labels == cv2.GC_PR_FGD).all():
             within[:] = True
             return out
-        # Its mixtures begin with k-means, which draws from a generator that all of OpenCV shares.
+        # GrabCut initializes its mixtures by k-means, which uses OpenCV's global random generator.
         cv2.setRNGSeed(_SEED)
         inside, outside = np.zeros((1, 65)), np.zeros((1, 65))
-        picture, nowhere = np.ascontiguousarray(small), (0, 0, 1, 1)  # the labels say where, not a rectangle
+        picture, nowhere = np.ascontiguousarray(small), (0, 0, 1, 1)  # the labels replace the rectangle
         mode = cv2.GC_INIT_WITH_MASK
         cv2.grabCut(picture, labels, nowhere, outside, inside, self._iterations, mode)
         found = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
@@ -88,8 +88,8 @@ class GrabCut:
 
 
 class SegmentModel:
-    """An ONNX that is given the box with what surrounds it and gives one map of the foreground: shares, or
-    logits where values lie outside of 0 to 1 (U2-Net, IS-Net and their like). Raises ForegroundError."""
+    """An ONNX (U2-Net, IS-Net or similar) from a crop around the box to one foreground map: shares, or logits
+    if any value is outside 0 to 1. Raises ForegroundError."""
 
     def __init__(self, config: ForegroundConfig) -> None:
         from edge_server.foreground.detector import open_model
@@ -108,10 +108,10 @@ class SegmentModel:
         unit = config.normalise == "unit"
         self._mean = np.zeros(3) if unit else _MEAN
         self._spread = np.ones(3) if unit else _SPREAD
-        self.mask(np.zeros((8, 8, 3), np.uint8), (1, 1, 7, 7))  # what cannot run fails here
+        self.mask(np.zeros((8, 8, 3), np.uint8), (1, 1, 7, 7))  # an unusable model fails here
 
     def mask(self, image: NDArray[np.uint8], box: Box) -> Mask:
-        """See ``Segmenter``; what the model finds outside of the box is not the object."""
+        """See ``Segmenter``; pixels outside the box are background."""
         part, _ = _surroundings(image.shape, box)
         crop = image[part[1] : part[3], part[0] : part[2]]
         fitted = cv2.resize(crop, (self._width, self._height), interpolation=cv2.INTER_LINEAR) / 255.0
@@ -137,7 +137,7 @@ class SegmentModel:
 
 
 def _surroundings(shape: tuple[int, ...], box: Box) -> tuple[Box, Box]:
-    """(the box with what surrounds it, in the image; the box within that)."""
+    """(the box plus margin, in image pixels; the box relative to that)."""
     left, top, right, bottom = box
     dx, dy = (max(2, round(_AROUND * side)) for side in (right - left, bottom - top))
     part = max(0, left - dx), max(0, top - dy), min(shape[1], right + dx), min(shape[0], bottom + dy)

@@ -1,9 +1,9 @@
-"""A field of its own for geometry, fitted when a mesh is asked for, before pictures decide (``sharpen``).
+"""A voxel field for geometry, fitted before mesh extraction; its depth initializes ``sharpen``.
 
-A field that is kept up to date for its looks may hold a surface several pixels too far off wherever texture
-is weak: splats paint it from a haze. Explicit voxels (``fields.voxel``) that start anew on the same pictures
-must empty every cell that some camera sees through, and stand where a plain background is hidden, textured
-or not. Their depth is a better start for the sweep, and what remains where no two pictures agree.
+A field trained for appearance may place a surface several pixels too far where texture is weak: splats render
+it from semi-transparent haze. A new voxel field (``fields.voxel``) on the same images must empty every cell
+that some camera sees through, and fill cells that hide a plain background, textured or not. Its depth is a
+better start for the sweep, and the fallback where no two images agree.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface.depth import DepthMap
 
-STEPS = 600  # of 8192 rays
-# Fewer pictures leave voxels room to explain them all without the surface: with ten of 48 x 48 the depth that
-# came out was off by 7.7 mm (median) after 150 steps and by 10.5 after 400; with thirty of 64 x 64, less
-# than 6 after 150.
+STEPS = 600  # training steps of 8192 rays
+# With fewer images, voxels can explain them all without the surface. Median depth error: ten images of
+# 48 x 48, 7.7 mm after 150 steps and 10.5 mm after 400; thirty of 64 x 64, below 6 mm after 150.
 LEAST_VIEWS = 30
-KNOWN = 0.3  # trust, of the cosine, from which on what the pictures say stands
-REST = 0.6  # trust, of the cosine, of what only the carved field says
+KNOWN = 0.3  # trust as a share of the cosine; from here on the swept depth is kept
+REST = 0.6  # trust as a share of the cosine, for depth from the carved field alone
 
 
 def box_of(renderer: Renderer, views: Sequence[View]) -> SceneBox | None:
-    """The box to carve: that of ``renderer``, if the scene ends there and there are ``LEAST_VIEWS``. Voxels
-    of a scene without end are too large far away to tell where a surface is."""
+    """The box of ``renderer``, if it bounds the scene and there are ``LEAST_VIEWS``; else None. Far voxels of
+    an unbounded scene are too large to locate a surface."""
     box = getattr(renderer, "box", None)
     ends = isinstance(box, SceneBox) and not box.contracted
     return box if ends and len(views) >= LEAST_VIEWS else None
@@ -39,8 +38,8 @@ def box_of(renderer: Renderer, views: Sequence[View]) -> SceneBox | None:
 def carved(
     box: SceneBox, background: Sequence[float] | None, views: Sequence[View], steps: int, pool: Pool | None
 ) -> Renderer:
-    """Voxels fitted to ``views`` in ``steps`` steps, the same whatever the number of threads. background:
-    the colour (3,) in [0, 1] behind the scene; None: found from the pictures."""
+    """Fit voxels to ``views`` in ``steps`` steps; the result does not depend on the number of threads.
+    background: color (3,) in [0, 1] behind the scene; None: estimated from the images."""
     from edge_server.fields.voxel.field import VoxelField
     from edge_server.fields.voxel.settings import make_settings
 
@@ -55,7 +54,7 @@ def carved(
 
 
 def completed(maps: Sequence[DepthMap], first: Sequence[DepthMap]) -> list[DepthMap]:
-    """``maps`` with the depth of ``first`` wherever they know none, or hardly trust theirs."""
+    """Replace depth in ``maps`` that is missing or has low trust by the depth of ``first``."""
     out = []
     for found, start in zip(maps, first, strict=True):
         poor = start.seen & (found.trust < KNOWN * start.cosine)

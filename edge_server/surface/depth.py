@@ -1,8 +1,8 @@
-"""Depth maps of what a field shows: where it is solid, how far, and how much each pixel is worth.
+"""Depth maps of a field, with a weight (trust) for each pixel.
 
-Every representation composites its depth as a mean along the ray. At the edge of what is near, a pixel's mean
-lies between what is near and what is far, on nothing at all: there the depth falls so steeply from pixel to
-pixel that no surface seen at a useful angle does, which is how such pixels are told and left out.
+Every representation composites depth as a mean along the ray. At an occlusion edge, the mean lies in empty
+space between the near and the far surface. Depth there changes more steeply from pixel to pixel than on any
+surface at a useful angle; such pixels are discarded.
 """
 
 from __future__ import annotations
@@ -17,20 +17,19 @@ from edge_server.fields import Renderer
 from edge_server.surface import SurfaceError
 from freshfield.geometry import Pinhole
 
-SOLID = 0.8  # opacity from which on a ray has met a surface
-EMPTY = 0.1  # opacity up to which it has met nothing at all
-EMPTY_TRUST = 0.25  # of a pixel whose ray meets nothing, beside 1 of one that meets a surface head-on
-MOST_M = 1e6  # what is said to be farther is no depth
-STEEPEST_DEG = 80.0  # between ray and normal: steeper is an edge, or of no use
+SOLID = 0.8  # minimum opacity of a ray that hits a surface
+EMPTY = 0.1  # maximum opacity of a ray that hits nothing
+EMPTY_TRUST = 0.25  # of a pixel whose ray hits nothing; 1 is a surface at normal incidence
+MOST_M = 1e6  # larger depths are invalid
+STEEPEST_DEG = 80.0  # maximum angle between ray and normal; beyond it is an edge, or unreliable
 Camera = tuple[NDArray[np.float64], Pinhole]
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """depth: float32 (H, W), metres along the ray; 0 where nothing is known, inf where the ray meets nothing.
-    trust: float32 (H, W), what a pixel counts for (w_new of 3.9), 0 where nothing is known. cosine: float32
-    (H, W), of the angle between ray and normal. color: uint8 (H, W, 3). camera_to_world: (4, 4), OpenCV axes,
-    metres."""
+    """depth: float32 (H, W), meters along the ray; 0: unknown, inf: the ray hits nothing. trust: float32
+    (H, W), weight (w_new of 3.9); 0: unknown. cosine: float32 (H, W), of the angle between ray and normal.
+    color: uint8 (H, W, 3). camera_to_world: (4, 4), OpenCV axes, meters."""
 
     depth: NDArray[np.float32]
     trust: NDArray[np.float32]
@@ -40,7 +39,7 @@ class DepthMap:
     intrinsics: Pinhole
 
     def points(self) -> NDArray[np.float64]:
-        """World metres (N, 3) of the pixels that see a surface, row by row."""
+        """World points (N, 3), meters, of the pixels that see a surface, row by row."""
         pose, seen = self.camera_to_world, self.seen
         rays = self.intrinsics.rays()[seen] @ pose[:3, :3].T
         points: NDArray[np.float64] = pose[:3, 3] + rays * self.depth[seen, None].astype(np.float64)
@@ -61,12 +60,11 @@ def depth_map(
     sure: NDArray[np.float32] | None = None,
     steepest_deg: float = STEEPEST_DEG,
 ) -> DepthMap:
-    """A depth map from depth along rays (H, W), metres, inf where a ray meets nothing; what is no number, not
-    positive or beyond ``MOST_M`` is not known. sure: float32 (H, W), a factor of the trust of pixels that see
-    a surface. SurfaceError: shapes that do not belong together.
+    """A depth map from depth along rays (H, W), meters; inf: the ray hits nothing; NaN, nonpositive or beyond
+    ``MOST_M``: unknown. sure: float32 (H, W), factor of the trust of pixels that see a surface.
+    SurfaceError: shapes do not match.
 
-    A pixel counts by the cosine at which it sees the surface, which is how much smaller the surface's piece
-    in it is: uncertainty grows as the surface turns away.
+    Trust is the cosine between ray and normal: uncertainty grows as the surface turns away.
     """
     shape = (intrinsics.height, intrinsics.width)
     if depth.shape != shape or color.shape != (*shape, 3):
@@ -85,8 +83,8 @@ def depth_map(
 
 
 def incidence(depth: NDArray[np.float32], intrinsics: Pinhole) -> NDArray[np.float32]:
-    """float32 (H, W): cosine of the angle between each ray and the surface's normal there; 0 where a
-    neighbour that the normal needs has no depth."""
+    """Cosine between each ray and the surface normal, float32 (H, W); 0 if a neighbor that the normal needs
+    has no depth."""
     rays = intrinsics.rays()
     points = rays * depth[..., None].astype(np.float64)
     right, down = (_slope(points, depth > 0, axis) for axis in (1, 0))
@@ -97,8 +95,8 @@ def incidence(depth: NDArray[np.float32], intrinsics: Pinhole) -> NDArray[np.flo
 
 
 def _slope(points: NDArray[np.float64], known: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
-    """How points (H, W, 3) change along an axis, from both neighbours, or from one at the border; 0 where a
-    neighbour is not known."""
+    """Difference of points (H, W, 3) along an axis, from both neighbors, or one at the border; 0 if a
+    neighbor is unknown."""
     step = np.diff(points, axis=axis)
     both = np.take(known, range(1, known.shape[axis]), axis) & np.take(
         known, range(known.shape[axis] - 1), axis
@@ -126,10 +124,8 @@ def rendered(
     steepest_deg: float = STEEPEST_DEG,
     on_map: Callable[[int], None] | None = None,
 ) -> Iterator[DepthMap]:
-    """Depth maps of what ``renderer`` shows to ``cameras``, one at a time. on_map: told how many are done.
-
-    A renderer that is ``planar`` has an unbiased depth, which ``render_surface`` shows.
-    """
+    """Render depth maps for ``cameras``, one at a time. on_map: called with the count done. For a ``planar``
+    renderer, ``render_surface`` gives unbiased depth."""
     show = renderer.render_surface if getattr(renderer, "planar", False) else renderer.render  # type: ignore[attr-defined]
     for k, (pose, lens) in enumerate(cameras):
         found = show(pose, lens)

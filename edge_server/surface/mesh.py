@@ -1,4 +1,4 @@
-"""Triangle meshes: extracted from a volume by marching cubes, cleaned, closed where asked."""
+"""Triangle meshes: extraction from a volume by marching cubes, and removal of small components."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from edge_server.surface.volume import Volume, unblocked
 
 Floats = NDArray[np.float32]
 
-SLAB_CELLS = 1 << 24  # voxels that marching cubes is given at once: 64 MB, and a few times that inside
-LAYER_CELLS = 1 << 23  # of the thinnest slab, which is SIDE layers
-# A distance of exactly 0 puts a vertex on a voxel, where several triangles shrink to nothing.
-LEAST = 1e-3  # voxels
-KEEP_SHARE = 0.02  # of the largest component's area: smaller ones are taken for dirt
+SLAB_CELLS = 1 << 24  # voxels per marching cubes call: 64 MB, and a few times that inside the call
+LAYER_CELLS = 1 << 23  # voxels in one layer, at most; the thinnest slab has SIDE layers
+LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
+KEEP_SHARE = 0.02  # share of the largest component's area; smaller components are removed
 INSTALL = "marching cubes needs scikit-image: pip install 'freshfield[surface]'"
 
 
@@ -33,7 +32,7 @@ class Mesh:
 
     @property
     def watertight(self) -> bool:
-        """Whether every edge belongs to exactly two faces, which run along it in opposite directions."""
+        """Whether every edge belongs to exactly two faces with opposite directions along it."""
         if not len(self.faces):
             return False
         edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
@@ -55,13 +54,11 @@ def extracted(
     watertight: bool = False,
     on_slab: Callable[[float], None] | None = None,
 ) -> Mesh:
-    """The zero level of a volume's distances (Lorensen and Cline 1987, in Lewiner's topologically sound
-    form).
+    """Extract the zero level set (Lorensen and Cline 1987, in Lewiner's topologically sound variant).
 
-    min_weight: voxels that were fused with no more weight are not known. Faces stand only between voxels
-    that are known; watertight: what no camera looked through counts as solid, as far as the box reaches, so
-    that the surface is closed. on_slab: told the share that is done. SurfaceError: scikit-image is missing,
-    or there is no surface.
+    min_weight: voxels need more fused weight than this to be known; faces connect only known voxels.
+    watertight: treat space in the box that no camera looked through as solid; this closes the surface.
+    on_slab: called with the completed share. SurfaceError: scikit-image is missing, or there is no surface.
     """
     try:
         from skimage.measure import marching_cubes
@@ -74,7 +71,7 @@ def extracted(
     count = 0
     for first, last in dense.slabs():
         distance, known = dense.slab(first, last)
-        # Of a cell, scikit-image reads the mask at its upper corner.
+        # scikit-image reads a cell's mask at its upper corner.
         cells = np.zeros(known.shape, np.bool_)
         cells[1:, 1:, 1:] = _all_corners(known) & _crossed(distance)
         if cells.any():
@@ -99,9 +96,8 @@ def extracted(
 def _joined(
     points: NDArray[np.float64], count: int, planes: tuple[int, int], seams: dict[bytes, int]
 ) -> NDArray[np.int64]:
-    """Numbers of ``points`` (N, 3), new ones from ``count`` on: those on the planes between two slabs have
-    the number they have in the neighbour, which computes them from the same voxels and so to the same
-    bits."""
+    """Vertex indices of ``points`` (N, 3); new indices start at ``count``. Points on a plane between slabs
+    share one index: both slabs compute them from the same voxels, so they are equal bit for bit."""
     number = np.full(len(points), -1, np.int64)
     at_seam = np.isin(points[:, 0], planes)
     for k in np.flatnonzero(at_seam):
@@ -114,7 +110,7 @@ def _joined(
 
 
 def _all_corners(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Of cells (X - 1, Y - 1, Z - 1): whether all their corners are known."""
+    """Whether all corners of each cell (X - 1, Y - 1, Z - 1) are known."""
     a = known[1:] & known[:-1]
     a = a[:, 1:] & a[:, :-1]
     found: NDArray[np.bool_] = a[:, :, 1:] & a[:, :, :-1]
@@ -122,7 +118,7 @@ def _all_corners(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _crossed(distance: Floats) -> NDArray[np.bool_]:
-    """Of cells: whether the surface passes through them; the others need not be looked at."""
+    """Whether the surface passes through each cell (X - 1, Y - 1, Z - 1)."""
     inside = distance < 0
     some, every = inside, inside
     for axis in range(3):
@@ -134,8 +130,8 @@ def _crossed(distance: Floats) -> NDArray[np.bool_]:
 
 
 class _Dense:
-    """Slabs of a volume as dense arrays. Indices count voxels from the first one of ``low``; where the
-    surface is to be closed, from an empty layer before it, and another follows the last."""
+    """Slabs of a volume as dense arrays. Indices start at the first voxel of block ``low``. A watertight
+    surface adds one empty layer before the first voxel and one after the last; indices include it."""
 
     def __init__(self, volume: Volume, min_weight: float, watertight: bool) -> None:
         self.volume, self.min_weight, self.watertight = volume, min_weight, watertight
@@ -152,13 +148,13 @@ class _Dense:
             raise SurfaceError("the volume is too wide for one slab: take larger voxels or smaller bounds")
 
     def slabs(self) -> list[tuple[int, int]]:
-        """(first, last) layers along x; neighbours share one."""
+        """(first, last) layers along x; neighboring slabs share one layer."""
         layers = max(SIDE, SLAB_CELLS // (self.span[1] * self.span[2]))
         end = self.span[0] - 1
         return [(x, min(x + layers, end)) for x in range(0, end, layers)]
 
     def slab(self, first: int, last: int) -> tuple[Floats, NDArray[np.bool_]]:
-        """Distances and whether they are known, of layers first to last inclusive."""
+        """Distances of layers first to last inclusive, and whether each is known."""
         grid, blocks, pad = self.volume.grid, self.volume.blocks, self.pad
         inner = self.span[0] - 2 * pad
         begin, end = max(first - pad, 0), min(last + 1 - pad, inner)  # voxels
@@ -186,14 +182,14 @@ class _Dense:
         return np.ascontiguousarray(dense), known
 
     def metres(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
-        """World metres of indices (N, 3)."""
+        """World coordinates (N, 3), meters, of voxel indices (N, 3)."""
         grid = self.volume.grid
         voxels = index - self.pad + SIDE * self.low
         metres: NDArray[np.float64] = np.array(grid.lower) + voxels * grid.voxel_m
         return metres
 
     def colors(self, index: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Colours (N, 3) at indices (N, 3), which lie between two voxels: between theirs; grey: unknown."""
+        """Colors (N, 3) at indices (N, 3), interpolated between two voxels; gray where unknown."""
         low, high = np.floor(index).astype(np.int64), np.ceil(index).astype(np.int64)
         share = (index - low).max(axis=1, keepdims=True)
         sums = (1.0 - share) * self._color_sums(low) + share * self._color_sums(high)
@@ -201,7 +197,7 @@ class _Dense:
         return np.where(sums[:, 3:] > 0, np.rint(mean), 128).astype(np.uint8)
 
     def _color_sums(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Weighted colours and their weights (N, 4) of voxels; 0 where there are none."""
+        """Weighted colors and weights (N, 4) of voxels; 0 outside the blocks."""
         table = self.volume.table
         block, inside = np.divmod(index - self.pad + SIDE * self.low, SIDE)
         within = ((block >= 0) & (block < table.shape)).all(axis=1)
@@ -212,7 +208,7 @@ class _Dense:
 
 
 def without_degenerate(mesh: Mesh) -> Mesh:
-    """The mesh without faces of no area and without vertices that no face uses."""
+    """Remove faces of zero area and unused vertices."""
     corners = mesh.faces
     apart = (
         (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2]) & (corners[:, 2] != corners[:, 0])
@@ -221,8 +217,7 @@ def without_degenerate(mesh: Mesh) -> Mesh:
 
 
 def cleaned(mesh: Mesh, keep_share: float = KEEP_SHARE, most: int | None = None) -> Mesh:
-    """The mesh's components of at least ``keep_share`` of the largest one's area, at most ``most`` of them,
-    largest first."""
+    """Keep components with at least ``keep_share`` of the largest area, and only the ``most`` largest."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -1,9 +1,9 @@
-"""How good a mesh is, against the exact surface of a synthetic scene.
+"""Compare a mesh with the exact surface of a synthetic scene.
 
-The truth is what the scene's own rays meet: points of the analytic surface, one a cell of ``spacing_m``, with
-the number of cameras that see each. A camera sees a point that lies in its picture, that its ray meets first,
-and that is turned towards it by at least ``STEEPEST_DEG``. Depth from pictures needs two cameras:
-completeness is asked of points that two or more see, accuracy is measured against all that any camera sees.
+The ground truth is ray-cast: points of the analytic surface, one per cell of ``spacing_m``, with the number
+of cameras that see each. A camera sees a point that lies in its image, that its ray hits first, and that
+faces it within ``STEEPEST_DEG``. Depth from images needs two cameras, so completeness uses points that two or
+more cameras see; accuracy uses all points that any camera sees.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ STEEPEST_DEG = 75.0
 SEEN_BY = 2
 WITHIN_M = 0.003
 SAMPLES = 200_000
-# What the project aims at, from 0.3 m.
+# The project's targets, from 0.3 m.
 TARGET_CHAMFER_MM, TARGET_COMPLETE = 1.5, 0.95
 
 
 @dataclass(frozen=True)
 class Truth:
-    """points: (N, 3), metres. cameras: int64 (N,), how many see each."""
+    """points: (N, 3), meters. cameras: int64 (N,), number of cameras that see each point."""
 
     points: Points
     cameras: NDArray[np.int64]
@@ -36,9 +36,9 @@ class Truth:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Distances in millimetres. accuracy: from the mesh to the surface; completeness: from the surface that
+    """Distances in millimeters. accuracy: from the mesh to the surface; completeness: from the surface that
     two cameras see to the mesh; chamfer: the mean of the two means. complete: share of that surface within
-    ``WITHIN_M`` of the mesh; precise: share of the mesh so near to the surface."""
+    ``WITHIN_M`` of the mesh; precise: share of the mesh within ``WITHIN_M`` of the surface."""
 
     chamfer_mm: float
     accuracy_mm: float
@@ -50,7 +50,7 @@ class Comparison:
 
 
 def thinned(points: Points, spacing_m: float) -> NDArray[np.int64]:
-    """Numbers of points (N, 3), the first one in every cell of a grid."""
+    """Indices of the first of points (N, 3) in every grid cell."""
     cells = np.floor(points / spacing_m).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     x, y, z = (int(n) + 1 for n in cells.max(axis=0, initial=0))
@@ -62,11 +62,11 @@ def thinned(points: Points, spacing_m: float) -> NDArray[np.int64]:
 
 
 def on_mesh(mesh: Mesh, count: int = SAMPLES, seed: int = 0) -> Points:
-    """``count`` points (N, 3) spread evenly over a mesh's area."""
+    """Sample ``count`` points (N, 3) uniformly over a mesh's area."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, 56]))
     area = mesh.areas_m2()
     edges = np.cumsum(area)
-    # Evenly along the faces laid end to end: less noise than drawing each.
+    # Stratified sampling over cumulative area: less noise than independent samples.
     at = (np.arange(count) + rng.random(count)) / count * edges[-1]
     face = np.minimum(np.searchsorted(edges, at, side="right"), len(area) - 1)
     a, b = rng.random((2, count))
@@ -101,8 +101,8 @@ def compare(mesh: Mesh, truth: Truth, samples: int = SAMPLES) -> Comparison:
 
 
 def depth_error_mm(depth: NDArray[np.float32], exact: NDArray[np.float64]) -> dict[str, float]:
-    """Bias (mean of what is too far less what is too near), median and 90th percentile of the size of
-    depth's error, mm, over pixels that have both. A pixel of more than 50 mm is a miss and counted apart."""
+    """Bias (mean signed error, positive: too far), and median and 90th percentile of the absolute error, mm,
+    over pixels with both depths. Errors above 50 mm are excluded and counted as missed."""
     both = (depth > 0) & np.isfinite(depth) & np.isfinite(exact)
     error = 1e3 * (depth[both].astype(np.float64) - exact[both])
     near = np.abs(error) <= 50.0

@@ -1,5 +1,4 @@
-"""From a renderer and its cameras to a mesh in one call: what the export command, the page and the bench
-do."""
+"""Mesh extraction from a renderer and its cameras, for the export command, the page and the bench."""
 
 from __future__ import annotations
 
@@ -18,21 +17,21 @@ from edge_server.surface.sharpen import PASSES, sharpened
 from edge_server.surface.volume import TRUNCATION, Grid, bounds_of, fused
 
 METHODS = ("tsdf", "sdf")
-GUESS = 0.5  # opacity of a surface that is only a first guess
-FINEST = 512  # voxels along the longest side, where no voxel size is given
+GUESS = 0.5  # minimum opacity of a surface as initial depth for sharpening
+FINEST = 512  # maximum voxels along the longest side without a given voxel size
 Corner = tuple[float, float, float]
 Say = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class MeshSettings:
-    """method: tsdf (3.8-3.10) or sdf (3.12-3.15). voxel_m: None takes what a pixel spans at the surface.
-    truncation: voxels. bounds: lower and upper corner, metres; None: of what cameras see. watertight: close
-    the surface where nothing was seen. min_weight: voxels of no more weight (a camera that looks straight on
-    counts 1) are not known. solid, steepest_deg: which pixels count. keep_share, most: which components stay.
-    memory_mb: of the volume. sharpen: move depth to where the pictures agree (``sharpen``). carve: with
-    sharpen, of a scene that ends at its field's box and has enough pictures: start from voxels fitted for it
-    in ``carve_steps`` steps, and keep their depth where pictures do not tell (``carve``)."""
+    """method: tsdf (3.8-3.10) or sdf (3.12-3.15). voxel_m: None: the size of a pixel at the surface.
+    truncation: voxels. bounds: lower and upper corner, meters; None: from the depth maps. watertight: close
+    the surface in unobserved space. min_weight: known voxels have more weight than this (a camera at normal
+    incidence counts 1). solid, steepest_deg: pixel selection. keep_share, most: component selection.
+    memory_mb: of the volume. sharpen: refine depth by photo-consistency (``sharpen``). carve: with sharpen,
+    in a scene bounded by its field's box with enough images: start from voxels fitted in ``carve_steps``
+    steps, and use their depth where the images are ambiguous (``carve``)."""
 
     method: str = "tsdf"
     sharpen: bool = True
@@ -62,7 +61,7 @@ class MeshSettings:
 
 
 def silent(what: str, share: float) -> None:
-    """Says nothing of the progress."""
+    """Report no progress."""
 
 
 def mesh_of(
@@ -72,8 +71,8 @@ def mesh_of(
     say: Say = silent,
     pool: Pool | None = None,
 ) -> Mesh:
-    """The surface that ``renderer`` shows to the cameras of ``views``. say: told of each stage how much of it
-    is done. SurfaceError: there is none, or it cannot be had as asked."""
+    """Extract the surface seen from the cameras of ``views``. say: called with each stage and its completed
+    share. SurfaceError: there is no surface, or the settings do not allow it."""
     settings = settings or MeshSettings()
     return mesh_of_maps(maps_of(renderer, views, settings, say, pool), settings, say, pool)
 
@@ -95,7 +94,7 @@ def maps_of(
         behind = getattr(renderer, "background", None)
         renderer = carved(box, behind, views, settings.carve_steps, pool)
         say("carve", 1.0)
-    # Where the pictures decide, a translucent first guess will do.
+    # A translucent initial surface is sufficient for sharpening.
     solid = min(settings.solid, GUESS) if settings.sharpen else settings.solid
     maps = list(
         rendered(
@@ -104,7 +103,7 @@ def maps_of(
     )
     if not settings.sharpen or len(maps) < 2:
         return maps
-    # What was carved is near enough to do without the widest search, which may go astray.
+    # Carved depth is accurate enough to skip the widest search, which may find a wrong match.
     passes = PASSES if box is None else PASSES[1:]
     sharp = sharpened(maps, [v.image for v in views], passes, pool, lambda share: say("sharpen", share))
     return sharp if box is None else completed(sharp, maps)
@@ -126,7 +125,7 @@ def mesh_of_maps(
 
 
 def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
-    """The grid of a mesh: as set, else found from the maps."""
+    """The grid of a mesh, from the settings, else from the maps."""
     voxel_m = settings.voxel_m or pixel_m(maps)
     if settings.bounds is not None:
         lower, upper = settings.bounds
@@ -138,7 +137,7 @@ def grid_for(maps: Sequence[DepthMap], settings: MeshSettings) -> Grid:
 
 
 def pixel_m(maps: Sequence[DepthMap]) -> float:
-    """What a pixel spans at the surface, metres: the median over the maps. SurfaceError: they show none."""
+    """Size of a pixel at the surface, meters, median over the maps. SurfaceError: no surface."""
     spans = [
         float(np.median(m.depth[m.seen])) / min(m.intrinsics.fx, m.intrinsics.fy)
         for m in maps

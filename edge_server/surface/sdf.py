@@ -1,11 +1,11 @@
-"""A signed distance function fitted to depth (thesis 3.12-3.15), as another way from depth maps to a mesh.
+"""A signed distance function fitted to depth (thesis 3.12-3.15), an alternative to TSDF fusion.
 
 d_theta of (3.14) is a grid of distances with trilinear interpolation, fitted from coarse to fine by Adam. The
-loss is that of (3.15): |d| at points seen on the surface, and the eikonal term (|grad d| - 1)^2 over the
-domain Omega. (3.15) alone does not say which side is inside, so a third term does: before a surface point on
-its ray d is positive, behind it negative (3.12), by at least half of what a plane there would give.
+loss is that of (3.15): |d| at observed surface points, and the eikonal term (|grad d| - 1)^2 over the domain
+Omega. (3.15) alone does not determine the inside, so a third term makes d positive before a surface point on
+its ray and negative behind it (3.12), by at least half the distance to a plane there.
 
-What comes out replaces the distances of a fused volume, whose evidence and colours stay as they are.
+The fitted distances replace those of a fused volume; its weights and colors are unchanged.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ MOST_NODES = 1 << 24
 
 @dataclass(frozen=True)
 class SdfSettings:
-    """levels: grids, each twice as fine as the one before. steps: of Adam on each. points: surface points of
-    a step, and as many of each other kind. eikonal: lambda of (3.15). sides: weight of the third term. rate:
-    of Adam, in voxels of the level."""
+    """levels: number of grids, each twice as fine as the last. steps: Adam steps per level. points: samples
+    of each kind per step. eikonal: lambda of (3.15). sides: weight of the third term. rate: Adam's learning
+    rate, in voxels of the level."""
 
     levels: int = 3
     steps: int = 60
@@ -48,8 +48,8 @@ def fitted(
     pool: Pool | None = None,
     settings: SdfSettings | None = None,
 ) -> Volume:
-    """A volume whose distances are those of a fitted function. SurfaceError: torch is missing, the grid is
-    too fine, or there is nothing to fit."""
+    """Fit a function to ``maps`` and return its distances as a volume. SurfaceError: torch is missing, the
+    grid is too fine, or there is nothing to fit."""
     settings = settings or SdfSettings()
     volume = fused(grid, maps, memory_mb, pool)
     samples = _Samples.of(maps, grid)
@@ -71,8 +71,8 @@ def fitted(
 
 @dataclass(frozen=True)
 class _Samples:
-    """points: float32 (N, 3), on the surface, metres from the grid's lower corner. rays: (N, 3), on from the
-    camera. cosine, trust: (N,)."""
+    """points: float32 (N, 3), on the surface, meters from the grid's lower corner. rays: (N, 3), directions
+    away from the camera. cosine, trust: (N,)."""
 
     points: NDArray[np.float32]
     rays: NDArray[np.float32]
@@ -96,7 +96,7 @@ class _Samples:
 def _optimised(
     grid: Grid, samples: _Samples, s: SdfSettings, say: Callable[[str, float], None] | None
 ) -> NDArray[np.float32]:
-    """Distances (X, Y, Z) at the grid's voxels, metres."""
+    """Distances (X, Y, Z) at the grid's voxels, meters."""
     try:
         import torch
         from torch.nn.functional import interpolate
@@ -107,7 +107,7 @@ def _optimised(
     cosine, trust = torch.from_numpy(samples.cosine), torch.from_numpy(samples.trust)
     chances = (trust.double() / trust.double().sum()).cumsum(0)
     size = tuple(int(n) for n in grid.blocks * SIDE)
-    # Everything starts a little outside: sides and surface points carve the inside out of it.
+    # All values start slightly outside; the sides term and surface points carve the inside.
     values = torch.full((1, 1, *_coarser(size, s.levels - 1)), 0.5 * grid.band_m)
     for level in range(s.levels):
         scale = 2 ** (s.levels - 1 - level)
@@ -119,7 +119,7 @@ def _optimised(
         extent = torch.tensor([(n - 1) * voxel for n in shape])
         optimiser = torch.optim.Adam([values], lr=s.rate * voxel, betas=(0.9, 0.95))
         for step in range(s.steps):
-            # Drawn by trust; numpy's searchsorted is what multinomial would do, without its limit of 2^24.
+            # Sample by trust; searchsorted does what multinomial would, without its limit of 2^24.
             drawn = torch.searchsorted(
                 chances, torch.rand(s.points, generator=generator, dtype=torch.float64)
             ).clamp_(max=len(chances) - 1)
@@ -141,14 +141,13 @@ def _coarser(size: tuple[int, ...], halvings: int) -> tuple[int, ...]:
 
 
 def _loss(values, extent, voxel, band, points, rays, cosine, s, generator):
-    """(3.15) with the term of the sides, on distances in voxels, so that it weighs the same on every
-    level."""
+    """(3.15) plus the sides term, on distances in voxels, so that its scale is the same on every level."""
     import torch
 
     reach = torch.rand(len(points), generator=generator) * band
     along = (reach * cosine)[:, None]
     before, behind = points - rays * reach[:, None], points + rays * reach[:, None]
-    # Somewhere between the camera and the band before the surface: free.
+    # Free space: a random point between the camera and the band before the surface.
     far = torch.rand(len(points), generator=generator)[:, None]
     free = points - rays * (band + far * (extent.max() - band))
     inside = ((free > 0) & (free < extent)).all(dim=1)
@@ -165,7 +164,7 @@ def _loss(values, extent, voxel, band, points, rays, cosine, s, generator):
 
 
 def at(values, points, extent):
-    """Distances (N,) at points (N, 3), metres from the grid's corner, between its nodes (1, 1, X, Y, Z)."""
+    """Interpolate grid values (1, 1, X, Y, Z) at points (N, 3), meters from the grid's corner: (N,)."""
     from torch.nn.functional import grid_sample
 
     where = (
@@ -175,7 +174,7 @@ def at(values, points, extent):
 
 
 def slope(values, points, extent, voxel):
-    """|grad d| (N,) by differences over a voxel to both sides (3.13)."""
+    """|grad d| (N,) by central differences over one voxel to each side (3.13)."""
     import torch
 
     steps = torch.eye(3) * voxel

@@ -1,11 +1,10 @@
-"""Depth maps made sharper by the pictures themselves, before they are fused.
+"""Refine depth maps by photo-consistency before fusion.
 
-A field is fitted to colours: where a surface has little texture its depth may be off by many pixels without
-the pictures showing it. Here every pixel's depth is moved to where other cameras' pictures agree with its own
-(plane sweep in the manner of multi-view stereo; PGSR, Chen et al. 2024, adds the same comparison to its
-loss), first far and coarsely, then near and finely, with the normals found so far. Pixels whose depth no
-other map confirms count for little. The field's part is what stereo lacks: a first depth nearly right
-everywhere.
+A field is fitted to colors, so its depth may be off by many pixels where a surface has little texture. This
+moves every pixel's depth to where other cameras' images agree with its own (plane sweep as in multi-view
+stereo; PGSR, Chen et al. 2024, has the same comparison in its loss), from coarse to fine, with the current
+normals. Pixels whose depth no other map confirms get a low weight. The field provides what stereo lacks: an
+initial depth nearly right everywhere.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.sweep import Others, sweep
 
-OTHERS = 4  # pictures that each is compared with
-# Share of the depth that is searched to both sides, and in how many steps, pass by pass.
+OTHERS = 4  # images to compare each image with
+# Per pass: search range to each side, as a share of the depth, and number of steps.
 PASSES = ((0.08, 17), (0.03, 17), (0.012, 13), (0.004, 9))
 BEST_DEG, LEAST_DEG, MOST_DEG = 25.0, 4.0, 65.0  # between two cameras' lines of sight
-SMOOTH_PX = 2.5  # radius over which normals are found
-AGREES = 0.5  # correlation from which on a place is believed
-CONFIRMED = 0.004  # of the distance, beside a pixel, within which another map has the same surface
-ENOUGH = 0.05  # share of good pixels around a bad one from which on it goes by them
-ALONE = 0.1  # trust of a pixel whose surface no other map has, beside 1
-UNSURE = 0.05  # trust of a pixel whose patch is flat, beside 1
+SMOOTH_PX = 2.5  # sigma of the Gaussian blur for normals
+AGREES = 0.5  # minimum correlation of a reliable depth
+CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
+ENOUGH = 0.05  # minimum share of good pixels around a bad one to interpolate from them
+ALONE = 0.1  # factor of the trust of a pixel that no other map confirms
+UNSURE = 0.05  # factor of the trust of a pixel with a flat patch
 
 
 def sharpened(
@@ -42,8 +41,8 @@ def sharpened(
     pool: Pool | None = None,
     on_map: Callable[[float], None] | None = None,
 ) -> list[DepthMap]:
-    """``maps`` with better depth. pictures: what the cameras took, uint8 (H, W, 3 or 4) each. on_map: told
-    the share that is done. SurfaceError: pictures that are not the maps'."""
+    """Refine the depth of ``maps``. pictures: camera images, uint8 (H, W, 3 or 4) each. on_map: called with
+    the completed share. SurfaceError: the images do not match the maps."""
     if len(maps) != len(pictures):
         raise SurfaceError(f"{len(pictures)} pictures do not belong to {len(maps)} depth maps")
     pool = pool or shared_pool()
@@ -64,7 +63,7 @@ def sharpened(
 
 
 def neighbours(maps: Sequence[DepthMap], k: int) -> list[int]:
-    """The maps to compare map k with: those that look at the same place from ``BEST_DEG`` or so aside."""
+    """Indices of the maps to compare map k with: same place, seen from an angle near ``BEST_DEG``."""
     points = maps[k].points()
     if not len(points):
         return []
@@ -86,8 +85,7 @@ def neighbours(maps: Sequence[DepthMap], k: int) -> list[int]:
 
 
 def confirmed(maps: Sequence[DepthMap], chosen: Sequence[Sequence[int]]) -> list[DepthMap]:
-    """``maps`` in which pixels that none of the maps ``chosen`` for theirs has on its surface count by
-    ``ALONE``."""
+    """Scale by ``ALONE`` the trust of pixels that no map in ``chosen`` for their map confirms."""
     out = []
     for k, found in enumerate(maps):
         points = found.points()
@@ -101,7 +99,7 @@ def confirmed(maps: Sequence[DepthMap], chosen: Sequence[Sequence[int]]) -> list
 
 
 def shows(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArray[np.bool_]:
-    """Whether a depth map has each of the points (N, 3) on its surface. within: share of the distance."""
+    """Whether each point (N, 3) lies on a depth map's surface. within: tolerance, share of the distance."""
     lens, pose = found.intrinsics, found.camera_to_world
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     with np.errstate(invalid="ignore"):
@@ -110,7 +108,7 @@ def shows(found: DepthMap, points: NDArray[np.float64], within: float) -> NDArra
     column, row = np.where(inside[:, None], at, 0.0).astype(np.int64).T
     distance = np.linalg.norm(local, axis=1)
     shown = np.where(found.seen, found.depth, 0.0)[row, column]
-    # The nearest pixel's ray may meet a steep surface a pixel's width nearer or farther.
+    # The nearest pixel's ray may hit a steep surface a pixel's width nearer or farther.
     tolerance = (within + 1.0 / min(lens.fx, lens.fy)) * distance
     agree: NDArray[np.bool_] = inside & (np.abs(shown - distance) <= tolerance)
     return agree
@@ -152,8 +150,8 @@ def _swept(
 
 
 def smooth_normals(found: DepthMap, rays: NDArray[np.float64]) -> NDArray[np.float32]:
-    """float32 (H, W, 3): unit normals in world axes of the plane that fits the pixels around each best, by
-    their derivatives: found points are smoothed first, those that are not known left out."""
+    """Unit normals float32 (H, W, 3) in world axes, from derivatives of the smoothed known points: the plane
+    that best fits the pixels around each."""
     seen = found.seen
     points = np.where(seen[..., None], rays * found.depth[..., None], 0.0)
     weight = cv2.GaussianBlur(seen.astype(np.float64), (0, 0), SMOOTH_PX)
@@ -167,8 +165,8 @@ def smooth_normals(found: DepthMap, rays: NDArray[np.float64]) -> NDArray[np.flo
 def _settled(
     depth: NDArray[np.float32], seen: NDArray[np.bool_], score: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Depth for the next pass to start from: where pictures agree, without single pixels that went astray
-    (the median of 5 x 5); where they do not, what lies between the pixels around that do."""
+    """Initial depth of the next pass: the 5 x 5 median, without outliers, where images agree; elsewhere
+    interpolated from nearby pixels where they agree."""
     known = cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     calm = np.where(known, cv2.medianBlur(depth, 5), depth)
     good = (seen & (score >= AGREES)).astype(np.float32)
@@ -179,7 +177,7 @@ def _settled(
 
 
 def _weighed(found: DepthMap, score: NDArray[np.float32]) -> DepthMap:
-    """A depth map of the depth found, whose pixels count by how well pictures agree there."""
+    """Weight each pixel of a depth map by how well the images agree there."""
     sure = np.clip((score - AGREES) / (1.0 - AGREES), 0.0, 1.0)
     sure = np.where(score == 0.0, np.float32(UNSURE), sure)
     depth = np.where(found.seen & (sure <= 0.0), np.float32(0.0), found.depth)

@@ -1,8 +1,8 @@
-"""A truncated signed distance field from depth maps (thesis 3.8-3.10), kept only around surfaces.
+"""A sparse truncated signed distance field from depth maps (thesis 3.8-3.10).
 
-Space is divided into blocks of 8 x 8 x 8 voxels; those within the truncation of some depth map's surface have
-memory, the others are one entry in a table. Fusing costs time for these blocks alone, and every voxel's sums
-are made in the order of the maps, so that the result is the same bit for bit on any number of threads.
+Blocks of 8 x 8 x 8 voxels within the truncation of a depth map's surface are allocated and fused; the others
+are one table entry each. Each voxel sums the maps in order, so the result is the same bit for bit on any
+number of threads.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from edge_server.surface import SurfaceError
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, Look, fuse
 
-BYTES = CELLS * 4 * (1 + 1 + 4)  # of a block
-MOST_ENTRIES = 1 << 24  # of the table of blocks: 24 bytes each while maps are fused
-TRUNCATION = 4.0  # voxels, unless said otherwise
+BYTES = CELLS * 4 * (1 + 1 + 4)  # per block
+MOST_ENTRIES = 1 << 24  # in the table of blocks: 24 bytes each during fusion
+TRUNCATION = 4.0  # voxels, the default
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where voxels are. lower, upper: (3,) metres, corners of the box. band_m: truncation, d_max of (3.8)."""
+    """The voxel grid. lower, upper: (3,) meters, corners of the box. band_m: truncation, d_max of (3.8)."""
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
@@ -61,14 +61,14 @@ class Grid:
         return np.maximum(np.ceil(span / (SIDE * self.voxel_m)), 1).astype(np.int64)
 
     def describe(self) -> str:
-        """The box, for people."""
+        """The box as readable text."""
         return " x ".join(f"{a:.3g}..{b:.3g}" for a, b in zip(self.lower, self.upper)) + " m"
 
 
 @dataclass(frozen=True)
 class Volume:
-    """Fused blocks. table: int32 (X, Y, Z) of all blocks in the box: number of a block, or -1. through: bool
-    (X, Y, Z), blocks whose middle some map sees in front of its surface."""
+    """Fused blocks. table: int32 (X, Y, Z), block index or -1. through: bool (X, Y, Z), whether a block's
+    center lies in front of some map's surface."""
 
     grid: Grid
     blocks: Blocks
@@ -79,8 +79,8 @@ class Volume:
 def bounds_of(maps: Sequence[DepthMap], margin_m: float, spare: float = 0.002) -> tuple[
     tuple[float, float, float], tuple[float, float, float]
 ]:  # fmt: skip
-    """Lower and upper corner, metres, of what the maps show, with a margin. spare: share of points at each
-    end of each axis that may be strays. SurfaceError: they show nothing."""
+    """Lower and upper corner, meters, of the maps' points, plus a margin. spare: share of points to ignore
+    as outliers at each end of each axis. SurfaceError: there are no points."""
     points = [m.points()[:: max(1, m.depth.size // 20000)] for m in maps]
     every = np.concatenate(points) if points else np.zeros((0, 3))
     if not len(every):
@@ -97,15 +97,14 @@ def fused(
     pool: Pool | None = None,
     on_map: Callable[[int], None] | None = None,
 ) -> Volume:
-    """Fuse ``maps`` in their order. on_map: told how many are done. SurfaceError: more blocks than
-    ``memory_mb`` holds."""
+    """Fuse ``maps`` in order. on_map: called with the count done. SurfaceError: more than ``memory_mb``."""
     maps = list(maps)
     pool = pool or shared_pool()
     table = np.full(tuple(grid.blocks), -1, np.int32)
     place = np.argwhere(near_surfaces(grid, maps)).astype(np.int32)
     needed_mb = len(place) * BYTES / 1e6
     if needed_mb > memory_mb:
-        # Blocks near a surface grow with the square of the resolution.
+        # The number of blocks near a surface grows with the square of the resolution.
         least_m = grid.voxel_m * np.sqrt(needed_mb / memory_mb)
         raise SurfaceError(
             f"{1e3 * grid.voxel_m:g} mm voxels need {needed_mb:.0f} MB, more than the {memory_mb:.0f} "
@@ -113,7 +112,7 @@ def fused(
         )
     table[tuple(place.T)] = np.arange(len(place), dtype=np.int32)
     blocks = _blocks(place, np.array(grid.lower), grid.band_m)
-    # The same for blocks as wholes: what is free and what is hidden where no voxels are.
+    # Fuse block centers too: they tell free from hidden space where no voxels are allocated.
     side = SIDE * grid.voxel_m
     across = -(-grid.blocks // SIDE)
     coarse = np.argwhere(np.ones(across, np.bool_)).astype(np.int32)
@@ -139,14 +138,14 @@ def _blocks(place: NDArray[np.int32], lowest: NDArray[np.float64], band_m: float
 
 
 def unblocked(blocks: NDArray) -> NDArray:
-    """Voxels (X, Y, Z, CELLS) of a box of blocks as one array (SIDE X, SIDE Y, SIDE Z)."""
+    """Reshape blocks of voxels (X, Y, Z, CELLS) to one array (SIDE X, SIDE Y, SIDE Z)."""
     x, y, z = blocks.shape[:3]
     layers = blocks.reshape(x, y, z, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5)
     return layers.reshape(x * SIDE, y * SIDE, z * SIDE)
 
 
 def as_look(found: DepthMap) -> Look:
-    """A depth map as the kernel reads it."""
+    """Convert a depth map to the kernel's input."""
     return Look(
         lens=np.array(lens_row(found.intrinsics), dtype=np.float64),
         rotation=np.ascontiguousarray(found.camera_to_world[:3, :3]),
@@ -162,7 +161,7 @@ def near_surfaces(grid: Grid, maps: Sequence[DepthMap]) -> NDArray[np.bool_]:
     """Which blocks (X, Y, Z) come within the truncation of a depth map's points."""
     wanted = np.zeros(tuple(grid.blocks), np.bool_)
     side = SIDE * grid.voxel_m
-    # Half a block beyond the band, so that a block that it only touches is there too.
+    # Half a block beyond the band includes blocks that the band only touches.
     reach = grid.band_m + 0.5 * side
     offsets = np.linspace(-reach, reach, 1 + 2 * max(1, int(np.ceil(2.0 * reach / side))))
     for found in maps:

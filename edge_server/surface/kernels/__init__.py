@@ -1,1 +1,1 @@
-"""Numba kernels of the surface; their plain references stand in tests/edge_server/surface."""
+"""Numba kernels of the surface; tests/edge_server/surface has their reference implementations."""

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 
-SIDE = 8  # voxels a side of a block
+SIDE = 8  # voxels per side of a block
 CELLS = SIDE**3
-FAR = 1e9  # metres: infinity would become NaN between two pixels
-FREE = 0.05  # weight of what a voxel far before a surface is told, beside 1 at the surface
-CLOSE = 2.0  # truncations that neighbouring pixels may differ by and still be one surface
+FAR = 1e9  # meters; interpolating infinity would give NaN
+FREE = 0.05  # weight factor of a voxel far before a surface; 1 at the surface
+CLOSE = 2.0  # maximum depth difference of neighboring pixels on one surface, in truncations
 
 
 class Look(NamedTuple):
@@ -62,8 +62,7 @@ def _bent(look, a, b):
 
 @njit(inline="always")
 def _depth_at(depth, u, v, band):
-    """Depth at image point (u, v): between the four pixels around it where they are one surface, else that
-    of the pixel it lies in; 0: none."""
+    """Depth at image point (u, v): bilinear if the four pixels are one surface, else nearest; 0: none."""
     height, width = depth.shape
     near = np.float64(depth[np.int64(v), np.int64(u)])
     if not near > 0.0:
@@ -87,18 +86,18 @@ def _row(look, k):
 
 @kernel
 def fuse(counter, worker, blocks, look, voxel_m, band_m):
-    """Add ``look`` to every voxel that it says something about. Tasks are blocks, so that a voxel's sums have
-    one order whatever the number of workers. band_m: d_max of (3.8).
+    """Fuse ``look`` into all voxels it observes. Tasks are blocks, so the order of a voxel's sums does not
+    depend on the number of workers. band_m: d_max of (3.8).
 
-    The distance of a voxel is that along its ray times the cosine at the surface: of the plane there. What
-    lies more than band_m behind a surface is hidden by it and stays as it is; before that its weight falls to
-    nothing, lest a thin part's back be pushed out by what sees its front. What lies more than band_m before
-    a surface counts by FREE: enough to dissolve what one camera alone claims, too little to pull a round
-    surface inwards by the rays that pass it by.
+    A voxel's distance is that along its ray times the cosine at the surface: the distance to the plane there.
+    Voxels more than band_m behind a surface are hidden and do not change; the weight falls to 0 over that
+    range, so that views of a thin part's front do not push out its back. Voxels more than band_m before a
+    surface have weight FREE: enough to remove a surface that only one camera sees, too little for passing
+    rays to pull a round surface inwards.
     """
     height, width = look.depth.shape
     f_width, f_height = np.float64(width), np.float64(height)
-    # Into locals: the compiler must assume that what is written to the blocks may change the camera.
+    # Copy to locals: the compiler must assume that writes to the blocks may alias the camera.
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = _row(look, 0), _row(look, 1), _row(look, 2)
     ox, oy, oz = look.origin[0], look.origin[1], look.origin[2]
     fx, fy, cx, cy = look.lens[0], look.lens[1], look.lens[2], look.lens[3]
@@ -111,7 +110,7 @@ def fuse(counter, worker, blocks, look, voxel_m, band_m):
         x0 = blocks.lowest[0] + voxel_m * (SIDE * blocks.place[b, 0]) - ox
         y0 = blocks.lowest[1] + voxel_m * (SIDE * blocks.place[b, 1]) - oy
         z0 = blocks.lowest[2] + voxel_m * (SIDE * blocks.place[b, 2]) - oz
-        # A block wholly behind the camera, or beside what a straight lens sees, is passed over.
+        # Skip a block wholly behind the camera, or outside the frustum of an undistorted lens.
         x, y, z = x0 + half, y0 + half, z0 + half
         ball = np.sqrt(3.0) * half
         deep = r02 * x + r12 * y + r22 * z

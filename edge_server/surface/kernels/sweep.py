@@ -1,8 +1,7 @@
-"""Photo-consistent depth: slides a small plane along each pixel's ray to where other pictures agree best.
+"""Photo-consistent depth: plane sweep along each pixel's ray to where other images agree best.
 
-The plane has the surface's present normal. A patch of TAPS x TAPS pixels on it is looked up in another
-picture by the affine map that the projection is around its middle, and compared by zero-mean normalised
-cross-correlation, which does not mind another exposure.
+The plane has the current surface normal. An affine approximation of the projection maps its patch of TAPS x
+TAPS pixels to another image. The score is zero-mean normalized cross-correlation, invariant to exposure.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 
-TAPS = 5  # pixels a side of a patch
+TAPS = 5  # pixels per side of a patch
 REACH = TAPS // 2
-FLAT = 0.25  # variance, in grey levels squared, below which a patch tells nothing
-NONE = -2.0  # score of a place that no other picture shows
+FLAT = 0.25  # minimum variance, gray levels squared, of a textured patch
+NONE = -2.0  # score of a point that no other image shows
 
 
 class Others(NamedTuple):
@@ -37,7 +36,7 @@ class Others(NamedTuple):
 
 @njit(inline="always")
 def _seen_at(others, s, x, y, z):
-    """Image point of a world point in picture s; -1e9 behind it or far outside."""
+    """Project a world point to image s; -1e9 if behind the camera or far outside."""
     x, y, z = x - others.origin[s, 0], y - others.origin[s, 1], z - others.origin[s, 2]
     r, lens = others.rotation, others.lens
     deep = r[s, 0, 2] * x + r[s, 1, 2] * y + r[s, 2, 2] * z
@@ -57,7 +56,7 @@ def _seen_at(others, s, x, y, z):
 
 @njit(inline="always")
 def _on_plane(rays, row, column, nx, ny, nz, reach):
-    """Distance along a pixel's ray to the plane n p = reach, from the camera; 0: never."""
+    """Distance from the camera along a pixel's ray to the plane n p = reach; 0: no intersection."""
     along = nx * rays[row, column, 0] + ny * rays[row, column, 1] + nz * rays[row, column, 2]
     return reach / along if abs(along) > 1e-3 else 0.0
 
