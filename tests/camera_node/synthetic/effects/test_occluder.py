@@ -49,7 +49,7 @@ def test_the_scene_it_was_made_from_is_unchanged():
     before = scene.render("cam00", 0.4)
     make().extend(scene).render("cam00", 0.4)
     assert np.array_equal(scene.render("cam00", 0.4), before)
-    assert len(scene.world.movers) == 1
+    assert len(scene.world.moving_bodies) == 1
 
 
 def test_it_hides_what_is_behind_and_is_hidden_by_what_is_in_front():

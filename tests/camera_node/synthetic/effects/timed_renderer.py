@@ -13,7 +13,7 @@ from freshfield.geometry import Pinhole
 
 
 @dataclass
-class Film:
+class TimedRenderer:
     """Shows ``render(t_s)``; ``asked`` are the instants and rows that were asked for."""
 
     render: Callable[[float], NDArray[np.uint8]]
