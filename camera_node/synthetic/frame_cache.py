@@ -119,24 +119,14 @@ class FrameCache:
             return payload.encode(self.frame(index), self.codec, self.quality)
         return self._stored(index)
 
-    def fill(
-        self,
-        progress: Callable[[int, int], None] | None = None,
-        first: int = 0,
-        stop: Callable[[], bool] | None = None,
-    ) -> int:
-        """Make all missing frames, from ``first`` on and around; returns how many were rendered.
-        ``progress(done, total)`` is called after each; ``stop`` ends it early. Frames can be read meanwhile:
-        a missing one is rendered at once."""
-        if self.repeats_after is None:
-            return 0
+    def fill(self, stop: Callable[[], bool] = lambda: False) -> int:
+        """Make all missing frames, until ``stop`` returns True; returns how many were rendered. Frames can be
+        read meanwhile: a missing one is rendered at once."""
         rendered = 0
-        for k in range(self.repeats_after):
-            if stop is not None and stop():
+        for index in range(self.repeats_after or 0):
+            if stop():
                 break
-            rendered += self._get_or_render(self._wrapped(first + k))[1]
-            if progress is not None:
-                progress(k + 1, self.repeats_after)
+            rendered += self._get_or_render(index)[1]
         return rendered
 
     def key(self) -> str:
@@ -271,19 +261,3 @@ def prune(root: Path, keep: Path | None = None, limit_bytes: int = MAX_DISK_BYTE
             shutil.rmtree(folder, ignore_errors=True)
             freed += size
     return freed
-
-
-def render_ahead(caches: list[FrameCache], progress: Callable[[int, int], None] | None = None) -> int:
-    """Fill several caches, and return how many frames had to be rendered: for a command that prepares a
-    scenario before its cameras start. ``progress(done, total)`` counts the frames of all."""
-    total = sum(each.repeats_after or 0 for each in caches)
-    before = rendered = 0
-    for each in caches:
-
-        def report(done: int, _: int, before: int = before) -> None:
-            if progress is not None:
-                progress(before + done, total)
-
-        rendered += each.fill(report)
-        before += each.repeats_after or 0
-    return rendered

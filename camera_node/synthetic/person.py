@@ -14,7 +14,7 @@ import numpy as np
 from camera_node.synthetic import motion
 from camera_node.synthetic.motion import PERIOD_UNIT_S, Vector
 from camera_node.synthetic.placement import MovingBody, Part
-from camera_node.synthetic.shapes import RoundCone, Sphere, capsule
+from camera_node.synthetic.shapes import RoundCone, Shape, Sphere, capsule
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
 from freshfield.geometry import Array
 
@@ -71,27 +71,21 @@ def _body_parts() -> list[tuple[str, Part]]:
         soft=0.02,
     )
     belt: Texture = Bands(jeans, [(-9.0, 9.0, 0.05, 0.09, (0.15, 0.10, 0.07))])
-    arm_up, arm_low = RoundCone(0.058, 0.046, _UPPER_ARM_M), RoundCone(0.046, 0.036, _FOREARM_M)
-    thigh, shin = RoundCone(0.088, 0.062, _THIGH_M), RoundCone(0.062, 0.045, _SHIN_M)
-    foot = RoundCone(0.055, 0.042, 0.17)
+    limbs: list[tuple[str, Shape, Texture]] = [
+        ("upper_arm", RoundCone(0.058, 0.046, _UPPER_ARM_M), sleeve),
+        ("forearm", RoundCone(0.046, 0.036, _FOREARM_M), skin),
+        ("hand", Sphere(0.05), skin),
+        ("thigh", RoundCone(0.088, 0.062, _THIGH_M), jeans),
+        ("shin", RoundCone(0.062, 0.045, _SHIN_M), jeans),
+        ("foot", RoundCone(0.055, 0.042, 0.17), boots),
+    ]
     return [
         ("pelvis", Part(RoundCone(0.145, 0.135, 0.12), belt)),
         ("torso", Part(RoundCone(0.135, 0.165, 0.33), shirt)),
         ("neck", Part(capsule(0.05, 0.12), skin)),
         ("head", Part(Sphere(0.12), face)),
         ("hair", Part(Sphere(0.124), hair)),
-        ("upper_arm_l", Part(arm_up, sleeve)),
-        ("upper_arm_r", Part(arm_up, sleeve)),
-        ("forearm_l", Part(arm_low, skin)),
-        ("forearm_r", Part(arm_low, skin)),
-        ("hand_l", Part(Sphere(0.05), skin)),
-        ("hand_r", Part(Sphere(0.05), skin)),
-        ("thigh_l", Part(thigh, jeans)),
-        ("thigh_r", Part(thigh, jeans)),
-        ("shin_l", Part(shin, jeans)),
-        ("shin_r", Part(shin, jeans)),
-        ("foot_l", Part(foot, boots)),
-        ("foot_r", Part(foot, boots)),
+        *((f"{name}_{side}", Part(shape, texture)) for name, shape, texture in limbs for side in "lr"),
     ]
 
 
@@ -113,20 +107,15 @@ _CONTACT = {
 
 def _direction(*terms: tuple[float, Vector]) -> Vector:
     """Normalized weighted sum of vectors."""
-    x = sum(w * v[0] for w, v in terms)
-    y = sum(w * v[1] for w, v in terms)
-    z = sum(w * v[2] for w, v in terms)
+    x, y, z = _offset((0.0, 0.0, 0.0), *terms)
     n = math.sqrt(x * x + y * y + z * z) or 1.0
     return x / n, y / n, z / n
 
 
 def _offset(p: Vector, *terms: tuple[float, Vector]) -> Vector:
     """p plus a weighted sum of vectors."""
-    return (
-        p[0] + sum(w * v[0] for w, v in terms),
-        p[1] + sum(w * v[1] for w, v in terms),
-        p[2] + sum(w * v[2] for w, v in terms),
-    )
+    x, y, z = (p[k] + sum(w * v[k] for w, v in terms) for k in range(3))
+    return x, y, z
 
 
 def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:

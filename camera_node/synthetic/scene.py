@@ -99,15 +99,6 @@ class Scene:
     static_key: str | None = field(default=None, repr=False, compare=False)
     _renderers: dict[str, CameraRenderer] = field(default_factory=dict, repr=False, compare=False)
 
-    @property
-    def held_out(self) -> str:
-        return HELD_OUT
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """Color in [0, 1] of rays that meet nothing."""
-        return self.world.background
-
     def render(self, camera_id: str, t_s: float) -> Image:
         """A camera's image at an instant: uint8 RGB (height, width, 3), exact and free of noise."""
         return self.renderer(camera_id).image(t_s)

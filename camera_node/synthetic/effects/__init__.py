@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
@@ -56,12 +56,21 @@ class EffectError(ScenarioError):
     """An effect that cannot be applied as listed; the message says what is valid."""
 
 
-def check_ranges(parameters: object, **ranges: tuple[float, float]) -> None:
-    """Raise ValueError, in one line, for an attribute outside (lowest, highest)."""
-    for name, (low, high) in ranges.items():
-        value = getattr(parameters, name)
-        if not low <= value <= high:  # NaN is refused, too
-            raise ValueError(f"{name} must be within {low:g} to {high:g}, got {value}")
+def bounded(default: float, lowest: float, highest: float) -> Any:
+    """Field of EffectParameters with a default and a range."""
+    return field(default=default, metadata={"range": (lowest, highest)})
+
+
+@dataclass(frozen=True)
+class EffectParameters:
+    """Raises ValueError, in one line, for a value outside the range of its field."""
+
+    def __post_init__(self) -> None:
+        for parameter in fields(self):
+            lowest, highest = parameter.metadata.get("range", (None, None))
+            value = getattr(self, parameter.name)
+            if lowest is not None and not lowest <= value <= highest:  # refuses NaN, too
+                raise ValueError(f"{parameter.name} must be within {lowest:g} to {highest:g}, got {value}")
 
 
 def effect_class(name: str) -> Any:

@@ -7,28 +7,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 
 
 @dataclass(frozen=True)
-class ClockDriftParameters:
+class ClockDriftParameters(EffectParameters):
     """offset_ms, drift_ppm: of every camera's clock. offset_spread_ms, drift_spread_ppm: standard deviations
     of what each camera adds to them, so that cameras disagree."""
 
-    offset_ms: float = 0.0
-    drift_ppm: float = 0.0
-    offset_spread_ms: float = 0.0
-    drift_spread_ppm: float = 0.0
+    offset_ms: float = bounded(0.0, -1e10, 1e10)  # four months
+    drift_ppm: float = bounded(0.0, -1e5, 1e5)
+    offset_spread_ms: float = bounded(0.0, 0.0, 1e9)
+    drift_spread_ppm: float = bounded(0.0, 0.0, 1e4)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            offset_ms=(-1e10, 1e10),  # four months
-            drift_ppm=(-1e5, 1e5),
-            offset_spread_ms=(0.0, 1e9),
-            drift_spread_ppm=(0.0, 1e4),
-        )
 
 
 class ClockDrift:

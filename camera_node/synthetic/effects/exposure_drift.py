@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import cv2
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from camera_node.synthetic.motion import phase_of
 
 if TYPE_CHECKING:
@@ -17,18 +17,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ExposureDriftParameters:
+class ExposureDriftParameters(EffectParameters):
     """amplitude_stops: amplitude of the exposure's sine; one stop doubles the exposure. period_s: of the
     sine; each camera has a random phase. offset_spread_stops: standard deviation of each camera's constant
     offset."""
 
-    amplitude_stops: float = 0.3
-    period_s: float = 20.0
-    offset_spread_stops: float = 0.1
+    amplitude_stops: float = bounded(0.3, 0.0, 8.0)
+    period_s: float = bounded(20.0, 0.01, 1e6)
+    offset_spread_stops: float = bounded(0.1, 0.0, 8.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, amplitude_stops=(0.0, 8.0), period_s=(0.01, 1e6), offset_spread_stops=(0.0, 8.0))
 
 
 class ExposureDrift:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from freshfield.geometry import Array
 
 if TYPE_CHECKING:
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FogParameters:
+class FogParameters(EffectParameters):
     """visibility_m: distance at which contrast falls to contrast_threshold (.02 is Koschmieder's, .05 the
     WMO's). airlight: color of the fog, RGB in [0, 1]."""
 
-    visibility_m: float = 20.0
-    contrast_threshold: float = 0.02
+    visibility_m: float = bounded(20.0, 0.01, 1e6)
+    contrast_threshold: float = bounded(0.02, 1e-6, 0.5)
     airlight: tuple[float, float, float] = (0.76, 0.78, 0.80)
     in_truth: bool = False
 
     def __post_init__(self) -> None:
-        check_ranges(self, visibility_m=(0.01, 1e6), contrast_threshold=(1e-6, 0.5))
+        super().__post_init__()
         if not all(0.0 <= c <= 1.0 for c in self.airlight):
             raise ValueError(f"airlight must be three shares within 0 to 1, got {list(self.airlight)}")
 

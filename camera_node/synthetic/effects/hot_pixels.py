@@ -12,34 +12,24 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import check_ranges, frame_rng
+from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
 
 if TYPE_CHECKING:
     from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
-class HotPixelsParameters:
+class HotPixelsParameters(EffectParameters):
     """hot_ppm: damaged pixels in a million at the start. growth_ppm_per_h: newly damaged ones in an hour.
     hot_counts: mean value that one adds, of 255 counts. hits_per_megapixel: mean number of particles a frame.
     hit_counts: mean value that one adds."""
 
-    hot_ppm: float = 300.0
-    growth_ppm_per_h: float = 0.0
-    hot_counts: float = 100.0
-    hits_per_megapixel: float = 50.0
-    hit_counts: float = 150.0
+    hot_ppm: float = bounded(300.0, 0.0, 1e6)
+    growth_ppm_per_h: float = bounded(0.0, 0.0, 1e6)
+    hot_counts: float = bounded(100.0, 0.0, 1e6)
+    hits_per_megapixel: float = bounded(50.0, 0.0, 1e6)
+    hit_counts: float = bounded(150.0, 0.0, 1e6)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            hot_ppm=(0.0, 1e6),
-            growth_ppm_per_h=(0.0, 1e6),
-            hot_counts=(0.0, 1e6),
-            hits_per_megapixel=(0.0, 1e6),
-            hit_counts=(0.0, 1e6),
-        )
 
 
 class HotPixels:

@@ -12,24 +12,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectError, check_ranges
+from camera_node.synthetic.effects import EffectError, EffectParameters, bounded
 from freshfield.geometry import Pinhole, invertible
 
 
 @dataclass(frozen=True)
-class LensDistortionParameters:
+class LensDistortionParameters(EffectParameters):
     """k1, k2: radial, p1, p2: tangential, without unit, as in OpenCV's model. calibrated: whether frames
     report the coefficients."""
 
-    k1: float = -0.15
-    k2: float = 0.03
-    p1: float = 0.001
-    p2: float = -0.0005
+    k1: float = bounded(-0.15, -10.0, 10.0)
+    k2: float = bounded(0.03, -10.0, 10.0)
+    p1: float = bounded(0.001, -1.0, 1.0)
+    p2: float = bounded(-0.0005, -1.0, 1.0)
     calibrated: bool = True
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, k1=(-10.0, 10.0), k2=(-10.0, 10.0), p1=(-1.0, 1.0), p2=(-1.0, 1.0))
 
 
 class LensDistortion:

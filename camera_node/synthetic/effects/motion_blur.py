@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 
 if TYPE_CHECKING:
     from camera_node.synthetic.effects import Renderer
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class MotionBlurParameters:
+class MotionBlurParameters(EffectParameters):
     """exposure_ms: time for which the shutter is open. samples: instants averaged within it."""
 
     exposure_ms: float = 20.0
-    samples: int = 5
+    samples: int = bounded(5, 1, 64)
     in_truth: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0.0 < self.exposure_ms <= 1000.0:
             raise ValueError(f"exposure_ms must be within 0 to 1000, got {self.exposure_ms}")
-        check_ranges(self, samples=(1, 64))
 
 
 class MotionBlur:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from camera_node.synthetic.motion import PERIOD_UNIT_S, bone_frames, phase_of
 from camera_node.synthetic.placement import MovingBody, Part
 from camera_node.synthetic.shapes import capsule
@@ -28,26 +28,17 @@ _JOINTS = 9  # of the arch
 
 
 @dataclass(frozen=True)
-class OccluderParameters:
+class OccluderParameters(EffectParameters):
     """period_s: one sweep there and back, rounded to a multiple of the scene's period. sweep_deg: angle to
     either side. distance_share: distance from the target as a share of the cameras' (1 = at the cameras); as
     far beyond the cameras if they look outward. thickness_share: diameter as a share of the cameras'
     distance."""
 
-    period_s: float = 6.0
-    sweep_deg: float = 100.0
-    distance_share: float = 0.7
-    thickness_share: float = 0.06
+    period_s: float = bounded(6.0, 0.6, 600.0)
+    sweep_deg: float = bounded(100.0, 0.0, 180.0)
+    distance_share: float = bounded(0.7, 0.05, 0.95)
+    thickness_share: float = bounded(0.06, 0.005, 0.3)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            period_s=(0.6, 600.0),
-            distance_share=(0.05, 0.95),
-            thickness_share=(0.005, 0.3),
-            sweep_deg=(0.0, 180.0),
-        )
 
 
 class Occluder:

@@ -10,30 +10,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges, frame_rng
+from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
 from freshfield.geometry import Array, Pose, so3_exp
 
 
 @dataclass(frozen=True)
-class PoseNoiseParameters:
+class PoseNoiseParameters(EffectParameters):
     """Standard deviations on each axis. translation_mm, rotation_deg: of the error of each frame, as of a
     tracker or an arm. translation_bias_mm, rotation_bias_deg: of each camera's constant error, as of a
     calibration."""
 
-    translation_mm: float = 5.0
-    rotation_deg: float = 0.2
-    translation_bias_mm: float = 0.0
-    rotation_bias_deg: float = 0.0
+    translation_mm: float = bounded(5.0, 0.0, 1e5)
+    rotation_deg: float = bounded(0.2, 0.0, 180.0)
+    translation_bias_mm: float = bounded(0.0, 0.0, 1e5)
+    rotation_bias_deg: float = bounded(0.0, 0.0, 180.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            translation_mm=(0.0, 1e5),
-            rotation_deg=(0.0, 180.0),
-            translation_bias_mm=(0.0, 1e5),
-            rotation_bias_deg=(0.0, 180.0),
-        )
 
 
 class PoseNoise:

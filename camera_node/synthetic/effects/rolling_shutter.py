@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 
 if TYPE_CHECKING:
     from camera_node.synthetic.effects import Renderer
@@ -15,18 +15,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RollingShutterParameters:
+class RollingShutterParameters(EffectParameters):
     """readout_ms: from the top row to the bottom one. stamped_share: row that the time stamp belongs to, from
     0 at the top to 1 at the bottom. rows_at_once: rows rendered at one instant, that of their middle; more is
     faster, with errors up to readout_ms * rows_at_once / (2 * height)."""
 
-    readout_ms: float = 20.0
-    stamped_share: float = 0.5
-    rows_at_once: int = 1
+    readout_ms: float = bounded(20.0, 0.0, 1000.0)
+    stamped_share: float = bounded(0.5, 0.0, 1.0)
+    rows_at_once: int = bounded(1, 1, 4096)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, readout_ms=(0.0, 1000.0), stamped_share=(0.0, 1.0), rows_at_once=(1, 4096))
 
 
 class RollingShutter:

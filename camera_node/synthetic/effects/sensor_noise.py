@@ -7,23 +7,20 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges, frame_rng
+from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
 
 if TYPE_CHECKING:
     from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
-class SensorNoiseParameters:
+class SensorNoiseParameters(EffectParameters):
     """read_noise_counts: standard deviation in black, of 255 counts. full_well_electrons: charge at 255
     counts, where the shot noise is 255 / sqrt(full_well_electrons); 0: no shot noise."""
 
-    read_noise_counts: float = 1.5
-    full_well_electrons: float = 4000.0
+    read_noise_counts: float = bounded(1.5, 0.0, 1e4)
+    full_well_electrons: float = bounded(4000.0, 0.0, 1e12)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, read_noise_counts=(0.0, 1e4), full_well_electrons=(0.0, 1e12))
 
 
 class SensorNoise:

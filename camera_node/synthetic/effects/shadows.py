@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from camera_node.synthetic.lighting import Light, SpecularReflection, SurfacePoints, direct_light
 from camera_node.synthetic.placement import PlacedParts, place_parts
 from camera_node.synthetic.render import blocked
@@ -25,17 +25,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ShadowsParameters:
+class ShadowsParameters(EffectParameters):
     """opacity: share of the light that a moving part holds back; 1 is solid. light_points: points of the
     scene's light that are traced, each standing for an equal share of all; 0 traces all. Fewer are faster and
     make penumbrae coarser."""
 
-    opacity: float = 1.0
-    light_points: int = 0
+    opacity: float = bounded(1.0, 0.0, 1.0)
+    light_points: int = bounded(0, 0, 1000)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, opacity=(0.0, 1.0), light_points=(0, 1000))
 
 
 @dataclass(frozen=True)

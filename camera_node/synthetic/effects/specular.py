@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from camera_node.synthetic.shapes import normalize
 from freshfield.geometry import Array
 
@@ -23,16 +23,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class SpecularParameters:
+class SpecularParameters(EffectParameters):
     """refractive_index: of the coat (1 reflects nothing, 1.5 is varnish or plastic). roughness: width of the
     GGX distribution, from .02 (polished) to 1 (matte)."""
 
-    refractive_index: float = 1.5
-    roughness: float = 0.2
+    refractive_index: float = bounded(1.5, 1.0, 50.0)
+    roughness: float = bounded(0.2, 0.02, 1.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, refractive_index=(1.0, 50.0), roughness=(0.02, 1.0))
 
 
 @dataclass(frozen=True)

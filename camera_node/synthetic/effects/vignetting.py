@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from freshfield.geometry import Pinhole
 
 if TYPE_CHECKING:
@@ -17,14 +17,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class VignettingParameters:
+class VignettingParameters(EffectParameters):
     """exponent: of the cosine of a ray's angle to the optical axis; 4: thin lens, 0: no vignetting."""
 
-    exponent: float = 4.0
+    exponent: float = bounded(4.0, 0.0, 64.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, exponent=(0.0, 64.0))
 
 
 class Vignetting:

@@ -41,7 +41,7 @@ class Scan:
     def options(self) -> dict[str, object]:
         """Settings of a field that a robot cell knows: where the scene is and what is behind it."""
         low, high = self.scene.bounds
-        behind = "#" + "".join(f"{round(255 * c):02x}" for c in self.scene.background)
+        behind = "#" + "".join(f"{round(255 * c):02x}" for c in self.scene.world.background)
         return {
             "centre_m": [float(c) for c in 0.5 * (low + high)],
             "radius_m": float(0.5 * (high - low).max()) + 0.01,

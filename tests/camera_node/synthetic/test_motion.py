@@ -71,11 +71,6 @@ def test_mean_speed_of_the_parts_is_the_one_asked_for(speed):
     assert metres / walk.period_s == pytest.approx(speed, rel=0.03)
 
 
-def test_zero_speed_stands_still():
-    body = person.walking_person(person.make_walk((0.0, 1.0), (0.7, 0.5), 0.0))
-    assert np.array_equal(body.matrices(0.0), body.matrices(12.345))
-
-
 @given(
     st.tuples(*[st.floats(-1, 1)] * 3),
     st.tuples(*[st.floats(-1, 1)] * 3),

@@ -36,7 +36,7 @@ def test_the_held_out_camera_is_15_degrees_from_every_other(name):
     scene = make_scene(name, {"count": 19, **SMALL})
     axes = np.stack([pose[:3, 2] for _, pose in scene.cameras.values()])
     angles = np.degrees(np.arccos(np.clip(axes[1:] @ axes[0], -1, 1)))
-    assert scene.held_out == "cam00" and angles.min() >= 15.0
+    assert angles.min() >= 15.0
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -67,20 +67,6 @@ def test_everything_seen_lies_within_the_bounds(name):
         points = (origin + np.where(np.isfinite(t), t, 0.0)[..., None] * d)[np.isfinite(t)]
         assert (points >= scene.bounds[0] - 1e-6).all() and (points <= scene.bounds[1] + 1e-6).all()
         assert np.isfinite(t).all() or name == "tile"
-
-
-@pytest.mark.parametrize("name", ["room", "tower"])
-@pytest.mark.parametrize("speed", [0.05, 1.0, 3.0, 8.0])
-def test_what_moves_stays_within_the_bounds_and_off_the_cameras(name, speed):
-    scene = make_scene(name, {"speed_m_per_s": speed, **SMALL})
-    eyes = np.stack([pose[:3, 3] for _, pose in scene.cameras.values()])
-    for body in scene.world.moving_bodies:
-        for t in np.linspace(0, scene.period_s, 41):
-            for part, m in zip(body.parts, body.matrices(t)):
-                center, radius = part.shape.bounding_sphere()
-                at = m[:3, :3] @ center + m[:3, 3]
-                assert (at + radius < scene.bounds[1]).all() and (at[:2] - radius > scene.bounds[0][:2]).all()
-                assert np.linalg.norm(eyes - at, axis=1).min() > radius + 0.3
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.4, 1.0, 4.0])
@@ -299,18 +285,20 @@ def test_renderers_of_drawn_motions_share_what_stands_still_and_nothing_else(nam
 
 
 @pytest.mark.parametrize("name", ["room", "tower"])
-@pytest.mark.parametrize("speed", [0.05, 1.0, 8.0])
-def test_drawn_motions_stay_within_the_bounds_and_out_of_the_furniture(name, speed):
-    for seed in range(6):
+@pytest.mark.parametrize("speed", [0.05, 1.0, 3.0, 8.0])
+def test_motions_stay_within_the_bounds_off_the_cameras_and_out_of_the_furniture(name, speed):
+    for seed in (None, *range(6)):
         scene = make_scene(name, {"speed_m_per_s": speed, "motion_seed": seed, **SMALL})
+        eyes = np.stack([pose[:3, 3] for _, pose in scene.cameras.values()])
         boxes = [p for p in scene.world.static_parts if isinstance(p.shape, Box) and p.shape.half[2] > 0.1]
         into = [(np.linalg.inv(p.matrix), np.array(p.shape.half)) for p in boxes]
         for body in scene.world.moving_bodies:
-            for t in np.linspace(0, scene.period_s, 21):
+            for t in np.linspace(0, scene.period_s, 41 if seed is None else 21):
                 for part, m in zip(body.parts, body.matrices(t)):
                     center, radius = part.shape.bounding_sphere()
                     at = m[:3, :3] @ center + m[:3, 3]
                     assert (at + radius < scene.bounds[1]).all()
                     assert (at[:2] - radius > scene.bounds[0][:2]).all()
+                    assert np.linalg.norm(eyes - at, axis=1).min() > radius + 0.3
                     for inverse, half in into:
                         assert (np.abs(inverse[:3, :3] @ at + inverse[:3, 3]) > half).any()

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from camera_node.synthetic.placement import MovingBody, Part, at
 from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.placement import MovingBody, Part, at
 from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from camera_node.synthetic.textures import Plain
@@ -27,7 +27,7 @@ BALL, DRUM = KINDS.index("ball"), KINDS.index("drum")
 LIGHT = Light(np.array([[0.0, 0.0, 5.0]]), 0.8, 5.0, (0.4, 0.4, 0.4), (0.6, 0.6, 0.6))
 
 
-def shot(static_parts=(), movers=(), kinds=()) -> Shot:
+def shot(statics=(), movers=(), kinds=()) -> Shot:
     camera = Pinhole.from_fov(128, 128, 60.0)
     return Shot(World(tuple(statics), tuple(movers), LIGHT), camera, look_at([0, -4, 0], [0, 0, 0]), kinds)
 
