@@ -85,7 +85,7 @@ def measure_effects(
     case's frames to those with default parameters."""
     scene = make_scene(scene_name, {"width": size[0], "height": size[1], "supersample": supersample})
     _prepared(scene)  # the first call of everything takes longer
-    plain, _ = _prepared(scene.with_world(scene.world, scene.period_s, scene.moving))
+    plain, _ = _prepared(scene.with_world(scene.world))
     image = plain.image(0.0)
     pose = Pose.from_matrix(scene.cameras[HELD_OUT][1])
     rows: list[dict[str, Any]] = []

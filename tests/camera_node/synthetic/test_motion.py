@@ -21,7 +21,7 @@ def test_phase_stays_in_range_and_refuses_what_is_not_a_time():
 
 
 @given(st.floats(0, 1, exclude_max=True))
-def test_the_figure_joins_up_at_the_end_of_the_loop(phase):
+def test_the_person_joins_up_at_the_end_of_the_loop(phase):
     for a, b in zip(person.bones(WALK, phase), person.bones(WALK, phase + 1.0)):
         assert np.allclose(a, b, atol=1e-9)
 

@@ -59,7 +59,7 @@ def test_culling_leaves_out_no_ray_that_hits():
         assert np.array_equal(which[hit], every.argmin(axis=0)[hit]) and (which[~hit] == -1).all()
 
 
-def test_rays_within_takes_all_from_inside_and_none_behind():
+def test_rays_near_sphere_takes_all_from_inside_and_none_behind():
     d = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     assert rays_near_sphere(np.zeros(3), d, np.array([0.1, 0.0, 0.0]), 0.5).size == 3
     assert rays_near_sphere(np.zeros(3), d, np.array([-5.0, -5.0, -5.0]), 0.5).size == 0

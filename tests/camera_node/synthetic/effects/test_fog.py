@@ -90,7 +90,7 @@ def test_a_body_hides_the_fog_behind_it_whatever_the_order():
     assert np.abs(images[0].astype(int) - still).max() <= 1
 
 
-def test_the_scene_it_was_made_from_stays_transmittance():
+def test_the_original_scene_stays_clear():
     scene = make_scene("tile", {"width": 16, "height": 16, "supersample": 1})
     before = scene.render("cam01", 0.0)
     assert not np.array_equal(make(visibility_m=1.0).extend(scene).render("cam01", 0.0), before)

@@ -44,7 +44,7 @@ def test_both_the_arm_and_the_scene_repeat_after_the_new_period():
         assert (np.abs(early - late).max(axis=-1) > 1).mean() < 2e-3
 
 
-def test_the_scene_it_was_made_from_is_unchanged():
+def test_the_original_scene_is_unchanged():
     scene = make_scene("room", SMALL)
     before = scene.render("cam00", 0.4)
     make().extend(scene).render("cam00", 0.4)
