@@ -1,4 +1,4 @@
-"""A view made of a function of time, for effects that ask a view for instants."""
+"""A renderer that shows a function of time, for effects that request instants."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from freshfield.geometry import Pinhole
 
 @dataclass
 class TimedRenderer:
-    """Shows ``render(t_s)``; ``asked`` are the instants and rows that were asked for."""
+    """Shows ``render(t_s)``. asked: the requested instants and rows."""
 
     render: Callable[[float], NDArray[np.uint8]]
     camera: Pinhole = field(default_factory=lambda: Pinhole.from_fov(2, 2, 60.0))
