@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
 from typing import Any
 
@@ -27,20 +26,14 @@ def sources() -> str:
 
 def effects() -> str:
     """Every effect with its parameters and their defaults."""
-    from camera_node.synthetic.effects import NAMES
+    from camera_node.synthetic.effects import NAMES, effect_class
 
     lines = ["source: {effects: {NAME: {parameters}}}; held-out cameras are spared unless in_truth: true"]
     for name in NAMES:
-        effect = _effect_class(name)
+        effect = effect_class(name)
         lines += ["", f"{name} (acts on: {effect.kind})", "", _doc(effect), "", _doc(effect.Parameters), ""]
         lines += _keys(effect.Parameters)
     return "\n".join(lines)
-
-
-def _effect_class(name: str) -> Any:
-    module = importlib.import_module(f"camera_node.synthetic.effects.{name}")
-    own = [c for _, c in inspect.getmembers(module, inspect.isclass) if c.__module__ == module.__name__]
-    return next(c for c in own if hasattr(c, "kind"))
 
 
 def _doc(model: type) -> str:

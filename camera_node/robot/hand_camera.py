@@ -93,7 +93,7 @@ class HandCamera(Source):
         mount: Array,
     ) -> None:
         self.camera, self.fps = camera, fps
-        self.intrinsics = effects.claimed_lens(lens)
+        self.intrinsics = effects.reported_lens(lens)
         self._scene, self._lens, self._effects = scene, lens, effects
         self._poses, self._truth = poses, truth
         self._arm, self._base, self._mount = arm, base, mount
@@ -107,7 +107,7 @@ class HandCamera(Source):
         image = view.image((t_ns % round(self._scene.period_s * 1e9)) * 1e-9)
         if self._effects.image:
             image = self._effects.apply(image, content, t_ns * 1e-9)
-        pose = self._effects.claimed_pose(paired.pose, content)
+        pose = self._effects.reported_pose(paired.pose, content)
         return Shot(image, pose, self.intrinsics, paired.gap_ns)
 
     def close(self) -> None:

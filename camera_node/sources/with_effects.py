@@ -57,7 +57,7 @@ class AffectedSource(Source):
 
     def read(self, content: int) -> Shot:
         shot = self._source.read(self._source.content(content) if self._each_differs else content)
-        shot = dataclasses.replace(shot, pose=self._effects.claimed_pose(shot.pose, content))
+        shot = dataclasses.replace(shot, pose=self._effects.reported_pose(shot.pose, content))
         if not self._effects.image:
             return shot
         image = shot.image

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from freshfield.geometry import Pinhole, look_at
+from freshfield.geometry import Array, Pinhole, look_at
 
-Array = NDArray[np.float64]
-Rig = dict[str, tuple[Pinhole, Array]]
+PosedCameras = dict[str, tuple[Pinhole, Array]]
 
 
 def on_sphere(
     target: ArrayLike, radius_m: float, azimuth_deg: float, elevation_deg: float, outward: bool = False
 ) -> Array:
-    """Camera-to-world (4, 4) looking at ``target``, or straight away from it; azimuth 0 is on its -y side,
-    90 on its +x side."""
+    """Camera-to-world (4, 4) looking at ``target``, or away from it; azimuth 0 is on its -y side, 90 on its
+    +x side."""
     a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
     away = np.array([np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), np.sin(e)])
     target = np.asarray(target, dtype=np.float64)
@@ -24,8 +23,8 @@ def on_sphere(
 
 
 def spread_order(directions: Array) -> list[int]:
-    """Farthest-point order of unit directions (N, 3), starting with the first: every prefix covers the
-    whole as evenly as its size allows. Ties go to the lower number."""
+    """Farthest-point order of unit directions (N, 3), starting with the first: every prefix is as well spread
+    as its size allows. Ties go to the lower number."""
     order = [0]
     nearest = directions @ directions[0]
     while len(order) < len(directions):
@@ -43,11 +42,11 @@ def build_rig(
     count: int,
     camera: Pinhole,
     outward: bool = False,
-) -> Rig:
+) -> PosedCameras:
     """Cameras cam00, cam01, ... at (azimuth, elevation) around ``target``, looking at it or outward.
 
-    The first entry is cam00, the held-out one; the others are numbered in spread order, so that a
-    smaller ``count`` leaves out the last names and the rest keep their places.
+    The first entry is cam00, which is held out; the others are numbered in spread order, so that a smaller
+    ``count`` leaves out the last names and the others keep their poses.
     """
     poses = [on_sphere(target, radius_m, a, e, outward) for a, e in angles_deg]
     away = np.stack([-p[:3, 2] for p in poses])

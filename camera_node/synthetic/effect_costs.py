@@ -1,11 +1,11 @@
 """What scenes and effects cost in milliseconds of processor time a frame.
 
-    python -m camera_node.synthetic.effect_costs --size 128x128 640x480 --json bench.json
+    python -m camera_node.synthetic.effect_costs --size 128x128 640x480 --json costs.json
 
-Medians over frames spread through a period; processor time of all threads, so that what else runs on the
-machine counts little. Scenes are rendered ahead and cached, so their cost and that of world, lens and
-exposure effects is paid once for every frame that differs; only image, clock and pose effects are paid
-while streaming. Added costs are the difference to the same frame without the effect, in the same run.
+Medians over frames spread through a period, of processor time of all threads, which other load affects
+little. Scenes are rendered ahead and cached: they and world, lens and exposure effects cost once for every
+different frame; only image, clock and pose effects cost while streaming. An added cost is the difference to
+the same frame without the effect, in the same run.
 """
 
 from __future__ import annotations
@@ -37,22 +37,21 @@ Size = tuple[int, int]
 
 
 def measure_ms(*calls: Callable[[int], object], frames: int, within_s: float = np.inf) -> list[float]:
-    """Median processor milliseconds of each call(k), k = 0 .. frames - 1, after one that does not count."""
+    """Median processor milliseconds of each call(k), k = 0 .. frames - 1, after a warm-up."""
     return [median(row) for row in _times_ms(*calls, frames=frames, within_s=within_s)]
 
 
 def added_ms(
     base: Callable[[int], object], full: Callable[[int], object], frames: int, within_s: float
 ) -> float:
-    """Median of what full(k) takes longer than base(k): frame by frame, because frames differ."""
+    """Median extra time of full(k) over base(k), frame by frame, because frames differ."""
     rows = _times_ms(base, full, frames=frames, within_s=within_s)
     return median(b - a for a, b in zip(*rows))
 
 
 def _times_ms(*calls: Callable[[int], object], frames: int, within_s: float) -> list[list[float]]:
-    """Processor milliseconds of each call. The calls take turns, so that a change in the machine's load meets
-    all of them; those that take longer than ``within_s`` together are measured on fewer frames, on three
-    at least."""
+    """Processor milliseconds of each call. Calls alternate, so that a change in the machine's load meets all
+    of them. If they take longer than ``within_s`` together, fewer frames are measured, but at least three."""
     for call in calls:
         call(0)
     times: list[list[float]] = [[] for _ in calls]
@@ -66,8 +65,8 @@ def _times_ms(*calls: Callable[[int], object], frames: int, within_s: float) -> 
     return times
 
 
-def bench_scenes(size: Size, frames: int, within_s: float) -> list[dict[str, Any]]:
-    """One row for each scene and supersampling: set-up of a camera and a frame without effects."""
+def measure_scenes(size: Size, frames: int, within_s: float) -> list[dict[str, Any]]:
+    """A row for each scene and supersampling: set-up of a camera, and a frame without effects."""
     rows = []
     for name in SCENES:
         for supersample in (1, 2):
@@ -78,15 +77,15 @@ def bench_scenes(size: Size, frames: int, within_s: float) -> list[dict[str, Any
     return rows
 
 
-def bench_effects(
+def measure_effects(
     size: Size, frames: int, within_s: float, scene_name: str = "room", supersample: int = 1
 ) -> list[dict[str, Any]]:
-    """One row for each of CASES, and one for no effect: added ms a frame, and when they are paid.
-    setup_ms: once for each camera, where the effect needs a renderer of its own. rms_counts: of a case that
-    saves time, how far its frames are from those of the same effect with its defaults."""
+    """A row for each of CASES, and one for no effect: added ms a frame, paid ahead or while streaming.
+    setup_ms: once for each camera, if the effect needs its own renderer. rms_counts: difference of a faster
+    case's frames to those with default parameters."""
     scene = make_scene(scene_name, {"width": size[0], "height": size[1], "supersample": supersample})
     _prepared(scene)  # the first call of everything takes longer
-    plain, _ = _prepared(scene.with_world(scene.world, scene.period_s, scene.moving))
+    plain, _ = _prepared(scene.with_world(scene.world))
     image = plain.image(0.0)
     pose = Pose.from_matrix(scene.cameras[HELD_OUT][1])
     rows: list[dict[str, Any]] = []
@@ -98,7 +97,7 @@ def bench_effects(
             changed = plain
             if made.world or made.lens:
                 changed, row["setup_ms"] = _prepared(made.extend(scene))
-            render = partial(_render, made.exposed(changed), scene.period_s)
+            render = partial(_render, made.with_exposure(changed), scene.period_s)
             added = added_ms(partial(_render, plain, scene.period_s), render, frames, within_s)
             row |= {"paid": "ahead", "added_ms": added}
             exact.setdefault(name, render)
@@ -113,20 +112,20 @@ def bench_effects(
     return rows
 
 
-def _prepared(scene: Scene) -> tuple[fx.View, float]:
+def _prepared(scene: Scene) -> tuple[fx.Renderer, float]:
     start = process_time()
     return scene.renderer(HELD_OUT), 1e3 * (process_time() - start)
 
 
-def _render(view: fx.View, period_s: float, k: int) -> Image:
-    # Steps of the golden section: any number of frames is spread over the period.
+def _render(view: fx.Renderer, period_s: float, k: int) -> Image:
+    # Golden-section steps spread any number of frames over the period.
     return view.image(k * 0.618034 % 1.0 * period_s)
 
 
 def _streaming_ms(effects: fx.Effects, image: Image, pose: Pose, frames: int, within_s: float) -> float:
     def stream(k: int) -> Image:
         effects.node_ns(k)
-        effects.claimed_pose(pose, k)
+        effects.reported_pose(pose, k)
         return effects.apply(image, k, k / 15.0)
 
     (ms,) = measure_ms(stream, frames=frames, within_s=within_s)
@@ -134,7 +133,7 @@ def _streaming_ms(effects: fx.Effects, image: Image, pose: Pose, frames: int, wi
 
 
 def table(size: Size, scenes: list[dict[str, Any]], effects: list[dict[str, Any]]) -> str:
-    """The figures of one image size for people."""
+    """The figures of one image size as text."""
     lines = [f"{size[0]} x {size[1]}, one camera, without effects", ""]
     lines.append(f"{'scene':<34}{'rays/pixel':>11}{'set-up ms':>13}{'ms a frame':>19}")
     for row in scenes:
@@ -175,8 +174,8 @@ def main(arguments: list[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     saved = []
     for size in args.size:
-        scenes = bench_scenes(size, args.frames, args.within)
-        effects = bench_effects(size, args.frames, args.within)
+        scenes = measure_scenes(size, args.frames, args.within)
+        effects = measure_effects(size, args.frames, args.within)
         print(table(size, scenes, effects), end="\n\n", flush=True)
         saved.append({"width": size[0], "height": size[1], "scenes": scenes, "effects": effects})
     if args.json:

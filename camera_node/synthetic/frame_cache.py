@@ -1,8 +1,8 @@
-"""Frames of a periodic scene, rendered ahead and kept on disk by content, so that streaming costs a look-up.
+"""Frames of a periodic scene, rendered ahead and kept on disk, so that streaming costs a look-up.
 
-The key of an entry is a hash of everything that decides its bytes: scene, parameters, the camera, frame
-rate, codec and quality, the effects that are rendered in, and the renderer's own source. An entry is
-therefore never stale, only unused; damaged or missing ones are rendered again.
+The key of an entry hashes everything that decides its bytes: scene, parameters, camera, frame rate, codec,
+quality, rendered effects and the renderer's source. An entry is therefore never stale, only unused. Damaged
+or missing ones are rendered again.
 """
 
 from __future__ import annotations
@@ -26,23 +26,19 @@ import numpy as np
 
 import freshfield.geometry
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
-from camera_node.synthetic.motion import TICK_S
+from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import Scene
 from freshfield import payload
 
-# Beyond this many different frames a sequence counts as not repeating: rendered as it goes, kept nowhere.
+# A sequence with more different frames counts as not repeating: it is rendered as it goes and not kept.
 MAX_FRAMES = 3000
 MAX_DISK_BYTES = 2 << 30
 MAX_MEMORY_BYTES = 32 << 20
 _MAGIC = b"FFC1"
 _NAME = re.compile("[0-9a-f]{32}")  # of the folder of one camera's frames
-_TOOLS = (
-    "frame_cache.py",
-    "effect_costs.py",
-    "preview.py",
-    "source.py",
-)  # do not decide what a frame looks like
+# Files here that do not decide what a frame looks like.
+_NOT_RENDERING = ("frame_cache.py", "effect_costs.py", "preview.py", "source.py")
 
 
 def default_folder() -> Path:
@@ -52,14 +48,14 @@ def default_folder() -> Path:
 
 
 class FrameCache:
-    """The frames of one camera at one rate. Frame k shows the scene at k / fps.
+    """The frames of one camera at one rate. Frame k shows the scene at k / fps. Safe for several threads.
 
-    fps: frames a second, kept as a fraction (29.97 is 2997/100). effects: what load_effects gave. codec,
-    quality: of the encoded frames. folder: None keeps frames in memory only.
+    fps: frames a second, kept as a fraction (29.97 is 2997/100). effects: from load_effects. codec, quality:
+    of the encoded frames. folder: default_folder() if None. on_disk: False keeps frames in memory only.
 
-    repeats_after: frames until the sequence starts again (1 for a static scene), None where there would
-    be more than MAX_FRAMES. contents: different outputs of ``read``, None where noise makes each unique.
-    disk_error: why the folder is not used, or None. Safe to use from several threads.
+    repeats_after: frames until the sequence repeats (1 for a static scene), None for more than MAX_FRAMES.
+    contents: number of different outputs of ``read``, None if noise makes each unique. disk_error: why the
+    folder is not used, or None.
     """
 
     def __init__(
@@ -83,7 +79,7 @@ class FrameCache:
         self.contents = None if effects.image else self.repeats_after
         self.disk_error: str | None = None
         self._effects = effects
-        # Frames that noise will be added to must be kept without loss.
+        # Frames that get noise later are kept without loss.
         self._stored_codec = "zstd" if effects.image else codec
         self._memory: dict[int, bytes] = {}
         self._memory_bytes = 0
@@ -96,55 +92,45 @@ class FrameCache:
 
     @property
     def on_disk(self) -> bool:
-        """Whether what is rendered outlives this process."""
+        """Whether rendered frames outlive this process."""
         return self._folder is not None
 
     def content(self, tick: int) -> int:
-        """Which output of ``read`` tick number ``tick`` shows."""
+        """The output of ``read`` that tick number ``tick`` shows."""
         return tick % self.contents if self.contents else tick
 
     def read(self, content: int) -> Image | bytes:
-        """What the node sends: encoded bytes, or where effects act on each frame, an image (H, W, 3) that
-        is still to be encoded."""
+        """What the node sends: encoded bytes or, if effects act on each frame, an image (H, W, 3) to
+        encode."""
         if self._effects.image:
             return self._effects.apply(self.frame(content), content, float(content / self.fps))
         return self.encoded(content)
 
     def frame(self, index: int) -> Image:
-        """Frame ``index`` before effects that act on each frame: uint8 (H, W, 3), exact."""
+        """Frame ``index`` before effects of kind image: uint8 (H, W, 3), exact."""
         if self._stored_codec == "jpeg" or self.repeats_after is None:
-            return self._render(self._place(index))
+            return self._render(self._wrapped(index))
         camera, _ = self.scene.cameras[self.camera_id]
         return payload.decode(self._stored(index), self._stored_codec, camera.width, camera.height)
 
     def encoded(self, index: int) -> bytes:
-        """Frame ``index`` in the codec and quality given, before effects that act on each frame."""
+        """Frame ``index``, encoded, before effects of kind image."""
         if self._stored_codec != self.codec or self.repeats_after is None:
             return payload.encode(self.frame(index), self.codec, self.quality)
         return self._stored(index)
 
-    def fill(
-        self,
-        progress: Callable[[int, int], None] | None = None,
-        first: int = 0,
-        stop: Callable[[], bool] | None = None,
-    ) -> int:
-        """Make every frame that is not there yet, from ``first`` on and around, and return how many had to
-        be rendered. ``progress(done, total)`` is called after each; ``stop`` ends it early. Frames can be
-        read meanwhile: one that is missing is rendered at once."""
-        if self.repeats_after is None:
-            return 0
+    def fill(self, stop: Callable[[], bool] = lambda: False) -> int:
+        """Make all missing frames, until ``stop`` returns True; returns how many were rendered. Frames can be
+        read meanwhile: a missing one is rendered at once."""
         rendered = 0
-        for k in range(self.repeats_after):
-            if stop is not None and stop():
+        for index in range(self.repeats_after or 0):
+            if stop():
                 break
-            rendered += self._ensure(self._place(first + k))[1]
-            if progress is not None:
-                progress(k + 1, self.repeats_after)
+            rendered += self._get_or_render(index)[1]
         return rendered
 
     def key(self) -> str:
-        """Hash (hex) of all that decides the bytes of the frames."""
+        """Hash (hex) of everything that decides the frames' bytes."""
         camera, pose = self.scene.cameras[self.camera_id]
         what = {
             "scene": self.scene.name,
@@ -156,53 +142,53 @@ class FrameCache:
             "codec": [self._stored_codec, self.quality if self._stored_codec == "jpeg" else None],
             "renderer": renderer_version(),
         }
-        # ``count`` decides which cameras there are, not what one of them sees.
+        # ``count`` decides which cameras there are, not what one sees.
         what["params"].pop("count")
         return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
 
-    def _place(self, index: int) -> int:
+    def _wrapped(self, index: int) -> int:
         if index < 0:
             raise ValueError(f"frame numbers start at 0, got {index}")
         return index % self.repeats_after if self.repeats_after else index
 
-    def _render(self, place: int) -> Image:
-        view = self._effects.exposed(self.scene.renderer(self.camera_id))
-        return view.image(float(place / self.fps))
+    def _render(self, frame: int) -> Image:
+        view = self._effects.with_exposure(self.scene.renderer(self.camera_id))
+        return view.image(float(frame / self.fps))
 
     def _stored(self, index: int) -> bytes:
-        place = self._place(index)
-        data = self._memory.get(place)
-        return self._ensure(place)[0] if data is None else data
+        frame = self._wrapped(index)
+        data = self._memory.get(frame)
+        return self._get_or_render(frame)[0] if data is None else data
 
-    def _ensure(self, place: int) -> tuple[bytes, bool]:
-        """A frame's bytes, now in memory, and whether it had to be rendered."""
+    def _get_or_render(self, frame: int) -> tuple[bytes, bool]:
+        """A frame's bytes, now in memory, and whether it was rendered."""
         with self._lock:
-            if place in self._memory:
-                return self._memory[place], False
-            data = self._load(place)
+            if frame in self._memory:
+                return self._memory[frame], False
+            data = self._load(frame)
             fresh = data is None
             if data is None:
-                data = payload.encode(self._render(place), self._stored_codec, self.quality)
-                self._save(place, data)
-            self._remember(place, data)
+                data = payload.encode(self._render(frame), self._stored_codec, self.quality)
+                self._save(frame, data)
+            self._keep_in_memory(frame, data)
             return data, fresh
 
-    def _remember(self, place: int, data: bytes) -> None:
+    def _keep_in_memory(self, frame: int, data: bytes) -> None:
         while self._memory and self._memory_bytes + len(data) > MAX_MEMORY_BYTES:
             oldest = next(iter(self._memory))
             self._memory_bytes -= len(self._memory.pop(oldest))
-        self._memory[place] = data
+        self._memory[frame] = data
         self._memory_bytes += len(data)
 
-    def _path(self, place: int) -> Path:
+    def _path(self, frame: int) -> Path:
         assert self._folder is not None
-        return self._folder / f"{place:06d}.{self._stored_codec}"
+        return self._folder / f"{frame:06d}.{self._stored_codec}"
 
-    def _load(self, place: int) -> bytes | None:
+    def _load(self, frame: int) -> bytes | None:
         if self._folder is None:
             return None
         try:
-            raw = self._path(place).read_bytes()
+            raw = self._path(frame).read_bytes()
         except OSError:
             return None
         head, data = raw[:8], raw[8:]
@@ -210,7 +196,7 @@ class FrameCache:
             return None
         return data
 
-    def _save(self, place: int, data: bytes) -> None:
+    def _save(self, frame: int, data: bytes) -> None:
         if self._folder is None:
             return
         try:
@@ -224,7 +210,7 @@ class FrameCache:
             try:
                 with os.fdopen(handle, "wb") as file:
                     file.write(_MAGIC + zlib.crc32(data).to_bytes(4, "little") + data)
-                os.replace(name, self._path(place))
+                os.replace(name, self._path(frame))
             except OSError:
                 Path(name).unlink(missing_ok=True)
                 raise
@@ -237,7 +223,7 @@ class FrameCache:
 def _repeats_after(scene: Scene, fps: Fraction) -> int | None:
     if not scene.moving:
         return 1
-    period = Fraction(round(scene.period_s / TICK_S)) * Fraction(TICK_S).limit_denominator(10)
+    period = Fraction(round(scene.period_s / PERIOD_UNIT_S)) * Fraction(PERIOD_UNIT_S).limit_denominator(10)
     # The numerator: so many frames take a whole number of periods.
     frames = (period * fps).numerator
     return frames if frames <= MAX_FRAMES else None
@@ -247,7 +233,7 @@ def _repeats_after(scene: Scene, fps: Fraction) -> int | None:
 def renderer_version() -> str:
     """Hash of the source files and libraries that decide what a frame looks like."""
     here = Path(__file__).parent
-    files = [p for p in sorted(here.rglob("*.py")) if p.name not in _TOOLS]
+    files = [p for p in sorted(here.rglob("*.py")) if p.name not in _NOT_RENDERING]
     files += [Path(freshfield.geometry.__file__), Path(payload.__file__)]
     digest = hashlib.sha256(f"{np.__version__} {cv2.__version__}".encode())
     for path in files:
@@ -275,19 +261,3 @@ def prune(root: Path, keep: Path | None = None, limit_bytes: int = MAX_DISK_BYTE
             shutil.rmtree(folder, ignore_errors=True)
             freed += size
     return freed
-
-
-def render_ahead(caches: list[FrameCache], progress: Callable[[int, int], None] | None = None) -> int:
-    """Fill several caches, and return how many frames had to be rendered: for a command that prepares a
-    scenario before its cameras start. ``progress(done, total)`` counts the frames of all."""
-    total = sum(each.repeats_after or 0 for each in caches)
-    before = rendered = 0
-    for each in caches:
-
-        def report(done: int, _: int, before: int = before) -> None:
-            if progress is not None:
-                progress(before + done, total)
-
-        rendered += each.fill(report)
-        before += each.repeats_after or 0
-    return rendered

@@ -1,7 +1,7 @@
-"""Light on surfaces: what they scatter, what a gloss mirrors, what a shadower and a veil take away.
+"""Light on surfaces: diffuse reflection always, and what effects add or take away.
 
-Scattering is always there. Gloss, shadower and veil are what effects hang on a world: this file knows only
-what they have to answer.
+Effects may give a world a specular reflection, a shadow model and a medium. This file knows only the
+protocols that these follow.
 """
 
 from __future__ import annotations
@@ -13,27 +13,33 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.placement import Placed
-from camera_node.synthetic.shapes import Array
-from camera_node.synthetic.textures import Colour
+from camera_node.synthetic.placement import PlacedParts
+from camera_node.synthetic.textures import Color
+from freshfield.geometry import Array
 
 
 @dataclass(frozen=True)
 class Light:
-    """A soft overhead light (points (S, 3), each visible or not) and an ambient term from below to above."""
+    """A soft overhead light of points (S, 3), each visible or not, and an ambient term from below to above.
+    falloff_m: distance at which a point's light has halved."""
 
     points: Array
     strength: float
-    reach_m: float
-    low: Colour
-    high: Colour
-    tint: Colour = (1.0, 1.0, 1.0)
+    falloff_m: float
+    ambient_below: Color
+    ambient_above: Color
+    tint: Color = (1.0, 1.0, 1.0)
+
+    @property
+    def point_color(self) -> Array:
+        """Light (3, 1) of one of the points."""
+        return np.array(self.tint)[:, None] * (self.strength / len(self.points))
 
 
 @dataclass(frozen=True)
-class Lit:
-    """Surface points (3, N), what they scatter (albedo), their unit normals and the unit rays (3, N) that met
-    them, and which of the light's points each sees past what stands still (S, N)."""
+class SurfacePoints:
+    """Points (3, N) of surfaces, their albedo, unit normals and the unit rays that met them (3, N each).
+    visible (S, N): 1 where no static part stands between a light point and a surface point, else 0."""
 
     points: Array
     albedo: Array
@@ -41,81 +47,92 @@ class Lit:
     rays: Array
     visible: Array
 
-    def part(self, chosen: NDArray[np.intp] | slice) -> Lit:
-        return Lit(*(a[:, chosen] for a in (self.points, self.albedo, self.normals, self.rays, self.visible)))
+    def select(self, chosen: NDArray[np.intp] | slice) -> SurfacePoints:
+        fields = (self.points, self.albedo, self.normals, self.rays, self.visible)
+        return SurfacePoints(*(values[:, chosen] for values in fields))
 
 
-class Gloss(Protocol):
-    """What surfaces send towards the viewer beyond what they scatter."""
+class SpecularReflection(Protocol):
+    """Light that surfaces reflect towards the viewer beyond the diffuse part."""
 
-    def share(self, to_light: Array, normals: Array, rays: Array) -> Array:
-        """Share (N,) of a light's strength that is mirrored along -rays (3, N), the cosine at the surface
-        included; to_light and normals are unit (3, N)."""
+    def reflectance(self, to_light: Array, normals: Array, rays: Array) -> Array:
+        """Share (N,) of a light's strength that is reflected along -rays (3, N), including the cosine at the
+        surface. to_light and normals: unit (3, N)."""
         ...
 
 
-class Veil(Protocol):
-    """A medium between surfaces and cameras, the same everywhere."""
+class Medium(Protocol):
+    """A homogeneous medium between surfaces and cameras."""
 
     @property
-    def airlight(self) -> Colour:
-        """What the medium itself looks like, in [0, 1]."""
+    def airlight(self) -> Color:
+        """Color of the medium itself, in [0, 1]."""
         ...
 
-    def clear(self, distance_m: Array) -> NDArray[np.float32]:
-        """Share (N,) of a surface's light that arrives from so far; 0 from infinity."""
-        ...
-
-
-class Shadower(Protocol):
-    """Takes away the light that moving parts keep from surfaces."""
-
-    def darken(self, lit: Lit, light: Light, there: Sequence[Placed], gloss: Gloss | None) -> Array:
-        """What surface points (N,) lose of their colours (3, N) to the parts that are ``there``."""
+    def transmittance(self, distance_m: Array) -> NDArray[np.float32]:
+        """Share (N,) of a surface's light that arrives from this distance; 0 from infinity."""
         ...
 
 
-def shade(light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None) -> Array:
-    """Colours (3, N). ``visible`` (S, N) says which light points each surface point sees; without it the
-    light is one unshadowed point at its centre."""
-    low, high = np.array(light.low)[:, None], np.array(light.high)[:, None]
-    energy = low + (high - low) * (0.5 + 0.5 * normals[2])
+class ShadowModel(Protocol):
+    """Shadows of moving parts."""
+
+    def blocked_light(
+        self,
+        surface: SurfacePoints,
+        light: Light,
+        moving: Sequence[PlacedParts],
+        specular: SpecularReflection | None,
+    ) -> Array:
+        """Part of the surface points' colors (3, N) that the moving parts take away."""
+        ...
+
+
+def shade_diffuse(
+    light: Light, albedo: Array, points: Array, normals: Array, visible: Array | None = None
+) -> Array:
+    """Colors (3, N) of surface points (3, N) under ambient light and Lambert's law. visible (S, N): see
+    SurfacePoints; None replaces the light by one unshadowed point at its center."""
+    low, high = np.array(light.ambient_below)[:, None], np.array(light.ambient_above)[:, None]
+    ambient = low + (high - low) * (0.5 + 0.5 * normals[2])
     sources = light.points if visible is not None else light.points.mean(axis=0, keepdims=True)
     direct = np.zeros(points.shape[1])
     for k, source in enumerate(sources):
-        term = _lambert(source, light.reach_m, points, normals)
+        term = _lambert(source, light.falloff_m, points, normals)
         direct += term if visible is None else term * visible[k]
-    return albedo * (energy + np.array(light.tint)[:, None] * (light.strength / len(sources)) * direct)
+    return albedo * (ambient + np.array(light.tint)[:, None] * (light.strength / len(sources)) * direct)
 
 
-def direct(lit: Lit, light: Light, source: Array, gloss: Gloss | None) -> Array:
-    """Colours (3, N) that one of the light's points (3,) adds to surface points that see it: scattered and,
-    with a gloss, mirrored."""
-    tint = np.array(light.tint)[:, None] * (light.strength / len(light.points))
-    scattered = lit.albedo * _lambert(source, light.reach_m, lit.points, lit.normals)
-    if gloss is None:
-        return tint * scattered
-    return tint * (scattered + _mirrored(gloss, source, light.reach_m, lit))
+def direct_light(
+    surface: SurfacePoints, light: Light, source: Array, specular: SpecularReflection | None
+) -> Array:
+    """Colors (3, N) that one of the light's points (3,) adds to surface points that see it."""
+    diffuse = surface.albedo * _lambert(source, light.falloff_m, surface.points, surface.normals)
+    if specular is None:
+        return light.point_color * diffuse
+    return light.point_color * (diffuse + _reflected(specular, source, light.falloff_m, surface))
 
 
-def _mirrored(gloss: Gloss, source: Array, reach_m: float, lit: Lit) -> Array:
-    to = source[:, None] - lit.points
-    distance2 = np.maximum((to * to).sum(axis=0), 1e-12)
-    share = gloss.share(to / np.sqrt(distance2), lit.normals, lit.rays)
-    return share / (1.0 + distance2 / (reach_m * reach_m))
-
-
-def gleam(light: Light, gloss: Gloss, lit: Lit) -> Array:
-    """Colours (3, N) that a gloss adds to surface points."""
-    total = np.zeros(lit.points.shape[1])
+def specular_light(light: Light, specular: SpecularReflection, surface: SurfacePoints) -> Array:
+    """Colors (3, N) that specular reflection of all visible light points adds to surface points."""
+    total = np.zeros(surface.points.shape[1])
     for k, source in enumerate(light.points):
-        total += _mirrored(gloss, source, light.reach_m, lit) * lit.visible[k]
-    return np.array(light.tint)[:, None] * (light.strength / len(light.points)) * total
+        total += _reflected(specular, source, light.falloff_m, surface) * surface.visible[k]
+    return light.point_color * total
 
 
-def _lambert(source: Array, reach_m: float, points: Array, normals: Array) -> Array:
+def _reflected(
+    specular: SpecularReflection, source: Array, falloff_m: float, surface: SurfacePoints
+) -> Array:
+    to = source[:, None] - surface.points
+    distance2 = np.maximum((to * to).sum(axis=0), 1e-12)
+    share = specular.reflectance(to / np.sqrt(distance2), surface.normals, surface.rays)
+    return share / (1.0 + distance2 / (falloff_m * falloff_m))
+
+
+def _lambert(source: Array, falloff_m: float, points: Array, normals: Array) -> Array:
     to = source[:, None] - points
     distance2 = (to * to).sum(axis=0)
     cosine = np.maximum((to * normals).sum(axis=0), 0.0) / np.sqrt(np.maximum(distance2, 1e-12))
-    # Gentler than the inverse square: a room lit by its walls as well has no black corners.
-    return cosine / (1.0 + distance2 / (reach_m * reach_m))
+    # Gentler than the inverse square: a room that its walls light as well has no black corners.
+    return cosine / (1.0 + distance2 / (falloff_m * falloff_m))

@@ -1,7 +1,7 @@
 """Periodic analytic motion: phases, closed paths, footsteps and the two-bone limb.
 
 All motion is a function of a phase in [0, 1); nothing is integrated, so any instant can be asked for in
-any order and a run of a year is as exact as a run of a second.
+any order, and a run of a year is as exact as a run of a second.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
+
 Vector = tuple[float, float, float]
 
 # Periods are whole multiples of this, so that frame sequences at the usual rates repeat after few frames:
 # 0.6 s holds 9 frames at 15 a second, 15 at 25, 18 at 30 and 20 at one every 30 ms.
-TICK_S = 0.6
+PERIOD_UNIT_S = 0.6
 MAX_SPEED_M_PER_S = 8.0
 
 
@@ -31,8 +31,8 @@ def phase_of(t_s: float, period_s: float) -> float:
 
 
 def period_for(path_m: float, speed_m_per_s: float) -> float:
-    """Period (s) of a loop of about ``path_m`` at ``speed_m_per_s``, rounded to a multiple of TICK_S."""
-    return max(1, round(path_m / speed_m_per_s / TICK_S)) * TICK_S
+    """Period (s) of a loop of about ``path_m``, a multiple of PERIOD_UNIT_S."""
+    return max(1, round(path_m / speed_m_per_s / PERIOD_UNIT_S)) * PERIOD_UNIT_S
 
 
 def smoothstep(x: float) -> float:
@@ -41,10 +41,10 @@ def smoothstep(x: float) -> float:
     return x * x * (3.0 - 2.0 * x)
 
 
-def step_phase(phase: float, cycles: int, offset: float, stance: float = 0.5) -> tuple[float, float]:
-    """Where on the path a foot stands while the body is at ``phase``, and how far through its swing it
-    is (0 while it stands). The foot rests for ``stance`` of each of ``cycles`` gait cycles a loop at the
-    path position the body passes at mid-stance, then swings smoothly to the next."""
+def footstep_phase(phase: float, cycles: int, offset: float, stance: float = 0.5) -> tuple[float, float]:
+    """A foot's position on the path (a phase) while the body is at ``phase``, and the progress of its swing
+    (0 while it stands). In each of ``cycles`` gait cycles a loop the foot rests for a share ``stance`` at the
+    position that the body passes at mid-stance, then swings smoothly to the next."""
     x = phase * cycles + offset
     whole = math.floor(x)
     swing = max(0.0, (x - whole - stance) / (1.0 - stance))
@@ -52,12 +52,12 @@ def step_phase(phase: float, cycles: int, offset: float, stance: float = 0.5) ->
     return (at - offset) / cycles, swing
 
 
-def two_bone(root: Vector, tip: Vector, upper: float, lower: float, pole: Vector) -> Vector:
+def two_bone_ik(root: Vector, tip: Vector, upper: float, lower: float, pole: Vector) -> Vector:
     """The joint between two bones from ``root`` to ``tip`` (law of cosines), bent towards ``pole``.
 
-    The bones have their lengths up to 9/10 of their reach. Beyond, both stretch a little instead of
-    straightening at once (the bend goes as the square root of what is left of the reach, so the joint
-    would snap), and no distance straightens them fully.
+    The bones keep their lengths up to 9/10 of their reach. Beyond, both stretch a little, because the bend
+    goes as the square root of the remaining reach and the joint would snap straight. No distance straightens
+    them fully.
     """
     dx, dy, dz = (tip[k] - root[k] for k in range(3))
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -80,14 +80,14 @@ def two_bone(root: Vector, tip: Vector, upper: float, lower: float, pole: Vector
 
 
 def bone_frames(start: Array, end: Array, side: Array) -> Array:
-    """Rigid frames (M, 4, 4) at ``start`` (M, 3): local z towards ``end`` (M, 3), local x as near to
-    ``side`` (M, 3) as can be."""
+    """Rigid frames (M, 4, 4) at ``start`` (M, 3): local z towards ``end`` (M, 3), local x as near as possible
+    to ``side`` (M, 3)."""
     z = end - start
     length = np.linalg.norm(z, axis=1, keepdims=True)
     z = np.where(length > 1e-12, z / np.maximum(length, 1e-12), [[0.0, 0.0, 1.0]])
     y = _cross(z, side)
     norm = np.linalg.norm(y, axis=1, keepdims=True)
-    # A bone along its own side vector has no preferred roll: any perpendicular will do.
+    # A bone along its side vector has no preferred roll: use any perpendicular.
     fallback = _cross(z, np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     y = np.where(norm < 1e-6, fallback, y)
     y /= np.linalg.norm(y, axis=1, keepdims=True)

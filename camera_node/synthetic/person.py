@@ -1,7 +1,7 @@
 """A person of round cones who walks an elliptic loop and waves whenever the path faces the cameras.
 
-The walk is closed-form: feet rest on footholds of the path and swing between them, knees follow by the
-two-bone construction, arms swing against the legs. Speed is set by the length of the loop's period.
+The walk is closed-form: feet rest on footholds of the path and swing between them, knees follow by inverse
+kinematics of two bones, arms swing against the legs. The loop's period sets the speed.
 """
 
 from __future__ import annotations
@@ -10,35 +10,34 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.synthetic import motion
-from camera_node.synthetic.placement import Mover, Part
-from camera_node.synthetic.shapes import RoundCone, Sphere, capsule
+from camera_node.synthetic.motion import PERIOD_UNIT_S, Vector
+from camera_node.synthetic.placement import MovingBody, Part
+from camera_node.synthetic.shapes import RoundCone, Shape, Sphere, capsule
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
 _CYCLES = 3  # gait cycles in one loop: strides of about 1.2 m
 _ANKLE_M = 0.07
 _THIGH_M, _SHIN_M = 0.42, 0.41
 _UPPER_ARM_M, _FOREARM_M = 0.29, 0.25
-# How far a walk that is drawn may differ from the scene's own: its centre, the radii's factors, the speed's.
-# So far it stays clear of the furniture.
-_SHIFT_M, _STRETCH, _FASTER = 0.2, (0.75, 1.15), (0.7, 1.4)
+# Largest differences of a drawn walk from the scene's own: shift of its center, factors of radii and speed.
+# Within these it stays clear of the furniture.
+_SHIFT_M, _RADIUS_FACTORS, _SPEED_FACTORS = 0.2, (0.75, 1.15), (0.7, 1.4)
 
 
 @dataclass(frozen=True)
 class Walk:
-    """An ellipse of ``radii`` times ``scale`` (metres), walked in ``period_s``. turn: 1.0 against the clock
-    seen from above, -1.0 with it. start_s: how far into the loop it is at instant 0."""
+    """An ellipse of ``radii`` times ``scale`` (metres), walked in ``period_s``. direction: seen from above,
+    1.0 is counterclockwise, -1.0 clockwise. start_s: time into the loop at instant 0."""
 
-    centre: tuple[float, float]
+    center: tuple[float, float]
     radii: tuple[float, float]
     period_s: float
     scale: float = 1.0
     still: bool = False
-    turn: float = 1.0
+    direction: float = 1.0
     start_s: float = 0.0
 
     def phase(self, t_s: float) -> float:
@@ -47,19 +46,19 @@ class Walk:
 
     def at(self, phase: float) -> tuple[float, float]:
         """Position on the floor at a phase, in metres."""
-        a = 2 * math.pi * phase * self.turn
+        a = 2 * math.pi * phase * self.direction
         rx, ry = self.radii[0] * self.scale, self.radii[1] * self.scale
-        return self.centre[0] + rx * math.cos(a), self.centre[1] + ry * math.sin(a)
+        return self.center[0] + rx * math.cos(a), self.center[1] + ry * math.sin(a)
 
     def heading(self, phase: float) -> tuple[float, float]:
         """Unit vector along the path at a phase."""
-        a = 2 * math.pi * phase * self.turn
-        x, y = -self.radii[0] * math.sin(a) * self.turn, self.radii[1] * math.cos(a) * self.turn
+        a = 2 * math.pi * phase * self.direction
+        x, y = -self.radii[0] * math.sin(a) * self.direction, self.radii[1] * math.cos(a) * self.direction
         n = math.hypot(x, y)
         return x / n, y / n
 
 
-def _clothes() -> list[tuple[str, Part]]:
+def _body_parts() -> list[tuple[str, Part]]:
     skin = Plain((0.86, 0.63, 0.50))
     shirt = Plaid((0.80, 0.20, 0.16), (0.30, 0.08, 0.12), (0.98, 0.86, 0.62), 1 / 8, 0.13)
     sleeve = Plaid((0.80, 0.20, 0.16), (0.30, 0.08, 0.12), (0.98, 0.86, 0.62), 1 / 4, 0.13)
@@ -72,31 +71,25 @@ def _clothes() -> list[tuple[str, Part]]:
         soft=0.02,
     )
     belt: Texture = Bands(jeans, [(-9.0, 9.0, 0.05, 0.09, (0.15, 0.10, 0.07))])
-    arm_up, arm_low = RoundCone(0.058, 0.046, _UPPER_ARM_M), RoundCone(0.046, 0.036, _FOREARM_M)
-    thigh, shin = RoundCone(0.088, 0.062, _THIGH_M), RoundCone(0.062, 0.045, _SHIN_M)
-    foot = RoundCone(0.055, 0.042, 0.17)
+    limbs: list[tuple[str, Shape, Texture]] = [
+        ("upper_arm", RoundCone(0.058, 0.046, _UPPER_ARM_M), sleeve),
+        ("forearm", RoundCone(0.046, 0.036, _FOREARM_M), skin),
+        ("hand", Sphere(0.05), skin),
+        ("thigh", RoundCone(0.088, 0.062, _THIGH_M), jeans),
+        ("shin", RoundCone(0.062, 0.045, _SHIN_M), jeans),
+        ("foot", RoundCone(0.055, 0.042, 0.17), boots),
+    ]
     return [
         ("pelvis", Part(RoundCone(0.145, 0.135, 0.12), belt)),
         ("torso", Part(RoundCone(0.135, 0.165, 0.33), shirt)),
         ("neck", Part(capsule(0.05, 0.12), skin)),
         ("head", Part(Sphere(0.12), face)),
         ("hair", Part(Sphere(0.124), hair)),
-        ("upper_arm_l", Part(arm_up, sleeve)),
-        ("upper_arm_r", Part(arm_up, sleeve)),
-        ("forearm_l", Part(arm_low, skin)),
-        ("forearm_r", Part(arm_low, skin)),
-        ("hand_l", Part(Sphere(0.05), skin)),
-        ("hand_r", Part(Sphere(0.05), skin)),
-        ("thigh_l", Part(thigh, jeans)),
-        ("thigh_r", Part(thigh, jeans)),
-        ("shin_l", Part(shin, jeans)),
-        ("shin_r", Part(shin, jeans)),
-        ("foot_l", Part(foot, boots)),
-        ("foot_r", Part(foot, boots)),
+        *((f"{name}_{side}", Part(shape, texture)) for name, shape, texture in limbs for side in "lr"),
     ]
 
 
-# Local scales of the parts that are not round: torsos and heads are deeper or narrower than wide.
+# Local scales of parts that are not round.
 _SCALES = {
     "pelvis": (1.0, 0.72, 1.0),
     "torso": (1.0, 0.66, 1.0),
@@ -105,29 +98,24 @@ _SCALES = {
     "hand_l": (0.7, 1.0, 1.25),
     "hand_r": (0.7, 1.0, 1.25),
 }
-# Balls that shade the floor: part and radius.
+# Spheres that shade the floor: part and radius (m).
 _CONTACT = {
     "foot_l": 0.10, "foot_r": 0.10, "shin_l": 0.08, "shin_r": 0.08,
     "thigh_l": 0.10, "thigh_r": 0.10, "pelvis": 0.14,
 }  # fmt: skip
 
 
-def _direction(*terms: tuple[float, tuple[float, float, float]]) -> tuple[float, float, float]:
-    """Normalised weighted sum of vectors."""
-    x = sum(w * v[0] for w, v in terms)
-    y = sum(w * v[1] for w, v in terms)
-    z = sum(w * v[2] for w, v in terms)
+def _direction(*terms: tuple[float, Vector]) -> Vector:
+    """Normalized weighted sum of vectors."""
+    x, y, z = _offset((0.0, 0.0, 0.0), *terms)
     n = math.sqrt(x * x + y * y + z * z) or 1.0
     return x / n, y / n, z / n
 
 
-def _go(p: tuple[float, float, float], *terms: tuple[float, tuple[float, float, float]]) -> motion.Vector:
+def _offset(p: Vector, *terms: tuple[float, Vector]) -> Vector:
     """p plus a weighted sum of vectors."""
-    return (
-        p[0] + sum(w * v[0] for w, v in terms),
-        p[1] + sum(w * v[1] for w, v in terms),
-        p[2] + sum(w * v[2] for w, v in terms),
-    )
+    x, y, z = (p[k] + sum(w * v[k] for w, v in terms) for k in range(3))
+    return x, y, z
 
 
 def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
@@ -140,26 +128,26 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
     swing, bob = math.sin(gait), -0.025 * math.cos(2 * gait)  # lowest when the legs are apart
 
     pelvis = (x, y, 0.845 + bob)
-    waist = _go(pelvis, (0.10, up), (0.01, forward))
-    chest = _go(waist, (0.33, up), (0.035, forward))
+    waist = _offset(pelvis, (0.10, up), (0.01, forward))
+    chest = _offset(waist, (0.33, up), (0.035, forward))
     # Shoulders turn against the hips.
     twist = 0.16 * swing
     shoulder_axis = _direction((math.cos(twist), right), (math.sin(twist), forward))
-    head = _go(chest, (0.285, up), (0.03, forward))
+    head = _offset(chest, (0.285, up), (0.03, forward))
 
-    starts: dict[str, motion.Vector] = {"pelvis": _go(pelvis, (-0.03, up)), "torso": waist}
-    ends: dict[str, motion.Vector] = {"pelvis": _go(pelvis, (0.12, up)), "torso": chest}
+    starts: dict[str, Vector] = {"pelvis": _offset(pelvis, (-0.03, up)), "torso": waist}
+    ends: dict[str, Vector] = {"pelvis": _offset(pelvis, (0.12, up)), "torso": chest}
     sides = {"pelvis": right, "torso": shoulder_axis}
-    starts["neck"], ends["neck"] = _go(chest, (0.08, up)), head
-    starts["head"], ends["head"] = head, _go(head, (1.0, up))
-    crown = _go(head, (0.028, up), (-0.026, forward))
-    starts["hair"], ends["hair"] = crown, _go(crown, (1.0, up))
+    starts["neck"], ends["neck"] = _offset(chest, (0.08, up)), head
+    starts["head"], ends["head"] = head, _offset(head, (1.0, up))
+    crown = _offset(head, (0.028, up), (-0.026, forward))
+    starts["hair"], ends["hair"] = crown, _offset(crown, (1.0, up))
 
     # Wave with the right hand while the path faces the cameras (-y), smoothly blended in and out.
     wave = motion.smoothstep((-fy + 0.05) / 0.8)
     hello = math.sin(2 * gait)
     for name, sign in (("l", -1.0), ("r", 1.0)):
-        shoulder = _go(chest, (0.205 * sign, shoulder_axis), (0.05, up))
+        shoulder = _offset(chest, (0.205 * sign, shoulder_axis), (0.05, up))
         a = 0.55 * swing * sign
         upper = _direction((-math.cos(a), up), (math.sin(a), forward), (0.16 * sign, right))
         b = a + 0.55
@@ -167,45 +155,45 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
         if sign > 0 and wave > 0.0:
             raised = _direction((0.25, up), (0.9, right), (0.25, forward))
             waving = _direction((1.0, up), (0.55 * hello + 0.1, right), (0.2, forward))
-            # By way of the side: straight from hanging to raised would pass through no direction at all.
+            # Through the side: a straight blend from hanging to raised would pass through the zero vector.
             keep, via = (1 - wave) ** 2, 2 * wave * (1 - wave)
             upper = _direction((keep, upper), (via, right), (wave * wave, raised))
             lower = _direction((keep, lower), (via, right), (via, forward), (wave * wave, waving))
-        elbow = _go(shoulder, (_UPPER_ARM_M, upper))
-        wrist = _go(elbow, (_FOREARM_M, lower))
-        hand = _go(wrist, (0.05, lower))
+        elbow = _offset(shoulder, (_UPPER_ARM_M, upper))
+        wrist = _offset(elbow, (_FOREARM_M, lower))
+        hand = _offset(wrist, (0.05, lower))
         starts[f"upper_arm_{name}"], ends[f"upper_arm_{name}"] = shoulder, elbow
         starts[f"forearm_{name}"], ends[f"forearm_{name}"] = elbow, wrist
-        starts[f"hand_{name}"], ends[f"hand_{name}"] = hand, _go(hand, (0.1, lower))
+        starts[f"hand_{name}"], ends[f"hand_{name}"] = hand, _offset(hand, (0.1, lower))
 
-        hip = _go(pelvis, (0.095 * sign, right))
-        at, lift = motion.step_phase(phase, _CYCLES, 0.0 if sign < 0 else 0.5)
+        hip = _offset(pelvis, (0.095 * sign, right))
+        at, lift = motion.footstep_phase(phase, _CYCLES, 0.0 if sign < 0 else 0.5)
         px, py = walk.at(at)
         hx, hy = walk.heading(at)
         toes, out = (hx, hy, 0.0), (hy, -hx, 0.0)
         height = _ANKLE_M + 0.11 * math.sin(math.pi * lift) ** 2
-        ankle = _go((px, py, height), (0.09 * sign, out))
-        knee = motion.two_bone(hip, ankle, _THIGH_M, _SHIN_M, forward)
+        ankle = _offset((px, py, height), (0.09 * sign, out))
+        knee = motion.two_bone_ik(hip, ankle, _THIGH_M, _SHIN_M, forward)
         pitch = -0.5 * math.sin(2 * math.pi * lift) if lift > 0.0 else 0.0
         ahead = _direction((math.cos(pitch), toes), (math.sin(pitch) - 0.06, up))
         starts[f"thigh_{name}"], ends[f"thigh_{name}"] = hip, knee
         starts[f"shin_{name}"], ends[f"shin_{name}"] = knee, ankle
-        heel = _go(ankle, (-0.03, ahead), (-0.01, up))
-        starts[f"foot_{name}"], ends[f"foot_{name}"] = heel, _go(heel, (1.0, ahead))
+        heel = _offset(ankle, (-0.03, ahead), (-0.01, up))
+        starts[f"foot_{name}"], ends[f"foot_{name}"] = heel, _offset(heel, (1.0, ahead))
 
     names = _NAMES
     side = [sides.get(n, right) for n in names]
     return np.array([starts[n] for n in names]), np.array([ends[n] for n in names]), np.array(side)
 
 
-_PARTS = _clothes()
+_PARTS = _body_parts()
 _NAMES = [name for name, _ in _PARTS]
 _ROUND = np.array([n.split("_")[0] in ("head", "hair", "hand", "foot") for n in _NAMES])
 _SCALE_ROWS = np.array([_SCALES.get(n, (1.0, 1.0, 1.0)) for n in _NAMES])
 
 
-def walking_person(walk: Walk) -> Mover:
-    """The figure as a mover of the world. ``walk.still`` freezes it at phase 0.62, mid-wave."""
+def walking_person(walk: Walk) -> MovingBody:
+    """The person as a body of the world. ``walk.still`` freezes it at phase 0.62, mid-wave."""
 
     def matrices(t_s: float) -> Array:
         phase = 0.62 if walk.still else walk.phase(t_s)
@@ -214,44 +202,45 @@ def walking_person(walk: Walk) -> Mover:
         return out
 
     contact = tuple((_NAMES.index(n), r) for n, r in _CONTACT.items())
-    return Mover(tuple(part for _, part in _PARTS), matrices, contact)
+    return MovingBody(tuple(part for _, part in _PARTS), matrices, contact)
 
 
 def loop_length_m(walk: Walk) -> float:
-    """Metres that the middles of the figure's parts travel in one loop, averaged over the parts."""
+    """Metres that the middles of the person's parts travel in one loop, averaged over the parts."""
 
     def middles(phase: float) -> Array:
         start, end, _ = bones(walk, phase)
-        # Heads, hands and feet are given by where they are, not by how far their axis points.
+        # Heads, hands and feet count by their position, not by the end of their axis.
         return np.where(_ROUND[:, None], start, 0.5 * (start + end))
 
     return motion.mean_path_m(middles)
 
 
-def walk_at(
-    centre: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int | None = None
+def make_walk(
+    center: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int | None = None
 ) -> Walk:
-    """The walk whose parts move at ``speed_m_per_s`` on average. The period is rounded to motion.TICK_S
-    and the ellipse stretched until the speed is right in spite of it. Zero speed stands still. seed: draws
-    another walk about the same place: its path, its sense, where on it it starts, and a speed about the one
-    given; None walks the loop as it is."""
+    """The walk whose parts move at ``speed_m_per_s`` on average; 0 stands still. The period is rounded to
+    PERIOD_UNIT_S, and the ellipse stretched to keep the speed. seed: draws another path about the same place,
+    its direction, start and a speed about this one; None walks the loop as it is."""
     if speed_m_per_s == 0.0:
-        return Walk(centre, radii, motion.TICK_S, still=True)
+        return Walk(center, radii, PERIOD_UNIT_S, still=True)
     if seed is not None:
-        return _drawn(centre, radii, speed_m_per_s, seed)
-    walk = Walk(centre, radii, 1.0)
+        return _draw_walk(center, radii, speed_m_per_s, seed)
+    walk = Walk(center, radii, 1.0)
     period = motion.period_for(loop_length_m(walk), speed_m_per_s)
     for _ in range(3):  # the length is nearly linear in the scale
         scale = walk.scale * speed_m_per_s * period / loop_length_m(walk)
-        walk = Walk(centre, radii, period, scale)
+        walk = Walk(center, radii, period, scale)
     return walk
 
 
-def _drawn(centre: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int) -> Walk:
+def _draw_walk(
+    center: tuple[float, float], radii: tuple[float, float], speed_m_per_s: float, seed: int
+) -> Walk:
     rng = np.random.default_rng(seed)
     dx, dy = rng.uniform(-_SHIFT_M, _SHIFT_M, 2).tolist()
-    wide, deep = rng.uniform(*_STRETCH, 2).tolist()
-    speed = min(speed_m_per_s * float(np.exp(rng.uniform(*np.log(_FASTER)))), motion.MAX_SPEED_M_PER_S)
-    turn, start = (1.0 if rng.random() < 0.5 else -1.0), float(rng.random())
-    walk = walk_at((centre[0] + dx, centre[1] + dy), (radii[0] * wide, radii[1] * deep), speed)
-    return replace(walk, turn=turn, start_s=start * walk.period_s)
+    wide, deep = rng.uniform(*_RADIUS_FACTORS, 2).tolist()
+    speed = min(speed_m_per_s * float(np.exp(rng.uniform(*np.log(_SPEED_FACTORS)))), motion.MAX_SPEED_M_PER_S)
+    direction, start = (1.0 if rng.random() < 0.5 else -1.0), float(rng.random())
+    walk = make_walk((center[0] + dx, center[1] + dy), (radii[0] * wide, radii[1] * deep), speed)
+    return replace(walk, direction=direction, start_s=start * walk.period_s)

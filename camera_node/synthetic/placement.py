@@ -1,4 +1,4 @@
-"""Parts of a world and where they stand: world-from-local matrices (4, 4)."""
+"""Parts of a world and their poses: world-from-local matrices (4, 4)."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from camera_node.synthetic.shapes import Array, Shape
+from camera_node.synthetic.motion import Vector
+from camera_node.synthetic.shapes import Shape
 from camera_node.synthetic.textures import Texture
-
-Vector = tuple[float, float, float]
+from freshfield.geometry import Array
 
 
 def at(x: float, y: float, z: float, turn_deg: float = 0.0) -> Array:
-    """Moved to a place (metres), turned about the vertical."""
+    """Pose (4, 4) at a position in metres, turned about the vertical."""
     a = np.deg2rad(turn_deg)
     out = np.eye(4)
     out[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
@@ -22,30 +22,30 @@ def at(x: float, y: float, z: float, turn_deg: float = 0.0) -> Array:
     return out
 
 
-def facing(x_axis: Vector, y_axis: Vector, centre: Vector) -> Array:
-    """With local x and y along the axes given, which are orthogonal and of unit length."""
+def facing(x_axis: Vector, y_axis: Vector, center: Vector) -> Array:
+    """Pose (4, 4) with local x and y along these axes, which are orthogonal and of unit length."""
     out = np.eye(4)
-    out[:3, 0], out[:3, 1], out[:3, 3] = x_axis, y_axis, centre
+    out[:3, 0], out[:3, 1], out[:3, 3] = x_axis, y_axis, center
     out[:3, 2] = np.cross(x_axis, y_axis)
     return out
 
 
 @dataclass(frozen=True)
 class Part:
-    """A shape with its texture and, for a part that does not move, its world-from-local matrix (4, 4)."""
+    """A shape with its texture and, if it does not move, its world-from-local matrix (4, 4)."""
 
     shape: Shape
     texture: Texture
     matrix: Array = field(default_factory=lambda: np.eye(4))
     casts_shadow: bool = True
     takes_contact: bool = False  # darkened beneath moving parts (floors, rugs)
-    glow: float = 0.0  # share of the albedo that shines of itself (lamps)
+    glow: float = 0.0  # share of the albedo that is emitted (lamps)
 
 
 @dataclass(frozen=True)
-class Mover:
-    """Parts that move together: ``matrices(t_s)`` gives their world-from-local matrices (M, 4, 4), which
-    may scale. ``contact`` lists the parts (index, radius in metres) that darken the floor beneath."""
+class MovingBody:
+    """Parts that move together. matrices(t_s): their world-from-local matrices (M, 4, 4), which may scale.
+    contact: parts (index, radius in metres) that darken the floor beneath them."""
 
     parts: tuple[Part, ...]
     matrices: Callable[[float], Array]
@@ -53,33 +53,38 @@ class Mover:
 
 
 @dataclass(frozen=True)
-class Placed:
-    """Parts where they are at one instant: world-from-local matrices (M, 4, 4), the inverses (M, 3, 3) of
-    their linear parts, and bounding spheres in world axes, centres (M, 3) and radii (M,)."""
+class PlacedParts:
+    """Parts at one instant: world-from-local matrices (M, 4, 4), the inverses (M, 3, 3) of their linear
+    parts, and bounding spheres in world axes, centers (M, 3) and radii (M,)."""
 
     parts: Sequence[Part]
     matrices: Array
     inverse: Array
-    centres: Array
+    centers: Array
     radii: Array
 
+    def bounding_sphere(self) -> tuple[Array, float]:
+        """Center (3,) and radius of a sphere around all parts."""
+        center = self.centers.mean(axis=0)
+        return center, float((np.linalg.norm(self.centers - center, axis=1) + self.radii).max())
 
-def place(parts: Sequence[Part], matrices: Array) -> Placed:
+
+def place_parts(parts: Sequence[Part], matrices: Array) -> PlacedParts:
     """Prepare ``parts`` at ``matrices`` (M, 4, 4) for casting."""
     linear = matrices[:, :3, :3]
     spheres = [p.shape.bounding_sphere() for p in parts]
-    centres = np.array([c for c, _ in spheres]).reshape(-1, 3, 1)
+    centers = np.array([c for c, _ in spheres]).reshape(-1, 3, 1)
     # The columns of rotation times scale are orthogonal, so the longest is the largest stretch.
     stretch = np.sqrt((linear * linear).sum(axis=1).max(axis=1, initial=0.0))
-    return Placed(
+    return PlacedParts(
         parts,
         matrices,
         np.asarray(np.linalg.inv(linear), dtype=np.float64),
-        (linear @ centres)[:, :, 0] + matrices[:, :3, 3],
+        (linear @ centers)[:, :, 0] + matrices[:, :3, 3],
         np.array([r for _, r in spheres]) * stretch,
     )
 
 
-def place_still(parts: Sequence[Part]) -> Placed:
-    """Prepare parts that do not move."""
-    return place(parts, np.array([p.matrix for p in parts]).reshape(-1, 4, 4))
+def place_static(parts: Sequence[Part]) -> PlacedParts:
+    """Prepare parts that do not move for casting."""
+    return place_parts(parts, np.array([p.matrix for p in parts]).reshape(-1, 4, 4))

@@ -28,9 +28,9 @@ def contact_sheet(scene: Scene, t_s: float, columns: int = 0) -> Image:
         y, x = gap + (k // columns) * (height + gap), gap + (k % columns) * (width + gap)
         image = scene.render(name, t_s)
         scale = width / 400
-        for colour, thick in ((0, 3), (255, 1)):
+        for color, thick in ((0, 3), (255, 1)):
             at = (int(6 * scale) + 2, int(14 * scale) + 6)
-            text = (colour, colour, colour)
+            text = (color, color, color)
             cv2.putText(image, name, at, cv2.FONT_HERSHEY_SIMPLEX, max(scale, 0.3), text, thick, cv2.LINE_AA)
         sheet[y : y + height, x : x + width] = image
     return sheet

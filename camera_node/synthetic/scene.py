@@ -1,7 +1,6 @@
 """Scenes: a world with cameras, bounds and a period, made by name from a dictionary of parameters.
 
-A scene is one module beside this one with a dataclass ``Params`` and a function ``build``; it is
-imported only when it is asked for.
+A scene is a module in scenes/ with a dataclass ``Params`` and a function ``build``, imported on first use.
 """
 
 from __future__ import annotations
@@ -12,11 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from camera_node.synthetic.camera_rig import Rig
+from camera_node.synthetic.camera_rig import PosedCameras
 from camera_node.synthetic.motion import MAX_SPEED_M_PER_S
 from camera_node.synthetic.render import CameraRenderer, Image, World
-from camera_node.synthetic.shapes import Array
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Array, Pinhole
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.scenario import ScenarioError, read_section
 
@@ -30,15 +28,15 @@ _RANGES = (
     ("horizontal_fov_deg", 5.0, 150.0),
     ("supersample", 1, 8),
 )
-# Parameters that decide nothing that stands still.
-_OF_MOTION = ("speed_m_per_s", "motion_seed")
-# Renderers from which others of the same still world are made: two rigs of cameras.
-_STANDING_KEPT = 2 * MAX_CAMERAS
-_STANDING: dict[tuple[str, str], CameraRenderer] = {}
+# Parameters that do not change static parts.
+_MOTION_PARAMETERS = ("speed_m_per_s", "motion_seed")
+# Renderers kept to be shared by scenes with the same static parts: of two sets of cameras.
+_MAX_STATIC_RENDERERS = 2 * MAX_CAMERAS
+_STATIC_RENDERERS: dict[tuple[str, str], CameraRenderer] = {}
 
 
 class SceneError(ScenarioError):
-    """A scene that cannot be made as asked; the message says what is valid."""
+    """A scene that cannot be made from its parameters; the message says what is valid."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,8 @@ class BaseParams:
 
 @dataclass(frozen=True)
 class MovingParams(BaseParams):
-    """speed_m_per_s: mean speed of what moves; 0 stands still. motion_seed: draws another motion, each seed
-    its own path, sense, start and speed (from 0.7 to 1.4 times the one given); None is the scene's own."""
+    """speed_m_per_s: mean speed of moving parts; 0 stands still. motion_seed: draws a path, direction, start
+    and speed (from 0.7 to 1.4 times the one given); None: the scene's own motion."""
 
     speed_m_per_s: float = 1.0
     motion_seed: int | None = None
@@ -83,70 +81,64 @@ class MovingParams(BaseParams):
 class Scene:
     """A world seen by posed cameras.
 
-    cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is the held-out one. target: the point (3,)
-    that they look at, or away from where they look outward. bounds: (2, 3), lower and upper corner in
-    metres of everything that can be seen (an effect's occluder apart).
-    period_s: the frames repeat after this long, a multiple of 0.6 s. moving: False where every instant is
-    the same. stands: tells scenes apart by what stands still in them, for motions that are drawn: their
-    renderers share what they hold of it.
+    cameras: name -> (Pinhole, camera-to-world (4, 4)); cam00 is held out. target: the point (3,) that cameras
+    look at, or away from. bounds (2, 3): lower and upper corner in metres of everything that can be seen,
+    except an occluder. period_s: frames repeat after this time, a multiple of 0.6 s. moving: False if every
+    instant is the same. static_key: identifies the static parts of scenes with a motion_seed, whose
+    renderers share what they hold of these; None otherwise.
     """
 
     name: str
     params: BaseParams
-    cameras: Rig
+    cameras: PosedCameras
     target: tuple[float, float, float]
     world: World
     bounds: Array
     period_s: float
     moving: bool = True
-    stands: str | None = field(default=None, repr=False, compare=False)
+    static_key: str | None = field(default=None, repr=False, compare=False)
     _renderers: dict[str, CameraRenderer] = field(default_factory=dict, repr=False, compare=False)
 
-    @property
-    def held_out(self) -> str:
-        return HELD_OUT
-
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """Colour in [0, 1] of rays that meet nothing."""
-        return self.world.background
-
     def render(self, camera_id: str, t_s: float) -> Image:
-        """What a camera sees at an instant: uint8 RGB (height, width, 3), free of noise and exact."""
+        """A camera's image at an instant: uint8 RGB (height, width, 3), exact and free of noise."""
         return self.renderer(camera_id).image(t_s)
 
     def renderer(self, camera_id: str) -> CameraRenderer:
-        """The camera's renderer, made on first use (some tenths of a second) and kept."""
+        """The camera's renderer, made on first use (in tenths of a second) and kept."""
         if camera_id not in self._renderers:
             if camera_id not in self.cameras:
                 known = ", ".join(self.cameras)
                 raise SceneError(f"scene {self.name}: no camera {camera_id!r}; it has {known}")
-            self._renderers[camera_id] = self._shared(camera_id) or self.view(*self.cameras[camera_id])
+            self._renderers[camera_id] = self._shared_renderer(camera_id) or self.view(
+                *self.cameras[camera_id]
+            )
         return self._renderers[camera_id]
 
-    def _shared(self, camera_id: str) -> CameraRenderer | None:
-        if self.stands is None:
+    def _shared_renderer(self, camera_id: str) -> CameraRenderer | None:
+        if self.static_key is None:
             return None
-        at = (self.stands, camera_id)
-        if at not in _STANDING:
-            while len(_STANDING) >= _STANDING_KEPT:
-                _STANDING.pop(next(iter(_STANDING)))
-            _STANDING[at] = self.view(*self.cameras[camera_id])
-        return _STANDING[at].of(self.world)
+        at = (self.static_key, camera_id)
+        if at not in _STATIC_RENDERERS:
+            while len(_STATIC_RENDERERS) >= _MAX_STATIC_RENDERERS:
+                _STATIC_RENDERERS.pop(next(iter(_STATIC_RENDERERS)))
+            _STATIC_RENDERERS[at] = self.view(*self.cameras[camera_id])
+        return _STATIC_RENDERERS[at].for_world(self.world)
 
     def view(self, camera: Pinhole, camera_to_world: Array) -> CameraRenderer:
         """A renderer for any other camera."""
         return CameraRenderer(self.world, camera, camera_to_world, self.params.supersample)
 
-    def with_world(self, world: World, period_s: float, moving: bool) -> Scene:
-        """The same cameras in another world (an effect adds to it)."""
+    def with_world(self, world: World, period_s: float | None = None, moving: bool | None = None) -> Scene:
+        """The same cameras in another world (an effect adds to it). None: as before."""
+        period_s = self.period_s if period_s is None else period_s
+        moving = self.moving if moving is None else moving
         return dataclasses.replace(
-            self, world=world, period_s=period_s, moving=moving, stands=None, _renderers={}
+            self, world=world, period_s=period_s, moving=moving, static_key=None, _renderers={}
         )
 
-    def with_cameras(self, cameras: Rig) -> Scene:
+    def with_cameras(self, cameras: PosedCameras) -> Scene:
         """The same world through other cameras (an effect changes their lenses)."""
-        return dataclasses.replace(self, cameras=cameras, stands=None, _renderers={})
+        return dataclasses.replace(self, cameras=cameras, static_key=None, _renderers={})
 
 
 def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
@@ -160,8 +152,8 @@ def make_scene(name: str, params: Mapping[str, Any] | None = None) -> Scene:
     scene: Scene = module.build(_checked(name, module.Params, params or {}))
     if getattr(scene.params, "motion_seed", None) is None:
         return scene
-    still = {k: v for k, v in dataclasses.asdict(scene.params).items() if k not in _OF_MOTION}
-    return dataclasses.replace(scene, stands=repr((name, still)))
+    still = {k: v for k, v in dataclasses.asdict(scene.params).items() if k not in _MOTION_PARAMETERS}
+    return dataclasses.replace(scene, static_key=repr((name, still)))
 
 
 def _checked(name: str, model: type[Any], given: Mapping[str, Any]) -> Any:
@@ -177,6 +169,6 @@ def _checked(name: str, model: type[Any], given: Mapping[str, Any]) -> Any:
 
 
 def pinhole(params: BaseParams) -> Pinhole:
-    """The camera that ``params`` describe."""
+    """The lens that ``params`` describe."""
     camera = Pinhole.from_fov(params.width, params.height, params.horizontal_fov_deg)
     return dataclasses.replace(camera, distortion=params.distortion)

@@ -1,11 +1,11 @@
 """Analytic shapes: where a ray enters and leaves them, their normals and surface coordinates.
 
-Every shape is defined in its own local axes and placed by a (4, 4) world-from-local matrix, which may
-scale. Arrays are component-first, (3, N), so that each component is contiguous. Distances are along the
-ray in units of the direction's length, which a linear map preserves; directions need not be unit.
+Every shape is defined in local axes and placed by a (4, 4) world-from-local matrix, which may scale. Arrays
+are component-first, (3, N), so that each component is contiguous. Distances are along the ray in units of
+the direction's length, which a linear map preserves; directions need not be unit.
 
-``interval`` returns (entry, exit), each (N,); a ray that misses has entry = +inf and exit = -inf. All
-shapes here are convex, so two numbers say everything, and a camera inside one sees its far side.
+``interval`` returns (entry, exit), each (N,); a ray that misses has entry = +inf and exit = -inf. All shapes
+are convex, so two numbers are enough, and a camera inside one sees its far side.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
-# A ray must travel this far (metres) before a hit counts, so that it does not meet what it starts on.
+# A hit counts from this distance (metres) on, so that a ray does not meet the surface it starts on.
 T_MIN = 1e-6
-# Stands for zero in a denominator; its reciprocal is finite, so no NaN can arise from 0 * inf.
+# Replaces zero in a denominator; its reciprocal is finite, so 0 * inf cannot make a NaN.
 _TINY = 1e-30
 
 
@@ -48,11 +47,11 @@ def nearest_hit(shape: Shape, origin: Array, direction: Array) -> Array:
 
 
 def nonzero(x: Array) -> Array:
-    """``x`` with zeros replaced by a tiny number of the same sign, fit to divide by."""
+    """``x`` with zeros replaced by a tiny number of the same sign, to divide by."""
     return np.where(np.abs(x) < _TINY, np.copysign(_TINY, x), x)
 
 
-def normalise(v: Array) -> Array:
+def normalize(v: Array) -> Array:
     """Unit vectors (3, N); a zero vector stays zero."""
     return v / np.sqrt(np.maximum(v[0] * v[0] + v[1] * v[1] + v[2] * v[2], _TINY))
 
@@ -81,7 +80,7 @@ def _slab(origin: Array, direction: Array, half: float) -> tuple[Array, Array]:
     return np.minimum(a, b), np.maximum(a, b)
 
 
-def _and(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
+def _intersect(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
     """Intersection of convex intervals; empty ones become (+inf, -inf)."""
     entry = np.maximum.reduce([i[0] for i in intervals])
     leave = np.minimum.reduce([i[1] for i in intervals])
@@ -100,7 +99,7 @@ class Sphere:
         return _quadratic(_dot(direction, direction), _dot(origin, direction), c)
 
     def surface(self, points: Array) -> tuple[Array, Array]:
-        normal = normalise(points)
+        normal = normalize(points)
         turns = np.arctan2(normal[1], normal[0]) / (2 * np.pi)
         return normal, np.stack([turns, normal[2]])
 
@@ -115,7 +114,7 @@ class Box:
     half: tuple[float, float, float]
 
     def interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
-        return _and(*(_slab(origin[k], direction[k], self.half[k]) for k in range(3)))
+        return _intersect(*(_slab(origin[k], direction[k], self.half[k]) for k in range(3)))
 
     def surface(self, points: Array) -> tuple[Array, Array]:
         ratio = np.abs(points) / np.array(self.half)[:, None]
@@ -134,8 +133,8 @@ class Box:
 
 @dataclass(frozen=True)
 class Quad:
-    """A rectangle in the local plane z = 0, visible from +z only: six of them make a room whose near
-    walls do not hide it from outside. Surface coordinates: x and y in metres."""
+    """A rectangle in the local plane z = 0, visible from +z only: six make a room whose near walls do not
+    hide its inside. Surface coordinates: x and y in metres."""
 
     half: tuple[float, float]
 
@@ -165,7 +164,7 @@ class Cylinder:
     def interval(self, origin: Array, direction: Array) -> tuple[Array, Array]:
         ox, oy, dx, dy = origin[0], origin[1], direction[0], direction[1]
         side = _quadratic(dx * dx + dy * dy, ox * dx + oy * dy, ox * ox + oy * oy - self.radius**2)
-        return _and(side, _slab(origin[2], direction[2], self.half_height))
+        return _intersect(side, _slab(origin[2], direction[2], self.half_height))
 
     def surface(self, points: Array) -> tuple[Array, Array]:
         x, y, z = points
@@ -239,11 +238,11 @@ class RoundCone:
         x, y, z = points
         along, d2 = self._along(z), self._d2
         body = (along > 0.0) & (along < d2)
-        centre = np.where(along >= d2, self.length, 0.0)
+        center = np.where(along >= d2, self.length, 0.0)
         normal = np.stack(
-            [x, y, np.where(body, z - self.length * along / d2, z - centre)],
+            [x, y, np.where(body, z - self.length * along / d2, z - center)],
         )
-        return normalise(normal), np.stack([np.arctan2(y, x) / (2 * np.pi), z])
+        return normalize(normal), np.stack([np.arctan2(y, x) / (2 * np.pi), z])
 
     def bounding_sphere(self) -> tuple[Array, float]:
         low, high = -self.r0, self.length + self.r1

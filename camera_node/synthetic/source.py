@@ -1,4 +1,4 @@
-"""Cameras in the synthetic world: exact at any instant, rendered ahead where the scene repeats."""
+"""Cameras in the synthetic world: exact at any instant, rendered ahead if the scene repeats."""
 
 from __future__ import annotations
 
@@ -26,49 +26,52 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("camera-node")
 
-Stopped = Callable[[], bool]
+Stopped = Callable[[], bool]  # whether to stop
 
 WORLD_FPS = 15.0
-# Casting takes some 350 bytes a ray at its peak. Beyond this many rays another process renders ahead, so
+# Casting takes about 350 bytes a ray at its peak. Beyond this many rays another process renders ahead, so
 # that this one stays small.
 _MAX_RAYS = 200_000
 _POLL_S = 0.1
 
 
 class WorldSource(Source):
-    """One camera of a scene, with its frames kept by ``FrameCache``."""
+    """One camera of a scene, with its frames in a ``FrameCache``."""
 
     def __init__(
-        self, camera: str, frames: FrameCache, effects: Effects, fill_elsewhere: Callable[[Stopped], None]
+        self,
+        camera: str,
+        frames: FrameCache,
+        effects: Effects,
+        render_in_subprocess: Callable[[Stopped], None],
     ) -> None:
         self.camera = camera
         self.fps = frames.fps
         lens, matrix = frames.scene.cameras[frames.camera_id]
-        self.intrinsics = effects.claimed_lens(lens)
-        # Frames that look the same but claim different poses are different shots.
+        self.intrinsics = effects.reported_lens(lens)
+        # Frames with equal images but different reported poses are different shots.
         self.contents = None if effects.pose_varies else frames.contents
         self._pose = Pose.from_matrix(matrix)
         self._effects = effects
         self._frames = frames
-        self._fill_elsewhere = fill_elsewhere
+        self._render_in_subprocess = render_in_subprocess
 
     def content(self, tick: int) -> int:
         return tick if self.contents is None else self._frames.content(tick)
 
     def read(self, content: int) -> Shot:
-        pose = self._effects.claimed_pose(self._pose, content)
+        pose = self._effects.reported_pose(self._pose, content)
         return Shot(self._frames.read(self._frames.content(content)), pose, self.intrinsics)
 
     def prepare(self, stopped: Stopped) -> None:
         rays = self.intrinsics.width * self.intrinsics.height * self._frames.scene.params.supersample**2
         if rays > _MAX_RAYS and self._frames.on_disk:
-            self._fill_elsewhere(stopped)
+            self._render_in_subprocess(stopped)
         self._frames.fill(stop=stopped)
 
     def release(self) -> None:
-        # The same scene without the renderers it has built so far.
-        scene = self._frames.scene
-        self._frames.scene = scene.with_world(scene.world, scene.period_s, scene.moving)
+        # The same scene without its renderers.
+        self._frames.scene = self._frames.scene.with_world(self._frames.scene.world)
 
 
 def open_sources(
@@ -92,7 +95,7 @@ def open_sources(
             camera,
             each,
             effects.get(camera) or NO_EFFECTS,
-            partial(fill_in_child, scenario, config, camera),
+            partial(render_in_subprocess, scenario, config, camera),
         )
         for camera, each in frames.items()
     }
@@ -106,7 +109,7 @@ def frame_caches(
         scene = make_scene(config.scene, {"count": len(scenario.cameras), **config.scene_parameters()})
     except ValueError as error:
         raise ScenarioError(f"{scenario.path}: source: {error}") from None
-    names = _names(scenario, scene)
+    names = _scene_cameras(scenario, scene)
     try:
         return {
             camera: FrameCache(
@@ -116,17 +119,17 @@ def frame_caches(
                 effects=effects.get(camera) or NO_EFFECTS,
                 codec=config.codec,
                 quality=config.quality,
-                # A training draws hundreds of motions and sees none of them again.
+                # A training draws hundreds of motions, each used once.
                 on_disk=config.motion_seed is None,
             )
             for camera in cameras
         }
-    except EffectError as error:  # one that does not go with this scene
+    except EffectError as error:  # an effect that does not fit this scene
         raise ScenarioError(f"{scenario.path}: source.effects: {error}") from None
 
 
-def _names(scenario: Scenario, scene: Scene) -> dict[str, str]:
-    """Scene camera of each scenario camera: the same name where all are known, else in order."""
+def _scene_cameras(scenario: Scenario, scene: Scene) -> dict[str, str]:
+    """Scene camera of each scenario camera: the same name if all are known, else in order."""
     known = list(scene.cameras)
     if all(camera in known for camera in scenario.cameras):
         return {camera: camera for camera in scenario.cameras}
@@ -135,10 +138,10 @@ def _names(scenario: Scenario, scene: Scene) -> dict[str, str]:
     return dict(zip(scenario.cameras, known))
 
 
-def fill_in_child(scenario: Scenario, config: WorldConfig, camera: str, stopped: Callable[[], bool]) -> None:
-    """Have one camera's frames rendered by a process of its own, which takes its memory along: casting a
-    large image takes hundreds of megabytes. Returns when the frames are there, when ``stopped`` says so, or
-    when the child failed; frames that are missing then are rendered as they are needed."""
+def render_in_subprocess(scenario: Scenario, config: WorldConfig, camera: str, stopped: Stopped) -> None:
+    """Render one camera's frames in another process, which returns its memory when it ends: casting a large
+    image takes hundreds of megabytes. Returns when the frames are cached, when ``stopped`` returns True, or
+    if the process fails; missing frames are then rendered as needed."""
     log.info("%s: rendering its frames ahead, once: they are kept for next time", camera)
     begin = time.perf_counter()
     child = subprocess.Popen([sys.executable, "-m", "camera_node.synthetic.source"], stdin=subprocess.PIPE)
@@ -148,7 +151,7 @@ def fill_in_child(scenario: Scenario, config: WorldConfig, camera: str, stopped:
             with child.stdin:
                 child.stdin.write(pickle.dumps((scenario, config, camera)))
         except BrokenPipeError:
-            pass  # its exit status says the same
+            pass  # the exit status tells
         while child.poll() is None and not stopped():
             time.sleep(_POLL_S)
     finally:
@@ -160,7 +163,7 @@ def fill_in_child(scenario: Scenario, config: WorldConfig, camera: str, stopped:
         log.warning("%s: rendering ahead failed (exit %d): frames are rendered as they come", camera, status)
 
 
-def _child() -> None:
+def _subprocess_main() -> None:
     scenario, config, camera = pickle.load(sys.stdin.buffer)
     from camera_node.sources.with_effects import camera_effects
 
@@ -172,4 +175,4 @@ def _child() -> None:
 
 
 if __name__ == "__main__":
-    _child()
+    _subprocess_main()

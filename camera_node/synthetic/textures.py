@@ -1,8 +1,7 @@
-"""Procedural textures: colours (3, N) in [0, 1] as functions of surface coordinates (2, N).
+"""Procedural textures: colors (3, N) in [0, 1] as functions of surface coordinates (2, N).
 
-All are soft-edged or sums of few sinusoids, so that images of a hundred pixels a side do not alias
-badly; ``supersample`` does the rest. Widths are in the surface's own units (metres, or turns around a
-round shape).
+All have soft edges or are sums of few sinusoids, so that images of a hundred pixels a side alias little;
+``supersample`` does the rest. Widths are in the surface's units (metres, or turns around a round shape).
 """
 
 from __future__ import annotations
@@ -11,19 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Colour = tuple[float, float, float]
+from freshfield.geometry import Array
+
+Color = tuple[float, float, float]
 Texture = Callable[[Array], Array]
 
 
-def _rgb(colour: Colour) -> Array:
-    return np.array(colour, dtype=np.float64)[:, None]
+def _rgb(color: Color) -> Array:
+    return np.array(color, dtype=np.float64)[:, None]
 
 
 def mix(a: Array, b: Array, weight: Array) -> Array:
-    """a where weight is 0, b where it is 1; colours (3, N) or (3, 1), weight (N,)."""
+    """a where weight is 0, b where it is 1; colors (3, N) or (3, 1), weight (N,)."""
     return a + (b - a) * weight
 
 
@@ -57,10 +56,10 @@ def cell_hash(i: Array, j: Array) -> Array:
 
 @dataclass(frozen=True)
 class Plain:
-    colour: Colour
+    color: Color
 
     def __call__(self, uv: Array) -> Array:
-        return np.broadcast_to(_rgb(self.colour), (3, uv.shape[1]))
+        return np.broadcast_to(_rgb(self.color), (3, uv.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,8 @@ class Noise:
 
 @dataclass(frozen=True)
 class Checker:
-    a: Colour
-    b: Colour
+    a: Color
+    b: Color
     size: float
     size_v: float | None = None
     soft: float = 0.02
@@ -108,8 +107,8 @@ class Checker:
 class Stripes:
     """Stripes across u (axis 0) or v (axis 1), each ``period`` wide in all."""
 
-    a: Colour
-    b: Colour
+    a: Color
+    b: Color
     period: float
     axis: int = 0
     soft: float = 0.02
@@ -122,8 +121,8 @@ class Stripes:
 class Brick:
     """Running bond with soft joints; each brick has its own tone."""
 
-    brick: Colour
-    joint: Colour
+    brick: Color
+    joint: Color
     width: float
     height: float
     joint_width: float = 0.035
@@ -146,8 +145,8 @@ class Brick:
 class Planks:
     """Boards along v, each with its own tone and a smooth grain."""
 
-    light: Colour
-    dark: Colour
+    light: Color
+    dark: Color
     width: float
     length: float
     seam: float = 0.015
@@ -172,11 +171,11 @@ class Planks:
 
 @dataclass(frozen=True)
 class Plaid:
-    """Two crossing sets of bands over a ground colour."""
+    """Two crossing sets of bands over a ground color."""
 
-    ground: Colour
-    band: Colour
-    thread: Colour
+    ground: Color
+    band: Color
+    thread: Color
     period_u: float
     period_v: float
 
@@ -191,9 +190,9 @@ class Plaid:
 class Diamonds:
     """A wallpaper of lozenges with a dot in each."""
 
-    ground: Colour
-    lozenge: Colour
-    dot: Colour
+    ground: Color
+    lozenge: Color
+    dot: Color
     width: float
     height: float
     soft: float = 0.18
@@ -210,8 +209,8 @@ class Diamonds:
 class Books:
     """Rows of book spines between shelf boards."""
 
-    colours: Sequence[Colour]
-    shelf: Colour
+    colors: Sequence[Color]
+    shelf: Color
     width: float
     height: float
     board: float = 0.05
@@ -220,7 +219,7 @@ class Books:
     def __call__(self, uv: Array) -> Array:
         row = np.floor(uv[1] / self.height)
         column = np.floor(uv[0] / self.width + cell_hash(row, row))
-        palette = np.array(self.colours).T
+        palette = np.array(self.colors).T
         pick = np.floor(cell_hash(column, row + 3.0) * palette.shape[1]).astype(int)
         spine = palette[:, pick] * (0.75 + 0.25 * cell_hash(column + 5.0, row))
         inside = (uv[1] / self.height) % 1.0
@@ -234,8 +233,8 @@ class Books:
 class Gradient:
     """From ``low`` to ``high`` along v between v0 and v1."""
 
-    low: Colour
-    high: Colour
+    low: Color
+    high: Color
     v0: float
     v1: float
 
@@ -248,7 +247,7 @@ class Framed:
     """A picture within a frame of ``border`` on a rectangle of half sizes ``half``."""
 
     picture: Texture
-    frame: Colour
+    frame: Color
     half: tuple[float, float]
     border: float
     soft: float = 0.015
@@ -260,31 +259,31 @@ class Framed:
 
 @dataclass(frozen=True)
 class Spots:
-    """Discs of given centres, radii and colours painted over a base texture."""
+    """Discs of given centers, radii and colors painted over a base texture."""
 
     base: Texture
-    discs: Sequence[tuple[float, float, float, Colour]]  # u, v, radius, colour
+    discs: Sequence[tuple[float, float, float, Color]]  # u, v, radius, color
     soft: float = 0.02
 
     def __call__(self, uv: Array) -> Array:
         out = self.base(uv)
-        for u, v, radius, colour in self.discs:
+        for u, v, radius, color in self.discs:
             away = np.hypot(uv[0] - u, uv[1] - v) - radius
-            out = mix(_rgb(colour), out, soft_step(away, self.soft))
+            out = mix(_rgb(color), out, soft_step(away, self.soft))
         return out
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Rectangles (u0, u1, v0, v1, colour) painted over a base texture, in order."""
+    """Rectangles (u0, u1, v0, v1, color) painted over a base texture, in order."""
 
     base: Texture
-    rectangles: Sequence[tuple[float, float, float, float, Colour]]
+    rectangles: Sequence[tuple[float, float, float, float, Color]]
     soft: float = 0.01
 
     def __call__(self, uv: Array) -> Array:
         out = self.base(uv)
-        for u0, u1, v0, v1, colour in self.rectangles:
+        for u0, u1, v0, v1, color in self.rectangles:
             inside = np.minimum(np.minimum(uv[0] - u0, u1 - uv[0]), np.minimum(uv[1] - v0, v1 - uv[1]))
-            out = mix(out, _rgb(colour), soft_step(inside, self.soft))
+            out = mix(out, _rgb(color), soft_step(inside, self.soft))
         return out

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import math
 import typing
 
@@ -77,8 +76,8 @@ def test_the_ends_of_the_ranges_give_sound_frames_in_every_scene(name, parameter
             image = frames.read(k)
             if isinstance(image, np.ndarray):
                 assert image.shape == (12, 16, 3) and image.dtype == np.uint8
-            claimed = made.claimed_pose(pose, k)
-            assert np.isfinite(claimed.matrix()).all()
+            reported = made.reported_pose(pose, k)
+            assert np.isfinite(reported.matrix()).all()
         assert np.array_equal(frames.frame(4), frames.frame(4))
 
 
@@ -96,8 +95,7 @@ def numbers() -> list[tuple[str, str]]:
     """Every number among the parameters of every effect."""
     found = []
     for name in fx.NAMES:
-        module = importlib.import_module(f"{fx.__name__}.{name}")
-        model = getattr(module, fx._CLASSES[name]).Parameters
+        model = fx.effect_class(name).Parameters
         hints = typing.get_type_hints(model)
         found += [(name, f.name) for f in dataclasses.fields(model) if hints[f.name] in (int, float)]
     return found
@@ -118,7 +116,7 @@ def test_there_are_numbers_to_refuse():
 
 @pytest.mark.filterwarnings("error")
 def test_a_camera_within_a_fog_of_a_thousand_suns():
-    """A veil, a coat and shadows where every ray starts inside a shape and where nothing is hit at all."""
+    """A medium, a coat and shadows where every ray starts inside a shape and where nothing is hit at all."""
     made = fx.load_effects(
         {"fog": {"visibility_m": 0.05}, "specular": {"roughness": 0.02}, "shadows": {}},
         lambda _: np.random.default_rng(0),

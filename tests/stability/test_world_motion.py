@@ -104,7 +104,7 @@ def test_all_effects_at_once_for_a_thousand_frames():
         now = made.node_ns(10**18 + k * 66_666_667)
         assert now > stamp
         stamp = now
-        far_m = np.subtract(made.claimed_pose(pose, k).translation_m, pose.translation_m)
+        far_m = np.subtract(made.reported_pose(pose, k).translation_m, pose.translation_m)
         assert np.abs(far_m).max() < 0.05
     assert np.ptp(means) < 90 and np.isfinite(means).all()
     # Nothing accumulates: two swings of the exposure, 20 s each, are as two others.

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.placement import Part
-from camera_node.synthetic.render import CameraRenderer, Light, World
+from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule, nearest_hit
 from camera_node.synthetic.textures import Checker
 from freshfield.geometry import Pinhole, look_at
@@ -23,7 +24,7 @@ AXES = np.concatenate([np.eye(3), -np.eye(3)]).T
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
 @pytest.mark.filterwarnings("error")
 def test_rays_along_the_axes_from_everywhere_are_finite_or_miss(shape):
-    """Origins on a grid that holds the surfaces, edges, corners, axes and centre of every shape."""
+    """Origins on a grid that holds the surfaces, edges, corners, axes and center of every shape."""
     steps = np.array([-2.0, -0.7, -0.5, -0.3, 0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.9, 2.0])
     for origin in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3):
         t = nearest_hit(shape, origin[:, None], AXES)
@@ -49,8 +50,8 @@ def test_any_ray_hits_within_the_bounding_sphere_or_misses(shape, origin, direct
     t = nearest_hit(shape, o, d)
     assert not np.isnan(t).any() and t[0] > 0
     if np.isfinite(t[0]):
-        centre, radius = shape.bounding_sphere()
-        assert np.linalg.norm((o + t * d)[:, 0] - centre) <= radius * (1 + 1e-6)
+        center, radius = shape.bounding_sphere()
+        assert np.linalg.norm((o + t * d)[:, 0] - center) <= radius * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)

@@ -1,30 +1,31 @@
-"""Effects: what a scene calls for beyond itself, one file and one class each, imported only when listed.
+"""Effects that a scenario may list: one file and one class each, imported only when listed.
 
 The kinds, by where they act:
 
-* ``world``    changes the scene: bodies, shadows, gloss, fog (rendered ahead and cached; nothing while
+* ``world``    changes the scene: bodies, shadows, highlights, fog (rendered ahead and cached; free while
   streaming);
-* ``lens``     changes the lens that a camera looks through, and what it says of it (likewise);
+* ``lens``     changes a camera's lens, and the lens that its frames report (likewise);
 * ``exposure`` changes how an instant becomes an image (likewise);
 * ``image``    changes each frame as it is streamed, recorded ones too (costs time a frame);
-* ``clock``    changes the node's clock, hence its time stamps;
-* ``pose``     changes where a camera says that it is, not what it sees.
+* ``clock``    changes the node's clock and so its time stamps;
+* ``pose``     changes the pose that frames report, not the image.
 
-Adding one is a file here with a class (attributes ``kind`` and ``Parameters``, constructor of parameters
-and a random stream) and a line in ``_CLASSES``.
+To add one, write a file here with a class (attributes ``kind`` and ``Parameters``, constructor of parameters
+and a random stream) and add a line to ``_CLASSES``.
 
-The held-out camera is the measuring instrument: it shows the sharp, noise-free, unobstructed scene at
-the true time, so effects do not apply to it unless they are listed with ``in_truth: true``.
+The held-out camera measures: it shows the sharp, noise-free, unobstructed scene at the true time. Effects
+apply to it only if they are listed with ``in_truth: true``.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from freshfield.geometry import Pinhole, Pose
 from freshfield.scenario import ScenarioError, read_section
@@ -52,40 +53,61 @@ NAMES = tuple(_CLASSES)
 
 
 class EffectError(ScenarioError):
-    """An effect that cannot be had as listed; the message says what is valid."""
+    """An effect that cannot be applied as listed; the message says what is valid."""
 
 
-def check_ranges(parameters: object, **ranges: tuple[float, float]) -> None:
-    """Raises ValueError, in one line, for an attribute outside (lowest, highest)."""
-    for name, (low, high) in ranges.items():
-        value = getattr(parameters, name)
-        if not low <= value <= high:  # nor is NaN
-            raise ValueError(f"{name} must be within {low:g} to {high:g}, got {value}")
+def bounded(default: float, lowest: float, highest: float) -> Any:
+    """Field of EffectParameters with a default and a range."""
+    return field(default=default, metadata={"range": (lowest, highest)})
+
+
+@dataclass(frozen=True)
+class EffectParameters:
+    """Raises ValueError, in one line, for a value outside the range of its field."""
+
+    def __post_init__(self) -> None:
+        for parameter in fields(self):
+            lowest, highest = parameter.metadata.get("range", (None, None))
+            value = getattr(self, parameter.name)
+            if lowest is not None and not lowest <= value <= highest:  # refuses NaN, too
+                raise ValueError(f"{parameter.name} must be within {lowest:g} to {highest:g}, got {value}")
+
+
+def effect_class(name: str) -> Any:
+    """The class of an effect, now imported. Raises EffectError for an unknown name."""
+    if name not in _CLASSES:
+        raise EffectError(f"unknown effect {name!r}; valid effects: {', '.join(NAMES)}")
+    return getattr(importlib.import_module(f"{__name__}.{name}"), _CLASSES[name])
+
+
+def frame_rng(key: NDArray[np.uint64], index: int) -> np.random.Generator:
+    """Random stream of frame number ``index`` under a key (2,): frames may be asked for in any order."""
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, index]))
 
 
 class WorldEffect(Protocol):
     kind: ClassVar[str]
 
     def extend(self, scene: Scene) -> Scene:
-        """The scene with something added to it."""
+        """The scene with this effect."""
         ...
 
 
 class LensEffect(Protocol):
     kind: ClassVar[str]
 
-    def through(self, camera: Pinhole) -> Pinhole:
-        """The lens that images are taken with, where the scene has ``camera``."""
+    def rendered(self, camera: Pinhole) -> Pinhole:
+        """The lens that images are rendered with instead of ``camera``."""
         ...
 
-    def claimed(self, camera: Pinhole) -> Pinhole:
-        """What is sent of the lens ``camera`` that ``through`` gave."""
+    def reported(self, camera: Pinhole) -> Pinhole:
+        """The lens that frames report, given the one from ``rendered``."""
         ...
 
 
-class View(Protocol):
-    """A camera that shows any instant, or only some rows of it: a CameraRenderer, or one seen through
-    effects."""
+class Renderer(Protocol):
+    """Renders a camera's image, or some of its rows, at any instant: a CameraRenderer, with effects or
+    not."""
 
     @property
     def camera(self) -> Pinhole: ...
@@ -96,8 +118,8 @@ class View(Protocol):
 class ExposureEffect(Protocol):
     kind: ClassVar[str]
 
-    def expose(self, view: View, t_s: float, rows: Rows | None = None) -> Image:
-        """The image of an exposure around an instant, or some of its rows (first, one after the last)."""
+    def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
+        """Image, or rows (first, one after the last), of an exposure around an instant."""
         ...
 
 
@@ -105,7 +127,7 @@ class ImageEffect(Protocol):
     kind: ClassVar[str]
 
     def apply(self, image: Image, index: int, t_s: float) -> Image:
-        """Frame number ``index``, taken ``t_s`` after the epoch, as the camera delivers it; must not change
+        """Frame number ``index``, taken ``t_s`` after the epoch, as the camera delivers it. Must not change
         ``image``."""
         ...
 
@@ -114,7 +136,7 @@ class ClockEffect(Protocol):
     kind: ClassVar[str]
 
     def node_ns(self, true_ns: int) -> int:
-        """What the node's clock shows at a true time."""
+        """Time of the node's clock at a true time."""
         ...
 
 
@@ -123,17 +145,17 @@ class PoseEffect(Protocol):
 
     @property
     def varies(self) -> bool:
-        """Whether frames of one camera claim different poses."""
+        """Whether frames of one camera report different poses."""
         ...
 
-    def claimed(self, pose: Pose, index: int) -> Pose:
-        """The pose that frame number ``index`` claims, taken from ``pose``."""
+    def reported(self, pose: Pose, index: int) -> Pose:
+        """The pose that frame number ``index``, taken from ``pose``, reports."""
         ...
 
 
 @dataclass(frozen=True)
 class Effects:
-    """The effects of one camera, by kind and in the order listed, and how they were listed."""
+    """The effects of one camera, by kind and in the order listed."""
 
     world: tuple[WorldEffect, ...] = ()
     lens: tuple[LensEffect, ...] = ()
@@ -141,32 +163,32 @@ class Effects:
     image: tuple[ImageEffect, ...] = ()
     clock: tuple[ClockEffect, ...] = ()
     pose: tuple[PoseEffect, ...] = ()
-    rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of those that change cached frames
+    rendered: tuple[tuple[str, Any], ...] = ()  # name and parameters of those that decide cached frames
 
     def extend(self, scene: Scene) -> Scene:
-        """The scene with what effects of the kinds world and lens make of it. Raises EffectError."""
+        """The scene with effects of the kinds world and lens. Raises EffectError."""
         for effect in self.world:
             scene = effect.extend(scene)
         if self.lens:
-            scene = scene.with_cameras({c: (self._through(k), p) for c, (k, p) in scene.cameras.items()})
+            scene = scene.with_cameras({c: (self._lens(k), p) for c, (k, p) in scene.cameras.items()})
         return scene
 
-    def _through(self, camera: Pinhole) -> Pinhole:
+    def _lens(self, camera: Pinhole) -> Pinhole:
         for effect in self.lens:
-            camera = effect.through(camera)
+            camera = effect.rendered(camera)
         return camera
 
-    def claimed_lens(self, camera: Pinhole) -> Pinhole:
-        """What is sent of the lens that the extended scene has."""
+    def reported_lens(self, camera: Pinhole) -> Pinhole:
+        """The lens that frames report, given the one of the extended scene."""
         for effect in reversed(self.lens):
-            camera = effect.claimed(camera)
+            camera = effect.reported(camera)
         return camera
 
-    def exposed(self, view: View) -> View:
-        """``view`` seen through every exposure effect; ``view`` itself where there is none."""
+    def with_exposure(self, renderer: Renderer) -> Renderer:
+        """``renderer`` with every exposure effect; ``renderer`` itself if there is none."""
         for effect in self.exposure:
-            view = _Exposed(effect, view)
-        return view
+            renderer = _ExposedRenderer(effect, renderer)
+        return renderer
 
     def apply(self, image: Image, index: int, t_s: float) -> Image:
         for effect in self.image:
@@ -182,9 +204,9 @@ class Effects:
     def pose_varies(self) -> bool:
         return any(effect.varies for effect in self.pose)
 
-    def claimed_pose(self, pose: Pose, index: int) -> Pose:
+    def reported_pose(self, pose: Pose, index: int) -> Pose:
         for effect in self.pose:
-            pose = effect.claimed(pose, index)
+            pose = effect.reported(pose, index)
         return pose
 
 
@@ -192,16 +214,16 @@ NO_EFFECTS = Effects()
 
 
 @dataclass(frozen=True)
-class _Exposed:
+class _ExposedRenderer:
     effect: ExposureEffect
-    view: View
+    renderer: Renderer
 
     @property
     def camera(self) -> Pinhole:
-        return self.view.camera
+        return self.renderer.camera
 
     def image(self, t_s: float, rows: Rows | None = None) -> Image:
-        return self.effect.expose(self.view, t_s, rows)
+        return self.effect.expose(self.renderer, t_s, rows)
 
 
 def load_effects(
@@ -209,18 +231,16 @@ def load_effects(
     rng_for: Callable[[str], np.random.Generator],
     held_out: bool = False,
 ) -> Effects:
-    """The listed effects (name -> parameters) of one camera.
+    """The listed effects (name -> parameters) of one camera; NO_EFFECTS if none applies.
 
-    rng_for: the random stream of an effect and this camera, called once for each effect that is made.
-    held_out: this camera shows the truth; only effects with ``in_truth: true`` apply.
-    Raises EffectError for an unknown effect or parameter. Nothing listed: nothing is imported or made.
+    rng_for: gives the random stream of an effect for this camera; called once for each effect that applies.
+    held_out: only effects with ``in_truth: true`` apply.
+    Raises EffectError for an unknown effect or parameter.
     """
     found: dict[str, list[Any]] = {}
     rendered: list[tuple[str, Any]] = []
     for name, given in listed.items():
-        if name not in _CLASSES:
-            raise EffectError(f"unknown effect {name!r}; valid effects: {', '.join(NAMES)}")
-        cls = getattr(importlib.import_module(f"{__name__}.{name}"), _CLASSES[name])
+        cls = effect_class(name)
         try:
             parameters = read_section(cls.Parameters, dict(given or {}), f"effect {name}")
         except ScenarioError as error:

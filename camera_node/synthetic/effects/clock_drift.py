@@ -7,35 +7,26 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 
 
 @dataclass(frozen=True)
-class ClockDriftParameters:
-    """offset_ms and drift_ppm apply to every camera; the spreads are standard deviations of what is added
-    to them for each camera, so that cameras disagree."""
+class ClockDriftParameters(EffectParameters):
+    """offset_ms, drift_ppm: of every camera's clock. offset_spread_ms, drift_spread_ppm: standard deviations
+    of what each camera adds to them, so that cameras disagree."""
 
-    offset_ms: float = 0.0
-    drift_ppm: float = 0.0
-    offset_spread_ms: float = 0.0
-    drift_spread_ppm: float = 0.0
+    offset_ms: float = bounded(0.0, -1e10, 1e10)  # four months
+    drift_ppm: float = bounded(0.0, -1e5, 1e5)
+    offset_spread_ms: float = bounded(0.0, 0.0, 1e9)
+    drift_spread_ppm: float = bounded(0.0, 0.0, 1e4)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            offset_ms=(-1e10, 1e10),  # four months
-            drift_ppm=(-1e5, 1e5),
-            offset_spread_ms=(0.0, 1e9),
-            drift_spread_ppm=(0.0, 1e4),
-        )
 
 
 class ClockDrift:
-    """node = true + offset + drift * (true - start), where start is the first time that is asked for.
+    """node = true + offset + drift * (true - start), where start is the time of the first call.
 
-    Whole nanoseconds throughout: a float64 holds today's time only to 256 ns. Well under a microsecond a
-    call. offset_ns, drift_ppb: what this camera drew.
+    Times are whole nanoseconds: a float64 holds today's time only to 256 ns. A call takes well under a
+    microsecond. offset_ns, drift_ppb: of this camera.
     """
 
     kind: ClassVar[str] = "clock"

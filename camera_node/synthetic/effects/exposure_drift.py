@@ -1,4 +1,4 @@
-"""Exposure drift: automatic exposure wanders, each camera's on its own."""
+"""Exposure drift: the automatic exposure of each camera drifts independently."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import cv2
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from camera_node.synthetic.motion import phase_of
 
 if TYPE_CHECKING:
@@ -17,24 +17,21 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ExposureDriftParameters:
-    """amplitude_stops: how far the exposure swings to either side; one stop doubles it. period_s: of a swing;
-    cameras begin anywhere in it. offset_spread_stops: standard deviation of what is added to each camera
-    for good."""
+class ExposureDriftParameters(EffectParameters):
+    """amplitude_stops: amplitude of the exposure's sine; one stop doubles the exposure. period_s: of the
+    sine; each camera has a random phase. offset_spread_stops: standard deviation of each camera's constant
+    offset."""
 
-    amplitude_stops: float = 0.3
-    period_s: float = 20.0
-    offset_spread_stops: float = 0.1
+    amplitude_stops: float = bounded(0.3, 0.0, 8.0)
+    period_s: float = bounded(20.0, 0.01, 1e6)
+    offset_spread_stops: float = bounded(0.1, 0.0, 8.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, amplitude_stops=(0.0, 8.0), period_s=(0.01, 1e6), offset_spread_stops=(0.0, 8.0))
 
 
 class ExposureDrift:
-    """Values become value * 2^stops, stops = offset + amplitude * sin(2 pi (t / period + phase)), cut off at
-    white. Displayed values are scaled, as everywhere in this world. phase, offset_stops: what this camera
-    drew."""
+    """Values become value * 2^stops, clipped at white, with stops = offset + amplitude * sin(2 pi (t / period
+    + phase)). Displayed values are scaled, as everywhere in this world. phase, offset_stops: of this
+    camera."""
 
     kind: ClassVar[str] = "image"
     Parameters = ExposureDriftParameters
@@ -45,12 +42,12 @@ class ExposureDrift:
         self.offset_stops = parameters.offset_spread_stops * float(rng.standard_normal())
 
     def stops(self, t_s: float) -> float:
-        """By how much the exposure is off at an instant."""
-        turn = phase_of(t_s, self._p.period_s) + self.phase
-        return self.offset_stops + self._p.amplitude_stops * math.sin(2 * math.pi * turn)
+        """Exposure error at an instant."""
+        phase = phase_of(t_s, self._p.period_s) + self.phase
+        return self.offset_stops + self._p.amplitude_stops * math.sin(2 * math.pi * phase)
 
     def apply(self, image: Image, index: int, t_s: float) -> Image:
         table = np.clip(np.rint(np.arange(256) * 2.0 ** self.stops(t_s)), 0.0, 255.0).astype(np.uint8)
         changed = np.asarray(cv2.LUT(image, table), dtype=np.uint8)
-        changed[..., 3:] = image[..., 3:]  # transparency is none of the exposure's
+        changed[..., 3:] = image[..., 3:]  # exposure does not change transparency
         return changed

@@ -1,6 +1,6 @@
 """Fog: low visibility, by Koschmieder's law.
 
-Of a surface's light exp(-beta d) arrives from a distance d, and airlight makes up for the rest (Koschmieder,
+A share exp(-beta d) of a surface's light arrives from a distance d, and airlight fills the rest (Koschmieder,
 "Theorie der horizontalen Sichtweite", 1924). The visibility is the distance at which a black object
 against the fog keeps ``contrast_threshold`` of its contrast: beta = -ln(threshold) / visibility.
 """
@@ -15,50 +15,49 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import check_ranges
-from camera_node.synthetic.shapes import Array
+from camera_node.synthetic.effects import EffectParameters, bounded
+from freshfield.geometry import Array
 
 if TYPE_CHECKING:
     from camera_node.synthetic.scene import Scene
 
 
 @dataclass(frozen=True)
-class FogParameters:
-    """visibility_m: how far one sees. contrast_threshold: what is left of the contrast there (.02 is
-    Koschmieder's, .05 the WMO's). airlight: colour of the fog itself, RGB in [0, 1]."""
+class FogParameters(EffectParameters):
+    """visibility_m: distance at which contrast falls to contrast_threshold (.02 is Koschmieder's, .05 the
+    WMO's). airlight: color of the fog, RGB in [0, 1]."""
 
-    visibility_m: float = 20.0
-    contrast_threshold: float = 0.02
+    visibility_m: float = bounded(20.0, 0.01, 1e6)
+    contrast_threshold: float = bounded(0.02, 1e-6, 0.5)
     airlight: tuple[float, float, float] = (0.76, 0.78, 0.80)
     in_truth: bool = False
 
     def __post_init__(self) -> None:
-        check_ranges(self, visibility_m=(0.01, 1e6), contrast_threshold=(1e-6, 0.5))
+        super().__post_init__()
         if not all(0.0 <= c <= 1.0 for c in self.airlight):
             raise ValueError(f"airlight must be three shares within 0 to 1, got {list(self.airlight)}")
 
 
 @dataclass(frozen=True)
-class Haze:
-    """A camera_node.synthetic.lighting.Veil. per_m: the extinction coefficient beta."""
+class FogMedium:
+    """Implements lighting.Medium. extinction_per_m: the extinction coefficient beta."""
 
-    per_m: float
+    extinction_per_m: float
     airlight: tuple[float, float, float]
 
-    def clear(self, distance_m: Array) -> NDArray[np.float32]:
-        return np.exp(-self.per_m * distance_m).astype(np.float32)
+    def transmittance(self, distance_m: Array) -> NDArray[np.float32]:
+        return np.exp(-self.extinction_per_m * distance_m).astype(np.float32)
 
 
 class Fog:
-    """Rendered ahead; nothing while streaming. What has no surface (a scene's background) is all fog."""
+    """Rendered ahead; free while streaming. A scene's background is all fog."""
 
     kind: ClassVar[str] = "world"
     Parameters = FogParameters
 
     def __init__(self, parameters: FogParameters, rng: np.random.Generator) -> None:
-        per_m = -math.log(parameters.contrast_threshold) / parameters.visibility_m
-        self._haze = Haze(per_m, parameters.airlight)
+        extinction_per_m = -math.log(parameters.contrast_threshold) / parameters.visibility_m
+        self._medium = FogMedium(extinction_per_m, parameters.airlight)
 
     def extend(self, scene: Scene) -> Scene:
-        world = dataclasses.replace(scene.world, veil=self._haze)
-        return scene.with_world(world, scene.period_s, scene.moving)
+        return scene.with_world(dataclasses.replace(scene.world, medium=self._medium))

@@ -1,7 +1,7 @@
-"""Hot pixels: what radiation does to a sensor, for good and in passing.
+"""Hot pixels: permanent and transient damage of a sensor by radiation.
 
-Damaged pixels leak charge in every frame, more of them as the dose grows; particles leave charge in a
-pixel for one frame. Behind a colour filter one of a pixel's three values is hit.
+Damaged pixels leak charge in every frame, and their number grows with the dose. Particles leave charge in a
+pixel for one frame. With a color filter, one of a pixel's three values is hit.
 """
 
 from __future__ import annotations
@@ -12,40 +12,30 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
 
 if TYPE_CHECKING:
     from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
-class HotPixelsParameters:
-    """hot_ppm: damaged pixels in a million, at the start. growth_ppm_per_h: how many join them in an hour.
-    hot_counts: mean of what one adds, of 255 counts. hits_per_megapixel: mean number of particles a frame.
-    hit_counts: mean of what one adds."""
+class HotPixelsParameters(EffectParameters):
+    """hot_ppm: damaged pixels in a million at the start. growth_ppm_per_h: newly damaged ones in an hour.
+    hot_counts: mean value that one adds, of 255 counts. hits_per_megapixel: mean number of particles a frame.
+    hit_counts: mean value that one adds."""
 
-    hot_ppm: float = 300.0
-    growth_ppm_per_h: float = 0.0
-    hot_counts: float = 100.0
-    hits_per_megapixel: float = 50.0
-    hit_counts: float = 150.0
+    hot_ppm: float = bounded(300.0, 0.0, 1e6)
+    growth_ppm_per_h: float = bounded(0.0, 0.0, 1e6)
+    hot_counts: float = bounded(100.0, 0.0, 1e6)
+    hits_per_megapixel: float = bounded(50.0, 0.0, 1e6)
+    hit_counts: float = bounded(150.0, 0.0, 1e6)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            hot_ppm=(0.0, 1e6),
-            growth_ppm_per_h=(0.0, 1e6),
-            hot_counts=(0.0, 1e6),
-            hits_per_megapixel=(0.0, 1e6),
-            hit_counts=(0.0, 1e6),
-        )
 
 
 class HotPixels:
-    """What is added is exponentially distributed and cut off at white; hits are a Poisson process. Which
-    pixels are damaged follows from the camera's stream, the hits of a frame from that and its number, so
-    frames may be asked for in any order."""
+    """Added values are exponentially distributed and clipped at white; hits are a Poisson process. The
+    camera's random stream decides which pixels are damaged; a frame's hits follow from that stream and its
+    number."""
 
     kind: ClassVar[str] = "image"
     Parameters = HotPixelsParameters
@@ -66,12 +56,12 @@ class HotPixels:
         return out
 
     def _hot(self, shape: tuple[int, ...], t_s: float) -> tuple[NDArray, NDArray]:
-        """Places in the flat image and counts of the pixels that are damaged by ``t_s``."""
+        """Flat indices and added counts of the pixels that are damaged by ``t_s``."""
         p = self._p
         if shape not in self._damage:
             rng = np.random.Generator(np.random.Philox(key=self._key))
             pixels = shape[0] * shape[1]
-            dose = rng.random(pixels)  # the share of damaged pixels at which each is one of them
+            dose = rng.random(pixels)  # share of damaged pixels from which on each is one
             order = np.argsort(dose) if p.growth_ppm_per_h else np.flatnonzero(dose < p.hot_ppm * 1e-6)
             at = shape[2] * order + rng.integers(0, 3, pixels)[order]
             self._damage[shape] = dose[order], at, rng.exponential(p.hot_counts, pixels)[order]
@@ -82,7 +72,7 @@ class HotPixels:
         return at[:damaged], counts[:damaged]
 
     def _hits(self, shape: tuple[int, ...], index: int) -> tuple[NDArray, NDArray]:
-        rng = np.random.Generator(np.random.Philox(key=self._frame_key, counter=[0, 0, 0, index]))
+        rng = frame_rng(self._frame_key, index)
         pixels = shape[0] * shape[1]
         hits = int(rng.poisson(self._p.hits_per_megapixel * 1e-6 * pixels))
         at = shape[2] * rng.integers(0, pixels, hits) + rng.integers(0, 3, hits)

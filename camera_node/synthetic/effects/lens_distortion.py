@@ -1,7 +1,7 @@
-"""Lens distortion: cameras look through a lens with OpenCV's radial and tangential distortion.
+"""Lens distortion: OpenCV's radial and tangential distortion.
 
-Images are rendered through that lens, ray by ray. What is sent of it is the truth, unless the cameras are
-not calibrated: then frames claim a lens without distortion.
+Images are rendered through the distorted lens, ray by ray. Frames of calibrated cameras report that lens,
+others a lens without distortion.
 """
 
 from __future__ import annotations
@@ -12,29 +12,26 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import EffectError, check_ranges
+from camera_node.synthetic.effects import EffectError, EffectParameters, bounded
 from freshfield.geometry import Pinhole, invertible
 
 
 @dataclass(frozen=True)
-class LensDistortionParameters:
-    """k1, k2: radial, p1, p2: tangential, without unit, as in OpenCV's model. calibrated: whether the
-    coefficients are sent with the frames."""
+class LensDistortionParameters(EffectParameters):
+    """k1, k2: radial, p1, p2: tangential, without unit, as in OpenCV's model. calibrated: whether frames
+    report the coefficients."""
 
-    k1: float = -0.15
-    k2: float = 0.03
-    p1: float = 0.001
-    p2: float = -0.0005
+    k1: float = bounded(-0.15, -10.0, 10.0)
+    k2: float = bounded(0.03, -10.0, 10.0)
+    p1: float = bounded(0.001, -1.0, 1.0)
+    p2: float = bounded(-0.0005, -1.0, 1.0)
     calibrated: bool = True
     in_truth: bool = False
 
-    def __post_init__(self) -> None:
-        check_ranges(self, k1=(-10.0, 10.0), k2=(-10.0, 10.0), p1=(-1.0, 1.0), p2=(-1.0, 1.0))
-
 
 class LensDistortion:
-    """Rendered ahead at no extra cost; nothing while streaming. Raises EffectError for a lens whose
-    distortion cannot be undone over the whole image, and where the scene's lenses have one already."""
+    """Rendered ahead at no extra cost; free while streaming. Raises EffectError if the distortion cannot be
+    inverted over the whole image, or if the scene's lenses have a distortion already."""
 
     kind: ClassVar[str] = "lens"
     Parameters = LensDistortionParameters
@@ -42,7 +39,7 @@ class LensDistortion:
     def __init__(self, parameters: LensDistortionParameters, rng: np.random.Generator) -> None:
         self._p = parameters
 
-    def through(self, camera: Pinhole) -> Pinhole:
+    def rendered(self, camera: Pinhole) -> Pinhole:
         p = self._p
         if camera.distorted:
             raise EffectError(
@@ -56,5 +53,5 @@ class LensDistortion:
             )
         return lens
 
-    def claimed(self, camera: Pinhole) -> Pinhole:
+    def reported(self, camera: Pinhole) -> Pinhole:
         return camera if self._p.calibrated else dataclasses.replace(camera, distortion=(0.0,) * 4)

@@ -7,30 +7,30 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from camera_node.synthetic.effects import EffectParameters, bounded
+
 if TYPE_CHECKING:
-    from camera_node.synthetic.effects import View
+    from camera_node.synthetic.effects import Renderer
     from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
-class MotionBlurParameters:
-    """exposure_ms: how long the shutter is open. samples: instants averaged within it."""
+class MotionBlurParameters(EffectParameters):
+    """exposure_ms: time for which the shutter is open. samples: instants averaged within it."""
 
     exposure_ms: float = 20.0
-    samples: int = 5
+    samples: int = bounded(5, 1, 64)
     in_truth: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0.0 < self.exposure_ms <= 1000.0:
             raise ValueError(f"exposure_ms must be within 0 to 1000, got {self.exposure_ms}")
-        if not 1 <= self.samples <= 64:
-            raise ValueError(f"samples must be within 1 to 64, got {self.samples}")
 
 
 class MotionBlur:
-    """The time stamp is the middle of the exposure, so that blur adds no age. Displayed values are
-    averaged, as everywhere in this world. Costs ``samples`` renderings a frame, ahead of time; nothing
-    while streaming."""
+    """The time stamp is the middle of the exposure, so that blur adds no age. Displayed values are averaged,
+    as everywhere in this world. Costs ``samples`` renderings a frame, ahead; free while streaming."""
 
     kind: ClassVar[str] = "exposure"
     Parameters = MotionBlurParameters
@@ -39,10 +39,10 @@ class MotionBlur:
         share = (np.arange(parameters.samples) + 0.5) / parameters.samples - 0.5
         self._offsets_s = share * parameters.exposure_ms * 1e-3
 
-    def expose(self, view: View, t_s: float, rows: Rows | None = None) -> Image:
+    def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
         total: np.ndarray | None = None
         for offset in self._offsets_s:
-            image = view.image(t_s + float(offset), rows).astype(np.uint16)  # 64 times 255 fits
+            image = renderer.image(t_s + float(offset), rows).astype(np.uint16)  # 64 times 255 fits
             total = image if total is None else total + image
         assert total is not None
         n = len(self._offsets_s)

@@ -1,8 +1,8 @@
 """Occluder: an arm that sweeps back and forth between the cameras and the scene, close to the cameras.
 
-It is a body of the world, so every training camera sees the same arm at the same instant, in front of
-what lies behind it. The held-out camera does not see it (``in_truth: false``): fidelity then asks how
-well the field shows the scene in spite of it. With ``in_truth: true`` it belongs to the scene.
+It is a body of the world: every training camera sees the same arm at the same instant, in front of whatever
+it hides. The held-out camera does not see it (``in_truth: false``): fidelity then measures how well the field
+shows the scene in spite of it. With ``in_truth: true`` it belongs to the scene.
 """
 
 from __future__ import annotations
@@ -14,50 +14,42 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.motion import TICK_S, bone_frames, phase_of
-from camera_node.synthetic.placement import Mover, Part
-from camera_node.synthetic.shapes import Array, capsule
+from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.synthetic.motion import PERIOD_UNIT_S, bone_frames, phase_of
+from camera_node.synthetic.placement import MovingBody, Part
+from camera_node.synthetic.shapes import capsule
 from camera_node.synthetic.textures import Stripes
+from freshfield.geometry import Array
 
 if TYPE_CHECKING:
     from camera_node.synthetic.scene import Scene
 
-_JOINTS = 9  # of the arch, from the horizon to the zenith
+_JOINTS = 9  # of the arch
 
 
 @dataclass(frozen=True)
-class OccluderParameters:
-    """period_s: one sweep there and back, rounded to a multiple of the scene's own period. sweep_deg: how
-    far to either side. distance_share: how far from the target towards the cameras (1 = at the cameras);
-    where cameras look outward, as far beyond them. thickness_share: diameter, as a share of the cameras'
+class OccluderParameters(EffectParameters):
+    """period_s: one sweep there and back, rounded to a multiple of the scene's period. sweep_deg: angle to
+    either side. distance_share: distance from the target as a share of the cameras' (1 = at the cameras); as
+    far beyond the cameras if they look outward. thickness_share: diameter as a share of the cameras'
     distance."""
 
-    period_s: float = 6.0
-    sweep_deg: float = 100.0
-    distance_share: float = 0.7
-    thickness_share: float = 0.06
+    period_s: float = bounded(6.0, 0.6, 600.0)
+    sweep_deg: float = bounded(100.0, 0.0, 180.0)
+    distance_share: float = bounded(0.7, 0.05, 0.95)
+    thickness_share: float = bounded(0.06, 0.005, 0.3)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        if not 0.6 <= self.period_s <= 600.0:
-            raise ValueError(f"period_s must be within 0.6 to 600, got {self.period_s}")
-        if not 0.05 <= self.distance_share <= 0.95:
-            raise ValueError(f"distance_share must be within 0.05 to 0.95, got {self.distance_share}")
-        if not 0.005 <= self.thickness_share <= 0.3:
-            raise ValueError(f"thickness_share must be within 0.005 to 0.3, got {self.thickness_share}")
-        if not 0.0 <= self.sweep_deg <= 180.0:
-            raise ValueError(f"sweep_deg must be within 0 to 180, got {self.sweep_deg}")
 
 
 class Occluder:
-    """An arch over the target from the horizon to the zenith, so that it passes cameras at any height.
-    Rendered ahead (some 1 to 3 ms a frame); nothing while streaming."""
+    """An arch over the target from the horizon to the zenith, which passes cameras at any height. Rendered
+    ahead (1 to 3 ms a frame); free while streaming."""
 
     kind: ClassVar[str] = "world"
     Parameters = OccluderParameters
 
     def __init__(self, parameters: OccluderParameters, rng: np.random.Generator) -> None:
-        # One body is the same for every camera, so nothing about it is drawn from a camera's stream.
+        # The body is the same for every camera, so it uses none of a camera's random stream.
         self._p = parameters
 
     def extend(self, scene: Scene) -> Scene:
@@ -68,7 +60,7 @@ class Occluder:
         reach = float(np.linalg.norm(away, axis=1).mean())
         outward = float((away * poses[:, :3, 2]).sum()) > 0.0
         share = 2.0 - p.distance_share if outward else p.distance_share
-        base = scene.period_s if scene.moving else TICK_S
+        base = scene.period_s if scene.moving else PERIOD_UNIT_S
         period = max(1, round(p.period_s / base)) * base
         elevation = np.linspace(0.0, 0.5 * math.pi, _JOINTS)
         joints = share * reach * np.stack(
@@ -80,11 +72,11 @@ class Occluder:
 
         def matrices(t_s: float) -> Array:
             a = math.radians(p.sweep_deg) * math.sin(2 * math.pi * phase_of(t_s, period))
-            turn = np.array([[math.cos(a), math.sin(a), 0], [-math.sin(a), math.cos(a), 0], [0, 0, 1]])
-            at = target + joints @ turn
-            side = np.broadcast_to(turn[0], (_JOINTS - 1, 3))
+            rotation = np.array([[math.cos(a), math.sin(a), 0], [-math.sin(a), math.cos(a), 0], [0, 0, 1]])
+            at = target + joints @ rotation
+            side = np.broadcast_to(rotation[0], (_JOINTS - 1, 3))
             return bone_frames(at[:-1], at[1:], side)
 
-        mover = Mover((arm,) * (_JOINTS - 1), matrices)
-        world = dataclasses.replace(scene.world, movers=(*scene.world.movers, mover))
+        body = MovingBody((arm,) * (_JOINTS - 1), matrices)
+        world = dataclasses.replace(scene.world, moving_bodies=(*scene.world.moving_bodies, body))
         return scene.with_world(world, period, moving=True)

@@ -1,6 +1,6 @@
-"""Pose noise: cameras are not quite where their frames claim, by calibration and by tracking.
+"""Pose noise: frames report poses with errors of calibration and tracking.
 
-Images are taken from the true pose; only what is sent of it is wrong.
+Images are taken from the true pose; only the reported pose is wrong.
 """
 
 from __future__ import annotations
@@ -10,35 +10,26 @@ from typing import ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
 from freshfield.geometry import Array, Pose, so3_exp
 
 
 @dataclass(frozen=True)
-class PoseNoiseParameters:
-    """Standard deviations on each axis. translation_mm, rotation_deg: of every frame, as of a tracker or an
-    arm. translation_bias_mm, rotation_bias_deg: of each camera for good, as of a calibration."""
+class PoseNoiseParameters(EffectParameters):
+    """Standard deviations on each axis. translation_mm, rotation_deg: of the error of each frame, as of a
+    tracker or an arm. translation_bias_mm, rotation_bias_deg: of each camera's constant error, as of a
+    calibration."""
 
-    translation_mm: float = 5.0
-    rotation_deg: float = 0.2
-    translation_bias_mm: float = 0.0
-    rotation_bias_deg: float = 0.0
+    translation_mm: float = bounded(5.0, 0.0, 1e5)
+    rotation_deg: float = bounded(0.2, 0.0, 180.0)
+    translation_bias_mm: float = bounded(0.0, 0.0, 1e5)
+    rotation_bias_deg: float = bounded(0.0, 0.0, 180.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            translation_mm=(0.0, 1e5),
-            rotation_deg=(0.0, 180.0),
-            translation_bias_mm=(0.0, 1e5),
-            rotation_bias_deg=(0.0, 180.0),
-        )
 
 
 class PoseNoise:
-    """Rotations by a normal rotation vector in camera axes, translations in world axes. The error of a frame
-    follows from the camera's stream and the frame's number alone, so frames may be asked for in any
-    order. Some .1 ms a frame."""
+    """Rotations by a normal rotation vector in camera axes, translations in world axes. A frame's error
+    follows from the camera's random stream and the frame's number alone. About .1 ms a frame."""
 
     kind: ClassVar[str] = "pose"
     Parameters = PoseNoiseParameters
@@ -54,15 +45,14 @@ class PoseNoise:
     def varies(self) -> bool:
         return bool(self._sigma.any())
 
-    def claimed(self, pose: Pose, index: int) -> Pose:
+    def reported(self, pose: Pose, index: int) -> Pose:
         matrix = pose.matrix()
-        _turn(matrix, self._bias)
+        _displace(matrix, self._bias)
         if self.varies:
-            rng = np.random.Generator(np.random.Philox(key=self._key, counter=[0, 0, 0, index]))
-            _turn(matrix, self._sigma * rng.standard_normal(6))
+            _displace(matrix, self._sigma * frame_rng(self._key, index).standard_normal(6))
         return Pose.from_matrix(matrix)
 
 
-def _turn(matrix: Array, error: Array) -> None:
+def _displace(matrix: Array, error: Array) -> None:
     matrix[:3, :3] = matrix[:3, :3] @ so3_exp(error[:3])
     matrix[:3, 3] += error[3:]

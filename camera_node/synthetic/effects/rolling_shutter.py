@@ -1,4 +1,4 @@
-"""Rolling shutter: a sensor reads its rows one after another, so that each shows its own instant."""
+"""Rolling shutter: a sensor reads its rows one after another, so each row shows its own instant."""
 
 from __future__ import annotations
 
@@ -7,32 +7,29 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 
 if TYPE_CHECKING:
-    from camera_node.synthetic.effects import View
+    from camera_node.synthetic.effects import Renderer
     from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
-class RollingShutterParameters:
-    """readout_ms: from the top row to the bottom one. stamped_share: which row the time stamp belongs to, 0
-    being the top one and 1 the bottom one. rows_at_once: rows that are rendered at one instant, that of
-    the middle of them: more is faster and wrong by up to readout_ms * rows_at_once / (2 * height)."""
+class RollingShutterParameters(EffectParameters):
+    """readout_ms: from the top row to the bottom one. stamped_share: row that the time stamp belongs to, from
+    0 at the top to 1 at the bottom. rows_at_once: rows rendered at one instant, that of their middle; more is
+    faster, with errors up to readout_ms * rows_at_once / (2 * height)."""
 
-    readout_ms: float = 20.0
-    stamped_share: float = 0.5
-    rows_at_once: int = 1
+    readout_ms: float = bounded(20.0, 0.0, 1000.0)
+    stamped_share: float = bounded(0.5, 0.0, 1.0)
+    rows_at_once: int = bounded(1, 1, 4096)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, readout_ms=(0.0, 1000.0), stamped_share=(0.0, 1.0), rows_at_once=(1, 4096))
 
 
 class RollingShutter:
     """Row i of n is read ``(i / (n - 1) - stamped_share) * readout_ms`` after the time stamp. Costs a good
-    part of a rendering for every row, ahead of time; nothing while streaming. List it after motion_blur
-    where both are wanted: that blurs each row around its own instant."""
+    part of a rendering for every row, ahead; free while streaming. To use it with motion_blur, list it after
+    motion_blur: each row is then blurred around its own instant."""
 
     kind: ClassVar[str] = "exposure"
     Parameters = RollingShutterParameters
@@ -41,18 +38,18 @@ class RollingShutter:
         self._p = parameters
 
     def row_offset_s(self, row: float, height: int) -> float:
-        """How long after the time stamp a row is read."""
+        """Time from the time stamp to the reading of a row."""
         share = row / (height - 1) if height > 1 else 0.5
         return (share - self._p.stamped_share) * self._p.readout_ms * 1e-3
 
-    def expose(self, view: View, t_s: float, rows: Rows | None = None) -> Image:
-        height, step = view.camera.height, self._p.rows_at_once
+    def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
+        height, step = renderer.camera.height, self._p.rows_at_once
         first, stop = (0, height) if rows is None else rows
         strips = []
-        # Bands are counted from the top row, so that a row looks the same whichever rows are asked for.
+        # Bands count from the top row, so that a row looks the same whichever rows are asked for.
         for top in range(first - first % step, stop, step):
             bottom = min(top + step, height)
             middle = 0.5 * (top + bottom - 1)
             part = (max(top, first), min(bottom, stop))
-            strips.append(view.image(t_s + self.row_offset_s(middle, height), part))
+            strips.append(renderer.image(t_s + self.row_offset_s(middle, height), part))
         return np.concatenate(strips)

@@ -7,29 +7,26 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded, frame_rng
 
 if TYPE_CHECKING:
     from camera_node.synthetic.render import Image
 
 
 @dataclass(frozen=True)
-class SensorNoiseParameters:
+class SensorNoiseParameters(EffectParameters):
     """read_noise_counts: standard deviation in black, of 255 counts. full_well_electrons: charge at 255
-    counts, which sets the shot noise there to 255 / sqrt(full_well_electrons); 0 leaves it out."""
+    counts, where the shot noise is 255 / sqrt(full_well_electrons); 0: no shot noise."""
 
-    read_noise_counts: float = 1.5
-    full_well_electrons: float = 4000.0
+    read_noise_counts: float = bounded(1.5, 0.0, 1e4)
+    full_well_electrons: float = bounded(4000.0, 0.0, 1e12)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, read_noise_counts=(0.0, 1e4), full_well_electrons=(0.0, 1e12))
 
 
 class SensorNoise:
-    """sigma^2 = read^2 + signal * 255 / full_well, in counts; the Gaussian limit of photon counting, good
-    above some ten electrons. The noise of a frame follows from the stream and the frame's number alone,
-    so frames may be asked for in any order. About .6 ms for 128 x 128."""
+    """sigma^2 = read^2 + signal * 255 / full_well, in counts: the Gaussian limit of photon counting, good
+    above about ten electrons. A frame's noise follows from the camera's random stream and the frame's number
+    alone. About .6 ms for 128 x 128."""
 
     kind: ClassVar[str] = "image"
     Parameters = SensorNoiseParameters
@@ -41,9 +38,7 @@ class SensorNoise:
         self._sigma = np.sqrt(parameters.read_noise_counts**2 + signal * gain).astype(np.float32)
 
     def apply(self, image: Image, index: int, t_s: float = 0.0) -> Image:
-        counter = [0, 0, 0, index]
-        rng = np.random.Generator(np.random.Philox(key=self._key, counter=counter))
-        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        noise = frame_rng(self._key, index).standard_normal(image.shape, dtype=np.float32)
         noise *= self._sigma[image]
         noise += image
         np.rint(noise, out=noise)

@@ -1,7 +1,7 @@
-"""Specular: highlights of the light on every surface, which move with the viewer.
+"""Specular highlights of the light on every surface, which move with the viewer.
 
-Everything gets a clear coat: a microfacet surface with the GGX distribution of slopes, Smith's masking for
-correlated heights and Fresnel's equations for unpolarised light (Walter et al., "Microfacet models for
+Every surface gets a clear coat: a microfacet surface with the GGX distribution of slopes, Smith's masking for
+correlated heights and Fresnel's equations for unpolarized light (Walter et al., "Microfacet models for
 refraction through rough surfaces", EGSR 2007, equations 20, 22 and 33; Heitz, "Understanding the
 masking-shadowing function", JCGT 2014, equation 99).
 """
@@ -14,37 +14,35 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from camera_node.synthetic.effects import check_ranges
-from camera_node.synthetic.shapes import Array, normalise
+from camera_node.synthetic.effects import EffectParameters, bounded
+from camera_node.synthetic.shapes import normalize
+from freshfield.geometry import Array
 
 if TYPE_CHECKING:
     from camera_node.synthetic.scene import Scene
 
 
 @dataclass(frozen=True)
-class SpecularParameters:
-    """refractive_index: of the coat (1 reflects nothing, 1.5 is varnish or plastic). roughness: the width of
-    GGX, from .02 (polished) to 1 (matt)."""
+class SpecularParameters(EffectParameters):
+    """refractive_index: of the coat (1 reflects nothing, 1.5 is varnish or plastic). roughness: width of the
+    GGX distribution, from .02 (polished) to 1 (matte)."""
 
-    refractive_index: float = 1.5
-    roughness: float = 0.2
+    refractive_index: float = bounded(1.5, 1.0, 50.0)
+    roughness: float = bounded(0.2, 0.02, 1.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, refractive_index=(1.0, 50.0), roughness=(0.02, 1.0))
 
 
 @dataclass(frozen=True)
-class Coat:
-    """A camera_node.synthetic.lighting.Gloss."""
+class ClearCoat:
+    """Implements lighting.SpecularReflection."""
 
     refractive_index: float
     roughness: float
 
-    def share(self, to_light: Array, normals: Array, rays: Array) -> Array:
-        """pi times the reflectance (1/sr) times the cosine at the surface: in the unit in which a white
-        Lambert surface has the cosine alone."""
-        half = normalise(to_light - rays)
+    def reflectance(self, to_light: Array, normals: Array, rays: Array) -> Array:
+        """pi times the BRDF (1/sr) times the cosine at the surface, so that a white Lambert surface has the
+        cosine alone."""
+        half = normalize(to_light - rays)
         light = np.maximum((normals * to_light).sum(axis=0), 0.0)
         view = np.maximum(-(normals * rays).sum(axis=0), 0.0)
         a2 = self.roughness**2
@@ -57,7 +55,7 @@ class Coat:
         return slopes * visibility * self.fresnel(-(half * rays).sum(axis=0)) * light
 
     def fresnel(self, cosine: Array) -> Array:
-        """Share of unpolarised light that a smooth facet reflects, by the cosine to its normal."""
+        """Share of unpolarized light that a smooth facet reflects, for a cosine to its normal."""
         c = np.clip(cosine, 0.0, 1.0)
         g = np.sqrt(self.refractive_index**2 - 1.0 + c * c)
         across = (g - c) / np.maximum(g + c, 1e-12)
@@ -66,15 +64,14 @@ class Coat:
 
 
 class Specular:
-    """Rendered ahead; nothing while streaming. List it ``in_truth: true`` where the highlights belong to what
-    a field is to show."""
+    """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
+    highlights."""
 
     kind: ClassVar[str] = "world"
     Parameters = SpecularParameters
 
     def __init__(self, parameters: SpecularParameters, rng: np.random.Generator) -> None:
-        self._coat = Coat(parameters.refractive_index, parameters.roughness)
+        self._coat = ClearCoat(parameters.refractive_index, parameters.roughness)
 
     def extend(self, scene: Scene) -> Scene:
-        world = dataclasses.replace(scene.world, gloss=self._coat)
-        return scene.with_world(world, scene.period_s, scene.moving)
+        return scene.with_world(dataclasses.replace(scene.world, specular=self._coat))

@@ -8,28 +8,25 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic.effects import check_ranges
+from camera_node.synthetic.effects import EffectParameters, bounded
 from freshfield.geometry import Pinhole
 
 if TYPE_CHECKING:
-    from camera_node.synthetic.effects import View
+    from camera_node.synthetic.effects import Renderer
     from camera_node.synthetic.render import Image, Rows
 
 
 @dataclass(frozen=True)
-class VignettingParameters:
-    """exponent: of the cosine of a ray's angle to the optical axis; 4 is a thin lens's, 0 none."""
+class VignettingParameters(EffectParameters):
+    """exponent: of the cosine of a ray's angle to the optical axis; 4: thin lens, 0: no vignetting."""
 
-    exponent: float = 4.0
+    exponent: float = bounded(4.0, 0.0, 64.0)
     in_truth: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, exponent=(0.0, 64.0))
 
 
 class Vignetting:
-    """Every pixel's value times cos(angle)^exponent, for the angle under which the lens sees it, distorted or
-    not. Displayed values are scaled, as everywhere in this world. Rendered ahead; nothing while streaming."""
+    """Multiplies every pixel by cos(angle)^exponent, with the angle at which the lens, distorted or not, sees
+    it. Displayed values are scaled, as everywhere in this world. Rendered ahead; free while streaming."""
 
     kind: ClassVar[str] = "exposure"
     Parameters = VignettingParameters
@@ -39,12 +36,12 @@ class Vignetting:
         self._gains: tuple[Pinhole, NDArray[np.float32]] | None = None
 
     def gain(self, camera: Pinhole) -> NDArray[np.float32]:
-        """(H, W, 1): what is left of each pixel's light; kept for the camera asked for last."""
+        """(H, W, 1): share of each pixel's light that is left; kept for the last camera."""
         if self._gains is None or self._gains[0] != camera:
             cosine = camera.rays()[..., 2:]
             self._gains = camera, (cosine**self._exponent).astype(np.float32)
         return self._gains[1]
 
-    def expose(self, view: View, t_s: float, rows: Rows | None = None) -> Image:
-        first, stop = (0, view.camera.height) if rows is None else rows
-        return np.rint(view.image(t_s, rows) * self.gain(view.camera)[first:stop]).astype(np.uint8)
+    def expose(self, renderer: Renderer, t_s: float, rows: Rows | None = None) -> Image:
+        first, stop = (0, renderer.camera.height) if rows is None else rows
+        return np.rint(renderer.image(t_s, rows) * self.gain(renderer.camera)[first:stop]).astype(np.uint8)

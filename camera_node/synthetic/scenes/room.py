@@ -1,7 +1,7 @@
 """Scene ``room``: a person walks and waves in a furnished, textured room of 6 x 6 x 3 m.
 
-Nineteen cameras look inward from a wide arc in three rows (DyNeRF-like); cam00, in the middle, is held
-out and more than 15 degrees from every other.
+Nineteen cameras look inward from a wide arc in three rows (DyNeRF-like). cam00, in the middle, is held out
+and more than 15 degrees from every other.
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ import numpy as np
 
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
-from camera_node.synthetic.person import walk_at, walking_person
-from camera_node.synthetic.placement import Part
-from camera_node.synthetic.placement import at as _at
-from camera_node.synthetic.placement import facing as _facing
-from camera_node.synthetic.render import Light, World
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.person import make_walk, walking_person
+from camera_node.synthetic.placement import Part, at, facing
+from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import MovingParams, Scene, pinhole
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere
 
@@ -27,7 +26,7 @@ _ANGLES_DEG = [(0.0, 20.0)] + [
     (a * s, e) for e, row in ((5.0, (12, 37, 62)), (22.0, (25, 46, 66)), (38.0, (12, 37, 62))) for a in row
     for s in (-1.0, 1.0)
 ]  # fmt: skip
-_LOOP_CENTRE, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
+_LOOP_CENTER, _LOOP_RADII_M = (0.0, 0.95), (0.74, 0.54)
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,11 @@ class Params(MovingParams):
 
 def build(params: Params) -> Scene:
     """The room as a scene."""
-    walk = walk_at(_LOOP_CENTRE, _LOOP_RADII_M, params.speed_m_per_s, params.motion_seed)
+    walk = make_walk(_LOOP_CENTER, _LOOP_RADII_M, params.speed_m_per_s, params.motion_seed)
     grid = np.stack(np.meshgrid([-0.8, 0.2, 1.2], [-1.0, 0.0, 1.0], [2.95]), axis=-1).reshape(-1, 3)
     light = Light(
-        points=grid, strength=0.80, reach_m=4.0, low=(0.30, 0.29, 0.29), high=(0.50, 0.52, 0.55),
-        tint=(1.0, 0.96, 0.88),
+        points=grid, strength=0.80, falloff_m=4.0, tint=(1.0, 0.96, 0.88),
+        ambient_below=(0.30, 0.29, 0.29), ambient_above=(0.50, 0.52, 0.55),
     )  # fmt: skip
     return Scene(
         name="room",
@@ -58,7 +57,7 @@ def build(params: Params) -> Scene:
 
 
 def _shell() -> list[Part]:
-    """Four walls, floor and ceiling, each seen from within only."""
+    """Four walls, floor and ceiling, each visible from inside only."""
     wall = Quad((3.0, 1.5))
     wide = Quad((3.0, 3.0))
     brick = tx.Noise(tx.Brick((0.72, 0.42, 0.32), (0.86, 0.80, 0.72), 0.60, 0.30), 0.5, 0.05, seed=1)
@@ -78,12 +77,12 @@ def _shell() -> list[Part]:
     )  # fmt: skip
     up = (0, 0, 1)
     return [
-        Part(wall, brick, _facing((1, 0, 0), up, (0, 3, 1.5)), casts_shadow=False),
-        Part(wall, paper, _facing((0, 1, 0), up, (-3, 0, 1.5)), casts_shadow=False),
-        Part(wall, stripes, _facing((0, -1, 0), up, (3, 0, 1.5)), casts_shadow=False),
-        Part(wall, plaster, _facing((-1, 0, 0), up, (0, -3, 1.5)), casts_shadow=False),
-        Part(wide, boards, _facing((1, 0, 0), (0, 1, 0), (0, 0, 0)), casts_shadow=False, takes_contact=True),
-        Part(wide, ceiling, _facing((1, 0, 0), (0, -1, 0), (0, 0, 3)), casts_shadow=False, glow=0.5),
+        Part(wall, brick, facing((1, 0, 0), up, (0, 3, 1.5)), casts_shadow=False),
+        Part(wall, paper, facing((0, 1, 0), up, (-3, 0, 1.5)), casts_shadow=False),
+        Part(wall, stripes, facing((0, -1, 0), up, (3, 0, 1.5)), casts_shadow=False),
+        Part(wall, plaster, facing((-1, 0, 0), up, (0, -3, 1.5)), casts_shadow=False),
+        Part(wide, boards, facing((1, 0, 0), (0, 1, 0), (0, 0, 0)), casts_shadow=False, takes_contact=True),
+        Part(wide, ceiling, facing((1, 0, 0), (0, -1, 0), (0, 0, 3)), casts_shadow=False, glow=0.5),
     ]
 
 
@@ -130,30 +129,30 @@ def _furniture() -> list[Part]:
     cushion = tx.Stripes((0.96, 0.84, 0.44), (0.90, 0.60, 0.24), 0.14)
     shade = tx.Plain((0.98, 0.90, 0.70))
     parts = [
-        Part(Box((1.35, 1.05, 0.006)), rug, _at(0, 0.95, 0.006), casts_shadow=False, takes_contact=True),
-        Part(Box((0.75, 0.03, 0.60)), window, _at(0.25, 2.97, 1.70)),
-        Part(Box((0.03, 0.55, 0.42)), sunset, _at(-2.97, 0.9, 1.80)),
-        Part(Box((0.03, 0.50, 0.50)), abstract, _at(2.97, 0.7, 1.75)),
-        Part(Box((0.65, 0.20, 1.05)), books, _at(-1.95, 2.78, 1.05)),
+        Part(Box((1.35, 1.05, 0.006)), rug, at(0, 0.95, 0.006), casts_shadow=False, takes_contact=True),
+        Part(Box((0.75, 0.03, 0.60)), window, at(0.25, 2.97, 1.70)),
+        Part(Box((0.03, 0.55, 0.42)), sunset, at(-2.97, 0.9, 1.80)),
+        Part(Box((0.03, 0.50, 0.50)), abstract, at(2.97, 0.7, 1.75)),
+        Part(Box((0.65, 0.20, 1.05)), books, at(-1.95, 2.78, 1.05)),
         # A table with a globe, a vase and a cube.
-        Part(Box((0.70, 0.42, 0.03)), oak, _at(1.75, 2.25, 0.75, -8)),
-        Part(Sphere(0.19), globe, _at(1.45, 2.22, 0.97, 30)),
-        Part(RoundCone(0.10, 0.05, 0.24), pot, _at(2.10, 2.34, 0.88)),
-        Part(Box((0.11, 0.11, 0.11)), dice, _at(1.78, 2.0, 0.89, 25)),
+        Part(Box((0.70, 0.42, 0.03)), oak, at(1.75, 2.25, 0.75, -8)),
+        Part(Sphere(0.19), globe, at(1.45, 2.22, 0.97, 30)),
+        Part(RoundCone(0.10, 0.05, 0.24), pot, at(2.10, 2.34, 0.88)),
+        Part(Box((0.11, 0.11, 0.11)), dice, at(1.78, 2.0, 0.89, 25)),
         # A sofa along the left wall.
-        Part(Box((0.38, 0.80, 0.21)), sofa, _at(-2.50, 1.15, 0.21)),
-        Part(Box((0.12, 0.80, 0.22)), sofa, _at(-2.84, 1.15, 0.60)),
-        Part(Box((0.14, 0.24, 0.14)), cushion, _at(-2.60, 0.70, 0.56, 14)),
+        Part(Box((0.38, 0.80, 0.21)), sofa, at(-2.50, 1.15, 0.21)),
+        Part(Box((0.12, 0.80, 0.22)), sofa, at(-2.84, 1.15, 0.60)),
+        Part(Box((0.14, 0.24, 0.14)), cushion, at(-2.60, 0.70, 0.56, 14)),
         # A plant, a lamp, a crate, a ball.
-        Part(RoundCone(0.15, 0.20, 0.22), pot, _at(2.55, 1.10, 0.15)),
-        Part(Sphere(1.0), leaf, _at(2.55, 1.10, 0.92) @ np.diag([0.34, 0.34, 0.46, 1.0])),
-        Part(Cylinder(0.025, 0.75), tx.Plain((0.20, 0.20, 0.22)), _at(-0.95, 2.72, 0.75)),
-        Part(RoundCone(0.22, 0.10, 0.24), shade, _at(-0.95, 2.72, 1.50), casts_shadow=False, glow=0.35),
-        Part(Box((0.25, 0.25, 0.25)), crate, _at(-1.55, 0.05, 0.25, 20)),
-        Part(Sphere(0.20), ball, _at(1.45, -0.05, 0.20, 40)),
+        Part(RoundCone(0.15, 0.20, 0.22), pot, at(2.55, 1.10, 0.15)),
+        Part(Sphere(1.0), leaf, at(2.55, 1.10, 0.92) @ np.diag([0.34, 0.34, 0.46, 1.0])),
+        Part(Cylinder(0.025, 0.75), tx.Plain((0.20, 0.20, 0.22)), at(-0.95, 2.72, 0.75)),
+        Part(RoundCone(0.22, 0.10, 0.24), shade, at(-0.95, 2.72, 1.50), casts_shadow=False, glow=0.35),
+        Part(Box((0.25, 0.25, 0.25)), crate, at(-1.55, 0.05, 0.25, 20)),
+        Part(Sphere(0.20), ball, at(1.45, -0.05, 0.20, 40)),
     ]  # fmt: skip
     for sx in (-1, 1):
         for sy in (-1, 1):
-            leg = _at(1.75, 2.25, 0.0, -8) @ _at(0.62 * sx, 0.34 * sy, 0.36)
+            leg = at(1.75, 2.25, 0.0, -8) @ at(0.62 * sx, 0.34 * sy, 0.36)
             parts.append(Part(Box((0.035, 0.035, 0.36)), white, leg))
     return parts

@@ -9,17 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
-from camera_node.synthetic.motion import TICK_S
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import Part
-from camera_node.synthetic.render import Light, World
+from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import BaseParams, Scene, pinhole
 from camera_node.synthetic.shapes import Box, Cylinder, Sphere
-
-Array = NDArray[np.float64]
+from freshfield.geometry import Array
 
 _BACKGROUND = (0.80, 0.83, 0.86)
 _TARGET = (0.0, 0.0, 0.03)
@@ -39,11 +38,11 @@ class Params(BaseParams):
 
 
 def build(params: Params) -> Scene:
-    """The tile as a scene; it does not move, so its period is the shortest there is."""
+    """The tile as a scene. It does not move, so it has the shortest period."""
     grid = np.stack(np.meshgrid([-0.5, -0.3, -0.1], [-0.5, -0.3, -0.1], [0.9]), axis=-1).reshape(-1, 3)
     light = Light(
-        points=grid, strength=0.95, reach_m=1.2, low=(0.28, 0.29, 0.31), high=(0.50, 0.52, 0.54),
-        tint=(1.0, 0.97, 0.92),
+        points=grid, strength=0.95, falloff_m=1.2, tint=(1.0, 0.97, 0.92),
+        ambient_below=(0.28, 0.29, 0.31), ambient_above=(0.50, 0.52, 0.54),
     )  # fmt: skip
     return Scene(
         name="tile",
@@ -52,7 +51,7 @@ def build(params: Params) -> Scene:
         target=_TARGET,
         world=World(tuple(_carrier() + _segments() + _bolts()), (), light, _BACKGROUND),
         bounds=np.array([[-0.26, -0.20, -0.07], [0.26, 0.20, 0.13]]),
-        period_s=TICK_S,
+        period_s=PERIOD_UNIT_S,
         moving=False,
     )
 

@@ -1,8 +1,8 @@
 """Scene ``tower``: cameras on a mast look outward into a workshop of 10 x 10 x 4 m (Eyeful-like).
 
-Every camera sees another part of the surroundings, and few see the same. A person walks on one side and a
-loaded cart drives on the other; or a person walks on one of four sides, and which cannot be known beforehand.
-cam00 is held out and more than 15 degrees from every other.
+Each camera sees a different part of the surroundings, with little overlap. A person walks on one side and a
+loaded cart drives on the other; or a person walks on one of four sides, drawn at random. cam00 is held out
+and more than 15 degrees from every other.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ import numpy as np
 
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
-from camera_node.synthetic.person import Walk, walk_at, walking_person
-from camera_node.synthetic.placement import Mover, Part, at, facing
-from camera_node.synthetic.render import Light, World
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.person import Walk, make_walk, walking_person
+from camera_node.synthetic.placement import MovingBody, Part, at, facing
+from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import MovingParams, Scene, pinhole
-from camera_node.synthetic.shapes import Array, Box, Cylinder, Quad, RoundCone, Sphere, capsule
+from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule
+from freshfield.geometry import Array
 
 _MAST = (0.0, 0.0, 1.70)
 _RADIUS_M = 0.55
@@ -30,20 +32,20 @@ _ANGLES_DEG = [(0.0, 3.0)] + [
     for a in row
 ]  # fmt: skip
 _HALF_M, _HEIGHT_M = 5.0, 4.0
-_WALK_CENTRE, _WALK_RADII_M = (0.2, -2.75), (1.35, 0.75)
-_DRIVE_CENTRE, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
-# Where a person may walk, alone: the sides that cameras tell apart, in the order south, east, north, west.
+_WALK_CENTER, _WALK_RADII_M = (0.2, -2.75), (1.35, 0.75)
+_DRIVE_CENTER, _DRIVE_RADII_M = (0.0, 2.9), (1.9, 0.8)
+# Where a person alone may walk: the sides that cameras tell apart: south, east, north, west.
 _SIDES = ((0.0, -2.9), (2.6, 0.0), (0.0, 2.9), (-2.6, 0.0))
 _SIDE_RADII_M = (0.5, 0.25)  # between the pillars
-_WHO = 5  # stream of who is there
+_MOVERS_STREAM = 5  # random stream that draws which bodies there are
 _STILL_PHASE = 0.62  # where the cart stands at speed 0, as the person does
 
 
 @dataclass(frozen=True)
 class Params(MovingParams):
-    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``; or
-    only ``one`` of them is there; or ``person``, alone and on any of four sides. The motion's seed draws
-    which: where something moves is then not known from where cameras stand, but can be seen."""
+    """speed_m_per_s: mean speed of the person's parts and of the cart; 0 stands still. movers: ``both``, only
+    ``one`` of them, or ``person``, alone on one of four sides; motion_seed draws which. Camera positions then
+    do not tell where something moves, but images do."""
 
     horizontal_fov_deg: float = 90.0
     movers: str = "both"
@@ -56,15 +58,15 @@ class Params(MovingParams):
 
 def build(params: Params) -> Scene:
     """The workshop as a scene."""
-    # A stream of its own: the walk's phase is the same wherever it is.
-    drawn = float(np.random.default_rng([_WHO, params.motion_seed or 0]).random())
+    # A separate stream: the walk's phase does not depend on the side.
+    drawn = float(np.random.default_rng([_MOVERS_STREAM, params.motion_seed or 0]).random())
     alone = params.movers == "person"
-    centre, radii = (_SIDES[int(4 * drawn)], _SIDE_RADII_M) if alone else (_WALK_CENTRE, _WALK_RADII_M)
-    walk = walk_at(centre, radii, params.speed_m_per_s, params.motion_seed)
+    center, radii = (_SIDES[int(4 * drawn)], _SIDE_RADII_M) if alone else (_WALK_CENTER, _WALK_RADII_M)
+    walk = make_walk(center, radii, params.speed_m_per_s, params.motion_seed)
     grid = np.stack(np.meshgrid([-2.6, 0.0, 2.6], [-2.6, 0.0, 2.6], [3.9]), axis=-1).reshape(-1, 3)
     light = Light(
-        points=grid, strength=0.85, reach_m=4.5, low=(0.30, 0.30, 0.31), high=(0.50, 0.52, 0.55),
-        tint=(1.0, 0.97, 0.92),
+        points=grid, strength=0.85, falloff_m=4.5, tint=(1.0, 0.97, 0.92),
+        ambient_below=(0.30, 0.30, 0.31), ambient_above=(0.50, 0.52, 0.55),
     )  # fmt: skip
     return Scene(
         name="tower",
@@ -73,7 +75,7 @@ def build(params: Params) -> Scene:
         target=_MAST,
         world=World(
             (*_shell(), *_mast(), *_workshop()),
-            _movers(params, walk, drawn),
+            _moving_bodies(params, walk, drawn),
             light,
         ),
         bounds=np.array([[-_HALF_M, -_HALF_M, 0.0], [_HALF_M, _HALF_M, _HEIGHT_M]]),
@@ -82,8 +84,8 @@ def build(params: Params) -> Scene:
     )
 
 
-def _movers(params: Params, walk: Walk, drawn: float) -> tuple[Mover, ...]:
-    """drawn: in [0, 1), says which of them is alone."""
+def _moving_bodies(params: Params, walk: Walk, drawn: float) -> tuple[MovingBody, ...]:
+    """drawn: in [0, 1), decides which body is alone."""
     person = walking_person(walk)
     if params.movers == "person":
         return (person,)
@@ -93,39 +95,43 @@ def _movers(params: Params, walk: Walk, drawn: float) -> tuple[Mover, ...]:
     return (person,) if drawn < 0.5 else (cart,)
 
 
-def _cart(walk: Walk, speed_m_per_s: float) -> Mover:
-    """A cart on an ellipse that it drives in the walk's period, as long as its speed asks for."""
+def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
+    """A cart that drives an ellipse in the walk's period; its speed sets the length."""
     deck = tx.Stripes((0.93, 0.72, 0.12), (0.16, 0.16, 0.18), 0.2, soft=0.03)
     crate = tx.Framed(tx.Checker((0.24, 0.46, 0.78), (0.90, 0.88, 0.82), 0.12), (0.55, 0.37, 0.20),
                       (0.24, 0.24), 0.04)  # fmt: skip
     drum = tx.Stripes((0.80, 0.24, 0.20), (0.94, 0.92, 0.88), 0.2, axis=1, soft=0.03)
-    tyre = tx.Plain((0.13, 0.13, 0.14))
+    tire = tx.Plain((0.13, 0.13, 0.14))
     parts = [
         (Part(Box((0.55, 0.32, 0.05)), deck), at(0.0, 0.0, 0.25)),
         (Part(Box((0.24, 0.24, 0.24)), crate), at(-0.22, 0.0, 0.54)),
         (Part(Cylinder(0.17, 0.22), drum), at(0.30, 0.05, 0.52)),
         (Part(capsule(0.025, 0.65), tx.Plain((0.25, 0.26, 0.30))), at(0.55, 0.0, 0.30)),
-        *((Part(Sphere(0.11), tyre), at(x, y, 0.11)) for x in (-0.38, 0.38) for y in (-0.27, 0.27)),
+        *((Part(Sphere(0.11), tire), at(x, y, 0.11)) for x in (-0.38, 0.38) for y in (-0.27, 0.27)),
     ]  # fmt: skip
     local = np.stack([matrix for _, matrix in parts])
     radii = np.array(_DRIVE_RADII_M)
     if not walk.still:
-        turn = 2 * math.pi * np.arange(720)[:, None] / 720
-        path = radii * np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
+        angle = 2 * math.pi * np.arange(720)[:, None] / 720
+        path = radii * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
         length_m = float(np.linalg.norm(np.diff(path, axis=0, append=path[:1]), axis=1).sum())
         radii = radii * (speed_m_per_s * walk.period_s / length_m)
 
     def matrices(t_s: float) -> Array:
-        a = 2 * math.pi * (_STILL_PHASE if walk.still else walk.phase(t_s)) * walk.turn
-        x, y = _DRIVE_CENTRE[0] + radii[0] * math.cos(a), _DRIVE_CENTRE[1] + radii[1] * math.sin(a)
-        heading = math.atan2(radii[1] * math.cos(a) * walk.turn, -radii[0] * math.sin(a) * walk.turn)
+        a = 2 * math.pi * (_STILL_PHASE if walk.still else walk.phase(t_s)) * walk.direction
+        x, y = _DRIVE_CENTER[0] + radii[0] * math.cos(a), _DRIVE_CENTER[1] + radii[1] * math.sin(a)
+        heading = math.atan2(
+            radii[1] * math.cos(a) * walk.direction, -radii[0] * math.sin(a) * walk.direction
+        )
         return np.asarray(at(x, y, 0.0, math.degrees(heading)) @ local, dtype=np.float64)
 
-    return Mover(tuple(part for part, _ in parts), matrices, contact=tuple((k, 0.2) for k in range(4, 8)))
+    return MovingBody(
+        tuple(part for part, _ in parts), matrices, contact=tuple((k, 0.2) for k in range(4, 8))
+    )
 
 
 def _shell() -> list[Part]:
-    """Four walls, floor and ceiling, each seen from within only."""
+    """Four walls, floor and ceiling, each visible from inside only."""
     wall, flat = Quad((_HALF_M, _HEIGHT_M / 2)), Quad((_HALF_M, _HALF_M))
     brick = tx.Noise(tx.Brick((0.70, 0.40, 0.30), (0.88, 0.82, 0.74), 0.80, 0.40), 0.6, 0.06, seed=41)
     tiles = tx.Bands(
@@ -161,16 +167,16 @@ def _shell() -> list[Part]:
 
 
 def _mast() -> list[Part]:
-    grey = tx.Plain((0.34, 0.35, 0.38))
+    gray = tx.Plain((0.34, 0.35, 0.38))
     hazard = tx.Stripes((0.95, 0.76, 0.12), (0.16, 0.15, 0.15), 0.25, axis=1, soft=0.02)
     return [
         Part(Cylinder(0.07, 1.30), hazard, at(0, 0, 1.30)),
-        Part(Box((0.32, 0.32, 0.04)), grey, at(0, 0, 0.04, 45)),
+        Part(Box((0.32, 0.32, 0.04)), gray, at(0, 0, 0.04, 45)),
     ]
 
 
 def _workshop() -> list[Part]:
-    """Shelves, a bench, machines, pipes and pillars, so that there is something near in every direction."""
+    """Shelves, a bench, machines, pipes and pillars: something near in every direction."""
     oak = tx.Noise(tx.Plain((0.62, 0.42, 0.24)), 0.2, 0.12, seed=46, stretch=4.0)
     books = tx.Books(
         [(0.74, 0.20, 0.18), (0.16, 0.36, 0.56), (0.93, 0.78, 0.36), (0.24, 0.50, 0.34), (0.86, 0.84, 0.78)],

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.camera_rig import on_sphere
-from camera_node.synthetic.placement import Placed, place_still
-from camera_node.synthetic.render import cast, surfaces
+from camera_node.synthetic.placement import PlacedParts, place_static
+from camera_node.synthetic.render import cast_rays, surface_properties
 from camera_node.synthetic.scene import Scene
 from edge_server.fields import View
 from edge_server.surface.metrics import STEEPEST_DEG, Truth, thinned
@@ -41,7 +41,7 @@ class Scan:
     def options(self) -> dict[str, object]:
         """Settings of a field that a robot cell knows: where the scene is and what is behind it."""
         low, high = self.scene.bounds
-        behind = "#" + "".join(f"{round(255 * c):02x}" for c in self.scene.background)
+        behind = "#" + "".join(f"{round(255 * c):02x}" for c in self.scene.world.background)
         return {
             "centre_m": [float(c) for c in 0.5 * (low + high)],
             "radius_m": float(0.5 * (high - low).max()) + 0.01,
@@ -74,16 +74,16 @@ def exact_depth(scene: Scene, view: View) -> NDArray[np.float64]:
 
 def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
     """The surface that the scan's cameras see, see ``surface.metrics``."""
-    placed = place_still(scan.scene.world.statics)
+    placed = place_static(scan.scene.world.static_parts)
     points, normals = [], []
     for view in scan.views:
         fine = view.intrinsics.scaled(_FINE)
         origin, rays = world_rays(fine, view.camera_to_world)
         rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
-        t, which = cast(origin, rays, placed, np.full(rays.shape[1], np.inf))
+        t, which = cast_rays(origin, rays, placed, np.full(rays.shape[1], np.inf))
         hit = np.flatnonzero(which >= 0)
         met = origin[:, None] + t[hit] * rays[:, hit]
-        _, facing = surfaces(placed, which[hit], met, rays[:, hit])
+        _, facing = surface_properties(placed, which[hit], met, rays[:, hit])
         seen = -(facing * rays[:, hit]).sum(axis=0) >= np.cos(np.deg2rad(STEEPEST_DEG))
         first = thinned(met.T[seen], spacing_m)
         points.append(met.T[seen][first])
@@ -98,7 +98,7 @@ def surface_truth(scan: Scan, spacing_m: float = SPACING_M) -> Truth:
 
 
 def _sees(
-    view: View, placed: Placed, points: NDArray[np.float64], normals: NDArray[np.float64]
+    view: View, placed: PlacedParts, points: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Whether a camera sees surface points (N, 3) with ``normals`` (N, 3)."""
     pose, lens = view.camera_to_world, view.intrinsics
@@ -110,7 +110,7 @@ def _sees(
     ray /= distance[:, None]
     turned = -(ray * normals).sum(axis=1) >= np.cos(np.deg2rad(STEEPEST_DEG))
     asked = np.flatnonzero(inside & turned)
-    t, _ = cast(pose[:3, 3], np.ascontiguousarray(ray[asked].T), placed, np.full(len(asked), np.inf))
+    t, _ = cast_rays(pose[:3, 3], np.ascontiguousarray(ray[asked].T), placed, np.full(len(asked), np.inf))
     out = np.zeros(len(points), np.bool_)
     out[asked] = np.abs(t - distance[asked]) <= _SAME * distance[asked]
     return out

@@ -94,8 +94,8 @@ def build_truth(
         lenses = {camera: scene.cameras[names[camera]] for camera in scenario.held_out}
         return ExactTruth(
             scorer,
-            {camera: (effects.claimed_lens(lens), pose) for camera, (lens, pose) in lenses.items()},
-            lambda camera, t_s: effects.exposed(scene.renderer(names[camera])).image(t_s),
+            {camera: (effects.reported_lens(lens), pose) for camera, (lens, pose) in lenses.items()},
+            lambda camera, t_s: effects.with_exposure(scene.renderer(names[camera])).image(t_s),
         )
     cameras = build_cameras(scenario, source, scenario.held_out, data, _CACHE_BYTES)
     return CapturedTruth(scorer, cameras, edge.noisy_truth)

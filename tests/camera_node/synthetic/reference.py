@@ -32,10 +32,10 @@ def _box(q: Array) -> Array:
 
 
 def _round_cone(s: RoundCone, p: Array) -> Array:
-    # The hull of two balls is the union of the balls of interpolated centre and radius.
+    # The hull of two balls is the union of the balls of interpolated center and radius.
     share = np.linspace(0.0, 1.0, 1001)
     out = np.full(p.shape[1], np.inf)
     for k in share:
-        centre = np.array([[0.0], [0.0], [k * s.length]])
-        out = np.minimum(out, np.linalg.norm(p - centre, axis=0) - (s.r0 + k * (s.r1 - s.r0)))
+        center = np.array([[0.0], [0.0], [k * s.length]])
+        out = np.minimum(out, np.linalg.norm(p - center, axis=0) - (s.r0 + k * (s.r1 - s.r0)))
     return out

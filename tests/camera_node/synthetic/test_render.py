@@ -7,23 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from camera_node.synthetic.placement import Mover, Part, place_still
-from camera_node.synthetic.render import CameraRenderer, Light, World, cast, rays_within
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.placement import MovingBody, Part, at, place_static
+from camera_node.synthetic.render import CameraRenderer, World, cast_rays, rays_near_sphere
 from camera_node.synthetic.shapes import Box, Quad, Sphere, nearest_hit
 from camera_node.synthetic.textures import Checker, Noise, Plain
 from freshfield.geometry import Pinhole, look_at, se3_inverse, world_rays
+from tests.camera_node.synthetic.worlds import FLAT_LIGHT as FLAT
+from tests.camera_node.synthetic.worlds import body
 
-FLAT = Light(np.array([[0.0, 0.0, 50.0]]), 0.0, 1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
 SOFT = Light(np.array([[0.0, -1.0, 4.0], [1.0, 0.0, 4.0]]), 0.6, 4.0, (0.3,) * 3, (0.5,) * 3)
 CAMERA = Pinhole.from_fov(96, 72, 60.0)
 POSE = look_at([1.5, -3.0, 1.2], [0.0, 0.0, 0.3])
 WHITE, RED = Plain((1.0, 1.0, 1.0)), Plain((0.8, 0.1, 0.1))
-
-
-def at(*xyz: float) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, 3] = xyz
-    return out
 
 
 @pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0), (-0.25, 0.06, 0.004, -0.003)])
@@ -48,7 +44,7 @@ def test_distance_is_along_the_ray():
     assert np.isinf(renderer.distance()[~seen]).all()
 
 
-def test_cones_leave_out_no_ray_that_hits():
+def test_culling_leaves_out_no_ray_that_hits():
     """The culled cast equals every ray tried on every part."""
     rng = np.random.default_rng(0)
     parts = [Part(Sphere(0.3), WHITE, at(*rng.uniform(-1, 1, 3))) for _ in range(6)]
@@ -56,43 +52,43 @@ def test_cones_leave_out_no_ray_that_hits():
     d = rng.standard_normal((3, 4000))
     d /= np.linalg.norm(d, axis=0)
     for origin in (np.array([2.0, 1.0, 0.5]), np.array([0.1, 0.0, 0.0]), parts[0].matrix[:3, 3]):
-        t, which = cast(origin, d, place_still(parts), np.full(4000, np.inf))
+        t, which = cast_rays(origin, d, place_static(parts), np.full(4000, np.inf))
         every = np.stack([nearest_hit(p.shape, (origin - p.matrix[:3, 3])[:, None], d) for p in parts])
         assert np.allclose(t, every.min(axis=0))
         hit = np.isfinite(t)
         assert np.array_equal(which[hit], every.argmin(axis=0)[hit]) and (which[~hit] == -1).all()
 
 
-def test_rays_within_takes_all_from_inside_and_none_behind():
+def test_rays_near_sphere_takes_all_from_inside_and_none_behind():
     d = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    assert rays_within(np.zeros(3), d, np.array([0.1, 0.0, 0.0]), 0.5).size == 3
-    assert rays_within(np.zeros(3), d, np.array([-5.0, -5.0, -5.0]), 0.5).size == 0
+    assert rays_near_sphere(np.zeros(3), d, np.array([0.1, 0.0, 0.0]), 0.5).size == 3
+    assert rays_near_sphere(np.zeros(3), d, np.array([-5.0, -5.0, -5.0]), 0.5).size == 0
 
 
-def test_what_moves_is_drawn_as_what_stands():
-    """A mover at rest gives the very pixels of a static part in the same place, in front and behind."""
+def test_moving_parts_are_drawn_like_static_parts():
+    """A body at rest gives the same pixels as a static part in the same place, in front and behind."""
     floor = Part(Quad((3.0, 3.0)), Checker((0.2, 0.4, 0.6), (0.9, 0.8, 0.7), 0.3))
     post = Part(Box((0.1, 0.1, 0.6)), RED, at(0.25, -0.4, 0.6))
     ball = Part(Sphere(0.4), Noise(WHITE, 0.2, 0.3), at(0.0, 0.0, 0.5) @ np.diag([1.0, 0.6, 1.3, 1.0]))
     still = World((floor, post, ball), (), FLAT)
-    moving = World((floor, post), (Mover((ball,), lambda t: ball.matrix[None]),), FLAT)
+    moving = World((floor, post), (body(ball),), FLAT)
     for supersample in (1, 2):
         a = CameraRenderer(still, CAMERA, POSE, supersample).image(0.0)
         assert np.array_equal(a, CameraRenderer(moving, CAMERA, POSE, supersample).image(0.0))
 
 
 @pytest.mark.parametrize("order", [0, 1])
-def test_movers_hide_each_other_by_distance_not_by_order(order):
+def test_bodies_hide_each_other_by_distance_not_by_order(order):
     near, far = Part(Sphere(0.2), RED, at(0.75, -1.5, 0.75)), Part(Sphere(0.5), WHITE, at(0.0, 0.0, 0.3))
-    movers = [Mover((p,), lambda t, p=p: p.matrix[None]) for p in (near, far)]
-    world = World((), tuple(movers[::-1] if order else movers), FLAT)
+    bodies = [body(near), body(far)]
+    world = World((), tuple(bodies[::-1] if order else bodies), FLAT)
     still = World((near, far), (), FLAT)
     assert np.array_equal(
         CameraRenderer(world, CAMERA, POSE).image(0.0), CameraRenderer(still, CAMERA, POSE).image(0.0)
     )
 
 
-def test_colour_depends_on_the_place_and_not_on_the_viewer():
+def test_color_depends_on_the_place_and_not_on_the_viewer():
     parts = (
         Part(Quad((3.0, 3.0)), Noise(Plain((0.6, 0.5, 0.4)), 0.8, 0.3)),
         Part(Sphere(0.5), Noise(Plain((0.3, 0.5, 0.8)), 0.4, 0.3), at(0.2, 0.1, 0.5)),
@@ -130,9 +126,9 @@ def test_a_shadow_falls_where_the_light_is_hidden():
 def test_a_moving_part_darkens_the_floor_beneath_it_only():
     floor = Part(Quad((3.0, 3.0)), WHITE, takes_contact=True)
     ball = Part(Sphere(0.1), RED, at(0.0, 0.0, 0.12))
-    mover = Mover((ball,), lambda t: ball.matrix[None], contact=((0, 0.1),))
+    floating = MovingBody((ball,), lambda t: ball.matrix[None], contact=((0, 0.1),))
     top = look_at([0.0, -1.0, 3.0], [0.0, 0.0, 0.0])
-    image = CameraRenderer(World((floor,), (mover,), FLAT), CAMERA, top).image(0.0)
+    image = CameraRenderer(World((floor,), (floating,), FLAT), CAMERA, top).image(0.0)
     u, v = CAMERA.project((se3_inverse(top) @ [0.16, 0.0, 0.0, 1.0])[:3]).astype(int)
     assert image[v, u, 1] < 245
     u, v = CAMERA.project((se3_inverse(top) @ [1.1, 0.0, 0.0, 1.0])[:3]).astype(int)
@@ -146,7 +142,7 @@ def test_supersampling_averages_the_finer_image():
     assert np.abs(CameraRenderer(world, CAMERA, POSE, 2).image(0.0) - mean).max() <= 1.0
 
 
-def test_a_world_of_nothing_is_its_background():
+def test_an_empty_world_is_its_background():
     image = CameraRenderer(World((), (), FLAT, (0.2, 0.4, 0.6)), CAMERA, POSE).image(0.0)
     assert (image == [51, 102, 153]).all() and image.shape == (72, 96, 3) and image.dtype == np.uint8
 

@@ -75,9 +75,9 @@ def test_bounding_sphere_holds_every_hit(shape):
     aim = rng.uniform(-1.0, 1.0, (3, 2000)) - origin
     t = nearest_hit(shape, origin, aim)
     p = (origin + t * aim)[:, np.isfinite(t)]
-    centre, radius = shape.bounding_sphere()
+    center, radius = shape.bounding_sphere()
     assert p.shape[1] > 20
-    assert np.linalg.norm(p - centre[:, None], axis=0).max() <= radius * (1 + 1e-9)
+    assert np.linalg.norm(p - center[:, None], axis=0).max() <= radius * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)

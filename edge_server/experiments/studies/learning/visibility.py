@@ -45,7 +45,7 @@ class Sight:
     def _look(self, moment: DecisionPoint) -> dict[str, float]:
         scenario = self._setting.seeded(moment.seed, moves=True)
         scene, _ = exact_scene(scenario, cast(WorldConfig, source_config(scenario)))
-        still = scene.with_world(dataclasses.replace(scene.world, movers=()), scene.period_s, False)
+        still = scene.with_world(dataclasses.replace(scene.world, moving_bodies=()), scene.period_s, False)
         found = {}
         for camera, arrival in moment.newest(moment.now_ns).items():
             t_s = (arrival.generated_ns % round(scene.period_s * 1e9)) * 1e-9

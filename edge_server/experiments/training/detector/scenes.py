@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import on_sphere
-from camera_node.synthetic.person import walk_at, walking_person
-from camera_node.synthetic.placement import Mover, Part, at, place, place_still
-from camera_node.synthetic.render import CameraRenderer, World, cast
+from camera_node.synthetic.person import make_walk, walking_person
+from camera_node.synthetic.placement import MovingBody, Part, at, place_parts, place_static
+from camera_node.synthetic.render import CameraRenderer, World, cast_rays
 from camera_node.synthetic.scene import Scene, make_scene
-from camera_node.synthetic.shapes import Array, Cylinder, Quad, Shape, Sphere
-from freshfield.geometry import Pinhole, look_at, world_rays
+from camera_node.synthetic.shapes import Cylinder, Quad, Shape, Sphere
+from freshfield.geometry import Array, Pinhole, look_at, world_rays
 
 KINDS = ("person", "cart", "ball", "drum")
 # The least that counts as seen: a side and an area of visible pixels.
@@ -52,14 +52,14 @@ class Shot:
         renderer = CameraRenderer(self.world, self.camera, self.camera_to_world, self.supersample)
         origin, rays = world_rays(self.camera, self.camera_to_world)
         rays = np.ascontiguousarray(rays.reshape(-1, 3).T)
-        statics = place_still(self.world.statics)
-        limit, still = cast(origin, rays, statics, np.full(rays.shape[1], np.inf))
-        still_kinds = [kind_of(p.shape, p.matrix) for p in self.world.statics]
+        statics = place_static(self.world.static_parts)
+        limit, still = cast_rays(origin, rays, statics, np.full(rays.shape[1], np.inf))
+        still_kinds = [kind_of(p.shape, p.matrix) for p in self.world.static_parts]
         images, boxes = [], []
         for t_s in instants_s:
             t, owner = limit, np.where(still >= 0, still, -1).astype(np.int64)
-            for k, mover in enumerate(self.world.movers):
-                t, which = cast(origin, rays, place(mover.parts, mover.matrices(t_s)), t)
+            for k, mover in enumerate(self.world.moving_bodies):
+                t, which = cast_rays(origin, rays, place_parts(mover.parts, mover.matrices(t_s)), t)
                 owner[which >= 0] = len(still_kinds) + k
             images.append(renderer.image(t_s))
             shape = (self.camera.height, self.camera.width)
@@ -113,13 +113,15 @@ def variation(seed: int, purpose: str, side: int) -> tuple[Shot, np.random.Gener
     held-out worlds apart whatever their seeds."""
     name, rng = _begun(seed, purpose)
     scene = make_scene(name, {"count": 1, "width": side, "height": side})
-    statics = tuple(p for p in scene.world.statics if isinstance(p.shape, Quad) or rng.random() < _PRESENT)
+    statics = tuple(
+        p for p in scene.world.static_parts if isinstance(p.shape, Quad) or rng.random() < _PRESENT
+    )
     things = _small_things(rng) if name == "tile" else _things(rng, name)
     light = scene.world.light
     world = dataclasses.replace(
         scene.world,
-        statics=statics,
-        movers=tuple(mover for _, mover in things),
+        static_parts=statics,
+        moving_bodies=tuple(mover for _, mover in things),
         light=dataclasses.replace(light, strength=light.strength * rng.uniform(0.7, 1.2)),
     )  # fmt: skip
     camera = Pinhole.from_fov(
@@ -129,7 +131,7 @@ def variation(seed: int, purpose: str, side: int) -> tuple[Shot, np.random.Gener
     return Shot(world, camera, pose, tuple(KINDS.index(kind) for kind, _ in things)), rng
 
 
-def _things(rng: np.random.Generator, name: str) -> list[tuple[str, Mover]]:
+def _things(rng: np.random.Generator, name: str) -> list[tuple[str, MovingBody]]:
     """People, carts, balls and drums on the floor of a room or workshop."""
     reach = 1.6 if name == "room" else 3.4
 
@@ -140,12 +142,12 @@ def _things(rng: np.random.Generator, name: str) -> list[tuple[str, Mover]]:
             if name == "room" or math.hypot(x, y) > 1.2:  # a workshop's cameras stand in its middle
                 return float(x), float(y)
 
-    found: list[tuple[str, Mover]] = []
+    found: list[tuple[str, MovingBody]] = []
     for _ in range(rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])):
-        walk = walk_at(somewhere(), (rng.uniform(0.3, 0.9), rng.uniform(0.3, 0.9)), 1.0)
+        walk = make_walk(somewhere(), (rng.uniform(0.3, 0.9), rng.uniform(0.3, 0.9)), 1.0)
         found.append(("person", walking_person(walk)))
     if rng.random() < 0.5:
-        cart = make_scene("tower", {"count": 1}).world.movers[1]
+        cart = make_scene("tower", {"count": 1}).world.moving_bodies[1]
         x, y = somewhere()
         found.append(("cart", _moved(cart, at(x, y, 0.0, rng.uniform(0, 360)) @ at(0.0, -2.9, 0.0))))
     for _ in range(rng.choice([0, 1, 2, 3], p=[0.25, 0.35, 0.25, 0.15])):
@@ -154,7 +156,7 @@ def _things(rng: np.random.Generator, name: str) -> list[tuple[str, Mover]]:
     return found
 
 
-def _small_things(rng: np.random.Generator) -> list[tuple[str, Mover]]:
+def _small_things(rng: np.random.Generator) -> list[tuple[str, MovingBody]]:
     """Balls and drums the size of a bolt or a probe, over the tile."""
     return [
         _thing(rng, (*rng.uniform((-0.2, -0.15), (0.2, 0.15)), 0.06), rng.uniform(0.018, 0.06), 0.05)
@@ -164,7 +166,7 @@ def _small_things(rng: np.random.Generator) -> list[tuple[str, Mover]]:
 
 def _thing(
     rng: np.random.Generator, place_m: tuple[float, float, float], size_m: float, path_m: float
-) -> tuple[str, Mover]:
+) -> tuple[str, MovingBody]:
     """A ball or a drum in random colours that circles ``place_m`` and turns."""
     kind = str(rng.choice(["ball", "drum"]))
     tall = rng.uniform(0.7, 1.8)
@@ -181,11 +183,11 @@ def _thing(
         where = at(x + path_m * math.cos(turn), y + path_m * math.sin(turn), z + lift, spin * t_s)
         return np.asarray(where @ lean, dtype=np.float64)[None]
 
-    return kind, Mover((Part(shape, _texture(rng)),), matrices)
+    return kind, MovingBody((Part(shape, _texture(rng)),), matrices)
 
 
 def _texture(rng: np.random.Generator) -> tx.Texture:
-    def colour() -> tx.Colour:
+    def colour() -> tx.Color:
         r, g, b = rng.uniform(0.08, 0.98, 3)
         return float(r), float(g), float(b)
 
@@ -198,11 +200,11 @@ def _texture(rng: np.random.Generator) -> tx.Texture:
     return made[int(rng.integers(len(made)))]
 
 
-def _moved(mover: Mover, matrix: Array) -> Mover:
+def _moved(mover: MovingBody, matrix: Array) -> MovingBody:
     return dataclasses.replace(mover, matrices=lambda t_s: np.asarray(matrix @ mover.matrices(t_s)))
 
 
-def _viewpoint(rng: np.random.Generator, name: str, scene: Scene, movers: Sequence[Mover]) -> Array:
+def _viewpoint(rng: np.random.Generator, name: str, scene: Scene, movers: Sequence[MovingBody]) -> Array:
     """Where cameras of the scene may stand; half of them look towards something that moves."""
     target = np.asarray(scene.target, dtype=np.float64)
     if name == "tile":

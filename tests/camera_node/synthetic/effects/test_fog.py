@@ -9,15 +9,14 @@ import pytest
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects.fog import Fog, FogParameters
-from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.placement import Mover, Part
+from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import CameraRenderer, World
-from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import Sphere
 from camera_node.synthetic.textures import Plain
 from freshfield.geometry import Pinhole, look_at
+from tests.camera_node.synthetic.worlds import FLAT_LIGHT as FLAT
+from tests.camera_node.synthetic.worlds import body, with_effect
 
-FLAT = Light(np.array([[0.0, 0.0, 50.0]]), 0.0, 1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
 CAMERA = Pinhole.from_fov(65, 65, 40.0)
 POSE = look_at([0.0, 0.0, 0.0], [0.0, 5.0, 0.0])
 AIR = (1.0, 0.9, 0.7)
@@ -28,15 +27,11 @@ def make(**parameters) -> Fog:
 
 
 def foggy(world: World, **parameters) -> World:
-    room = make_scene("room", {"width": 8, "height": 8})
-    scene = Scene("balls", room.params, {}, (0, 5, 0), world, np.zeros((2, 3)), 0.6)
-    return make(**parameters).extend(scene).world
+    return with_effect(make(**parameters), world)
 
 
-def ball(distance_m: float, colour: float, radius: float = 0.5) -> Part:
-    matrix = np.eye(4)
-    matrix[:3, 3] = 0.0, distance_m, 0.0
-    return Part(Sphere(radius), Plain((colour,) * 3), matrix)
+def ball(distance_m: float, color: float, radius: float = 0.5) -> Part:
+    return Part(Sphere(radius), Plain((color,) * 3), at(0.0, distance_m, 0.0))
 
 
 @pytest.mark.parametrize("distance_m", [1.0, 3.0, 6.0, 12.0])
@@ -44,8 +39,7 @@ def ball(distance_m: float, colour: float, radius: float = 0.5) -> Part:
 def test_the_transmission_at_a_known_distance(distance_m, moving):
     """The nearest point of a dark ball, on the axis: what arrives, and the airlight for the rest."""
     part = ball(distance_m + 0.5, 0.06)
-    mover = Mover((part,), lambda t: part.matrix[None])
-    world = World((), (mover,), FLAT) if moving else World((part,), (), FLAT)
+    world = World((), (body(part),), FLAT) if moving else World((part,), (), FLAT)
     image = CameraRenderer(foggy(world, visibility_m=6.0), CAMERA, POSE).image(0.0)
     arrives = 0.02 ** (distance_m / 6.0)  # 2 % at the visibility
     expected = [255 * (0.06 * arrives + a * (1 - arrives)) for a in AIR]
@@ -55,10 +49,12 @@ def test_the_transmission_at_a_known_distance(distance_m, moving):
 @pytest.mark.parametrize(("visibility_m", "threshold"), [(6.0, 0.02), (40.0, 0.05)])
 def test_koschmieder_s_constant(visibility_m, threshold):
     """3.912 / visibility at 2 %, 2.996 / visibility at 5 %."""
-    haze = make(visibility_m=visibility_m, contrast_threshold=threshold)._haze
-    assert haze.per_m * visibility_m == pytest.approx({0.02: 3.912, 0.05: 2.996}[threshold], abs=5e-4)
+    haze = make(visibility_m=visibility_m, contrast_threshold=threshold)._medium
+    assert haze.extinction_per_m * visibility_m == pytest.approx(
+        {0.02: 3.912, 0.05: 2.996}[threshold], abs=5e-4
+    )
     far = np.array([0.0, 0.5 * visibility_m, visibility_m, np.inf])
-    assert haze.clear(far) == pytest.approx([1.0, threshold**0.5, threshold, 0.0], rel=1e-6)
+    assert haze.transmittance(far) == pytest.approx([1.0, threshold**0.5, threshold, 0.0], rel=1e-6)
 
 
 def test_the_threshold_defines_the_visibility():
@@ -82,20 +78,20 @@ def test_nothing_to_see_is_all_fog_and_the_distance_is_along_the_ray():
     assert 0.75 < still.mean() < 1.0
 
 
-def test_a_mover_hides_the_fog_behind_it_whatever_the_order():
+def test_a_body_hides_the_fog_behind_it_whatever_the_order():
     near, far = ball(2.5, 0.9), ball(6.0, 0.1, radius=1.4)
-    movers = [Mover((p,), lambda t, p=p: p.matrix[None]) for p in (near, far)]
+    bodies = [body(near), body(far)]
     images = [
         CameraRenderer(foggy(World((), tuple(order), FLAT)), CAMERA, POSE).image(0.0)
-        for order in (movers, movers[::-1])
+        for order in (bodies, bodies[::-1])
     ]
     assert np.array_equal(*images)
     still = CameraRenderer(foggy(World((near, far), (), FLAT)), CAMERA, POSE).image(0.0)
     assert np.abs(images[0].astype(int) - still).max() <= 1
 
 
-def test_the_scene_it_was_made_from_stays_clear():
+def test_the_original_scene_stays_clear():
     scene = make_scene("tile", {"width": 16, "height": 16, "supersample": 1})
     before = scene.render("cam01", 0.0)
     assert not np.array_equal(make(visibility_m=1.0).extend(scene).render("cam01", 0.0), before)
-    assert scene.world.veil is None and np.array_equal(scene.render("cam01", 0.0), before)
+    assert scene.world.medium is None and np.array_equal(scene.render("cam01", 0.0), before)

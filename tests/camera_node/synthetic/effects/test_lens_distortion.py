@@ -9,14 +9,13 @@ import pytest
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import EffectError, load_effects
 from camera_node.synthetic.frame_cache import FrameCache
-from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Sphere
 from camera_node.synthetic.textures import Plain
 from freshfield.geometry import Pinhole, se3_inverse
+from tests.camera_node.synthetic.worlds import FLAT_LIGHT as FLAT
 
-FLAT = Light(np.array([[0.0, 0.0, 50.0]]), 0.0, 1.0, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
 LENS = {"k1": -0.22, "k2": 0.05, "p1": 0.004, "p2": -0.003}
 
 
@@ -30,7 +29,7 @@ def test_a_ball_appears_where_opencv_projects_it():
     k = scene.cameras["cam00"][0]
     matrix = np.array(
         [[k.fx, 0, k.cx - 0.5], [0, k.fy, k.cy - 0.5], [0, 0, 1]]
-    )  # OpenCV counts pixel centres
+    )  # OpenCV counts pixel centers
     for x, y in ((0.0, 0.0), (1.05, 0.7), (-1.1, 0.6), (-1.0, -0.75), (0.9, 0.0)):
         in_camera = np.array([x, y, 2.0])
         ball = np.eye(4)
@@ -53,10 +52,10 @@ def test_frames_carry_the_coefficients_unless_uncalibrated():
     calibrated, naive = made(**LENS), made(**LENS, calibrated=False)
     seen = calibrated.extend(scene).cameras["cam03"][0]
     assert seen.distortion == tuple(LENS.values())
-    assert calibrated.claimed_lens(seen) == seen
+    assert calibrated.reported_lens(seen) == seen
     assert naive.extend(scene).cameras["cam03"][0] == seen
-    assert naive.claimed_lens(seen) == scene.cameras["cam03"][0]
-    # What is claimed does not change what is seen, so both share what was rendered.
+    assert naive.reported_lens(seen) == scene.cameras["cam03"][0]
+    # The reported lens does not change the image, so both share what was rendered.
     caches = [FrameCache(scene, "cam03", 15, effects=e, on_disk=False) for e in (calibrated, naive)]
     assert caches[0].key() == caches[1].key() != FrameCache(scene, "cam03", 15, on_disk=False).key()
     assert np.array_equal(caches[0].frame(2), caches[1].frame(2))

@@ -1,4 +1,4 @@
-"""Motion blur is the mean over the exposure, centred on the time stamp."""
+"""Motion blur is the mean over the exposure, centerd on the time stamp."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects.motion_blur import MotionBlur, MotionBlurParameters
-from tests.camera_node.synthetic.effects.views import Film
+from tests.camera_node.synthetic.effects.timed_renderer import TimedRenderer
 
 RNG = np.random.default_rng(0)
 
@@ -28,7 +28,7 @@ def test_the_mean_of_the_exposure_is_at_its_middle():
         asked.append(t_s)
         return ramp(t_s)
 
-    assert (make(exposure_ms=400.0, samples=8).expose(Film(render), 1.0) == 100).all()
+    assert (make(exposure_ms=400.0, samples=8).expose(TimedRenderer(render), 1.0) == 100).all()
     assert np.mean(asked) == pytest.approx(1.0)
     assert max(asked) - min(asked) == pytest.approx(0.4 * 7 / 8)
     assert len(asked) == 8
@@ -36,7 +36,7 @@ def test_the_mean_of_the_exposure_is_at_its_middle():
 
 def test_bright_images_do_not_overflow():
     white = np.full((2, 2, 3), 255, np.uint8)
-    assert (make(samples=64).expose(Film(lambda t: white), 0.0) == 255).all()
+    assert (make(samples=64).expose(TimedRenderer(lambda t: white), 0.0) == 255).all()
 
 
 def test_one_sample_is_the_instant_itself():

@@ -44,12 +44,12 @@ def test_both_the_arm_and_the_scene_repeat_after_the_new_period():
         assert (np.abs(early - late).max(axis=-1) > 1).mean() < 2e-3
 
 
-def test_the_scene_it_was_made_from_is_unchanged():
+def test_the_original_scene_is_unchanged():
     scene = make_scene("room", SMALL)
     before = scene.render("cam00", 0.4)
     make().extend(scene).render("cam00", 0.4)
     assert np.array_equal(scene.render("cam00", 0.4), before)
-    assert len(scene.world.movers) == 1
+    assert len(scene.world.moving_bodies) == 1
 
 
 def test_it_hides_what_is_behind_and_is_hidden_by_what_is_in_front():

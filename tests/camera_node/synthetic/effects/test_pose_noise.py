@@ -26,7 +26,7 @@ def errors(poses: list[Pose]) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_noise_of_many_frames():
     noise = make(translation_mm=8.0, rotation_deg=0.5)
-    moved, turned = errors([noise.claimed(POSE, k) for k in range(4000)])
+    moved, turned = errors([noise.reported(POSE, k) for k in range(4000)])
     assert moved.std(axis=0) == pytest.approx([8.0] * 3, rel=0.04)
     assert turned.std(axis=0) == pytest.approx([0.5] * 3, rel=0.04)
     assert np.abs(moved.mean(axis=0)).max() < 0.5 and np.abs(turned.mean(axis=0)).max() < 0.03
@@ -39,27 +39,27 @@ def test_the_noise_of_many_frames():
 def test_the_bias_is_a_camera_s_own_and_for_good():
     cameras = [make(k, translation_bias_mm=12.0, rotation_bias_deg=0.8) for k in range(2000)]
     assert not cameras[0].varies
-    assert cameras[5].claimed(POSE, 0) == cameras[5].claimed(POSE, 900)
-    moved, turned = errors([c.claimed(POSE, 0) for c in cameras])
+    assert cameras[5].reported(POSE, 0) == cameras[5].reported(POSE, 900)
+    moved, turned = errors([c.reported(POSE, 0) for c in cameras])
     assert moved.std(axis=0) == pytest.approx([12.0] * 3, rel=0.05)
     assert turned.std(axis=0) == pytest.approx([0.8] * 3, rel=0.05)
 
 
 def test_frames_repeat_in_any_order_and_cameras_differ():
     noise = make(translation_mm=5.0)
-    poses = {k: noise.claimed(POSE, k) for k in (0, 1, 2**40)}
+    poses = {k: noise.reported(POSE, k) for k in (0, 1, 2**40)}
     assert len({p.translation_m for p in poses.values()}) == 3
     again = make(translation_mm=5.0)
-    assert all(again.claimed(POSE, k) == poses[k] for k in (2**40, 1, 0))
-    assert make(1, translation_mm=5.0).claimed(POSE, 0) != poses[0]
+    assert all(again.reported(POSE, k) == poses[k] for k in (2**40, 1, 0))
+    assert make(1, translation_mm=5.0).reported(POSE, 0) != poses[0]
 
 
 def test_no_noise_is_the_pose_itself():
-    claimed = make().claimed(POSE, 3)
-    assert np.allclose(claimed.matrix(), POSE.matrix(), atol=1e-15) and not make().varies
+    reported = make().reported(POSE, 3)
+    assert np.allclose(reported.matrix(), POSE.matrix(), atol=1e-15) and not make().varies
 
 
 def test_a_large_error_is_still_a_pose():
     noise = make(rotation_deg=180.0, translation_mm=1e5)
     for k in range(200):
-        Pose.from_matrix(noise.claimed(POSE, k).matrix())
+        Pose.from_matrix(noise.reported(POSE, k).matrix())

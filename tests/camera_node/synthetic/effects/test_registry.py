@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import pkgutil
 import subprocess
 import sys
@@ -77,43 +76,43 @@ for name in fx.NAMES:
     assert out.stdout.split("\n")[:-1] == [f"{name} True" for name in fx.NAMES]
 
 
-def test_without_gloss_shadower_and_veil_none_of_their_light_is_computed(monkeypatch):
-    monkeypatch.setattr(render, "gleam", None)
-    monkeypatch.setattr(render.CameraRenderer, "_shadow", None)
+def test_without_specular_shadows_and_medium_nothing_of_them_is_computed(monkeypatch):
+    monkeypatch.setattr(render, "specular_light", None)
+    monkeypatch.setattr(render.CameraRenderer, "_shadow_static", None)
     scene = make_scene("room", {"width": 16, "height": 16, "supersample": 1})
     view = scene.renderer("cam00")
     view.image(0.3)
-    assert view._clear is None and not hasattr(view, "_lit")
+    assert view._transmittance is None and not hasattr(view, "_static_surface")
 
 
 def test_nothing_listed_passes_everything_through_untouched():
-    effects = fx.load_effects({}, lambda name: pytest.fail("no stream is asked for"))
+    effects = fx.load_effects({}, lambda name: pytest.fail("no stream is needed"))
     scene, image = make_scene("tile", {"width": 8, "height": 8}), np.zeros((8, 8, 3), np.uint8)
     assert effects is fx.NO_EFFECTS
     assert effects.extend(scene) is scene
     assert effects.apply(image, 3, 0.2) is image
     view, pose = scene.renderer("cam00"), Pose.from_matrix(scene.cameras["cam00"][1])
-    assert effects.exposed(view) is view
+    assert effects.with_exposure(view) is view
     assert effects.node_ns(12345) == 12345
-    assert effects.claimed_lens(view.camera) is view.camera
-    assert effects.claimed_pose(pose, 3) is pose and not effects.pose_varies
+    assert effects.reported_lens(view.camera) is view.camera
+    assert effects.reported_pose(pose, 3) is pose and not effects.pose_varies
 
 
 def test_every_file_is_registered_and_follows_the_protocol():
     on_disk = sorted(m.name for m in pkgutil.iter_modules(fx.__path__))
     assert sorted(fx.NAMES) == on_disk
     methods = {
-        "world": "extend", "lens": "through", "exposure": "expose",
-        "image": "apply", "clock": "node_ns", "pose": "claimed",
+        "world": "extend", "lens": "rendered", "exposure": "expose",
+        "image": "apply", "clock": "node_ns", "pose": "reported",
     }  # fmt: skip
     for name in fx.NAMES:
-        cls = getattr(importlib.import_module(f"camera_node.synthetic.effects.{name}"), fx._CLASSES[name])
+        cls = fx.effect_class(name)
         assert callable(getattr(cls, methods[cls.kind]))
         parameters = cls.Parameters()
         assert dataclasses.is_dataclass(parameters) and parameters.in_truth is False
 
 
-def test_the_held_out_camera_shows_the_truth_unless_told_otherwise():
+def test_the_held_out_camera_shows_the_truth_unless_in_truth():
     listed = {"sensor_noise": {}, "occluder": {"in_truth": True}, "clock_drift": None}
     asked: list[str] = []
 
@@ -163,13 +162,13 @@ def test_the_held_out_camera_shows_the_truth_unless_told_otherwise():
         ({"pose_noise": {"translation_mm": float("nan")}}, "translation_mm"),
     ],
 )
-def test_an_effect_that_cannot_be_is_refused_in_one_line(listed, message):
+def test_an_invalid_effect_is_refused_in_one_line(listed, message):
     with pytest.raises(fx.EffectError, match=message) as error:
         fx.load_effects(listed, lambda name: np.random.default_rng(0))
     assert "\n" not in str(error.value)
 
 
-def test_a_stream_of_its_own_for_each_effect():
+def test_each_effect_has_its_own_random_stream():
     """What one effect draws does not depend on which others are listed."""
 
     def rng_for(name: str) -> np.random.Generator:

@@ -9,7 +9,7 @@ from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import load_effects
 from camera_node.synthetic.effects.rolling_shutter import RollingShutter, RollingShutterParameters
 from freshfield.geometry import Pinhole
-from tests.camera_node.synthetic.effects.views import Film
+from tests.camera_node.synthetic.effects.timed_renderer import TimedRenderer
 
 CAMERA = Pinhole.from_fov(4, 11, 60.0)
 
@@ -25,7 +25,7 @@ def clock(t_s: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("share", "first_ms"), [(0.0, 100), (0.5, 80), (1.0, 60)])
 def test_rows_tell_their_own_time(share, first_ms):
-    image = make(readout_ms=40.0, stamped_share=share).expose(Film(clock, CAMERA), 0.1)
+    image = make(readout_ms=40.0, stamped_share=share).expose(TimedRenderer(clock, CAMERA), 0.1)
     assert image[:, 0, 0].tolist() == [first_ms + 4 * row for row in range(11)]
     assert (image == image[:, :1, :1]).all()
 
@@ -51,19 +51,19 @@ def test_no_readout_is_a_global_shutter_and_so_is_a_scene_at_rest():
 
 
 def test_several_rows_at_once_are_wrong_by_no_more_than_said():
-    fine = make(readout_ms=100.0).expose(Film(clock, CAMERA), 0.1).astype(int)
-    film = Film(clock, CAMERA)
-    coarse = make(readout_ms=100.0, rows_at_once=4).expose(film, 0.1).astype(int)
-    assert [rows for _, rows in film.asked] == [(0, 4), (4, 8), (8, 11)]
+    fine = make(readout_ms=100.0).expose(TimedRenderer(clock, CAMERA), 0.1).astype(int)
+    renderer = TimedRenderer(clock, CAMERA)
+    coarse = make(readout_ms=100.0, rows_at_once=4).expose(renderer, 0.1).astype(int)
+    assert [rows for _, rows in renderer.asked] == [(0, 4), (4, 8), (8, 11)]
     assert 0 < np.abs(coarse - fine).max() <= 100 * 4 / (2 * 11)
 
 
 def test_rows_are_the_same_whichever_are_asked_for():
     """Bands of rows are counted from the top of the image, not of what is asked for."""
     shutter = make(readout_ms=100.0, rows_at_once=4)
-    whole = shutter.expose(Film(clock, CAMERA), 0.1)
+    whole = shutter.expose(TimedRenderer(clock, CAMERA), 0.1)
     for rows in ((0, 11), (2, 3), (3, 9), (8, 11)):
-        assert np.array_equal(shutter.expose(Film(clock, CAMERA), 0.1, rows), whole[slice(*rows)])
+        assert np.array_equal(shutter.expose(TimedRenderer(clock, CAMERA), 0.1, rows), whole[slice(*rows)])
 
 
 def test_blurred_rows_are_blurred_around_their_own_instants():
@@ -73,10 +73,10 @@ def test_blurred_rows_are_blurred_around_their_own_instants():
         "vignetting": {"exponent": 0.0},
     }
     made = load_effects(listed, lambda name: np.random.default_rng(0))
-    film = Film(clock, CAMERA)
-    assert made.exposed(film).image(0.1)[:, 0, 0].tolist() == [80 + 4 * row for row in range(11)]
-    assert len(film.asked) == 33
-    first = sorted(t for t, rows in film.asked if rows == (0, 1))
+    renderer = TimedRenderer(clock, CAMERA)
+    assert made.with_exposure(renderer).image(0.1)[:, 0, 0].tolist() == [80 + 4 * row for row in range(11)]
+    assert len(renderer.asked) == 33
+    first = sorted(t for t, rows in renderer.asked if rows == (0, 1))
     assert first == pytest.approx([0.077, 0.080, 0.083])
 
 

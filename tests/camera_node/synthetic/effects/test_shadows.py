@@ -1,4 +1,4 @@
-"""What moves casts the shadow that it would cast if it stood still."""
+"""Moving parts cast the same shadows as static ones."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from camera_node.synthetic import make_scene
 from camera_node.synthetic.effects import load_effects
 from camera_node.synthetic.effects.shadows import Shadows, ShadowsParameters
 from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.placement import Mover, Part
+from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import CameraRenderer, World
-from camera_node.synthetic.scene import Scene
 from camera_node.synthetic.shapes import Box, Quad, Sphere
 from camera_node.synthetic.textures import Checker, Plain
 from freshfield.geometry import Pinhole, look_at, se3_inverse
+from tests.camera_node.synthetic.worlds import body, with_effect
 
 LAMPS = Light(
     np.array([[0.0, 0.0, 3.0], [0.4, 0.2, 3.0]]), 0.6, 10.0, (0.2,) * 3, (0.2,) * 3, (1.0, 0.9, 0.8)
@@ -27,24 +27,9 @@ FLOOR = Part(Quad((3.0, 3.0)), Checker((0.5, 0.7, 0.9), (0.9, 0.8, 0.6), 0.4))
 RED = Plain((0.8, 0.1, 0.1))
 
 
-def at(*xyz: float) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, 3] = xyz
-    return out
-
-
-def moved(part: Part) -> Mover:
-    return Mover((part,), lambda t: part.matrix[None])
-
-
 def shadowed(world: World, opacity: float = 1.0, light_points: int = 0) -> World:
-    room = make_scene("room", {"width": 8, "height": 8})
-    scene = Scene("floor", room.params, {}, (0, 0, 0), world, np.zeros((2, 3)), 0.6)
-    return (
-        Shadows(ShadowsParameters(opacity=opacity, light_points=light_points), np.random.default_rng(0))
-        .extend(scene)
-        .world
-    )
+    parameters = ShadowsParameters(opacity=opacity, light_points=light_points)
+    return with_effect(Shadows(parameters, np.random.default_rng(0)), world)
 
 
 def image(world: World, pose: np.ndarray = POSE) -> np.ndarray:
@@ -52,27 +37,27 @@ def image(world: World, pose: np.ndarray = POSE) -> np.ndarray:
 
 
 @pytest.mark.parametrize("listed", [{}, {"specular": {"roughness": 0.4}}])
-def test_a_mover_s_shadow_is_that_of_the_same_body_standing_still(listed):
-    """Static shadows are what the renderer always had: the reference. With gloss, highlights go as well."""
+def test_a_body_s_shadow_is_that_of_the_same_static_part(listed):
+    """Static shadows are what the renderer always had: the reference. With specular, highlights go as
+    well."""
     ball, box = Part(Sphere(0.4), RED, at(0.0, 0.0, 1.2)), Part(Box((0.2, 0.3, 0.3)), RED, at(-0.7, 0.3, 0.3))
     made = load_effects(listed, lambda name: np.random.default_rng(0))
 
     def lit(world: World) -> World:
-        room = make_scene("room", {"width": 8, "height": 8})
-        return made.extend(Scene("w", room.params, {}, (0, 0, 0), world, np.zeros((2, 3)), 0.6)).world
+        return with_effect(made, world)
 
     still = image(lit(World((FLOOR, ball, box), (), LAMPS)))
-    moving = image(lit(shadowed(World((FLOOR,), (moved(ball), moved(box)), LAMPS))))
+    moving = image(lit(shadowed(World((FLOOR,), (body(ball), body(box)), LAMPS))))
     assert np.abs(moving - still).max() <= 1
-    among = image(lit(shadowed(World((FLOOR, box), (moved(ball),), LAMPS))))  # a shadow falls on both kinds
+    among = image(lit(shadowed(World((FLOOR, box), (body(ball),), LAMPS))))  # a shadow falls on both kinds
     assert np.abs(among - still).max() <= 1
-    assert np.abs(image(lit(World((FLOOR,), (moved(ball), moved(box)), LAMPS))) - still).max() > 40
+    assert np.abs(image(lit(World((FLOOR,), (body(ball), body(box)), LAMPS))) - still).max() > 40
 
 
 def test_a_known_point_in_the_shadow_keeps_the_ambient_light():
     white = dataclasses.replace(FLOOR, texture=Plain((1.0, 1.0, 1.0)))
     one = dataclasses.replace(LAMPS, points=LAMPS.points[:1])
-    world = World((white,), (moved(Part(Sphere(0.4), RED, at(0.0, 0.0, 1.2))),), one)
+    world = World((white,), (body(Part(Sphere(0.4), RED, at(0.0, 0.0, 1.2))),), one)
     u, v = CAMERA.project((se3_inverse(POSE) @ [0.0, 0.0, 0.0, 1.0])[:3]).astype(int)
     assert image(shadowed(world))[v, u] == pytest.approx([51, 51, 51], abs=1)  # .2 of white
     lit = image(world)[v, u]
@@ -86,7 +71,7 @@ def test_a_known_point_in_the_shadow_keeps_the_ambient_light():
 def test_two_lamps_make_a_penumbra():
     """Behind the ball both lamps are hidden, beside it one."""
     white = dataclasses.replace(FLOOR, texture=Plain((1.0, 1.0, 1.0)))
-    world = World((white,), (moved(Part(Sphere(0.2), RED, at(0.0, 0.0, 1.0))),), LAMPS)
+    world = World((white,), (body(Part(Sphere(0.2), RED, at(0.0, 0.0, 1.0))),), LAMPS)
     lost = image(world) - image(shadowed(world))
     levels = np.unique(lost[..., 0][lost[..., 0] > 20])
     assert levels.size and (np.diff(levels) > 20).sum() == 1  # two clusters: one lamp, both lamps
@@ -95,7 +80,7 @@ def test_two_lamps_make_a_penumbra():
 def test_fewer_points_of_the_light_stand_for_all():
     """One of two lamps: where both are hidden as much is lost; where only the other one is, nothing."""
     white = dataclasses.replace(FLOOR, texture=Plain((1.0, 1.0, 1.0)))
-    world = World((white,), (moved(Part(Sphere(0.2), RED, at(0.0, 0.0, 1.0))),), LAMPS)
+    world = World((white,), (body(Part(Sphere(0.2), RED, at(0.0, 0.0, 1.0))),), LAMPS)
     plain, all_of_it, half = image(world), image(shadowed(world)), image(shadowed(world, light_points=1))
     lost, lost_of_one = plain - all_of_it, plain - half
     umbra = lost[..., 0] > 0.9 * lost[..., 0].max()
@@ -108,7 +93,7 @@ def test_fewer_points_of_the_light_stand_for_all():
 
 def test_what_casts_no_shadow_casts_none():
     ghost = Part(Sphere(0.4), RED, at(0.0, 0.0, 1.2), casts_shadow=False)
-    world = World((FLOOR,), (moved(ghost),), LAMPS)
+    world = World((FLOOR,), (body(ghost),), LAMPS)
     plain, shadows = image(world), image(shadowed(world))
     floor = np.isfinite(CameraRenderer(World((FLOOR,), (), LAMPS), CAMERA, POSE).distance())
     u, v = CAMERA.project((se3_inverse(POSE) @ [0.0, 0.0, 0.0, 1.0])[:3]).astype(int)
@@ -117,7 +102,7 @@ def test_what_casts_no_shadow_casts_none():
 
 def test_a_light_among_the_moving_parts_does_no_harm():
     around = Part(Sphere(0.5), RED, at(0.0, 0.0, 3.0))
-    assert image(shadowed(World((FLOOR,), (moved(around),), LAMPS))).max() > 0
+    assert image(shadowed(World((FLOOR,), (body(around),), LAMPS))).max() > 0
 
 
 def test_the_person_of_the_room_darkens_what_is_behind_and_nothing_gets_brighter():

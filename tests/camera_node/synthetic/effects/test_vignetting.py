@@ -10,9 +10,9 @@ import pytest
 
 from camera_node.synthetic.effects.vignetting import Vignetting, VignettingParameters
 from freshfield.geometry import Pinhole
-from tests.camera_node.synthetic.effects.views import Film
+from tests.camera_node.synthetic.effects.timed_renderer import TimedRenderer
 
-CAMERA = Pinhole.from_fov(129, 65, 90.0)  # odd: the middle pixel's centre is on the axis
+CAMERA = Pinhole.from_fov(129, 65, 90.0)  # odd: the middle pixel's center is on the axis
 WHITE = np.full((65, 129, 3), 200, np.uint8)
 
 
@@ -21,7 +21,7 @@ def make(exponent: float = 4.0) -> Vignetting:
 
 
 def test_known_pixels():
-    image = make().expose(Film(lambda t: WHITE, CAMERA), 0.0)
+    image = make().expose(TimedRenderer(lambda t: WHITE, CAMERA), 0.0)
     assert (image[32, 64] == 200).all()  # on the axis
     # At the middle of the right edge the angle is atan(64 / 64.5), nearly 45 degrees: a quarter is left.
     assert (image[32, 128] == round(200 * math.cos(math.atan(64 / 64.5)) ** 4)).all()
@@ -31,12 +31,13 @@ def test_known_pixels():
 
 
 def test_the_exponent_is_a_parameter_and_none_changes_nothing():
-    film = Film(lambda t: WHITE, CAMERA)
-    assert np.array_equal(make(0.0).expose(film, 0.0), WHITE)
-    assert (make(2.0).expose(film, 0.0)[32, 128] == round(200 * math.cos(math.atan(64 / 64.5)) ** 2)).all()
+    renderer = TimedRenderer(lambda t: WHITE, CAMERA)
+    assert np.array_equal(make(0.0).expose(renderer, 0.0), WHITE)
+    edge = round(200 * math.cos(math.atan(64 / 64.5)) ** 2)
+    assert (make(2.0).expose(renderer, 0.0)[32, 128] == edge).all()
 
 
-def test_it_follows_the_lens_off_its_centre_and_distorted():
+def test_it_follows_the_lens_off_its_center_and_distorted():
     lens = dataclasses.replace(CAMERA, cx=30.5, cy=20.5, distortion=(-0.1, 0.01, 0.0, 0.0))
     gain = make().gain(lens)[..., 0]
     assert np.unravel_index(gain.argmax(), gain.shape) == (20, 30)
@@ -48,11 +49,11 @@ def test_it_follows_the_lens_off_its_centre_and_distorted():
 
 
 def test_some_rows_are_those_rows_of_the_whole():
-    film = Film(lambda t: WHITE, CAMERA)
-    assert np.array_equal(make().expose(film, 0.0, (10, 20)), make().expose(film, 0.0)[10:20])
+    renderer = TimedRenderer(lambda t: WHITE, CAMERA)
+    assert np.array_equal(make().expose(renderer, 0.0, (10, 20)), make().expose(renderer, 0.0)[10:20])
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_steep_law_blackens_the_corners_and_nothing_overflows():
-    image = make(64.0).expose(Film(lambda t: np.full_like(WHITE, 255), CAMERA), 0.0)
+    image = make(64.0).expose(TimedRenderer(lambda t: np.full_like(WHITE, 255), CAMERA), 0.0)
     assert image[32, 64, 0] == 255 and image[0, 0, 0] == 0

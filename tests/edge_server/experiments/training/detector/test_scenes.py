@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from camera_node.synthetic.placement import Mover, Part, at
-from camera_node.synthetic.render import Light, World
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.placement import MovingBody, Part, at
+from camera_node.synthetic.render import World
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from camera_node.synthetic.textures import Plain
 from edge_server.experiments.training.detector.dataset import Pictures, render
@@ -31,8 +32,8 @@ def shot(statics=(), movers=(), kinds=()) -> Shot:
     return Shot(World(tuple(statics), tuple(movers), LIGHT), camera, look_at([0, -4, 0], [0, 0, 0]), kinds)
 
 
-def moving(shape, matrix) -> Mover:
-    return Mover((Part(shape, Plain((1, 0, 0))),), lambda t_s: (at(t_s, 0, 0) @ matrix)[None])
+def moving(shape, matrix) -> MovingBody:
+    return MovingBody((Part(shape, Plain((1, 0, 0))),), lambda t_s: (at(t_s, 0, 0) @ matrix)[None])
 
 
 @pytest.mark.parametrize("x, radius", [(0.0, 0.5), (0.7, 0.3), (-1.2, 0.4)])

@@ -1,4 +1,4 @@
-"""A test view that renders a function of time, for effects that request instants."""
+"""A renderer that shows a function of time, for effects that request instants."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from freshfield.geometry import Pinhole
 
 
 @dataclass
-class Film:
+class TimedRenderer:
     """Shows ``render(t_s)``. asked: the requested instants and rows."""
 
     render: Callable[[float], NDArray[np.uint8]]
