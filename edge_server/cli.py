@@ -86,7 +86,7 @@ _COMMANDS = {
     ),
     "explain": (
         "report.explain_command",
-        "what moved a decision of a run: part of the state, camera, region of its picture",
+        "what moved a decision of a run: part of the state, camera, region of an image",
     ),
     "export": (
         "export.command",

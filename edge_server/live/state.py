@@ -138,48 +138,42 @@ class EdgeState:
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=4096))
     _renderer: Renderer | None = None
     _comparison: Comparison | None = None
-    _changed: threading.Condition = field(default_factory=threading.Condition)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def publish(self, publication: Publication, renderer: Renderer) -> None:
-        """Add a publication, and wake everybody who waits."""
-        with self._changed:
+        """Add a publication."""
+        with self._lock:
             self._publications.append(publication)
             self._renderer = renderer
             self.started = True
-            self._changed.notify_all()
 
     def scored(self, publication: Publication, comparison: Comparison | None) -> None:
         """Replace the publication of the same number by this one, which has scores."""
-        with self._changed:
+        with self._lock:
             for i in range(len(self._publications) - 1, -1, -1):
                 if self._publications[i].number == publication.number:
                     self._publications[i] = publication
                     break
             if comparison is not None:
                 self._comparison = comparison
-            self._changed.notify_all()
 
     def publications(self, since: int = -1) -> list[Publication]:
         """Publications with a number above ``since``, oldest first."""
-        with self._changed:
+        with self._lock:
             return [p for p in self._publications if p.number > since]
 
     def newest(self, scored: bool = False) -> Publication | None:
         """The newest publication, or the newest one that has scores; None before the first."""
-        with self._changed:
+        with self._lock:
             every = reversed(self._publications)
             return next((p for p in every if not scored or p.psnr_db is not None), None)
 
     @property
     def renderer(self) -> Renderer | None:
-        with self._changed:
+        with self._lock:
             return self._renderer
 
     @property
     def comparison(self) -> Comparison | None:
-        with self._changed:
+        with self._lock:
             return self._comparison
-
-    def wait_for_change(self, timeout_s: float) -> None:
-        with self._changed:
-            self._changed.wait(timeout_s)
