@@ -1,8 +1,9 @@
-"""The commands that move an arm: simulate one, drive one, teleoperate one. Imports none of what they use."""
+"""The commands that simulate, drive and teleoperate an arm. Imports their modules only when they run."""
 
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ COMMANDS = ("simulate-arm", "drive-arm", "teleop")
 
 
 def add_commands(commands: Any) -> None:
-    """Add their parsers to the sub-commands ``commands``."""
+    """Add the parsers of ``COMMANDS`` to the sub-commands ``commands``."""
     simulate = commands.add_parser(
         "simulate-arm", help="a simulated UR controller that real client programs connect to",
         description="Serves the ports of a Universal Robots controller whose arm is simulated: state and "
@@ -98,12 +99,16 @@ def _add_teleop(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run one of ``COMMANDS``. Raises ScenarioError."""
+    """Run one of ``COMMANDS`` and return its exit status. Raises ScenarioError."""
     try:
         if args.command == "simulate-arm":
             from camera_node.robot.simulated_controller import command
 
             return command.run(args)
+        logging.basicConfig(
+            level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s",
+            datefmt="%H:%M:%S",
+        )  # fmt: skip
         if args.command == "drive-arm":
             from camera_node.robot.arm import drive
 
@@ -111,6 +116,6 @@ def run(args: argparse.Namespace) -> int:
         from camera_node.robot.teleop import command as teleop
 
         return teleop.run(args)
-    except ValueError as error:  # what an arm or a file has to say, in one line
+    except ValueError as error:  # an error of an arm or a file, in one line
         print(f"camera-node: {error}", file=sys.stderr)
         return 2

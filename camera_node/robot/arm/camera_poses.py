@@ -1,4 +1,4 @@
-"""From a scenario's ``arm`` to pose providers for the cameras that it carries or looks at."""
+"""The arm of a scenario: its kinematic model, hand-eye calibrations, and the poses of its cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from camera_node.robot.arm.hand_eye_mount import (
     read_hand_eye,
 )
 from camera_node.robot.arm.kinematics import MODELS, ArmModel, KinematicsError, apply_calibration
-from freshfield.clock import Clock, WallClock
+from freshfield.clock import WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import Scenario, ScenarioError
 
@@ -27,12 +27,12 @@ log = logging.getLogger("camera-node")
 
 
 def arm_model(scenario: Scenario, config: ArmConfig) -> ArmModel:
-    """The arm, with its own deviations where a file is named. Raises ScenarioError."""
+    """The arm's model, with the robot's own calibration if the scenario names one. Raises ScenarioError."""
     model = MODELS[config.robot]
     if config.calibration is None:
         return model
     try:
-        return apply_calibration(model, resolve_path(scenario, config.calibration))
+        return apply_calibration(model, _resolve_path(scenario, config.calibration))
     except KinematicsError as error:
         raise ScenarioError(f"{scenario.path}: source.arm.calibration: {error}") from None
 
@@ -47,7 +47,8 @@ def base_matrix(config: ArmConfig) -> NDArray[np.float64]:
 
 
 def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> dict[str, HandEye]:
-    """The hand-eye calibration of those of ``cameras`` that the arm has to do with. Raises ScenarioError."""
+    """Hand-eye calibrations of those ``cameras`` that ``config`` lists, by camera; identity where none is
+    named yet. Raises ScenarioError."""
     where = f"{scenario.path}: source.arm.cameras"
     for camera in config.cameras:
         if camera not in scenario.cameras:
@@ -61,19 +62,25 @@ def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]
             found[camera] = HandEye(EYE_IN_HAND, np.eye(4))
             continue
         try:
-            found[camera] = read_hand_eye(resolve_path(scenario, file))
+            found[camera] = read_hand_eye(_resolve_path(scenario, file))
         except HandEyeError as error:
             raise ScenarioError(f"{where}.{camera}: {error}") from None
     return found
 
 
-def camera_poses(
-    scenario: Scenario, config: ArmConfig | None, cameras: Iterable[str], clock: Clock | None = None
-) -> dict[str, PoseProvider]:
-    """Poses of ``cameras``, as far as an arm gives them. Connects to the arm where a camera is on its hand.
+def mount_on_hand(scenario: Scenario, config: ArmConfig) -> NDArray[np.float64]:
+    """Flange-from-camera (4, 4) of the first camera on the hand. Raises ScenarioError if there is none."""
+    for mount in load_hand_eyes(scenario, config, config.cameras).values():
+        if mount.setup != EYE_TO_HAND:
+            return mount.transform
+    raise ScenarioError(f"{scenario.path}: source.arm.cameras: none of them is on the hand")
 
-    Raises ScenarioError, and ArmError where the arm cannot be had.
-    """
+
+def camera_poses(
+    scenario: Scenario, config: ArmConfig | None, cameras: Iterable[str]
+) -> dict[str, PoseProvider]:
+    """Poses of those ``cameras`` that ``config`` lists, by camera. Connects to the arm if one of them is on
+    its hand. Raises ScenarioError and ArmError."""
     if config is None:
         return {}
     mounts = load_hand_eyes(scenario, config, cameras)
@@ -88,9 +95,8 @@ def camera_poses(
         from camera_node.robot.arm.joint_states import ArmStream, HandPoses
 
         stream = ArmStream(
-            config.host, clock or WallClock(), config.frequency_hz,
-            config.pairing == "interpolated", config.max_gap_ms,
-        )  # fmt: skip
+            config.host, WallClock(), config.frequency_hz, config.pairing == "interpolated", config.max_gap_ms
+        )
         stream.start()
         log.info("arm at %s: connected; it carries %s", config.host, ", ".join(moving))
         hand = HandPoses(stream, model, base)
@@ -98,7 +104,7 @@ def camera_poses(
     return poses
 
 
-def resolve_path(scenario: Scenario, name: str) -> Path:
-    """A file that a scenario names, relative to the scenario."""
+def _resolve_path(scenario: Scenario, name: str) -> Path:
+    """A file named in a scenario, relative to it."""
     path = Path(name).expanduser()
     return path if path.is_absolute() else scenario.path.parent / path

@@ -32,15 +32,14 @@ _RADII_M = (0.064, 0.055, 0.046, 0.04, 0.036, 0.036, 0.033)
 
 @dataclass(frozen=True)
 class CapsuleModel:
-    """Capsules of one arm with its tool. tool_m, tool_radius_m: along the flange's axis, from the flange."""
+    """Capsules of one arm with its tool.
+
+    tool_m, tool_radius_m: length and radius of the tool, along the flange's axis, from the flange.
+    """
 
     arm: ArmModel
     tool_m: float
     tool_radius_m: float
-
-    def flange(self, joints: Array) -> Array:
-        """Positions (T, 3) of the flange for joints (T, 6), in base axes, metres."""
-        return link_frames(self.arm, joints)[:, 6, :3, 3]
 
     def segments(self, frames: Array) -> tuple[Array, Array]:
         """Ends (T, 8, 3), (T, 8, 3) of the parts' axes, in the order of PARTS, from the ``link_frames``
@@ -61,9 +60,9 @@ class CapsuleModel:
         return np.array([*_RADII_M, self.tool_radius_m])
 
     def clearance(self, frames: Array) -> tuple[Array, Array]:
-        """Clearances from the ``link_frames`` (T, 7, 4, 4) of the arm's ``nominal_model``: (T, pairs) metres
-        between the surfaces of PAIRS, negative where they overlap, and (T,) the height of the lowest point
-        beyond the upper arm."""
+        """Clearances in metres, from the ``link_frames`` (T, 7, 4, 4) of the arm's ``nominal_model``: (T,
+        pairs) between the surfaces of PAIRS, negative where they overlap, and the height (T,) of the lowest
+        point beyond the upper arm."""
         a, b = self.segments(frames)
         first, second = np.array(PAIRS).T
         radii = self.radii

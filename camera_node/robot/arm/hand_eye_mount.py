@@ -1,11 +1,11 @@
-"""A camera on a hand: the saved hand-eye calibration, and poses of the camera from poses of the hand (4.7).
+"""The saved hand-eye calibration, and poses of the camera from poses of the hand (4.7).
 
-The file is what ``camera-node calibrate hand-eye --out FILE`` writes::
+``camera-node calibrate hand-eye --out FILE`` writes the file::
 
     setup: eye-in-hand             # or eye-to-hand: the camera stands still, the hand holds the target
     transform: [[...], [...], [...], [0, 0, 0, 1]]   # camera in hand (4.2), or camera in base; metres
     time_offset_s: 0.0             # the arm's stamp of an instant minus the camera's
-    ...                            # how it was found, for people
+    ...                            # details of the calibration, for people
 """
 
 from __future__ import annotations
@@ -21,20 +21,25 @@ from numpy.typing import NDArray
 from camera_node.pose.providers import Closable, FixedPose, PairedPose, PoseProvider
 from freshfield.geometry import GeometryError, Pose
 
-# Of a file: more is the difference of two clocks' beginnings, such as 1970 and a machine's start.
 MAX_OFFSET_S = 1e6
+"""Bound of the time offset: a larger one is the difference between two clocks' epochs."""
 EYE_IN_HAND, EYE_TO_HAND = "eye-in-hand", "eye-to-hand"
 SETUPS = (EYE_IN_HAND, EYE_TO_HAND)
 
 
 class HandEyeError(ValueError):
-    """A hand-eye file that cannot be used; the message names the file and what is wrong in it."""
+    """A hand-eye file that cannot be used. The message names the file and the mistake."""
 
 
 @dataclass(frozen=True)
 class HandEye:
-    """transform: (4, 4), metres: T_EE^C for eye-in-hand, T_B^C for eye-to-hand. time_offset_s: add it to a
-    camera's stamp to have the arm's."""
+    """A hand-eye calibration.
+
+    setup: one of ``SETUPS``.
+    transform: (4, 4), metres: T_EE^C for eye-in-hand, T_B^C for eye-to-hand.
+    time_offset_s: the arm's stamp of an instant minus the camera's.
+    details: the file's other keys.
+    """
 
     setup: str
     transform: NDArray[np.float64]
@@ -42,7 +47,7 @@ class HandEye:
     details: dict[str, Any] = field(default_factory=dict)
 
     def camera_poses(self, hand: PoseProvider) -> PoseProvider:
-        """Poses of the camera in the base's axes, given those of the hand."""
+        """Poses of the camera in the base's axes, from those of the hand."""
         if self.setup == EYE_TO_HAND:
             return FixedPose(Pose.from_matrix(self.transform))
         return MountedCameraPoses(hand, self)
@@ -57,18 +62,18 @@ class MountedCameraPoses:
         self._offset_ns = round(calibration.time_offset_s * 1e9)
 
     def at(self, t_ns: int) -> PairedPose:
-        """Raises PoseGapError where the hand has no pose near enough."""
+        """Pose of the camera at its stamp ``t_ns``. Raises PoseGapError."""
         paired = self._hand.at(t_ns + self._offset_ns)
         return PairedPose(Pose.from_matrix(paired.pose.matrix() @ self._transform), paired.gap_ns)
 
     def close(self) -> None:
-        """Let go of what gives the hand's poses."""
+        """Close the provider of the hand's poses."""
         if isinstance(self._hand, Closable):
             self._hand.close()
 
 
 def read_hand_eye(path: Path) -> HandEye:
-    """Raises HandEyeError, one line naming file and key."""
+    """Read a hand-eye calibration. Raises HandEyeError."""
     try:
         data = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -81,11 +86,7 @@ def read_hand_eye(path: Path) -> HandEye:
     if setup not in SETUPS:
         raise HandEyeError(f"{path}: setup: expected {' or '.join(SETUPS)}, got {setup!r}")
     try:
-        matrix = np.array(data.pop("transform"), dtype=np.float64)
-        if matrix.shape != (4, 4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
-            raise GeometryError("expected 4 x 4 numbers with the last row 0 0 0 1")
-        # Digits in a file are rounded: what is loaded is exactly rigid.
-        transform = Pose.from_matrix(matrix).matrix()
+        transform = rigid_transform(data.pop("transform"))
     except (ValueError, TypeError) as error:
         raise HandEyeError(f"{path}: transform: {error}") from None
     try:
@@ -97,3 +98,12 @@ def read_hand_eye(path: Path) -> HandEye:
             f"{path}: time_offset_s: expected seconds, less than {MAX_OFFSET_S:g} either way"
         ) from None
     return HandEye(setup, transform, offset_s, data)
+
+
+def rigid_transform(value: object) -> NDArray[np.float64]:
+    """Exactly rigid (4, 4) nearest to the rounded numbers of a file. Raises ValueError or TypeError."""
+    matrix = np.array(value, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        shape = " x ".join(map(str, matrix.shape))
+        raise GeometryError(f"expected 4 x 4 numbers with the last row 0 0 0 1, got {shape}")
+    return Pose.from_matrix(matrix).matrix()

@@ -1,9 +1,8 @@
-"""An arm as a source of poses: joint states with their times, through the manufacturer's data exchange
-(4.3.3).
+"""Time-stamped joint states of an arm, through the manufacturer's Real-Time Data Exchange (4.3.3).
 
-The library's getters go on returning the last values after a connection is lost, so nothing is believed but
-stamps that advance: a stream that stands still for ``STALE_S`` is given up and connected anew, with growing
-pauses. Meanwhile no frame gets a pose.
+The library keeps returning the last values after a connection is lost. So only stamps that advance count: a
+stream without a new stamp for ``STALE_S`` is closed and reconnected, with growing pauses. Until then no frame
+gets a pose.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +37,9 @@ Joints = NDArray[np.float64]
 
 RTDE_PORT = 30004
 PROBE_S = 2.0
+"""Time for a controller to answer ``probe``."""
 STALE_S = 0.5
+"""Default age at which a state counts as stale."""
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 _ROBOT_MODES = {
     -1: "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "powered off",
@@ -52,19 +52,17 @@ _SAFETY_MODES = {
 
 
 class ArmError(ValueError):
-    """An arm that cannot be used; one line: what, where, what to do."""
+    """An arm that cannot be used. The message is one line: what, where, what to do."""
 
 
-def probe(host: str, timeout_s: float = PROBE_S) -> None:
-    """Whether a controller answers at ``host``, asked without the library, which would wait for ever.
-
-    Raises ArmError within ``timeout_s``, with what to do about it.
-    """
+def probe(host: str) -> None:
+    """Check that a controller answers at ``host``, without the library, which would wait forever. Raises
+    ArmError within ``PROBE_S``."""
     where = f"arm at {host}"
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + PROBE_S
     try:
-        with socket.create_connection((host, RTDE_PORT), timeout_s) as link:
-            link.sendall(b"\x00\x05V\x00\x02")  # which protocol version do you speak: 2?
+        with socket.create_connection((host, RTDE_PORT), PROBE_S) as link:
+            link.sendall(b"\x00\x05V\x00\x02")  # request protocol version 2
             answer = b""
             while len(answer) < 4:
                 link.settimeout(max(0.01, deadline - time.monotonic()))
@@ -81,7 +79,7 @@ def probe(host: str, timeout_s: float = PROBE_S) -> None:
         raise ArmError(f"{where}: no such host: give the IP address from the teach pendant") from None
     except TimeoutError:
         raise ArmError(
-            f"{where}: no answer on port {RTDE_PORT} within {timeout_s:g} s: check address, cable and subnet"
+            f"{where}: no answer on port {RTDE_PORT} within {PROBE_S:g} s: check address, cable and subnet"
         ) from None
     except OSError as error:
         raise ArmError(f"{where}: {error.strerror or error}: check address, cable and subnet") from None
@@ -90,13 +88,17 @@ def probe(host: str, timeout_s: float = PROBE_S) -> None:
 
 
 class ArmStream:
-    """Joint states of the arm at ``host``, read by a process and a thread of their own.
+    """Joint states of one arm, read by a process and a thread of their own.
 
-    frequency_hz: samples asked for, at most 500. interpolate: joints between two samples, else the nearest
-    one. max_gap_ms: no pose farther from a sample than this. stale_s: how long its state may stand still.
-    each: called with the stamp (ns, our clock) and joints (6,) of every sample, from the stream's thread.
-    ``start`` raises ArmError; after that the stream mends itself, and ``trouble`` says what is wrong (""
-    where nothing is).
+    After ``start`` the stream reconnects by itself. ``trouble`` says what is wrong; it is "" if nothing is.
+
+    host: the controller's address.
+    clock: gives the samples their stamps.
+    frequency_hz: samples requested per second, at most 500.
+    interpolate: interpolate between two samples; otherwise take the nearest one.
+    max_gap_ms: largest distance of an instant from a sample.
+    stale_s: reconnect after so many seconds without a new state.
+    on_sample: called from the stream's thread with the stamp (ns) and joints (6,) of every sample.
     """
 
     def __init__(
@@ -109,13 +111,11 @@ class ArmStream:
         stale_s: float = STALE_S,
         on_sample: Callable[[int, Joints], None] | None = None,
     ) -> None:
-        self.host = host
-        self._stale_s, self._on_sample = stale_s, on_sample
+        self.host, self.stale_s = host, stale_s
         self.trouble = "not connected yet"
         self.connections = 0
-        self._clock = clock
-        self._frequency_hz = frequency_hz
-        self._interpolate = interpolate
+        self._clock, self._on_sample = clock, on_sample
+        self._frequency_hz, self._interpolate = frequency_hz, interpolate
         self._samples = SampleBuffer[Joints](
             interpolate_joints if interpolate else None, round(max_gap_ms * 1e6)
         )
@@ -125,8 +125,8 @@ class ArmStream:
         self._thread = threading.Thread(target=self._run, name=f"arm {host}", daemon=True)
 
     def start(self) -> None:
-        """Connect, and return when the first sample is here. Raises ArmError, within three seconds where
-        nothing is there, or where the library is missing."""
+        """Connect and wait for the first sample. Raises ArmError, within three seconds if there is no
+        controller."""
         if importlib.util.find_spec("rtde_receive") is None:
             raise ArmError("arms need the package ur-rtde: pip install 'freshfield[ur]'")
         probe(self.host)
@@ -146,8 +146,11 @@ class ArmStream:
             self._thread.join(2.0)
 
     def at(self, t_ns: int, wait_s: float = 0.0) -> tuple[Joints, int]:
-        """Joint angles (6,) at an instant, and how far (ns) the nearest sample is from it. wait_s: how long a
-        sample as new as the instant may be waited for. Raises PoseGapError."""
+        """Joint angles (6,) at an instant, and its distance (ns) from the nearest sample. Raises
+        PoseGapError.
+
+        wait_s: longest wait for a sample as new as the instant.
+        """
         until = time.monotonic() + wait_s
         while self._interpolate and not self._samples.ready(t_ns) and time.monotonic() < until:
             if self._stop.wait(0.001):
@@ -158,16 +161,17 @@ class ArmStream:
             raise PoseGapError(self.trouble or f"arm at {self.host}: {error}") from None
         return match.sample, match.gap_ns
 
-    def status(self) -> dict[str, Any]:
-        """For people and logs."""
-        counts = self._samples.counts
-        return {
-            "host": self.host,
-            "trouble": self.trouble,
-            "connections": self.connections,
-            "samples": counts.samples,
-            "refused": counts.refused,
-        }
+    def now(self) -> Joints:
+        """Current joint angles (6,). Raises ArmError if there is no state that is new enough."""
+        try:
+            return self.at(self._clock.now_ns())[0]
+        except PoseGapError as error:
+            raise ArmError(str(error)) from None
+
+    @property
+    def received(self) -> int:
+        """Number of samples received since ``start``."""
+        return self._samples.counts.samples
 
     def _run(self) -> None:
         failures = 0
@@ -184,15 +188,12 @@ class ArmStream:
             self._stop.wait(pause_s)
 
     def _read(self) -> bool:
-        """One connection, from start to end; whether it received anything."""
-        command = [
-            sys.executable,
-            "-m",
-            "camera_node.robot.arm.rtde_process",
-            self.host,
-            str(self._frequency_hz),
-        ]
-        child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        """Read one connection until it ends. Returns whether it received anything."""
+        module = "camera_node.robot.arm.rtde_process"
+        child = subprocess.Popen(
+            [sys.executable, "-m", module, self.host, str(self._frequency_hz)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
         self._child = child
         assert child.stdout is not None and child.stderr is not None
         received, patience_s = False, CONNECT_S
@@ -212,7 +213,7 @@ class ArmStream:
                 whole = len(pending) - len(pending) % SAMPLE.size
                 for stamp_s, *joints, mode, safety in SAMPLE.iter_unpack(pending[:whole]):
                     if stamp_s < last_s:
-                        clock = ArrivalClock()  # the controller was started anew
+                        clock = ArrivalClock()  # the controller was restarted
                     last_s = stamp_s
                     t_ns, angles = clock.host_ns(round(stamp_s * 1e9), arrived_ns), np.array(joints)
                     self._samples.add(t_ns, angles)
@@ -220,7 +221,7 @@ class ArmStream:
                         self._on_sample(t_ns, angles)
                     self._check_modes(mode, safety)
                 if whole and not received:
-                    received, patience_s = True, self._stale_s
+                    received, patience_s = True, self.stale_s
                     self.connections += 1
                     self._first_sample.set()
                 pending = pending[whole:]
@@ -231,7 +232,7 @@ class ArmStream:
             child.stderr.close()
 
     def _check_modes(self, mode: int, safety: int) -> None:
-        """Joint angles stay true in every mode; that nothing will move is worth a word."""
+        """Report modes in which the arm cannot move; joint angles are valid in every mode."""
         wrong = []
         if mode != 7:
             wrong.append(f"robot mode: {_ROBOT_MODES.get(mode, mode)}")
@@ -244,7 +245,7 @@ class ArmStream:
             if trouble:
                 log.warning("%s", trouble)
             elif self.connections:
-                log.info("arm at %s: well again", self.host)
+                log.info("arm at %s: recovered", self.host)
             self.trouble = trouble
 
     def _end_child(self) -> None:
@@ -256,9 +257,10 @@ class ArmStream:
 
 
 class HandPoses:
-    """Poses of the flange in the world: forward kinematics of an arm's joints, from where its base stands.
+    """Poses of the flange in the world, by forward kinematics of the arm's joints.
 
-    wait_s: how long to wait for the sample after the instant, so that there is one on either side.
+    base: world-from-base (4, 4).
+    wait_s: longest wait for the sample after the instant, which interpolation needs.
     """
 
     def __init__(
@@ -272,5 +274,5 @@ class HandPoses:
         return PairedPose(Pose.from_matrix(self._base @ self._model.forward(joints)), gap_ns)
 
     def close(self) -> None:
-        """Let go of the arm."""
+        """Disconnect from the arm."""
         self._stream.stop()

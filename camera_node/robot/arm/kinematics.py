@@ -34,6 +34,7 @@ _ZEROS: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _REACH_TOLERANCE = 1e-9
 # Below this sin(q5), q6 would be rounding noise: it is free and gets a chosen value.
 _WRIST_FREE_SIN = 1e-9
+_REFINE_ITERATIONS = 50
 _REACHED_M = 1e-7
 _REACHED_RAD = 1e-7
 SINGULAR_SIN = math.sin(math.radians(5.0))
@@ -46,8 +47,14 @@ class KinematicsError(ValueError):
 
 @dataclass(frozen=True)
 class ArmModel:
-    """Denavit-Hartenberg parameters and limits of one arm. theta_rad: added to each joint's angle.
-    lower_rad, upper_rad: joint limits. speed_rad_s: maximum speed of each joint."""
+    """Denavit-Hartenberg parameters and limits of one arm.
+
+    d_m, a_m, alpha_rad: of each link.
+    theta_rad: added to each joint's angle.
+    lower_rad, upper_rad: joint limits.
+    speed_rad_s: maximum speed of each joint.
+    nominal: the uncalibrated model, for which the closed form is solved; None: this one.
+    """
 
     name: str
     d_m: Six
@@ -58,19 +65,19 @@ class ArmModel:
     upper_rad: Six = (2 * math.pi,) * 6  # type: ignore[assignment]
     speed_rad_s: Six = (math.pi,) * 3 + (2 * math.pi,) * 3  # type: ignore[assignment]
     nominal: ArmModel | None = None
-    """The uncalibrated model that the closed form is solved for; None: this one."""
 
     @property
     def nominal_model(self) -> ArmModel:
-        """The uncalibrated model, whose link frames lie within the arm's parts, as clearances need them.
-        Frames of a calibrated model do not: the factory's fit puts metres into lengths along parallel axes,
-        which nearly cancel at the flange, so the elbow's frame may lie metres away."""
+        """The uncalibrated model. Its link frames lie within the arm's parts, as clearances require. Those of
+        a
+        calibrated model do not: the factory's fit puts metres into lengths along parallel axes, which nearly
+        cancel at the flange, so the elbow's frame may lie metres away."""
         return self.nominal or self
 
     def link_frames(self, joints: ArrayLike) -> Array:
-        """Base-from-link transforms (7, 4, 4) of joint angles (6,) in radians: the base itself, then each
-        link's frame; the last one is the flange. For the positions of its parts use ``nominal_model``.
-        Raises KinematicsError for angles that are not finite."""
+        """Base-from-link transforms (7, 4, 4) for joint angles (6,) in radians: the base itself, then each
+        link; the last one is the flange. For the positions of the arm's parts use ``nominal_model``. Raises
+        KinematicsError for angles that are not finite."""
         q = _check_joints(joints)
         out = np.empty((7, 4, 4))
         out[0] = np.eye(4)
@@ -81,7 +88,7 @@ class ArmModel:
         return out
 
     def forward(self, joints: ArrayLike) -> Array:
-        """Base-from-flange transform (4, 4) of joint angles (6,) in radians (thesis 4.1)."""
+        """Base-from-flange transform (4, 4) for joint angles (6,) in radians (thesis 4.1)."""
         flange: Array = self.link_frames(joints)[6]
         return flange
 
@@ -93,8 +100,8 @@ class ArmModel:
         return np.concatenate([np.cross(axes, levers).T, axes.T])
 
     def singularities(self, joints: ArrayLike) -> tuple[str, ...]:
-        """Nearby singularities of ``shoulder``, ``elbow`` and ``wrist``: elbow and wrist within 5 degrees;
-        shoulder with the wrist's center within 2 cm of the base's axis."""
+        """Names of the singularities nearby: ``shoulder`` (the wrist's center within 2 cm of the base's
+        axis), ``elbow`` and ``wrist`` (within 5 degrees)."""
         factors = self.singularity_factors(joints)
         limits = (SINGULAR_M, SINGULAR_SIN, SINGULAR_SIN)
         names = ("shoulder", "elbow", "wrist")
@@ -112,11 +119,13 @@ class ArmModel:
         return reach, math.sin(q[2]), math.sin(q[4])
 
     def inverse(self, target: ArrayLike, near: ArrayLike | None = None) -> list[Posture]:
-        """All postures, at most eight, that bring the flange to ``target``, base-from-flange (4, 4).
+        """All postures, at most eight, that bring the flange to a target; none if the joint limits exclude
+        it.
 
+        target: base-from-flange (4, 4).
         near: joint angles (6,); each joint is shifted by full turns towards them within the limits, and the
-        nearest posture comes first. Where the wrist is singular, joint 6 keeps ``near``'s angle (else 0) and
-        joint 4 compensates. The list is empty if the target is out of reach or only beyond the limits.
+            nearest posture comes first. If the wrist is singular, joint 6 keeps this angle (else 0) and joint
+            4 compensates.
         """
         wanted = np.asarray(target, dtype=np.float64)
         if wanted.shape != (4, 4) or not np.all(np.isfinite(wanted)):
@@ -138,13 +147,13 @@ class ArmModel:
             found.sort(key=lambda p: float(np.abs(p.joints - start).max()))
         return found
 
-    def refine(self, target: ArrayLike, start: ArrayLike, iterations: int = 50) -> Array | None:
+    def refine(self, target: ArrayLike, start: ArrayLike) -> Array | None:
         """The posture (6,) near ``start`` that brings the flange to ``target``, by damped least squares
-        (Levenberg-Marquardt); None where it does not get within 1e-7 m and rad."""
+        (Levenberg-Marquardt); None if it does not come within 1e-7 m and rad."""
         wanted, q = np.asarray(target, dtype=np.float64), _check_joints(start).copy()
         error = pose_difference(self.forward(q), wanted)
         damping = 1e-6
-        for _ in range(iterations):
+        for _ in range(_REFINE_ITERATIONS):
             if np.abs(error).max() < 1e-12:
                 break
             j = self.jacobian(q)
@@ -160,7 +169,7 @@ class ArmModel:
         return q if _reaches(self.forward(q), wanted) else None
 
     def _unwrap_near(self, joints: Array, near: Array) -> Array | None:
-        """``joints`` shifted by full turns towards ``near`` within the limits; None if none fits."""
+        """``joints`` shifted by full turns towards ``near`` within the limits; None if that is impossible."""
         low, high = np.array(self.lower_rad), np.array(self.upper_rad)
         turn = 2 * math.pi
         q = joints + turn * np.round((near - joints) / turn)
@@ -191,10 +200,10 @@ MODELS = {UR3E.name: UR3E}
 def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
     """``model`` with one robot's own deviations, measured at the factory, from its ``calibration.conf``.
 
-    The file lies on the controller, in ``/root/.urcontrol/``; it is an INI file whose section ``mounting``
-    has ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, each a list of six numbers (radians and
-    metres) that are added to the data sheet's Denavit-Hartenberg parameters. A missing list is zero;
-    a file with none of them is an error. Raises KinematicsError.
+    The controller stores the file in ``/root/.urcontrol/``. It is an INI file whose section ``mounting`` has
+    ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, each a list of six numbers (radians and
+    metres) to add to the data sheet's Denavit-Hartenberg parameters. A missing list is zero. Raises
+    KinematicsError, also for a file without any of them.
     """
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
     try:
@@ -225,13 +234,13 @@ def apply_calibration(model: ArmModel, file: Path) -> ArmModel:
 
 
 def _closed_form(arm: ArmModel, target: Array, free_rad: float) -> list[Array]:
-    """Joint angles (6,) of every posture of an uncalibrated arm; ``free_rad`` is joint 6 where it is free."""
+    """Joint angles (6,) of every posture of an uncalibrated arm. free_rad: angle of joint 6 if it is free."""
     (d1, _, _, d4, d5, d6), (_, a2, a3, *_) = arm.d_m, arm.a_m
     r = target[:3, :3]
     wrist = target[:3, 3] - d6 * r[:, 2]
     out = math.hypot(wrist[0], wrist[1])
     if out < d4 - _REACH_TOLERANCE:
-        return []  # inside the cylinder that the forearm's offset keeps free
+        return []  # inside the cylinder that the forearm's offset makes unreachable
     around = math.acos(min(1.0, d4 / out))
     postures = []
     for q1 in {math.atan2(wrist[1], wrist[0]) + s * around + math.pi / 2 for s in (1.0, -1.0)}:
@@ -262,19 +271,17 @@ def _closed_form(arm: ArmModel, target: Array, free_rad: float) -> list[Array]:
 def _dh_transform(theta: float, d: float, a: float, alpha: float) -> Array:
     """Rz(theta) Tz(d) Tx(a) Rx(alpha), (4, 4)."""
     ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
-    return np.array(
-        [
-            [ct, -st * ca, st * sa, a * ct],
-            [st, ct * ca, -ct * sa, a * st],
-            [0.0, sa, ca, d],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    return np.array([
+        [ct, -st * ca, st * sa, a * ct],
+        [st, ct * ca, -ct * sa, a * st],
+        [0.0, sa, ca, d],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip
 
 
 def pose_difference(now: Array, wanted: Array) -> Array:
-    """Difference (6,) from pose ``now`` to pose ``wanted`` (4, 4) in base axes: metres, then a rotation
-    vector in radians."""
+    """Difference (6,) from pose ``now`` to pose ``wanted``, both (4, 4), in base axes: metres, then a
+    rotation vector in radians."""
     return np.concatenate([wanted[:3, 3] - now[:3, 3], so3_log(wanted[:3, :3] @ now[:3, :3].T)])
 
 

@@ -1,18 +1,17 @@
-"""How far the poses that an arm's joint states give are from the truth, while a simulated arm moves.
+"""Measures the error of hand poses from joint states while a simulated arm moves.
 
     camera-node simulate-arm cell & camera-node drive-arm cell &
     python -m camera_node.robot.arm.pose_error cell [--seconds 45] [--out DIR] [--json]
 
-At random instants the pose of the hand is compared with where the simulated controller says that it really
-was: nearest joint state and interpolated, at several rates of joint states, all in the same run. Errors are
-told by rate, and by the gap to the nearest joint state and the hand's speed just then: an arm that starts and
-stops at viewpoints has all speeds up to its fastest (``source.arm.path.speed_rad_s``).
+At random instants it compares the pose of the hand with the simulated controller's true one: from the nearest
+joint state and interpolated, at several rates of joint states, all in the same run. It reports the errors by
+rate, and by gap to the nearest joint state and speed of the hand. An arm that stops at viewpoints has all
+speeds up to its fastest (``source.arm.path.speed_rad_s``).
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 import json
 import sys
@@ -25,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.pose.providers import PoseGapError
+from camera_node.robot import tables
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix
 from camera_node.robot.arm.joint_states import ArmStream, HandPoses
 from camera_node.robot.hand_camera import TruthClient
@@ -37,18 +37,22 @@ RATES_HZ = (500.0, 125.0, 20.0)
 PAIRINGS = ("nearest", "interpolated")
 GAPS_MS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 SPEEDS_M_PER_S = (0.01, 0.05, 0.1, 0.2, 0.4, 1.6)
-MIN_INSTANTS = 5  # of a median that is shown
-_SETTLE_S = 0.1  # by when the sample after an instant has come even at the lowest rate
+MIN_INSTANTS = 5  # for a median to be shown
+_SETTLE_S = 0.1  # even at the lowest rate, the sample after an instant arrives within this time
 _SPEED_OVER_NS = 5_000_000
-_WINDOW_S, _INSTANTS = 0.2, 6  # so many instants are looked at together
+_WINDOW_S, _INSTANTS = 0.2, 6  # so many instants are examined together
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class PoseError:
-    """One pose that joint states of one stream gave at one instant, held against the truth. gap_ms: to the
-    nearest joint state. speed_m_per_s: of the hand, then."""
+    """Error of one stream's pose at one instant.
+
+    gap_ms: time to the nearest joint state.
+    speed_m_per_s: of the hand at that instant.
+    mm, deg: error in position and rotation.
+    """
 
     pairing: str
     rate_hz: float
@@ -58,23 +62,19 @@ class PoseError:
     deg: float
 
 
-def measure(scenario: str, seconds: float, seed: int = 0) -> list[PoseError]:
-    """Of every instant and stream. Raises ScenarioError, ArmError, PoseGapError."""
+def measure(scenario: str, seconds: float) -> list[PoseError]:
+    """The errors at every instant and of every stream. Raises ScenarioError, ArmError and PoseGapError."""
     plan = load(scenario)
     config = require_arm(plan)
-    model, base, clock, truth = (
-        arm_model(plan, config),
-        base_matrix(config),
-        WallClock(),
-        TruthClient(config.host),
-    )
+    model, base = arm_model(plan, config), base_matrix(config)
+    clock, truth = WallClock(), TruthClient(config.host)
     streams = {
         (pairing, rate): ArmStream(config.host, clock, rate, pairing == "interpolated", max_gap_ms=200.0)
         for rate in RATES_HZ
         for pairing in PAIRINGS
     }
     errors = []
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     try:
         for stream in streams.values():
             stream.start()
@@ -91,14 +91,11 @@ def measure(scenario: str, seconds: float, seed: int = 0) -> list[PoseError]:
                     try:
                         claimed = HandPoses(stream, model, base, 0.0).at(t_ns)
                     except PoseGapError:
-                        continue  # it would not be sent either
+                        continue  # a node would not send this frame
                     pose = claimed.pose.matrix()
-                    apart_mm = 1e3 * float(np.linalg.norm(true[:3, 3] - pose[:3, 3]))
-                    turned_rad = float(np.linalg.norm(so3_log(true[:3, :3].T @ pose[:3, :3])))
-                    gap_ms = claimed.gap_ns / 1e6
-                    errors.append(
-                        PoseError(pairing, rate, gap_ms, speed, apart_mm, float(np.rad2deg(turned_rad)))
-                    )
+                    mm = 1e3 * float(np.linalg.norm(true[:3, 3] - pose[:3, 3]))
+                    deg = float(np.rad2deg(np.linalg.norm(so3_log(true[:3, :3].T @ pose[:3, :3]))))
+                    errors.append(PoseError(pairing, rate, claimed.gap_ns / 1e6, speed, mm, deg))
     finally:
         for stream in streams.values():
             stream.stop()
@@ -116,8 +113,7 @@ def by_rate(errors: Sequence[PoseError]) -> list[Row]:
 
 
 def by_gap_and_speed(errors: Sequence[PoseError]) -> list[Row]:
-    """Errors by pairing, gap and speed, of all rates together; cells of fewer than five instants are left
-    out."""
+    """Errors by pairing, gap and speed, over all rates. Cells with fewer than five instants are left out."""
     rows = []
     gaps, speeds = itertools.pairwise(GAPS_MS), itertools.pairwise(SPEEDS_M_PER_S)
     for pairing, gap, speed in itertools.product(PAIRINGS, gaps, speeds):
@@ -172,38 +168,25 @@ def format_gaps(rows: Sequence[Row]) -> str:
 
 
 def write(rates: Sequence[Row], gaps: Sequence[Row], folder: Path) -> None:
-    """Both tables as CSV, and the second as a picture where matplotlib is there. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, rows in (("rates", rates), ("gaps", gaps)):
-        with (folder / f"{name}.csv").open("w", newline="") as file:
-            table = csv.DictWriter(file, list(rows[0]) if rows else [])
-            table.writeheader()
-            table.writerows(rows)
-    if gaps:
-        _plot(gaps, folder / "gaps.png")
-
-
-def _plot(rows: Sequence[Row], path: Path) -> None:
-    try:
-        import matplotlib
-    except ImportError:
+    """Write both tables as CSV, and plot the second if matplotlib is installed. Raises OSError."""
+    tables.write_csv(folder / "rates.csv", rates)
+    tables.write_csv(folder / "gaps.csv", gaps)
+    plt = tables.pyplot()
+    if not gaps or plt is None:
         return
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     figure, panels = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", sharex=True, sharey=True)
     for pairing, panel in zip(PAIRINGS, panels):
         for k, (low, high) in enumerate(itertools.pairwise(GAPS_MS)):
-            chosen = [r for r in rows if r["pairing"] == pairing and r["gap_ms_from"] == low]
-            at = [r["m_per_s"] for r in chosen]
+            chosen = [r for r in gaps if r["pairing"] == pairing and r["gap_ms_from"] == low]
+            speeds = [r["m_per_s"] for r in chosen]
             label = f"{low:g} to {high:g} ms"
-            panel.loglog(at, [r["median_mm"] for r in chosen], "o-", color=f"C{k}", label=label)
+            panel.loglog(speeds, [r["median_mm"] for r in chosen], "o-", color=f"C{k}", label=label)
         panel.set(title=pairing, xlabel="speed of the hand (m/s)")
         panel.set_xticks([], minor=True)
         panel.set_xticks([0.03, 0.1, 0.3, 1.0], ["0.03", "0.1", "0.3", "1"])
     panels[0].set(ylabel="hand's place, median (mm)")
     panels[1].legend(title="gap to the nearest joint state")
-    figure.savefig(path, dpi=110)
+    figure.savefig(folder / "gaps.png", dpi=110)
     plt.close(figure)
 
 
@@ -226,14 +209,13 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"measure: {error}", file=sys.stderr)
         return 2
     speeds = [e.speed_m_per_s for e in errors] or [0.0]
-    speed = {"median_m_per_s": float(np.median(speeds)), "most_m_per_s": float(np.max(speeds))}
+    median, most = float(np.median(speeds)), float(np.max(speeds))
     if args.json:
+        speed = {"median_m_per_s": median, "most_m_per_s": most}
         print(json.dumps({"speed": speed, "rates": rates, "gaps": gaps}, indent=1))
-        return 0
-    print(
-        f"the flange moves at {speed['median_m_per_s']:.3f} m/s (median), {speed['most_m_per_s']:.3f} at most"
-    )
-    print(f"{format_rates(rates)}\n\n{format_gaps(gaps)}")
+    else:
+        print(f"the flange moves at {median:.3f} m/s (median), {most:.3f} at most")
+        print(f"{format_rates(rates)}\n\n{format_gaps(gaps)}")
     return 0
 
 

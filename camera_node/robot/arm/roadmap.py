@@ -1,7 +1,7 @@
-"""Collision-free paths between postures of an arm: straight in joint space where that is free, else the
+"""Collision-free paths between postures of an arm: the straight line in joint space if it is free, else the
 shortest path through other postures (Dijkstra on a roadmap whose nodes are the tour's own postures).
 
-It knows the arm (with a camera of usual size on its flange), one floor and no other obstacle.
+Obstacles are the arm itself, a camera of usual size on its flange, and one floor.
 """
 
 from __future__ import annotations
@@ -18,17 +18,22 @@ from camera_node.robot.arm.kinematics import ArmModel
 
 Array = NDArray[np.float64]
 
-_CHECKED_POSTURES = 24  # postures tested between two
-_TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and what holds it
+FARTHEST_RAD = 2.0
+"""Largest turn of a joint in one move."""
+_CHECKED_POSTURES = 24  # tested along a path
+_TOOL_M, _TOOL_RADIUS_M = 0.08, 0.04  # as in TeleopConfig: the camera and its mount
 _MARGIN_M = 0.01  # between parts of the arm, whose capsules are rounded up
-FARTHEST_RAD = 2.0  # of one move and joint: beyond, the arm would be flung into another posture
 _EQUAL_RAD = 1e-6
 
 
 class Roadmap:
-    """Postures (P, 6) of an arm, each with the number of the place that it takes the hand to. base:
-    world-from-base (4, 4). floor_m: see ``is_free``. Results of ``is_free`` are
-    cached."""
+    """Graph of an arm's postures. It caches the results of ``is_free``.
+
+    base: world-from-base (4, 4).
+    postures: joint angles (6,) each.
+    places: for each posture, the number of the place to which it brings the hand.
+    floor_m: see ``is_free``.
+    """
 
     def __init__(
         self, arm: ArmModel, base: Array, postures: Sequence[Array], places: Sequence[int], floor_m: float
@@ -42,8 +47,12 @@ class Roadmap:
         self._known: set[bytes] = set()
 
     def shortest_path(self, start: Array, wanted: Collection[int]) -> list[tuple[Array, int]] | None:
-        """Postures (6,) to take in turn from ``start`` to the nearest of the places ``wanted``, with their
-        places; None if there is no way. Its length is what the fastest joint turns: the time it takes."""
+        """Shortest path from the posture ``start`` (6,) to any of the places ``wanted``; None if there is
+        none.
+
+        Returns its postures (6,), without ``start``, and their places. The length of a step is the largest
+        turn of a joint, which is proportional to the time that the step takes.
+        """
         order = itertools.count()  # breaks ties: the first of equally long paths
         ends: list[tuple[float, int, Array, int, tuple[bytes, ...]]] = [(0.0, next(order), start, -1, ())]
         found: dict[bytes, tuple[Array, int]] = {}
@@ -67,7 +76,7 @@ class Roadmap:
 
     @property
     def reachable(self) -> int:
-        """Number of places with a free posture."""
+        """Number of places that have a free posture."""
         return len(set(self._places.tolist()))
 
     def has_visited(self, joints: Array) -> bool:
@@ -75,7 +84,7 @@ class Roadmap:
         return _key(joints) in self._known
 
     def _unwrap_near(self, at: Array) -> Array:
-        """The postures, shifted by full turns towards ``at``: otherwise they are too far for one move."""
+        """The postures (P, 6), shifted by full turns towards ``at``."""
         turn = 2.0 * np.pi
         return self._postures + turn * np.round((at - self._postures) / turn)
 
@@ -88,8 +97,13 @@ class Roadmap:
 
 
 def is_free(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> NDArray[np.bool_]:
-    """Whether the straight paths from ``a`` to ``b``, (6,) or (N, 6), are free (N,): the arm's parts keep
-    their distance, and every joint's center beyond the shoulder stays above ``floor_m`` in the world."""
+    """Whether straight paths in joint space are free (N,): the arm's parts keep their distance, and every
+    joint center beyond the shoulder stays above the floor.
+
+    base: world-from-base (4, 4).
+    a, b: joint angles of both ends, (6,) or (N, 6).
+    floor_m: height of the floor in the world.
+    """
     a, b = np.broadcast_arrays(np.atleast_2d(a), np.atleast_2d(b))
     if not len(b):
         return np.zeros(0, np.bool_)

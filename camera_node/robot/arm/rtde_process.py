@@ -1,10 +1,10 @@
-"""The process that holds the connection to an arm's controller: reads joint states, writes them to a pipe.
+"""The process that is connected to an arm's controller: it reads joint states and writes them to a pipe.
 
     python -m camera_node.robot.arm.rtde_process HOST FREQUENCY_HZ
 
-Apart from the node because the client library (ur_rtde) holds Python's lock while it connects, and waits for
-ever for a controller that has accepted and then says nothing: a node must be able to end it. What goes down
-the pipe is ``SAMPLE``, one for each new stamp; silence means that there is none.
+The client library (ur_rtde) holds Python's lock while it connects, and waits forever for a controller that
+accepts the connection and then does not answer. So it runs in a process of its own, which the node can end.
+It writes one ``SAMPLE`` for each new stamp.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LIBRARY_MISSING = 3
 
 
 def main(host: str, frequency_hz: float) -> int:
-    """Until the controller is gone (exit 1) or nobody reads any more (exit 0)."""
+    """Write samples until the controller is gone (exit 1) or the reader is (exit 0)."""
     # The default action needs no Python: it ends a process that is stuck inside the library.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.setitimer(signal.ITIMER_REAL, CONNECT_S)
@@ -31,7 +31,7 @@ def main(host: str, frequency_hz: float) -> int:
         from rtde_receive import RTDEReceiveInterface
     except ImportError:
         return _LIBRARY_MISSING
-    # What the library prints there must not come between the samples.
+    # The library prints to standard output, which must carry samples only.
     pipe = os.dup(1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
@@ -47,7 +47,7 @@ def main(host: str, frequency_hz: float) -> int:
         if not arm.isConnected():
             return 1
         stamp, joints = arm.getTimestamp(), arm.getActualQ()
-        # Another thread writes these: a pair that a new sample has come between is left for the next look.
+        # Another thread writes these values: skip a pair that a new sample came between.
         if stamp == last or stamp != arm.getTimestamp() or len(joints) != 6:
             continue
         last = stamp
@@ -59,5 +59,5 @@ def main(host: str, frequency_hz: float) -> int:
 
 
 if __name__ == "__main__":
-    # What the library's threads still hold must not delay the end.
+    # Do not wait for the library's threads.
     os._exit(main(sys.argv[1], float(sys.argv[2])))

@@ -1,9 +1,8 @@
-"""A tour for a camera on an arm: viewpoints around a target, and postures that take the camera to them.
+"""Plans a tour of viewpoints around a target for a camera on an arm.
 
-Viewpoints that the arm does not reach, reaches only next to a singularity, or cannot get to from any other
-without coming near itself, or with the middle of a joint below the floor, are left out. For the floor, links,
-camera and cable have a thickness that ``floor_m`` must allow for. This knows the arm (with a camera of usual
-size on its flange), one floor and no other obstacle: on a real bench, watch the first round with a hand on
+A viewpoint is left out if the arm cannot reach it, reaches it only near a singularity, or has no free path to
+it (see ``roadmap``). The floor check looks at joint centers only, so ``floor_m`` must include the thickness
+of links, camera and cable. Other obstacles are unknown: on a real bench, watch the first round with a hand on
 the stop.
 """
 
@@ -24,12 +23,12 @@ Array = NDArray[np.float64]
 
 
 class PathError(ValueError):
-    """A tour that the arm cannot make; the message says what to change."""
+    """The arm cannot make the tour. The message says what to change."""
 
 
 def viewpoints(path: PathConfig) -> list[Array]:
-    """Camera-to-world (4, 4) of every viewpoint: from the highest ring down, beside that up again, and so
-    on."""
+    """Camera-to-world (4, 4) of every viewpoint: down from the highest ring, up again at the next azimuth,
+    and so on."""
     target = np.array(path.target_m)
     poses = []
     for elevation_deg, a in _places(path):
@@ -49,7 +48,7 @@ def _places(path: PathConfig) -> list[tuple[float, float]]:
 
 
 def _roll(angle_deg: float) -> Array:
-    """(4, 4): a turn about the camera's own line of sight."""
+    """Rotation (4, 4) about the camera's optical axis."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     turn = np.eye(4)
     turn[:2, :2] = [[c, -s], [s, c]]
@@ -58,33 +57,36 @@ def _roll(angle_deg: float) -> Array:
 
 @dataclass(frozen=True)
 class Tour:
-    """stops: joint angles (6,) in the order in which the arm takes them; from every one the camera looks at
-    the target, from some twice. places: for each, the number of its viewpoint in ``viewpoints``."""
+    """A tour of an arm.
+
+    stops: joint angles (6,) in the order of the drive. A viewpoint may be visited more than once.
+    places: for each stop, the number of its viewpoint in ``viewpoints``.
+    """
 
     stops: list[Array]
     places: list[int]
 
     @property
     def reached(self) -> int:
-        """How many viewpoints the camera comes to."""
+        """Number of viewpoints visited."""
         return len(set(self.places))
 
     def reached_by_ring(self, path: PathConfig) -> list[int]:
-        """The same of each ring, in the order of ``path.elevations_deg``."""
-        of = [elevation_deg for elevation_deg, _ in _places(path)]
-        rings = [of[place] for place in set(self.places)]
-        return [rings.count(elevation_deg) for elevation_deg in path.elevations_deg]
+        """Number of viewpoints visited in each ring, in the order of ``path.elevations_deg``."""
+        elevations_deg = [elevation_deg for elevation_deg, _ in _places(path)]
+        visited_deg = [elevations_deg[place] for place in set(self.places)]
+        return [visited_deg.count(elevation_deg) for elevation_deg in path.elevations_deg]
 
 
 def plan_tour(
     arm: ArmModel, base: Array, hand_eye: Array, path: PathConfig, start: ArrayLike | None = None
 ) -> Tour:
-    """Through the viewpoints that the arm can visit: of those that are left always to the nearest, if need be
-    by way of others, where it has been before.
+    """Plan a tour that always goes on to the nearest viewpoint left, if necessary through earlier ones.
 
-    base: world-from-base, hand_eye: flange-from-camera, both (4, 4). start: where the arm stands; the tour
-    begins near there, with a viewpoint to which the way is free. Raises PathError if it can visit fewer than
-    three.
+    base: world-from-base (4, 4).
+    hand_eye: flange-from-camera (4, 4).
+    start: current joint angles (6,); the tour begins near them, with a viewpoint to which the path is free.
+    Raises PathError if the arm can visit fewer than three viewpoints.
     """
     camera_to_flange, base_inverse = se3_inverse(hand_eye), se3_inverse(base)
     goals = [
@@ -92,7 +94,7 @@ def plan_tour(
         for pose in viewpoints(path)
     ]
     begin = None if start is None else np.asarray(start, dtype=np.float64)
-    sound = [
+    postures = [
         (p.joints, k)
         for k, turned in enumerate(goals)
         for goal in turned
@@ -100,12 +102,12 @@ def plan_tour(
         if not p.singular
     ]
     if begin is not None:
-        sound.sort(key=lambda each: float(np.abs(each[0] - begin).max()))
-    roadmap = Roadmap(arm, base, [joints for joints, _ in sound], [k for _, k in sound], path.floor_m)
+        postures.sort(key=lambda each: float(np.abs(each[0] - begin).max()))
+    roadmap = Roadmap(arm, base, [joints for joints, _ in postures], [k for _, k in postures], path.floor_m)
     best = Tour([], [])
-    for joints, k in sound:
-        # The posture that a tour begins with decides how much of it can be had: as much as from any other
-        # that an earlier search has come to from there.
+    for joints, k in postures:
+        # The first posture decides which viewpoints a tour can reach. Every posture that an earlier search
+        # visited reaches the same ones.
         if best.reached == roadmap.reachable:
             break
         if roadmap.has_visited(joints):
@@ -121,12 +123,12 @@ def plan_tour(
 
 
 def _extend_tour(roadmap: Roadmap, count: int, first: Array, place: int) -> Tour:
-    """The tour of ``count`` viewpoints that begins with the posture ``first`` at ``place``."""
+    """Tour of ``count`` viewpoints that begins with the posture ``first`` (6,) at viewpoint ``place``."""
     stops, places = [first], [place]
     left = set(range(count)) - {place}
-    while left and (way := roadmap.shortest_path(stops[-1], left)) is not None:
-        for joints, where in way:
+    while left and (steps := roadmap.shortest_path(stops[-1], left)) is not None:
+        for joints, visited in steps:
             stops.append(joints)
-            places.append(where)
-            left.discard(where)
+            places.append(visited)
+            left.discard(visited)
     return Tour(stops, places)

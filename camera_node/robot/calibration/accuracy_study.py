@@ -5,14 +5,14 @@
   one pairing.
 - ``poses``: error of the hand-eye calibration against the number of poses, by method, beside the Cramer-Rao
   bound; arm noise .5 mm and .002 rad an axis. ``rms_mm_std``, ``rms_deg_std``: standard deviations of the
-  errors over the trials (an error below its bound is chance within these). ``planned``: the refinement, with
-  poses after the first four where the guided session proposes them; its bound is that of its own poses.
+  errors over the trials, within which an error may lie below its bound by chance. ``planned``: the
+  refinement, with poses after the first four as the guided session proposes them; its bound is that of its
+  own poses.
 - ``offset``: error of the time offset between arm and camera against the length of the recording and speed.
 """
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -28,12 +28,13 @@ from camera_node.pose.pairing import (
     interpolate_linear,
     interpolate_screw,
 )
+from camera_node.robot import tables
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, HandEye
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.files import Track
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, REFINED, angle_deg, distance_mm
-from camera_node.robot.calibration.hand_eye.closed_form import solve
+from camera_node.robot.calibration.hand_eye.closed_form import METHODS, solve
 from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
 from camera_node.robot.calibration.hand_eye.next_pose import propose_pose
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse
@@ -58,7 +59,8 @@ _DETECTION_RAD, _DETECTION_M = 0.0005, 0.0003
 
 
 def run_tables(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]:
-    """Yield each table when it is done. quick: fewer frames and trials, seconds instead of two minutes."""
+    """Yield the name and rows of each table when it is done. quick: fewer frames and trials, for a run of
+    seconds instead of two minutes."""
     periods_ms, speeds = (PERIODS_MS[::2], SPEEDS_M_PER_S[1::2]) if quick else (PERIODS_MS, SPEEDS_M_PER_S)
     yield "pairing", pairing(4.0 if quick else 20.0, periods_ms, speeds, seed)
     yield "poses", poses(COUNTS[::2] if quick else COUNTS, 10 if quick else 100, seed)
@@ -66,8 +68,8 @@ def run_tables(quick: bool = False, seed: int = 0) -> Iterator[tuple[str, Rows]]
 
 
 def pairing(seconds: float, periods_ms: tuple[float, ...], speeds: tuple[float, ...], seed: int = 0) -> Rows:
-    """Camera pose errors and pairing gaps over frames at 30 a second, whose stamps are independent of the
-    arm's. The arm's poses are exact, so only the pairing contributes."""
+    """Camera pose errors and pairing gaps over frames at 30 per second, with stamps independent of the arm's.
+    The arm's poses are exact, so only the pairing contributes."""
     rng = np.random.default_rng([seed, 1])
     mount = HandEye(EYE_IN_HAND, simulated.CAMERA_IN_HAND)
     rows = []
@@ -103,9 +105,7 @@ def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
     """Root mean square errors over trials; ``failed`` counts the trials without a solution."""
     rows = []
     x, y = simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE
-    methods: dict[str, Callable[[Samples], Any]] = {
-        name: partial(solve, method=name) for name in ALL_METHODS if name != REFINED
-    }
+    methods: dict[str, Callable[[Samples], Any]] = {name: partial(solve, method=name) for name in METHODS}
     methods[REFINED] = methods[PLANNED] = lambda samples: refine(samples).x
     for count in counts:
         errors: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
@@ -140,8 +140,8 @@ def poses(counts: tuple[int, ...], trials: int, seed: int = 0) -> Rows:
 
 
 def rms(errors: Array) -> tuple[Array, Array]:
-    """Root mean squares of the columns of (N, K), and their standard deviations from the scatter of the
-    squares; nan where there are too few rows to tell."""
+    """Root mean squares (K,) of the columns of (N, K), and their standard deviations from the scatter of the
+    squares; nan if there are too few rows."""
     squares = np.square(errors)
     count = len(squares)
     nothing = np.full(squares.shape[1], np.nan)
@@ -160,7 +160,7 @@ def _samples(hands: Array, rng: np.random.Generator) -> tuple[Samples, Samples]:
 
 
 def _proposed_hands(count: int, rng: np.random.Generator) -> tuple[Samples, Samples]:
-    """The same for hand poses that follow the proposals after the first four."""
+    """The same for hand poses that follow the session's proposals after the first four."""
     hands = simulated.random_hands(min(count, 4), rng)
     middle = (inverse(simulated.TARGET_IN_BASE) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
     while len(hands) < count:
@@ -173,7 +173,7 @@ def _proposed_hands(count: int, rng: np.random.Generator) -> tuple[Samples, Samp
 
 
 def offset(trials: int, durations_s: tuple[float, ...], seed: int = 0) -> Rows:
-    """Time offset errors, with a noisy arm at 125 Hz, noisy detector at 15 Hz, true offsets up to 1 s."""
+    """Time offset errors, for a noisy arm at 125 Hz, a noisy detector at 15 Hz and true offsets up to 1 s."""
     rows = []
     for speed in (0.05, 0.1, 0.25):
         for duration_s in durations_s:
@@ -204,20 +204,19 @@ def offset(trials: int, durations_s: tuple[float, ...], seed: int = 0) -> Rows:
 
 
 def streams(
-    sweep: simulated.Sweep, seconds: float, offset_s: float, rng: np.random.Generator, noise: float = 1.0
+    sweep: simulated.Sweep, seconds: float, offset_s: float, rng: np.random.Generator
 ) -> tuple[Track, Track]:
-    """Hand track at 125 Hz and target track at 15 Hz, with ``offset_s`` between their stamps. noise: factor
-    on the default noise of both."""
+    """Hand track at 125 Hz and target track at 15 Hz, both noisy, with ``offset_s`` between their stamps."""
     hand_s = np.arange(0.0, seconds, 1 / 125.0)
     seen_s = np.arange(0.1, seconds - 0.1, 1 / 15.0) + float(rng.uniform(0.0, 0.05))
-    hands = simulated.add_noise(sweep.hands(hand_s), rng, simulated.ARM_RAD * noise, simulated.ARM_M * noise)
-    targets = inverse(simulated.CAMERA_IN_HAND) @ inverse(sweep.hands(seen_s)) @ simulated.TARGET_IN_BASE
-    targets = simulated.add_noise(targets, rng, _DETECTION_RAD * noise, _DETECTION_M * noise)
+    hands = simulated.add_noise(sweep.hands(hand_s), rng, *_NOISE)
+    targets = simulated.observed_targets(sweep.hands(seen_s))
+    targets = simulated.add_noise(targets, rng, _DETECTION_RAD, _DETECTION_M)
+    hand_ns = np.round((hand_s + offset_s) * 1e9).astype(np.int64)
+    seen_ns = np.round(seen_s * 1e9).astype(np.int64)
     return (
-        Track(
-            np.round((hand_s + offset_s) * 1e9).astype(np.int64), hands, PairingCounts(samples=len(hand_s))
-        ),
-        Track(np.round(seen_s * 1e9).astype(np.int64), targets, PairingCounts(samples=len(seen_s))),
+        Track(hand_ns, hands, PairingCounts(samples=len(hand_s))),
+        Track(seen_ns, targets, PairingCounts(samples=len(seen_s))),
     )
 
 
@@ -230,35 +229,21 @@ def format_table(name: str, rows: Rows) -> str:
     return "\n".join([name, *lines, ""])
 
 
-def write_csv(name: str, rows: Rows, folder: Path) -> None:
-    """Write a table as CSV. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f"{name}.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, list(rows[0]))
-        table.writeheader()
-        table.writerows(rows)
-
-
-def plot(tables: dict[str, Rows], path: Path) -> None:
-    """Plot the pairing and poses tables; does nothing without matplotlib. Raises OSError."""
-    try:
-        import matplotlib
-    except ImportError:
+def plot(pairing_rows: Rows, poses_rows: Rows, path: Path) -> None:
+    """Plot the pairing and poses tables, if matplotlib is installed. Raises OSError."""
+    plt = tables.pyplot()
+    if plt is None:
         return
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    rows = tables["pairing"]
-    speed = sorted({r["speed_m_per_s"] for r in rows})[len({r["speed_m_per_s"] for r in rows}) // 2]
+    speeds = sorted({r["speed_m_per_s"] for r in pairing_rows})
+    speed = speeds[len(speeds) // 2]
     for name in INTERPOLATIONS:
-        chosen = [r for r in rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
+        chosen = [r for r in pairing_rows if r["pairing"] == name and r["speed_m_per_s"] == speed]
         left.loglog([r["arm_period_ms"] for r in chosen], [r["mm_p95"] for r in chosen], "o-", label=name)
     left.set(xlabel="the arm's period (ms)", ylabel="camera's place, 95 % (mm)", title=f"at {speed:g} m/s")
     left.legend()
-    rows = tables["poses"]
     for name in (*ALL_METHODS, PLANNED):
-        chosen = [r for r in rows if r["method"] == name]
+        chosen = [r for r in poses_rows if r["method"] == name]
         right.loglog([r["poses"] for r in chosen], [r["rms_mm"] for r in chosen], "o-", label=name)
         if name in (REFINED, PLANNED):
             right.loglog([r["poses"] for r in chosen], [r["bound_mm"] for r in chosen], "k--", linewidth=0.8)

@@ -1,4 +1,4 @@
-"""``camera-node calibrate``: hand-eye, intrinsics, a target to print, and what accuracy costs."""
+"""``camera-node calibrate``: hand-eye, intrinsics, a target to print, and the accuracy study."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import contextlib
 import json
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from camera_node.robot import stdout
 from camera_node.robot.calibration import DEFAULT_METHOD, MAX_GAP_S, WANT_MM, CalibrationError
@@ -43,7 +44,7 @@ from, one of:
 """
 
 
-# Option -> the inputs that use it; with any other input it is an error, not ignored.
+# Option -> the inputs that use it. With any other input it is an error.
 _GOES_WITH = {
     "board": ("folder", "live"), "lens": ("folder", "live"), "max_gap_ms": ("hand", "live"),
     **dict.fromkeys(
@@ -76,11 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="FILE", help="calibration JSON, as the video source reads it"
     )
     lens.add_argument("--json", action="store_true", help="print what --out writes")
-    live = lens.add_argument_group("with --live").add_argument
-    live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    live = _add_live_group(lens)
     live("--moving", action="store_true", help="take pictures while the target moves too: short exposures")
-    live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
-    live("--seconds", type=float, metavar="S", help="end after so long with what there is")
     target = what.add_parser("target", help="a picture of a target, to print", epilog=EXAMPLES,
                              formatter_class=raw)  # fmt: skip
     target.add_argument("board", metavar="SPEC", help="see hand-eye --board")
@@ -92,6 +90,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     study.add_argument("--seed", type=int, default=0, metavar="N", help="(default %(default)s)")
     study.add_argument("--out", type=Path, metavar="DIR", help="tables as CSV, and a picture")
     study.add_argument("--json", action="store_true", help="print the tables as JSON")
+
+
+def _add_live_group(parser: argparse.ArgumentParser) -> Callable[..., Any]:
+    """Add the options of every guided session. Returns what adds further ones to their group."""
+    live = parser.add_argument_group("with --live").add_argument
+    live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
+    live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
+    live("--seconds", type=float, metavar="S", help="end after so long with what there is")
+    return live
 
 
 def _add_board(parser: argparse.ArgumentParser, required: bool) -> None:
@@ -122,9 +129,8 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
         help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
     add("--out", type=Path, metavar="FILE.yaml", help="for the node (source.trajectory.hand_eye)")
     add("--plot", type=Path, metavar="FILE.png", help="residuals, axes of the turns, scatter of the target")
-    live = parser.add_argument_group("with --live").add_argument
+    live = _add_live_group(parser)
     live("--camera", metavar="ID", help="of the scenario")
-    live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
     live("--want-mm", type=float, metavar="MM",
          help=f"enough when the standard deviation is below this (default {WANT_MM:g})")
     live("--moving", action="store_true", help="take pictures while the hand moves too; with an arm, the "
@@ -136,25 +142,20 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
          help="with --moving and an arm: keeps both streams, hand.csv and target.csv, for --hand, --target")
     live("--samples", type=Path, metavar="FILE",
          help="keeps each sample as --pairs reads it; goes on with those that are there")
-    live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
-    live("--seconds", type=float, metavar="S", help="end after so long with what there is")
 # fmt: on
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run a calibrate command. Raises CalibrationError, which ends it with exit code 2."""
+    """Run a calibrate command and return its exit status. Raises CalibrationError."""
     if args.what == "target":
         return _target(args)
     try:
         import scipy  # noqa: F401
     except ImportError:
         raise CalibrationError("calibration needs scipy (pip install 'freshfield[calibrate]')") from None
+    moves_arm = args.what == "hand-eye" and args.drive
     try:
-        with (
-            stdout.only_python_output()
-            if args.what == "hand-eye" and args.drive
-            else contextlib.nullcontext()
-        ):
+        with stdout.only_python_output() if moves_arm else contextlib.nullcontext():
             return {"hand-eye": _hand_eye, "intrinsics": _intrinsics, "accuracy": _accuracy}[args.what](args)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
@@ -184,7 +185,7 @@ def _hand_eye(args: argparse.Namespace) -> int:
     if args.json:
         for warning in found.warnings:
             _note(f"note: {warning}")
-    # Print first, so that a file that cannot be written does not lose the session's answer.
+    # Print first: the result is not lost if a file cannot be written.
     print(json.dumps(found.to_dict()) if args.json else report.show(found), flush=True)
     if args.out is not None:
         report.write_yaml(found, args.out)
@@ -264,7 +265,7 @@ def _target(args: argparse.Namespace) -> int:
     width, height = (round(side_m / 0.0254 * args.dpi) for side_m in board.size_m)
     if not 64 <= width <= 32_000:
         raise CalibrationError(f"--dpi: makes a picture {width} pixels wide, expected 64 to 32000")
-    # Draw finer, in whole pixels a module, then scale: rounding errors of the modules would add up.
+    # Draw finer, with whole pixels per module, then scale. Otherwise the modules' rounding errors add up.
     fine = board.draw(board.modules * math.ceil(2 * width / board.modules))
     picture = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
     # Detectors need a white border.
@@ -280,6 +281,7 @@ def _target(args: argparse.Namespace) -> int:
 
 def _accuracy(args: argparse.Namespace) -> int:
     from camera_node.robot.calibration import accuracy_study
+    from camera_node.robot.tables import write_csv
 
     if args.seed < 0:
         raise CalibrationError("--seed: expected a whole number from 0")
@@ -290,9 +292,9 @@ def _accuracy(args: argparse.Namespace) -> int:
             if not args.json:
                 print(accuracy_study.format_table(name, rows), flush=True)
             if args.out is not None:
-                accuracy_study.write_csv(name, rows, args.out)
+                write_csv(args.out / f"{name}.csv", rows)
         if args.out is not None:
-            accuracy_study.plot(tables, args.out / "accuracy.png")
+            accuracy_study.plot(tables["pairing"], tables["poses"], args.out / "accuracy.png")
     except OSError as error:
         raise CalibrationError(f"--out: {args.out}: {error.strerror}") from None
     if args.json:

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from camera_node.pose.pairing import PairingCounts, sort_samples
 from camera_node.pose.providers import TrajectoryError, read_samples
+from camera_node.robot.arm.hand_eye_mount import rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.targets import Target, TargetPose, estimate_pose, to_gray
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.rig_calibration import load_calibration
-from freshfield.geometry import GeometryError, Pinhole, Pose, so3_exp
+from freshfield.geometry import Pinhole, so3_exp
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 # Lower bound in pixels, so that perfect (rendered) images do not make a corner exact.
@@ -51,11 +52,11 @@ def read_pairs(file: Path, setup: str) -> Samples:
     for k, pair in enumerate(data):
         try:
             hand, target = pair
-            hands.append(_rigid(hand))
-            targets.append(_rigid(target))
+            hands.append(rigid_transform(hand))
+            targets.append(rigid_transform(target))
         except (ValueError, TypeError) as error:
             raise CalibrationError(
-                f"{file}: pair {k + 1}: expected [hand in base, target in camera], 4 x 4 each: {error}"
+                f"{file}: pair {k + 1}: expected [hand in base, target in camera]: {error}"
             ) from None
     return Samples(_stacked(hands), _stacked(targets), setup)
 
@@ -233,18 +234,6 @@ def read_visp_folder(
 def _number(file: Path) -> int | None:
     match = re.search(r"(\d+)$", file.stem)
     return int(match.group(1)) if match else None
-
-
-def _rigid(matrix: object) -> Array:
-    given = np.asarray(matrix, dtype=np.float64)
-    if given.shape != (4, 4) or not np.allclose(given[3], [0.0, 0.0, 0.0, 1.0]):
-        raise ValueError(
-            f"got {' x '.join(map(str, given.shape))} numbers, or a last row that is not 0 0 0 1"
-        )
-    try:
-        return Pose.from_matrix(given).matrix()
-    except GeometryError as error:
-        raise ValueError(str(error)) from None
 
 
 def _stacked(matrices: list[Array]) -> Array:

@@ -1,8 +1,8 @@
-"""A simulated controller of a Universal Robots arm: the real client library connects to it as to a robot.
+"""A simulated controller of a Universal Robots arm, to which the real client library connects as to a robot.
 
-``motion`` moves the joints, ``recipes`` speaks the binary protocol, ``controller`` answers what a client
-asks, ``server`` holds the ports.
+``joint_motion`` moves the joints, ``rtde_protocol`` is the binary protocol, ``controller`` executes commands,
+``server`` serves the ports.
 """
 
 TRUTH_PORT = 30010
-"""Says where the arm really was; no real controller has it."""
+"""Tells the arm's true joint angles. No real controller has it."""

@@ -20,8 +20,8 @@ from freshfield.scenario import Scenario, ScenarioError, load
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until Ctrl-C or SIGTERM. Raises ScenarioError; 1 where a port is taken."""
-    host, arm = _which(args)
+    """Serve until Ctrl-C or SIGTERM. Returns 1 if a port is taken. Raises ScenarioError."""
+    host, arm = _host_and_model(args)
     joints = np.array(HOME_RAD) if args.joints is None else read_joints(args.joints)
     clock = WallClock()
     try:
@@ -51,16 +51,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def require_arm(scenario: Scenario) -> ArmConfig:
-    """The arm of a scenario that has one. Raises ScenarioError."""
-    arm = getattr(source_config(scenario), "arm", None)
+    """The arm of a scenario. Raises ScenarioError if it has none."""
+    arm: ArmConfig | None = getattr(source_config(scenario), "arm", None)
     if arm is None:
         raise ScenarioError(f"{scenario.path}: source.arm: missing: this scenario has no arm")
-    config: ArmConfig = arm
-    return config
+    return arm
 
 
 def read_joints(text: str) -> np.ndarray:
-    """Six angles in degrees with commas, as radians (6,). Raises ScenarioError."""
+    """Parse six angles in degrees, separated by commas, to radians (6,). Raises ScenarioError."""
     try:
         angles = [math.radians(float(part)) for part in text.split(",")]
     except ValueError:
@@ -70,7 +69,7 @@ def read_joints(text: str) -> np.ndarray:
     return np.array(angles)
 
 
-def _which(args: argparse.Namespace) -> tuple[str, ArmModel]:
+def _host_and_model(args: argparse.Namespace) -> tuple[str, ArmModel]:
     if args.scenario is not None:
         scenario = load(args.scenario)
         config = require_arm(scenario)

@@ -1,9 +1,9 @@
-"""What the simulated controller knows and does: joints, registers, the program that a client has uploaded.
+"""The simulated controller's state and commands: joints, registers, and the program that a client uploaded.
 
 The client library drives an arm through registers: it uploads a program that reads command numbers from an
-input register and answers in an output register. Here that program is not interpreted; its commands are
-carried out directly, those of ``SIMULATED`` and no others. What a real controller refuses, and what is not
-simulated, stops the program, as a fault does there: a client that took it for done would be wrong.
+input register and answers in an output register. Here that program is not interpreted; the commands of
+``SIMULATED`` are executed directly. Other commands, and those that a real controller refuses, stop the
+program as a fault does there, so that the client cannot take them for done.
 """
 
 from __future__ import annotations
@@ -37,10 +37,12 @@ PLAYING, STOPPED = 2, 1
 
 
 class Controller:
-    """One arm. Time is the caller's: ``advance_to`` brings everything to an instant.
+    """Controller of one arm. The caller passes the time to ``advance_to``.
 
-    drift_ppm: how much faster the controller's clock runs than true time. noise_rad: standard deviation of
-    what the joint encoders add (the truth has none of it). seed: of that noise.
+    start_ns: the instant of step 0.
+    joints: initial joint angles (6,), radians.
+    drift_ppm: how much faster the controller's clock runs than true time.
+    noise_rad, seed: standard deviation and seed of the joint encoders' noise. The true joints have none.
     """
 
     def __init__(
@@ -70,8 +72,9 @@ class Controller:
         self._history = np.tile(self.motion.q, (_HISTORY_STEPS, 1))
 
     def advance_to(self, now_ns: int, on_step: Callable[[], None] | None = None) -> None:
-        """Take every step that is due at ``now_ns``; ``on_step`` is called after each. A clock that went back
-        is waited for; after a long standstill of the machine the arm goes on from where it was."""
+        """Execute every step that is due at ``now_ns``, and call ``on_step`` after each. Nothing happens
+        until a clock that was set back has caught up. After a long pause of the machine the arm continues
+        from where it was."""
         due = (now_ns - self._start_ns) // STEP_NS
         if due - self.steps > _MAX_CATCH_UP_STEPS:
             self._start_ns += (due - self.steps) * STEP_NS
@@ -82,17 +85,15 @@ class Controller:
             self._history[self.steps % _HISTORY_STEPS] = self.motion.q
             if self._busy and not self.motion.moving:
                 self._finish()
-            if (
-                self._watchdog_steps is not None
-                and self.steps - self._watchdog_reset_step > self._watchdog_steps
-            ):
-                self.fault(f"its client has been silent for {self._watchdog_steps * STEP_S:g} s (watchdog)")
+            limit = self._watchdog_steps
+            if limit is not None and self.steps - self._watchdog_reset_step > limit:
+                self.fault(f"its client has been silent for {limit * STEP_S:g} s (watchdog)")
             if on_step is not None:
                 on_step()
 
     def true_joints(self, t_ns: int) -> tuple[int, Array]:
-        """Where the joints (6,) really were at ``t_ns``, between the two steps around it, and the instant
-        that this is: ``t_ns``, or the nearest that is known of (the last step, or 20 s ago)."""
+        """True joint angles (6,) at ``t_ns``, interpolated between two steps. Returns their instant too:
+        ``t_ns``, or the nearest one that is known (the last step, or 20 s ago)."""
         position = (t_ns - self._start_ns) / STEP_NS
         position = min(max(position, float(max(0, self.steps - _HISTORY_STEPS + 2))), float(self.steps))
         whole = int(position)
@@ -102,7 +103,7 @@ class Controller:
         return round(self._start_ns + position * STEP_NS), (1.0 - part) * a + part * b
 
     def values(self) -> dict[str, Any]:
-        """The variables of an output recipe now. Each call draws the encoders' noise anew."""
+        """Current values of the output variables. Each call draws new encoder noise."""
         m = self.motion
         q = m.q + self._rng.normal(0.0, self._noise_rad, 6) if self._noise_rad > 0.0 else m.q
         flange = self.arm.forward(q)
@@ -125,19 +126,19 @@ class Controller:
         }  # fmt: skip
 
     def start_program(self) -> None:
-        """A client has uploaded its program."""
-        self.motion.stop()
-        self.runtime_state, self._busy, self._watchdog_steps = PLAYING, False, None
-        self.output_int[0] = READY
+        """Start the program that a client has uploaded."""
+        self.stop_program()
+        self.runtime_state, self.output_int[0] = PLAYING, READY
         self.inputs.clear()
 
     def stop_program(self) -> None:
+        """Stop the program and bring the arm to rest."""
         self.motion.stop()
         self.runtime_state, self._busy, self._watchdog_steps = STOPPED, False, None
         self.output_int[0] = 0
 
     def write_inputs(self, given: dict[str, Any]) -> None:
-        """Input registers from a client, and what they ask for."""
+        """Take a client's input registers, and execute their command."""
         self.inputs.update(given)
         self._set_outputs(given)
         if "input_int_register_0" not in given or self.runtime_state != PLAYING:
@@ -149,23 +150,22 @@ class Controller:
         elif command == STOP_SCRIPT:
             self.stop_program()
         elif command == SERVO_J:
-            if not self.motion.servo(self._doubles(0, 6)):  # answers nothing: the next target follows at once
+            if not self.motion.servo(self._joints()):  # without an answer: the next target follows at once
                 self.fault("servoJ to where the joints cannot go")
         elif command == SPEED_J:
-            if not self.motion.speed(self._doubles(0, 6), self._double(6)):
+            if not self.motion.speed(self._joints(), self._double(6)):
                 self.fault("speedJ without a speed or an acceleration")
         else:
             self._command(command)
 
     def _command(self, command: int) -> None:
-        """One that is answered when it is done."""
+        """Execute a command that is answered when it is done."""
         if command == MOVE_J:
-            if not self.motion.move(self._doubles(0, 6), self._double(6), self._double(7)):
+            if not self.motion.move(self._joints(), self._double(6), self._double(7)):
                 self.fault("moveJ to where the joints cannot go, or without a speed or an acceleration")
                 return
-            self._busy = self.motion.moving
-            if self.inputs.get("input_int_register_1", 0) == 1:  # asked for without waiting
-                self._busy = False
+            asynchronous = self.inputs.get("input_int_register_1", 0) == 1
+            self._busy = self.motion.moving and not asynchronous
         elif command in (SERVO_STOP, SPEED_STOP, STOP_J):
             self.motion.stop(self._double(0))
             self._busy = self.motion.moving
@@ -183,7 +183,7 @@ class Controller:
             self.output_int[0] = DONE
 
     def fault(self, why: str) -> None:
-        """Stop the program, as a controller does that is asked for what it cannot do."""
+        """Stop the program, as a controller does after a command that it cannot execute."""
         log.warning("simulated arm: %s: the program is stopped", why)
         self.stop_program()
 
@@ -197,5 +197,5 @@ class Controller:
     def _double(self, register: int) -> float:
         return float(self.inputs.get(f"input_double_register_{register}", 0.0))
 
-    def _doubles(self, first: int, count: int) -> list[float]:
-        return [self._double(first + k) for k in range(count)]
+    def _joints(self) -> list[float]:
+        return [self._double(k) for k in range(6)]

@@ -1,7 +1,7 @@
-"""How the joints move: towards what was asked for, within limits of speed and acceleration.
+"""Motion of the joints towards a command, within limits of speed and acceleration.
 
-Time advances in steps of ``STEP_S``, as in the controller that this stands for; the same commands at the same
-steps give the same motion, bit for bit.
+Time advances in steps of ``STEP_S``, as in the real controller. The same commands at the same steps give the
+same motion, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Mode = Literal["idle", "move", "servo", "speed", "stop"]
 
 STEP_S = 0.002
 MAX_ACCELERATION_RAD_S2 = 40.0
-"""No client is granted more; UR's own default for moveJ is 1.4."""
+"""Bound of every command. UR's default for moveJ is 1.4."""
 STOP_RAD_S2 = 10.0
 _SERVO_WITHOUT_COMMAND_S = 0.2
 
@@ -53,8 +53,8 @@ class JointMotion:
         return not self.qd.any()
 
     def move(self, target: ArrayLike, speed_rad_s: float, acceleration_rad_s2: float) -> bool:
-        """moveJ: all joints together, starting and ending at rest; an arm that is still moving comes to rest
-        first. A target beyond the limits is refused (False)."""
+        """moveJ: move all joints together, from rest to rest. An arm that is still moving stops first.
+        Returns False for a target beyond the limits."""
         goal = np.array(target, dtype=np.float64)
         if not self._within_limits(goal) or not speed_rad_s > 0 or not acceleration_rad_s2 > 0:
             return False
@@ -62,24 +62,20 @@ class JointMotion:
             self.stop()
             self._next = (goal, speed_rad_s, acceleration_rad_s2)
             return True
-        way = np.abs(goal - self.q)
-        speed, acceleration = (
-            np.minimum(speed_rad_s, self._speed),
-            min(acceleration_rad_s2, MAX_ACCELERATION_RAD_S2),
-        )
+        distance = np.abs(goal - self.q)
         self._start, self.target = self.q.copy(), goal
-        # The joint that needs longest sets the pace: s runs from 0 to 1 for all of them.
-        longest = float(way.max())
-        if longest < 1e-12:
+        farthest = float(distance.max())
+        if farthest < 1e-12:
             return True
-        rate = float(np.min(speed / np.maximum(way, 1e-12)))
-        self._ramp = _Ramp(rate, acceleration / longest)
+        # The slowest joint determines the rate at which s runs from 0 to 1 for all of them.
+        rate = float(np.min(np.minimum(speed_rad_s, self._speed) / np.maximum(distance, 1e-12)))
+        self._ramp = _Ramp(rate, min(acceleration_rad_s2, MAX_ACCELERATION_RAD_S2) / farthest)
         self._elapsed_s, self.mode = 0.0, "move"
         return True
 
     def servo(self, target: Sequence[float]) -> bool:
-        """servoJ: go after ``target``, which is replaced as often as the client likes; within the limits of
-        speed and acceleration, so that a jump of the target is no jump of the arm."""
+        """servoJ: follow ``target`` (6,), which the client may replace at any time, within the limits of
+        speed and acceleration. Returns False for a target beyond the limits."""
         goal = np.array(target, dtype=np.float64)
         if not self._within_limits(goal):
             return False
@@ -87,7 +83,8 @@ class JointMotion:
         return True
 
     def speed(self, velocity: Sequence[float], acceleration_rad_s2: float) -> bool:
-        """speedJ: run at these joint speeds until told otherwise, or until a limit is near."""
+        """speedJ: move at these joint speeds (6,) until another command, or until a limit is near. Returns
+        False for speeds that are not finite."""
         wanted = np.array(velocity, dtype=np.float64)
         if not np.isfinite(wanted).all() or not acceleration_rad_s2 > 0:
             return False
@@ -97,14 +94,14 @@ class JointMotion:
         return True
 
     def stop(self, deceleration_rad_s2: float = STOP_RAD_S2) -> None:
-        """Come to rest as fast as this allows."""
+        """Come to rest at this deceleration."""
         rate = deceleration_rad_s2 if deceleration_rad_s2 > 0 else STOP_RAD_S2
         self._deceleration = min(rate, MAX_ACCELERATION_RAD_S2)
         self.mode = "stop" if not self.at_rest else "idle"
         self._next = None
 
     def step(self) -> None:
-        """One ``STEP_S``."""
+        """Advance by ``STEP_S``."""
         if self.mode == "idle":
             return
         before = self.qd
@@ -125,14 +122,14 @@ class JointMotion:
     def _follow_ramp(self) -> None:
         assert self._ramp is not None
         self._elapsed_s += STEP_S
-        way = self.target - self._start
+        path = self.target - self._start
         s, rate = self._ramp.at(self._elapsed_s)
-        self.q, self.qd = self._start + s * way, rate * way
+        self.q, self.qd = self._start + s * path, rate * path
         if s >= 1.0:
             self.q, self.qd, self.mode = self.target.copy(), np.zeros(6), "idle"
 
     def _target_velocity(self) -> tuple[Array, float]:
-        """Joint speeds to aim for, and the acceleration that may be used."""
+        """Joint speeds to reach, and the acceleration allowed."""
         if self.mode == "stop":
             return np.zeros(6), self._deceleration
         if self.mode == "speed":
@@ -140,7 +137,7 @@ class JointMotion:
             most = _max_stoppable_speed(np.maximum(room, 0.0), self._deceleration)
             return np.clip(self._velocity, -most, most), self._deceleration
         self._elapsed_s += STEP_S
-        if self._elapsed_s > _SERVO_WITHOUT_COMMAND_S:  # the client has gone quiet
+        if self._elapsed_s > _SERVO_WITHOUT_COMMAND_S:
             self.stop()
             return np.zeros(6), self._deceleration
         left = self.target - self.q
@@ -157,14 +154,15 @@ class JointMotion:
 
 
 def _max_stoppable_speed(room: Array, deceleration: float) -> Array:
-    """The fastest from which a joint can still come to rest within ``room``, a step's way in hand."""
+    """The highest speed from which a joint can still stop within ``room``, less the motion of one step."""
     lag = 0.5 * deceleration * STEP_S
     fastest: Array = np.minimum(np.sqrt(lag * lag + 2.0 * deceleration * room) - lag, room / STEP_S)
     return fastest
 
 
 class _Ramp:
-    """s(t) from 0 to 1: up at ``acceleration``, on at ``rate``, down again (a triangle where s is short)."""
+    """s(t) from 0 to 1 with a trapezoidal rate: up to ``rate`` at ``acceleration``, and down again (a
+    triangle if there is no time to reach ``rate``)."""
 
     def __init__(self, rate: float, acceleration: float) -> None:
         self.acceleration = acceleration

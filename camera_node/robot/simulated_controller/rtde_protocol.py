@@ -1,7 +1,7 @@
 """The Real-Time Data Exchange protocol of a controller, version 2: packets, recipes and their types.
 
-Big-endian. A packet is a 16-bit size that counts its own header, an 8-bit type, and the payload. A recipe is
-an agreed list of variables that travel without their names afterwards. (Universal Robots, "Real-Time Data
+Big-endian. A packet is a 16-bit size (with the header), an 8-bit type, and the payload. A recipe is a list of
+variables agreed upon at the start, so that later packets need no names. (Universal Robots, "Real-Time Data
 Exchange (RTDE) Guide".)
 """
 
@@ -15,7 +15,6 @@ from typing import Any
 
 REQUEST_VERSION = 86
 CONTROLLER_VERSION = 118
-TEXT_MESSAGE = 77
 DATA = 85
 SETUP_OUTPUTS = 79
 SETUP_INPUTS = 73
@@ -37,16 +36,15 @@ _TYPES = {
     "tool_analog_input1 payload speed_slider_fraction standard_analog_output_0 standard_analog_output_1 "
     "tcp_force_scalar",
     "VECTOR6D": "target_q target_qd target_qdd target_current target_moment actual_q actual_qd "
-    "actual_current "
-    "actual_current_window joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force "
-    "target_TCP_pose target_TCP_speed joint_temperatures actual_joint_voltage ft_raw_wrench payload_inertia "
-    "external_force_torque tcp_offset",
+    "actual_current actual_current_window joint_control_output actual_TCP_pose actual_TCP_speed "
+    "actual_TCP_force target_TCP_pose target_TCP_speed joint_temperatures actual_joint_voltage ft_raw_wrench "
+    "payload_inertia external_force_torque tcp_offset",
     "VECTOR3D": "actual_tool_accelerometer payload_cog elbow_position elbow_velocity",
     "VECTOR6INT32": "joint_mode",
     "INT32": "robot_mode safety_mode safety_status",
     "UINT32": "runtime_state robot_status_bits safety_status_bits speed_slider_mask "
-    "output_bit_registers0_to_31 "
-    "output_bit_registers32_to_63 input_bit_registers0_to_31 input_bit_registers32_to_63 io_current_types",
+    "output_bit_registers0_to_31 output_bit_registers32_to_63 input_bit_registers0_to_31 "
+    "input_bit_registers32_to_63 io_current_types",
     "UINT64": "actual_digital_input_bits actual_digital_output_bits",
     "UINT8": "standard_digital_output_mask standard_digital_output configurable_digital_output_mask "
     "configurable_digital_output tool_digital_output_mask tool_digital_output standard_analog_output_mask "
@@ -61,7 +59,7 @@ _REGISTERS = (
 
 
 def type_of(name: str) -> str:
-    """The type of a variable, NOT_FOUND for one that a controller does not know."""
+    """The type of a variable; NOT_FOUND for an unknown one."""
     if name in _TYPE_OF:
         return _TYPE_OF[name]
     for pattern, count, kind in _REGISTERS:
@@ -88,22 +86,19 @@ class Recipe:
         return bool(self.names) and NOT_FOUND not in self.types
 
     def pack(self, values: Mapping[str, Any]) -> bytes:
-        """The recipe's number and its variables; what ``values`` lacks is zero."""
+        """The recipe's number and its variables. Those that ``values`` lacks are zero."""
         parts = [bytes([self.number])]
         for name, kind in zip(self.names, self.types):
-            layout = ">" + _FORMATS[kind]
-            value = values.get(name)
+            layout, value = ">" + _FORMATS[kind], values.get(name)
             if value is None:
                 parts.append(bytes(struct.calcsize(layout)))
-            elif kind.startswith("VECTOR"):
-                parts.append(struct.pack(layout, *value))
             else:
-                parts.append(struct.pack(layout, value))
+                parts.append(struct.pack(layout, *(value if kind.startswith("VECTOR") else (value,))))
         return b"".join(parts)
 
     def unpack(self, payload: bytes) -> dict[str, Any]:
-        """Variables by name of a payload without the recipe's number. Raises struct.error for a
-        wrong size."""
+        """Variables by name, from a payload without the recipe's number. Raises struct.error for a wrong
+        size."""
         layout = ">" + "".join(_FORMATS[kind] for kind in self.types)
         flat = list(struct.unpack(layout, payload))
         values: dict[str, Any] = {}

@@ -1,14 +1,13 @@
-"""The ports of the simulated controller: those that a client of a real one connects to, and one for the
-truth.
+"""The ports of the simulated controller.
 
     30004  Real-Time Data Exchange: state out, registers in
     29999  dashboard: a line in, a line out
     30001, 30002, 30003  programs in (nothing is streamed out)
-    30010  the truth, which no real controller has: a line with an instant (ns) in, a line of JSON out with
-           the instant and the joint angles (rad) then. Simulated cameras see the arm where it really was.
+    30010  not on a real controller: a line with an instant (ns) in, a line of JSON out with the instant and
+           the true joint angles (rad), from which simulated cameras render
 
-Clients know the port numbers by heart, so every simulated arm needs an address of its own: 127.0.0.2,
-127.0.0.3, ... are this machine too.
+Clients have fixed port numbers, so every simulated arm needs an address of its own. 127.0.0.2, 127.0.0.3, ...
+are this machine too.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from collections.abc import Awaitable, Callable
 
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller import rtde_protocol as rtde
-from camera_node.robot.simulated_controller.controller import Controller
+from camera_node.robot.simulated_controller.controller import PLAYING, Controller
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from freshfield.clock import Clock
 
@@ -43,7 +42,7 @@ _DASHBOARD = {
 
 
 class ControllerServer:
-    """Serves ``controller`` at ``host`` until stopped; its steps follow ``clock``."""
+    """Serves ``controller`` at ``host`` until stopped, in the time of ``clock``."""
 
     def __init__(self, controller: Controller, host: str, clock: Clock) -> None:
         self.controller, self.host, self.clock = controller, host, clock
@@ -53,7 +52,7 @@ class ControllerServer:
         self._task: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Open every port. Raises OSError if one is taken."""
+        """Open every port. Raises OSError if one of them is taken."""
         handlers: dict[int, Handler] = {
             RTDE_PORT: self._serve_rtde,
             DASHBOARD_PORT: self._serve_dashboard,
@@ -84,7 +83,7 @@ class ControllerServer:
     async def _run(self) -> None:
         while True:
             self.controller.advance_to(self.clock.now_ns(), self._publish)
-            # Nobody looks oftener than the fastest listener: steps between are made up for at once.
+            # Wake up as often as the fastest client needs. Each time, all steps that are due are executed.
             fastest = min((client.every_steps for client in self.clients), default=_IDLE_STEPS)
             await asyncio.sleep(STEP_S * min(fastest, _IDLE_STEPS))
 
@@ -101,9 +100,9 @@ class ControllerServer:
             try:
                 await handler(reader, writer)
             except (OSError, asyncio.IncompleteReadError) as error:
-                log.debug("a client went: %s", error)
+                log.debug("a client disconnected: %s", error)
             except (asyncio.LimitOverrunError, ValueError) as error:
-                log.warning("simulated arm: a client said what is not understood, and is let go: %s", error)
+                log.warning("simulated arm: disconnecting a client whose message is invalid: %s", error)
             finally:
                 self._writers.discard(writer)
                 writer.close()
@@ -124,7 +123,7 @@ class ControllerServer:
                 except struct.error as error:
                     if kind != rtde.DATA:
                         raise ValueError(str(error)) from None
-                    # Of some of the library's calls, packets and recipes differ.
+                    # Some of the library's calls send packets that do not match their recipes.
                     self.controller.fault(f"registers that are not of the recipe ({error})")
                     continue
                 if given:
@@ -146,15 +145,14 @@ class ControllerServer:
             self.controller.stop_program()
             return "Stopped"
         if request in ("running", "programState"):
-            playing = self.controller.runtime_state == 2
-            state = "PLAYING" if playing else "STOPPED"
-            return (
-                f"Program running: {str(playing).lower()}" if request == "running" else f"{state} simulated"
-            )
+            playing = self.controller.runtime_state == PLAYING
+            if request == "running":
+                return f"Program running: {str(playing).lower()}"
+            return f"{'PLAYING' if playing else 'STOPPED'} simulated"
         return _DASHBOARD.get(request.lower(), f"could not understand: '{request}'")
 
     async def _serve_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        # What the program says is not interpreted: a client's is known to listen to the registers.
+        # The program is not interpreted: the client library's program only executes register commands.
         while await reader.read(1 << 16):
             self.controller.start_program()
 
@@ -167,7 +165,7 @@ class ControllerServer:
 
 
 class _Client:
-    """One connection of the data exchange: its recipes, and whether it listens."""
+    """One connection of the data exchange, with its recipes."""
 
     def __init__(self, writer: asyncio.StreamWriter) -> None:
         self._writer = writer
@@ -181,12 +179,12 @@ class _Client:
 
     def send(self, values: dict) -> None:
         assert self._output is not None
-        # A client that does not read must not fill this machine's memory: it loses samples instead.
+        # A client that does not read loses samples, so that it cannot fill this machine's memory.
         if self._writer.transport.get_write_buffer_size() < _MAX_WAITING_BYTES:
             self._reply(rtde.DATA, self._output.pack(values))
 
     def handle(self, kind: int, payload: bytes) -> dict | None:
-        """Answer one packet; input registers are returned for the controller."""
+        """Answer one packet. Returns input registers for the controller, if there are any."""
         if kind == rtde.REQUEST_VERSION:
             self._reply(kind, bytes([struct.unpack(">H", payload)[0] == 2]))
         elif kind == rtde.CONTROLLER_VERSION:
@@ -197,7 +195,7 @@ class _Client:
             if recipe.valid:
                 self._output = recipe
                 self.every_steps = max(1, round(1.0 / (STEP_S * max(frequency_hz, 1.0))))
-            self._reply(kind, bytes([1 if recipe.valid else 0]) + ",".join(recipe.types).encode())
+            self._reply(kind, bytes([recipe.valid]) + ",".join(recipe.types).encode())
         elif kind == rtde.SETUP_INPUTS:
             recipe = rtde.Recipe.of(len(self._inputs) + 1, _names(payload))
             if recipe.valid:

@@ -15,59 +15,52 @@ import numpy as np
 from camera_node.config import ArmConfig
 from camera_node.robot import stdout
 from camera_node.robot.arm.camera_poses import arm_model
-from camera_node.robot.arm.drive import confirm_motion, patience_s, stop_event
+from camera_node.robot.arm.drive import confirm_motion, open_stream, stop_event
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.command import require_arm
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
-from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile, current_joints
+from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
-from freshfield.clock import Clock, WallClock
+from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load, read_section
 
 log = logging.getLogger("camera-node.teleop")
 
 _SHOW_S = 0.5
-# No stop takes longer within the limits of a TeleopConfig.
+# Within the limits of a TeleopConfig no stop takes longer.
 _LONGEST_STOP_S = 3.0
 
 
+@stdout.only_python_output()
 def run(args: argparse.Namespace) -> int:
-    """Until the operator ends it, Ctrl-C or ``--seconds``. Raises ScenarioError, TeleopError and ArmError
-    before anything moves; 1 where it had to be ended."""
-    with stdout.only_python_output():
-        return _run(args)
-
-
-def _run(args: argparse.Namespace) -> int:
-    logging.basicConfig(
-        level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S"
-    )
+    """Teleoperate until the operator ends it, Ctrl-C or ``--seconds``. Returns 1 after an error of the arm or
+    the file. Raises ScenarioError, TeleopError and ArmError before the arm moves."""
     scenario = load(args.scenario)
     arm_config = require_arm(scenario)
     config = teleop_config(scenario, arm_config)
     model = arm_model(scenario, arm_config)
     if args.seconds is not None and not args.seconds > 0:
         raise TeleopError("--seconds: expected a positive number")
-    clock = WallClock()
     stream: ArmStream | None = None
     stylus: Stylus | None = None
     try:
         joints = np.array(HOME_RAD)
         if args.dry_run is None:
-            stream = _connect(arm_config, clock)
-            joints = current_joints(stream, clock)
+            stream = open_stream(arm_config, arm_config.frequency_hz)
+            stream.start()
+            joints = stream.now()
         operator = Teleoperator(model, config, joints)
         asks = stream is not None and not (args.yes or arm_config.simulated)
         if asks and not confirm_motion(arm_config.host, "follow the stylus"):
             return 2
         # After the question, because a keyboard stylus switches the terminal's line mode off.
         stylus = open_stylus(args.stylus)
-        sink = _sink(args.dry_run, stream, model, clock, config)
-        status = _run_loop(operator, stylus, sink, clock, args.seconds, args.json)
+        sink = _sink(args.dry_run, stream, model, config)
+        status = _run_loop(operator, stylus, sink, args.seconds, args.json)
     finally:
         if stylus is not None:
             stylus.close()
@@ -80,13 +73,13 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def teleop_config(scenario: Scenario, arm: ArmConfig) -> TeleopConfig:
-    """The section ``source.arm.teleop``; raises ScenarioError."""
+    """The section ``source.arm.teleop``. Raises ScenarioError."""
     return read_section(TeleopConfig, dict(arm.teleop or {}), f"{scenario.path}: source.arm.teleop")
 
 
 def open_stylus(text: str) -> Stylus:
-    """``keyboard``, ``gamepad``, ``gamepad:/dev/input/eventN``, ``network:PORT`` or ``network:HOST:PORT``.
-    Raises TeleopError."""
+    """Open a stylus by its name on the command line: ``keyboard``, ``gamepad``,
+    ``gamepad:/dev/input/eventN``, ``network:PORT`` or ``network:HOST:PORT``. Raises TeleopError."""
     kind, _, rest = text.partition(":")
     if kind == "keyboard" and not rest:
         from camera_node.robot.teleop.keyboard import KEYS, KeyboardStylus
@@ -110,20 +103,9 @@ def open_stylus(text: str) -> Stylus:
     raise TeleopError(f"--stylus: expected keyboard, gamepad or network:PORT, got {text!r}")
 
 
-def _connect(config: ArmConfig, clock: Clock) -> ArmStream:
-    stale_s = patience_s(config)
-    stream = ArmStream(
-        config.host, clock, config.frequency_hz, False, max_gap_ms=1e3 * stale_s, stale_s=stale_s
-    )
-    stream.start()
-    return stream
-
-
-def _sink(
-    file: Path | None, stream: ArmStream | None, model: ArmModel, clock: Clock, config: TeleopConfig
-) -> Sink:
+def _sink(file: Path | None, stream: ArmStream | None, model: ArmModel, config: TeleopConfig) -> Sink:
     if stream is not None:
-        return ServoSink(stream, clock, 1.0 / config.rate_hz)
+        return ServoSink(stream, 1.0 / config.rate_hz)
     assert file is not None
     try:
         return TrajectoryFile(file, model)
@@ -132,10 +114,10 @@ def _sink(
 
 
 def _run_loop(
-    operator: Teleoperator, stylus: Stylus, sink: Sink, clock: Clock, seconds: float | None, as_json: bool
+    operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float | None, as_json: bool
 ) -> int:
-    """Tick until asked to end, then come to rest within the limits."""
-    stop_requested = stop_event()
+    """Tick until asked to end, then bring the arm to rest within the limits. Returns the exit status."""
+    stop_requested, clock = stop_event(), WallClock()
     period_s = 1.0 / operator.config.rate_hz
     status, started_s = 0, time.monotonic()
     next_s, shown_s, late = started_s, started_s, 0
@@ -152,7 +134,7 @@ def _run_loop(
                 print(f"\r{_status_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
             next_s += period_s
             if next_s < now_s:
-                # Missed ticks are not made up for: the arm would hurry.
+                # Missed ticks are not made up for: the arm would move too fast.
                 next_s, late = now_s, late + 1
             else:
                 stop_requested.wait(next_s - now_s)
@@ -167,20 +149,18 @@ def _run_loop(
     finally:
         sink.close()
     summary = {**operator.summary(), "late_ticks": late}
-    print(
-        json.dumps(summary) if as_json else f"\n{_status_line(operator)}; {late} ticks late", file=sys.stdout
-    )
+    print(json.dumps(summary) if as_json else f"\n{_status_line(operator)}; {late} ticks late")
     return status
 
 
 def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float, send: bool) -> None:
     for _ in range(round(_LONGEST_STOP_S / period_s)):
         begun_s = time.monotonic()
-        command, still = operator.stop()
+        command, at_rest = operator.stop()
         if not send:
-            return  # the sink has failed: closing it is all that can be done
+            return  # the sink has failed and can only be closed
         sink.send(operator.ticks * period_s, command)
-        if still:
+        if at_rest:
             return
         time.sleep(max(0.0, period_s - (time.monotonic() - begun_s)))
 
@@ -188,8 +168,8 @@ def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float, send: boo
 def _status_line(operator: Teleoperator) -> str:
     x, y, z = operator.arm.forward(operator.limiter.q)[:3, 3]
     counts = operator.mapping.counts
-    refused = {name: n for name, n in vars(operator.limiter.refused).items() if n}
-    held = f", held by {', '.join(f'{name} {n}' for name, n in refused.items())}" if refused else ""
+    refused = [f"{name} {n}" for name, n in vars(operator.limiter.refused).items() if n]
+    held = f", held by {', '.join(refused)}" if refused else ""
     return (
         f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts.taken} messages, "
         f"{counts.unsound + counts.backwards} refused, {counts.jumps} jumps{held}"

@@ -1,7 +1,7 @@
 """A gamepad as a stylus, through the kernel's event devices (evdev, extra ``gamepad``).
 
 Left stick: x and y. Right stick: turn and tip. Triggers: down and up. Shoulder buttons: roll. The arm follows
-while the south button (A, cross) is held, and stops when it is let go. The pad's own dead zone counts.
+while the south button (A, cross) is held. The dead zone is the pad's own, or 8 % if that is smaller.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _TRIGGERS = (_Z, _RZ)
 
 @dataclass(frozen=True)
 class AxisRange:
-    """What an axis reports at its ends, and around its middle without meaning anything."""
+    """Range of an axis. flat: its dead zone around the middle."""
 
     low: int
     high: int
@@ -40,33 +40,34 @@ class AxisRange:
 class GamepadState:
     """State of a pad from its events: axes in [-1, 1] (triggers in [0, 1]) and buttons."""
 
-    def __init__(self, spans: dict[int, AxisRange]) -> None:
-        self._spans = spans
+    def __init__(self, ranges: dict[int, AxisRange]) -> None:
+        self._ranges = ranges
         self._axes = dict.fromkeys((*_STICKS, *_TRIGGERS), 0.0)
         self._pressed: set[int] = set()
 
     def update(self, kind: int, code: int, value: int) -> None:
-        """One event of the kernel's."""
+        """Process one event of the kernel."""
         if kind == _EV_KEY:
             self._pressed.discard(code) if value == 0 else self._pressed.add(code)
-        elif kind == _EV_ABS and code in self._axes and code in self._spans:
-            span = self._spans[code]
-            if span.high <= span.low:
+        elif kind == _EV_ABS and code in self._axes and code in self._ranges:
+            axis = self._ranges[code]
+            width = axis.high - axis.low
+            if width <= 0:
                 return
-            share = min(max((value - span.low) / (span.high - span.low), 0.0), 1.0)
+            position = min(max((value - axis.low) / width, 0.0), 1.0)
             if code in _STICKS:
-                share = 2.0 * share - 1.0
-                dead = max(_DEAD_ZONE, 2.0 * span.flat / (span.high - span.low))
-                # From the edge of the dead zone on, so that a stick does not begin with a jerk.
-                share = np.sign(share) * max(abs(share) - dead, 0.0) / max(1.0 - dead, 1e-6)
-            self._axes[code] = float(share)
+                position = 2.0 * position - 1.0
+                dead = max(_DEAD_ZONE, 2.0 * axis.flat / width)
+                # Zero at the edge of the dead zone, so that a stick does not start with a jump.
+                position = np.sign(position) * max(abs(position) - dead, 0.0) / max(1.0 - dead, 1e-6)
+            self._axes[code] = float(position)
 
     @property
     def clutch(self) -> bool:
         return _SOUTH in self._pressed
 
     def speeds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Speeds (3,) m/s and (3,) rad/s that the sticks ask for."""
+        """Speeds (3,) m/s and (3,) rad/s that the sticks command."""
         a = self._axes
         roll = float(_RIGHT_SHOULDER in self._pressed) - float(_LEFT_SHOULDER in self._pressed)
         speed = np.array([-a[_Y], -a[_X], a[_RZ] - a[_Z]]) * SPEED_M_S
@@ -74,26 +75,25 @@ class GamepadState:
 
 
 class GamepadStylus:
-    """The pad at ``path``, or the first there is. Raises TeleopError where there is none."""
+    """The pad at ``path``, or the first one. Raises TeleopError if there is none."""
 
-    def __init__(self, path: str | None = None) -> None:
+    def __init__(self, path: str | None) -> None:
         self._device = _open(path)
-        spans = {
-            code: AxisRange(i.min, i.max, i.flat) for code, i in self._device.capabilities().get(_EV_ABS, [])
-        }
-        self._pad, self._hand = GamepadState(spans), PoseIntegrator()
+        axes = self._device.capabilities().get(_EV_ABS, [])
+        self._pad = GamepadState({code: AxisRange(i.min, i.max, i.flat) for code, i in axes})
+        self._hand = PoseIntegrator()
         self.ended = False
         log.info("gamepad: %s (%s)", self._device.name, self._device.path)
 
     def poll(self, now_ns: int) -> list[StylusSample]:
-        """See ``Stylus``; a pad that is pulled out says nothing more."""
+        """See ``Stylus``. A pad that was unplugged gives no more samples."""
         try:
             for event in self._device.read():
                 self._pad.update(event.type, event.code, event.value)
         except BlockingIOError:
             pass
         except OSError:
-            log.error("gamepad: it is gone: the arm stops")
+            log.error("gamepad: it was unplugged: the arm stops")
             self.ended = True
             return []
         return [self._hand.advance(now_ns, *self._pad.speeds(), self._pad.clutch)]

@@ -1,14 +1,13 @@
 """Differential inverse kinematics: joint speeds towards a target, by pink (constraint-aware) or damped least
 squares.
 
-Safety rests on neither: ``limits`` checks every result. With pink the arm slides along a wall or past itself
-where damped least squares would be stopped.
+Safety does not depend on the solver: ``limits`` checks every result. With pink the arm slides along a wall or
+past its own parts; with damped least squares it stops there.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import logging
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,8 +17,6 @@ from camera_node.robot.arm.capsules import ABOVE_FLOOR, PAIRS, CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel, pose_difference
 from camera_node.robot.teleop import TeleopError
 from camera_node.robot.teleop.settings import TeleopConfig
-
-log = logging.getLogger("camera-node.teleop")
 
 Array = NDArray[np.float64]
 
@@ -35,18 +32,18 @@ _PACKAGES = ("pink", "pinocchio", "coal", "daqp")
 
 
 class Solver(Protocol):
-    """failed: ticks for which it found no speeds."""
+    """failed: number of ticks without a solution."""
 
     name: str
     failed: int
 
-    def speeds(self, q: Array, v: Array, target: Array) -> Array:
-        """Joint speeds (6,) from joints and speeds (6,) towards base-from-flange ``target`` (4, 4)."""
+    def speeds(self, q: Array, target: Array) -> Array:
+        """Joint speeds (6,), rad/s, from joints ``q`` (6,) towards ``target``, base-from-flange (4, 4)."""
         ...
 
 
 def make_solver(arm: ArmModel, config: TeleopConfig) -> Solver:
-    """The solver that a scenario asks for. Raises TeleopError where pink is asked for and not installed."""
+    """The solver named in a scenario. Raises TeleopError if it is pink and not installed."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if config.solver == "dls" or (config.solver == "auto" and missing):
         return DampedLeastSquares(arm, config)
@@ -58,14 +55,14 @@ def make_solver(arm: ArmModel, config: TeleopConfig) -> Solver:
 
 
 def commanded_twist(arm: ArmModel, q: Array, target: Array, config: TeleopConfig) -> Array:
-    """Speed (6,) of the hand towards the target, no faster than its limit, so that its direction is kept."""
+    """Speed (6,) of the hand towards the target, in m/s and rad/s, scaled down to its speed limit."""
     wanted = config.gain_per_s * pose_difference(arm.forward(q), target)
     fastest = float(np.linalg.norm(wanted[:3]))
     return wanted * min(1.0, config.speed_m_s / fastest) if fastest > 0.0 else wanted
 
 
 class DampedLeastSquares:
-    """``v = J^T (J J^T + damping^2)^-1 twist`` (Wampler 1986), slowed where a joint would be too fast."""
+    """``v = J^T (J J^T + damping^2)^-1 twist`` (Wampler 1986), scaled down to the joints' speed limit."""
 
     name = "dls"
 
@@ -73,9 +70,8 @@ class DampedLeastSquares:
         self._arm, self._config = arm, config
         self.failed = 0
 
-    def speeds(self, q: Array, v: Array, target: Array) -> Array:
+    def speeds(self, q: Array, target: Array) -> Array:
         """See ``Solver``."""
-        del v
         wanted = commanded_twist(self._arm, q, target, self._config)
         left, values, right = np.linalg.svd(self._arm.jacobian(q))
         damping = _DAMPING * max(0.0, 1.0 - (float(values[-1]) / _DAMPING_THRESHOLD) ** 2)
@@ -85,8 +81,8 @@ class DampedLeastSquares:
 
 
 class PinkSolver:
-    """A quadratic program each tick (pink, on pinocchio): the hand's task under limits of joints and speed,
-    with barriers at the workspace's walls and between the arm's parts."""
+    """One quadratic program per tick (pink, on pinocchio): follow the target within limits of joints and
+    speed, with barriers at the workspace's walls and between the arm's parts."""
 
     name = "pink"
 
@@ -125,9 +121,8 @@ class PinkSolver:
         ]  # fmt: skip
         self.failed = 0
 
-    def speeds(self, q: Array, v: Array, target: Array) -> Array:
-        """See ``Solver``; a stop where the program has no solution (counted)."""
-        del v
+    def speeds(self, q: Array, target: Array) -> Array:
+        """See ``Solver``; zero if the program has no solution (counted)."""
         self._configuration.update(q)
         # The task tries to reach its target in one tick, so the target is one tick's step away.
         step = commanded_twist(self._arm, q, target, self._config) * self._dt_s
@@ -148,7 +143,8 @@ class PinkSolver:
 
 
 def _model(arm: ArmModel, config: TeleopConfig) -> tuple[Any, Any]:
-    """The arm for pinocchio: its chain with limits, and its capsules with the pairs to keep apart."""
+    """The arm as pinocchio's models: its joints with limits, and its capsules with the pairs to keep
+    apart."""
     import coal
     import pinocchio as pin
 

@@ -1,7 +1,7 @@
 """The keyboard as a stylus: keys move it by steps, the space bar presses and releases the clutch.
 
-Terminals say that a key was pressed, not that it is held: every press, and every repetition of a held key, is
-one step. The filter makes a motion of them.
+A terminal reports presses, not whether a key is held. Every press, and every repetition of a held key, is one
+step. The filter turns the steps into a smooth motion.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _ESCAPE, _END_OF_FILE, _MAX_BYTES = "\x1b", "\x04", 32
 
 
 class KeyboardStylus:
-    """Reads the terminal ``fd`` without waiting, its line mode switched off until ``close``. Raises
-    TeleopError where that is no terminal."""
+    """Reads the terminal ``fd`` without blocking; its line mode is off until ``close``. Raises TeleopError if
+    it is not a terminal."""
 
     def __init__(self, fd: int | None = None) -> None:
         self._fd = sys.stdin.fileno() if fd is None else fd
@@ -50,7 +50,7 @@ class KeyboardStylus:
             ) from None
 
     def poll(self, now_ns: int) -> list[StylusSample]:
-        """See ``Stylus``; one sample, whether or not a key was pressed: the keyboard is there."""
+        """See ``Stylus``. Returns one sample, also if no key was pressed."""
         shift = np.zeros(6)
         for key in self._read():
             if key in ("q", _END_OF_FILE):
@@ -64,12 +64,12 @@ class KeyboardStylus:
         return [self._hand.advance(now_ns, np.zeros(3), np.zeros(3), self._clutch and not self.ended)]
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal's settings."""
         with contextlib.suppress(termios.error):
             termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def _read(self) -> str:
-        """What was typed since the last time; of arrow and function keys nothing."""
+        """Keys typed since the last call, without arrow and function keys."""
         if not select.select([self._fd], [], [], 0.0)[0]:
             return ""
         try:

@@ -1,17 +1,18 @@
-"""The last word on every tick: joint speeds that keep all limits now, and from which the arm can always stop.
+"""Limits of every tick: joint speeds that keep all limits now, and from which the arm can always stop.
 
 Time advances in ticks of ``dt``. A state is (q, v); a tick chooses v' and sets q' = q + v' dt.
 
-*Each joint by itself.* Stopping from v takes ``stop_way(v) = dt (v + (v - a dt) + (v - 2 a dt) + ...)`` while
-positive, v itself being the first step. The rule is: choose v' with |v' - v| <= a dt, |v'| <= v_max, and
-``stop_way(v') <= upper - q`` (below likewise). It can always be kept: if it was kept by v, then v' = v - a dt
-(or 0, where that is less) has ``stop_way(v') = stop_way(v) - v dt <= upper - q_before - v dt = upper - q``.
-At rest it holds wherever q is within its limits. So by induction no joint ever leaves them.
+*Each joint by itself.* Stopping from v takes ``stop_way(v) = dt (v + (v - a dt) + (v - 2 a dt) + ...)`` over
+the positive terms, the first of which is v itself. The rule is: choose v' with |v' - v| <= a dt, |v'| <=
+v_max, and ``stop_way(v') <= upper - q`` (likewise for the lower limit). This is always possible: if v obeys
+the rule, then v' = v - a dt (or 0, if that is negative) has
+``stop_way(v') = stop_way(v) - v dt <= upper - q_before - v dt = upper - q``. At rest the rule holds for every
+q within its limits. So by induction no joint ever leaves them.
 
-*All of them together.* Box, floor, the flange's speed and the distance between the arm's parts depend on all
-joints. There the stop itself is the proof: before v' is let through, every tick of the stop that would follow
-it (each joint at its full deceleration) is computed and examined. If one of them breaks a limit, less is
-tried, and at last the stop that the tick before was let through with. That one has been examined already.
+*All joints together.* Box, floor, the flange's speed and the distance between the arm's parts depend on all
+joints. There the stop itself is the proof: before a tick is accepted, every tick of the stop that would
+follow it (each joint at its full deceleration) is computed and checked. If one of them breaks a limit,
+smaller steps are tried, and finally the stop that was checked with the tick before.
 """
 
 from __future__ import annotations
@@ -28,13 +29,18 @@ from camera_node.robot.teleop.settings import TeleopConfig
 
 Array = NDArray[np.float64]
 
-# Sums over a stop round differently from one tick to the next: limits are kept this much tighter than asked.
+# Limits are this much tighter than configured, because sums over a stop round differently at each tick.
 _ROUNDING = 1e-9
 _STEP_FRACTIONS = (1.0, 0.5, 0.2)
 
 
 class JointLimits:
-    """Limits of the joints by themselves: radians and seconds, arrays (n,)."""
+    """Limits of each joint by itself.
+
+    low, high: joint limits (n,), radians.
+    speed, acceleration: of every joint, rad/s and rad/s^2.
+    dt_s: length of a tick.
+    """
 
     def __init__(
         self, low: ArrayLike, high: ArrayLike, speed: float, acceleration: float, dt_s: float
@@ -46,15 +52,15 @@ class JointLimits:
         self._change = acceleration * dt_s * (1.0 - _ROUNDING)
 
     def clamp(self, q: Array, v: Array, wanted: Array) -> Array:
-        """Speeds (n,) that may be had next, as far towards ``wanted`` as they can be."""
+        """Speeds (n,) of the next tick, as close to ``wanted`` as the limits allow."""
         up = np.minimum(self._speed, self._max_stoppable_speed(self.high - q))
         down = np.maximum(-self._speed, -self._max_stoppable_speed(q - self.low))
         change = np.minimum(np.maximum(wanted, down), up) - v
-        # All joints change alike, as far as the one that has most to change: the hand keeps its direction.
+        # All changes are scaled alike, by the largest one, so that the hand keeps its direction.
         most = float(np.abs(change).max())
         change *= min(1.0, self._change / most) if most > 0.0 else 1.0
         allowed = np.minimum(np.maximum(v + change, down), up)
-        # Last, because the proof above says that it takes nothing away: only rounding does.
+        # This clamp comes last, because by the proof above it corrects rounding only.
         return np.minimum(np.maximum(allowed, v - self._change), v + self._change)
 
     def stopping(self, v: Array) -> Array:
@@ -62,16 +68,16 @@ class JointLimits:
         return np.sign(v) * np.maximum(np.abs(v) - self._change, 0.0)
 
     def stop(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Joints and speeds (T, n) of a stop from (q, v), the state itself first."""
+        """Joints and speeds (T, n) of a stop from (q, v), beginning with that state."""
         ticks = int(np.ceil(np.abs(v).max() / self._change)) if v.any() else 0
         left = np.abs(v) - self._change * np.arange(ticks + 1)[:, None]
         speeds = np.sign(v) * np.maximum(left, 0.0)
-        ways = np.cumsum(speeds[1:], axis=0) * self.dt_s
-        return np.concatenate([q[None], q + ways]), speeds
+        moved = np.cumsum(speeds[1:], axis=0) * self.dt_s
+        return np.concatenate([q[None], q + moved]), speeds
 
     def _max_stoppable_speed(self, room: Array) -> Array:
-        """The largest v with ``stop_way(v) <= room``. With n whole steps of deceleration in v, stop_way is
-        ``dt ((n + 1) v - a dt n (n + 1) / 2)``, and at v = n a dt it is ``a dt^2 n (n + 1) / 2``."""
+        """The largest v with ``stop_way(v) <= room``. If v is n whole steps of deceleration and a remainder,
+        stop_way is ``dt ((n + 1) v - a dt n (n + 1) / 2)``; at v = n a dt it is ``a dt^2 n (n + 1) / 2``."""
         room = np.maximum(room, 0.0)
         unit = self._change * self.dt_s
         n = np.floor((np.sqrt(1.0 + 8.0 * room / unit) - 1.0) / 2.0)
@@ -81,8 +87,8 @@ class JointLimits:
 
 @dataclass
 class Refusals:
-    """Ticks in which less was let through than the joints by themselves could have done, and why; and those
-    in which what was wanted was no number."""
+    """Numbers of ticks in which a limit reduced the speeds, by limit, or the wanted speeds were invalid
+    (unsound)."""
 
     box: int = 0
     floor: int = 0
@@ -92,8 +98,8 @@ class Refusals:
 
 
 class Limiter:
-    """Joints (6,) and speeds (6,) that keep every limit of a TeleopConfig. Raises TeleopError where the arm
-    does not keep them standing still."""
+    """Joints ``q`` (6,) and speeds ``v`` (6,) that keep every limit of a TeleopConfig. The arm starts at rest
+    at ``joints`` (6,). Raises TeleopError if these break a limit."""
 
     def __init__(self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike) -> None:
         self.config, self.dt_s = config, 1.0 / config.rate_hz
@@ -110,7 +116,8 @@ class Limiter:
         self._check_start()
 
     def step(self, wanted: ArrayLike) -> tuple[Array, Array]:
-        """One tick towards joint speeds ``wanted`` (6,), which may be anything: (joints, speeds) to send."""
+        """One tick towards joint speeds ``wanted`` (6,), which may be any value. Returns joints and speeds
+        (6,)."""
         speeds = np.asarray(wanted, dtype=np.float64)
         if speeds.shape != (6,) or not np.isfinite(speeds).all():
             self.refused.unsound += 1
@@ -130,7 +137,7 @@ class Limiter:
         return self.q.copy(), self.v.copy()
 
     def _violated_limit(self, q: Array, v: Array) -> str | None:
-        """The limit that stopping from (q, v) would break, if any."""
+        """The limit that a stop from (q, v) would break, or None."""
         path, _ = self.joint_limits.stop(q, v)
         arm = self.shape.arm
         frames = link_frames(arm, np.concatenate([self.q[None], path]))
@@ -149,7 +156,7 @@ class Limiter:
         return "near" if apart.min() < self.config.margin_m + _ROUNDING else None
 
     def _check_start(self) -> None:
-        """Say why the arm cannot be teleoperated from where it stands."""
+        """Raise TeleopError if the arm breaks a limit at the start."""
         c, q = self.config, self.q
         if q.shape != (6,) or not np.isfinite(q).all():
             raise TeleopError("the arm gives no joint angles")
@@ -160,7 +167,7 @@ class Limiter:
                 f"joint {joint + 1} stands at {np.degrees(q[joint]):.1f} degrees, within joint_margin_rad of "
                 "its limit: turn it back with the pendant"
             )
-        at = self.shape.flange(q[None])[0]
+        at = link_frames(self.shape.arm, q[None])[0, 6, :3, 3]
         if np.any(at < self._low_m) or np.any(at > self._high_m):
             raise TeleopError(
                 f"the flange stands at {np.round(at, 3).tolist()} m, outside the workspace "

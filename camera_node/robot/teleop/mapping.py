@@ -1,8 +1,8 @@
-"""From the stylus to where the hand is to go: a scaled map with a clutch (4.1).
+"""Maps poses of the stylus to target poses of the hand: a scaled map with a clutch (4.1).
 
-``p_ee = p_ee0 + S R (p_h - p_h0)``: both references are taken when the clutch is pressed, the arm's being the
-pose it is at then. So pressing it commands no motion, wherever the stylus was carried meanwhile; so does a
-stylus that is found somewhere else from one message to the next, or one that was silent.
+``p_ee = p_ee0 + S R (p_h - p_h0)``: both references are the poses of arm and stylus when the clutch is
+pressed. So pressing it commands no motion, wherever the stylus is. A stylus that jumps from one message to
+the next, or that was silent, gets new references too.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ Array = NDArray[np.float64]
 
 @dataclass
 class MessageCounts:
-    """What happened to the messages."""
+    """Numbers of messages and events.
+
+    taken: messages used; unsound, backwards: refused ones, because they are invalid or older than the last.
+    jumps: stylus found elsewhere. engaged: clutch pressed. silences: watchdog expired.
+    """
 
     taken: int = 0
     unsound: int = 0
@@ -35,7 +39,7 @@ class MessageCounts:
 
 @dataclass
 class _ClutchReference:
-    """References of (4.1). hand: pose (4, 4) of the arm; the stylus's position and rotation."""
+    """References of (4.1): pose (4, 4) of the hand, position (3,) and rotation (3, 3) of the stylus."""
 
     hand: Array
     position: Array
@@ -44,7 +48,7 @@ class _ClutchReference:
 
 @dataclass
 class Mapping:
-    """Turns samples into targets. ``target``: base-from-flange (4, 4) to go to, or None: stay."""
+    """Turns samples into targets. target: base-from-flange (4, 4), or None to stay."""
 
     config: TeleopConfig
     target: Array | None = None
@@ -59,14 +63,12 @@ class Mapping:
         self._filter = OneEuro(self.config.filter_hz, self.config.filter_hz_s_m)
         self._reference: _ClutchReference | None = None
         self._last: tuple[int, Array, Array] | None = None
-        # A clutch that is held when the first message comes has not been pressed by anybody who saw the arm.
+        # A clutch that is held in the first message does not count: it must be released once.
         self._released = False
 
     def add_sample(self, sample: StylusSample, hand: Array) -> bool:
-        """A message that came while the arm's commanded pose was ``hand`` (4, 4); whether it counts as one.
-
-        What cannot be a pose, or is older than the last, is counted and changes nothing.
-        """
+        """Process a message. hand: the commanded pose (4, 4). Returns False for a message that is invalid or
+        older than the last one, which is counted and otherwise ignored."""
         if not sample.is_valid():
             self.counts.unsound += 1
             return False
@@ -89,8 +91,8 @@ class Mapping:
         return True
 
     def silence(self) -> None:
-        """Nothing has come for too long: let go. Following takes a new press of the clutch, and the stylus's
-        clock may begin anew."""
+        """Stop following, because no message came for too long. The clutch must then be pressed again, and
+        the stylus's clock may restart."""
         if self._last is not None:
             self.counts.silences += 1
         self._release()
@@ -115,10 +117,10 @@ class Mapping:
         reference = self._reference
         target = reference.hand.copy()
         moved = reference.hand[:3, 3] + self._scale * (self._axes @ (position - reference.position))
-        # Beyond the box nothing can follow: the target waits at its wall, and comes back with the stylus.
+        # The target stays inside the box and returns from its wall together with the stylus.
         target[:3, 3] = np.clip(moved, self._low, self._high)
         if self.config.orientation:
             turn = self._axes @ rotation @ reference.rotation.T @ self._axes.T
-            # Products of rotations drift; a quaternion between keeps them exactly rigid.
+            # Products of rotations drift; the conversion to a quaternion keeps them rigid.
             target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ reference.hand[:3, :3]
         self.target = target

@@ -1,16 +1,10 @@
-"""A stylus on the network: what a driver of a 3D Systems Touch, a VR controller or a script sends.
+"""A stylus on the network: a driver of a 3D Systems Touch, a VR controller or a script sends its samples.
 
-One UDP datagram a message, JSON, at most 2048 bytes, at 50 to 1000 a second::
+Each message is a UDP datagram of JSON, of at most 2048 bytes. ``camera-node teleop --help`` describes it; the
+axes of ``p`` are the arm's base's after a rotation by ``yaw_deg``, so z is up.
 
-    {"t_ns": 1234567890, "p": [x, y, z], "q": [w, x, y, z], "clutch": true}
-
-``t_ns``: when the pose was measured, nanoseconds of any clock that does not go back. ``p``: metres, in axes
-of the stylus's own; x, y and z are the arm's base's after ``yaw_deg``, so z up. ``q``: its orientation.
-``clutch``: whether the button is held; the arm follows only then. A driver of the Touch reads the three from
-``HD_CURRENT_TRANSFORM`` (millimetres, y up: p = [x, -z, y] / 1000) and ``HD_CURRENT_BUTTONS``.
-
-Only one sender is listened to: the first, until it has been silent for a second. Datagrams carry no secret
-and are not encrypted: the default address hears this machine alone.
+Only the first sender counts, until it has been silent for a second. Datagrams are neither authenticated nor
+encrypted, so the default address is reachable from this machine alone.
 """
 
 from __future__ import annotations
@@ -25,20 +19,17 @@ from camera_node.robot.teleop.stylus import StylusSample
 log = logging.getLogger("camera-node.teleop")
 
 MAX_BYTES = 2048
-# Of one poll: a flood must not keep the arm waiting.
-_MAX_MESSAGES = 64
+_MAX_MESSAGES = 64  # per poll, so that a flood does not delay the arm
 _OWNED_NS = 1_000_000_000
 
 
 class NetworkStylus:
-    """Listens at ``host``:``port``; port 0 takes a free one (``port`` then says which). ``malformed``,
-    ``from_other_senders``: datagrams that were no message, or another sender's. Raises TeleopError."""
+    """Listens at ``host``:``port``; port 0 takes a free one, which ``port`` then tells. Raises
+    TeleopError."""
 
     ended = False
 
     def __init__(self, host: str, port: int) -> None:
-        self.malformed = 0
-        self.from_other_senders = 0
         self._owner: tuple[str, int] | None = None
         self._heard_ns = 0
         try:
@@ -61,11 +52,9 @@ class NetworkStylus:
             except OSError:
                 break  # nothing there
             if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < _OWNED_NS:
-                self.from_other_senders += 1
                 continue
             sample = parse(data)
             if sample is None:
-                self.malformed += 1
                 continue
             if self._owner != sender[:2]:
                 log.info("stylus: messages come from %s:%d", *sender[:2])
@@ -78,7 +67,7 @@ class NetworkStylus:
 
 
 def parse(data: bytes) -> StylusSample | None:
-    """A message, or None for what is none. Whether its numbers make a pose is looked at later."""
+    """Parse a message; None if it is malformed. Its numbers are checked later (``StylusSample.is_valid``)."""
     if len(data) > MAX_BYTES:
         return None
     try:
@@ -95,6 +84,6 @@ def parse(data: bytes) -> StylusSample | None:
 
 
 def encode(sample: StylusSample) -> bytes:
-    """The datagram of a sample: what a sender in Python sends."""
+    """The datagram of a sample, for senders in Python."""
     message = {"t_ns": sample.t_ns, "p": sample.position_m, "q": sample.quaternion, "clutch": sample.clutch}
     return json.dumps(message).encode()

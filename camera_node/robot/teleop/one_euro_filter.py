@@ -1,4 +1,5 @@
-"""The one-euro filter (Casiez, Roussel and Vogel, CHI 2012): smooth when slow, quick when fast."""
+"""The one-euro filter (Casiez, Roussel and Vogel, CHI 2012): little noise at low speed, little lag at
+high."""
 
 from __future__ import annotations
 
@@ -11,14 +12,13 @@ from freshfield.geometry import quaternion_multiply, quaternion_to_matrix, slerp
 
 Array = NDArray[np.float64]
 
-_SPEED_HZ = 2.0  # cutoff of the speed that the cutoff follows
-# Stamps nearer or farther than these say more about a clock than about a hand.
-_MIN_S, _MAX_S = 1e-4, 0.5
+_SPEED_HZ = 2.0  # cutoff of the filter of the speed itself
+_MIN_S, _MAX_S = 1e-4, 0.5  # bounds of the time between two samples: others come from a faulty clock
 
 
 class OneEuro:
-    """Position (3,) and orientation (4,), w first, low-passed with a cutoff of ``hz + hz_per_speed * speed``,
-    each by its own speed (m/s, rad/s). ``reset`` makes the next sample pass as it is."""
+    """Low-pass of position (3,) and quaternion (4,), w first, with a cutoff of ``hz + hz_per_speed * speed``,
+    each by its own speed (m/s, rad/s). After ``reset`` the next sample passes unchanged."""
 
     def __init__(self, hz: float, hz_per_speed: float) -> None:
         self._hz, self._slope = hz, hz_per_speed
@@ -47,6 +47,6 @@ class OneEuro:
 
 
 def _smoothing_factor(cutoff_hz: float, dt_s: float) -> float:
-    """How much of the way to a new value a first-order low-pass makes in ``dt_s``."""
+    """Share of the difference to a new value that a first-order low-pass follows within ``dt_s``."""
     rate = 2.0 * math.pi * cutoff_hz * dt_s
     return rate / (rate + 1.0)

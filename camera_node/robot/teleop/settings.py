@@ -11,22 +11,27 @@ SOLVERS = ("auto", "pink", "dls")
 
 @dataclass(frozen=True)
 class TeleopConfig:
-    """How a stylus moves the arm. Positions are of the flange, in the axes of the arm's base.
+    """How a stylus moves the arm. Positions are those of the flange, in the axes of the arm's base.
 
-    scale: metres of the arm for a metre of the stylus, along each axis of the base: S of (4.1). yaw_deg: the
-    stylus's axes are turned by this about the vertical. orientation: whether the arm turns with the stylus.
-    rate_hz: joint targets a second, 20 to 500. gain_per_s: share of the way to its target that the arm sets
-    out to make in a second. filter_hz, filter_hz_s_m: of the one-euro filter: its cutoff at rest, and what a
-    speed of 1 m/s (or rad/s) adds. watchdog_ms: with no message for so long, the arm comes to rest. jump_m,
-    jump_rad: a stylus that moves farther between two messages is taken to have been put elsewhere.
+    scale: S of (4.1): metres of the arm per metre of the stylus, along each axis of the base.
+    yaw_deg: rotation of the stylus's axes about the vertical.
+    orientation: whether the arm turns with the stylus.
+    rate_hz: joint targets per second, 20 to 500.
+    gain_per_s: the commanded speed per distance from the target.
+    filter_hz, filter_hz_s_m: cutoff of the one-euro filter at rest, and its increase per m/s (or rad/s).
+    watchdog_ms: the arm stops if no message comes for so long.
+    jump_m, jump_rad: a larger motion between two messages counts as a stylus put elsewhere.
 
-    Limits, which hold at every tick whatever the stylus does. workspace_low_m, workspace_high_m: the box that
-    the flange stays in. joint_margin_rad: distance kept from the joints' limits. speed_rad_s,
-    acceleration_rad_s2: of every joint. speed_m_s: of the flange. margin_m: kept between parts of the arm
-    that are no neighbours. floor_m: nothing of the arm beyond the shoulder comes lower. tool_m and
-    tool_radius_m: the camera and what holds it, as a capsule along the flange's axis.
+    The following limits hold at every tick, whatever the stylus does.
 
-    solver: pink (extra ``teleop``), dls (damped least squares, no extra), auto: pink where it is installed.
+    workspace_low_m, workspace_high_m: corners of the box that the flange stays in.
+    joint_margin_rad: distance from the joints' limits.
+    speed_rad_s, acceleration_rad_s2: of every joint; speed_m_s: of the flange.
+    margin_m: distance between parts of the arm that are not neighbors.
+    floor_m: lowest height of the arm's parts beyond the shoulder.
+    tool_m, tool_radius_m: the camera and its mount, as a capsule along the flange's axis.
+
+    solver: pink (extra ``teleop``), dls (damped least squares, no extra), or auto: pink if it is installed.
     """
 
     scale: Vector3 = (1.0, 1.0, 1.0)
@@ -68,7 +73,7 @@ class TeleopConfig:
         for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise ValueError(f"{name}: expected {low:g} to {high:g}, got {getattr(self, name):g}")
-        # Every tick of a stop is examined before a tick is let through.
+        # The limiter checks every tick of a stop in advance, so stops must be short.
         if self.speed_rad_s / self.acceleration_rad_s2 > 2.0:
             raise ValueError("acceleration_rad_s2: too low to come to rest from speed_rad_s within 2 s")
         if self.solver not in SOLVERS:

@@ -1,4 +1,4 @@
-"""Where joint targets go: to an arm's controller, or to a file."""
+"""Sinks of joint targets: an arm's controller, or a file."""
 
 from __future__ import annotations
 
@@ -7,26 +7,22 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from camera_node.pose.providers import PoseGapError
-from camera_node.robot.arm.drive import connect_control, stop_within_timeout
+from camera_node.robot.arm.drive import STOP_RAD_S2, connect_control, joints_in_motion, stop_within_timeout
 from camera_node.robot.arm.joint_states import ArmError, ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.teleop.teleoperator import Command
-from freshfield.clock import Clock
 
-# servoJ's own filter: how far ahead it looks and how hard it pulls (UR's script manual: 0.03 to 0.2 s, 100 to
-# 2000). The gentlest pull that still holds; smoothing is ours already.
+# servoJ's own filter: lookahead time and gain (UR's script manual: 0.03 to 0.2 s, 100 to 2000). The gain is
+# the lowest that still follows well, because the targets are smooth already.
 _LOOKAHEAD_S, _SERVO_GAIN = 0.1, 300.0
-# An arm farther than this from where it was sent is being held, or has stopped.
+# An arm that lags more than this behind its target is held by something, or has stopped.
 _MAX_LAG_RAD = 0.35
-_STOP_RAD_S2 = 2.0
 HEADER = "t_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m,state"
 
 
 class Sink(Protocol):
-    """Takes a command a tick. Raises ArmError or OSError where it cannot go on."""
+    """Takes one command per tick. Raises ArmError or OSError if it cannot continue."""
 
     def send(self, t_s: float, command: Command) -> None: ...
 
@@ -34,7 +30,7 @@ class Sink(Protocol):
 
 
 class TrajectoryFile:
-    """A CSV, a line a tick: seconds, joints, where the flange is in the base's axes, the state."""
+    """A CSV file with a line per tick: time, joints, position of the flange in the base's axes, state."""
 
     def __init__(self, path: Path, arm: ArmModel) -> None:
         self._arm = arm
@@ -52,26 +48,24 @@ class TrajectoryFile:
 
 
 class ServoSink:
-    """A controller, through the manufacturer's library: servoJ a tick. stream: the same arm's joint states;
-    an arm that says nothing, or does not come after, ends it with ArmError."""
+    """A controller, through the manufacturer's library: one servoJ per tick.
 
-    def __init__(self, stream: ArmStream, clock: Clock, period_s: float) -> None:
-        self._stream, self._clock, self._period_s = stream, clock, period_s
+    stream: joint states of the same arm, which must not be stale or lag behind the targets.
+    period_s: length of a tick.
+    """
+
+    def __init__(self, stream: ArmStream, period_s: float) -> None:
+        self._stream, self._period_s = stream, period_s
         self._control: Any = connect_control(stream.host)
 
     def send(self, t_s: float, command: Command) -> None:
         """See ``Sink``."""
         del t_s
-        try:
-            actual, _ = self._stream.at(self._clock.now_ns())
-        except PoseGapError as error:
-            raise ArmError(f"{error}: stopped") from None
-        if self._stream.trouble:  # a program that is paused by a stop would go on by a leap when released
-            raise ArmError(f"{self._stream.trouble}: stopped")
-        behind = float(np.abs(actual - command.joints).max())
-        if behind > _MAX_LAG_RAD:
+        # An arm that was stopped must get no target: its program would jump there when it is released.
+        lag_rad = float(np.abs(joints_in_motion(self._stream) - command.joints).max())
+        if lag_rad > _MAX_LAG_RAD:
             raise ArmError(
-                f"arm at {self._stream.host}: {np.degrees(behind):.0f} degrees behind its target: stopped; "
+                f"arm at {self._stream.host}: {np.degrees(lag_rad):.0f} degrees behind its target: stopped; "
                 "is something in its way, or is its speed slider down?"
             )
         if not self._control.servoJ(
@@ -85,13 +79,5 @@ class ServoSink:
 
     def _stop(self) -> None:
         with contextlib.suppress(RuntimeError):
-            self._control.servoStop(_STOP_RAD_S2)
+            self._control.servoStop(STOP_RAD_S2)
             self._control.stopScript()
-
-
-def current_joints(stream: ArmStream, clock: Clock) -> NDArray[np.float64]:
-    """Joints (6,) of an arm now. Raises ArmError."""
-    try:
-        return stream.at(clock.now_ns(), 0.0)[0]
-    except PoseGapError as error:
-        raise ArmError(str(error)) from None

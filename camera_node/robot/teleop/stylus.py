@@ -1,7 +1,7 @@
-"""What every stylus gives: its pose, whether the clutch is pressed, and when that was.
+"""The samples of every stylus: pose, clutch and time.
 
-Adapters (keyboard, gamepad, network) are polled once a tick and give whatever came since; nothing in them is
-checked against the arm, and nothing they give can hurt it (see ``limits``).
+Adapters (keyboard, gamepad, network) are polled once per tick. They do not know the arm; ``limits`` makes
+every sample safe for it.
 """
 
 from __future__ import annotations
@@ -17,14 +17,19 @@ from freshfield.geometry import quaternion_normalize
 
 Array = NDArray[np.float64]
 
-# A stylus that reports positions farther than this has lost its origin.
 FARTHEST_M = 10.0
+"""Positions farther from the origin are invalid."""
 
 
 @dataclass(frozen=True)
 class StylusSample:
-    """position_m: (3,) of the stylus in its own axes. quaternion: (4,), w first. clutch: the arm follows
-    while it is pressed. t_ns: on the stylus's clock, whatever that is; only differences are used."""
+    """One sample of a stylus.
+
+    t_ns: on any clock; only differences are used.
+    position_m: (3,) in the stylus's own axes.
+    quaternion: (4,), w first.
+    clutch: the arm follows while it is pressed.
+    """
 
     t_ns: int
     position_m: tuple[float, float, float]
@@ -32,7 +37,8 @@ class StylusSample:
     clutch: bool
 
     def is_valid(self) -> bool:
-        """Whether this can be a pose at all: finite, of a quaternion that is one, within reach of a desk."""
+        """Whether this is a possible pose: finite, with a quaternion of about unit length, and not too
+        far."""
         values = (*self.position_m, *self.quaternion)
         if len(values) != 7 or not all(map(math.isfinite, values)):
             return False
@@ -40,20 +46,20 @@ class StylusSample:
         return max(map(abs, self.position_m)) <= FARTHEST_M and 0.5 < norm < 2.0 and 0 <= self.t_ns < 2**63
 
     def arrays(self) -> tuple[Array, Array]:
-        """Position (3,) and unit quaternion (4,) of a sound sample."""
+        """Position (3,) and unit quaternion (4,) of a valid sample."""
         return np.array(self.position_m), quaternion_normalize(self.quaternion)
 
 
 class Stylus(Protocol):
-    """Something an operator holds."""
+    """An input device in the operator's hand."""
 
     @property
     def ended(self) -> bool:
-        """The operator has asked to stop, or the device is gone for good."""
+        """Whether the operator asked to stop, or the device is gone."""
         ...
 
     def poll(self, now_ns: int) -> list[StylusSample]:
-        """What came since the last call, oldest first; never blocks, never raises for bad input."""
+        """Samples since the last call, oldest first. Never blocks, and never raises for bad input."""
         ...
 
     def close(self) -> None: ...

@@ -1,6 +1,6 @@
 """One tick of teleoperation: messages in, joint targets out.
 
-Time is the caller's, and ticks are equally long. The same messages at the same ticks give the same
+The caller passes the time, and all ticks are equally long. The same messages at the same ticks give the same
 motion, bit for bit.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.teleop.ik_solver import Solver, make_solver
+from camera_node.robot.teleop.ik_solver import make_solver
 from camera_node.robot.teleop.limits import Limiter
 from camera_node.robot.teleop.mapping import Mapping
 from camera_node.robot.teleop.settings import TeleopConfig
@@ -27,8 +27,13 @@ WAITING, HOLDING, FOLLOWING, SILENT = "waiting", "holding", "following", "silent
 
 @dataclass(frozen=True)
 class Command:
-    """What the arm is to do next. joints: (6,) radians; speeds: (6,) rad/s; state: waiting for the first
-    message, holding (clutch open), following, or silent (the watchdog has let go)."""
+    """The next target of the arm.
+
+    joints: (6,) radians.
+    speeds: (6,) rad/s.
+    state: waiting for the first message, holding (clutch open), following, or silent (stopped by the
+        watchdog).
+    """
 
     joints: Array
     speeds: Array
@@ -36,15 +41,13 @@ class Command:
 
 
 class Teleoperator:
-    """An arm at ``joints`` (6,), standing still, moved by stylus messages. Raises TeleopError where it stands
-    outside its limits."""
+    """Moves an arm by stylus messages. The arm starts at rest at ``joints`` (6,). Raises TeleopError if these
+    are outside its limits."""
 
-    def __init__(
-        self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike, solver: Solver | None = None
-    ) -> None:
+    def __init__(self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike) -> None:
         self.arm, self.config = arm, config
         self.limiter = Limiter(arm, config, joints)
-        self.solver = solver or make_solver(arm, config)
+        self.solver = make_solver(arm, config)
         self.mapping = Mapping(config)
         self.state = WAITING
         self.ticks = 0
@@ -52,10 +55,10 @@ class Teleoperator:
         self._heard_ns: int | None = None
 
     def tick(self, now_ns: int, samples: Iterable[StylusSample]) -> Command:
-        """The command of one period of ``config.rate_hz``, given what came since the last."""
+        """The command of this tick, given the messages since the last one."""
         hand = self.arm.forward(self.limiter.q)
         if self._heard_ns is not None and now_ns < self._heard_ns:
-            self._heard_ns = now_ns  # the clock was set back: silence is counted from here
+            self._heard_ns = now_ns  # the clock was set back: restart the watchdog
         for sample in samples:
             if self.mapping.add_sample(sample, hand):
                 self._heard_ns, self.state = now_ns, HOLDING
@@ -66,21 +69,23 @@ class Teleoperator:
         wanted = np.zeros(6)
         if target is not None:
             self.state = FOLLOWING
-            wanted = self.solver.speeds(self.limiter.q, self.limiter.v, target)
+            wanted = self.solver.speeds(self.limiter.q, target)
+        return self._step(wanted)
+
+    def stop(self) -> tuple[Command, bool]:
+        """One tick of a stop, without the stylus. Returns the command and whether the arm is now at rest."""
+        self.mapping.silence()
+        self._heard_ns, self.state = None, SILENT
+        command = self._step(np.zeros(6))
+        return command, not command.speeds.any()
+
+    def _step(self, wanted: Array) -> Command:
         joints, speeds = self.limiter.step(wanted)
         self.ticks += 1
         return Command(joints, speeds, self.state)
 
-    def stop(self) -> tuple[Command, bool]:
-        """One tick of coming to rest, whatever the stylus says; and whether the arm now stands still."""
-        self.mapping.silence()
-        self._heard_ns, self.state = None, SILENT
-        joints, speeds = self.limiter.step(np.zeros(6))
-        self.ticks += 1
-        return Command(joints, speeds, self.state), not speeds.any()
-
     def summary(self) -> dict[str, Any]:
-        """Counts for people and logs."""
+        """Counts of the whole run."""
         return {
             "ticks": self.ticks,
             "state": self.state,

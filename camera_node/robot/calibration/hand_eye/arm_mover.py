@@ -1,8 +1,7 @@
 """``camera-node calibrate hand-eye --live --drive``: the arm moves to the poses that the session proposes.
 
-Between two moves the arm's control is released, so an operator may move the hand with the pendant. Paths are
-checked as by ``drive-arm`` (``robot.arm.roadmap``): against arm, camera and floor, but not against the
-target, the cable and other objects, which are unknown.
+Control is released between two moves, so an operator may move the hand with the pendant. ``roadmap`` checks
+the paths against arm, camera and floor, but not against target, cable and other objects, which are unknown.
 """
 
 from __future__ import annotations
@@ -10,30 +9,25 @@ from __future__ import annotations
 import ctypes
 import threading
 
-import numpy as np
-
 from camera_node.config import ArmConfig, PathConfig
-from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix
-from camera_node.robot.arm.drive import DriveLimits, confirm_motion, connect_control, open_stream, visit_stops
+from camera_node.robot.arm.drive import confirm_motion, connect_control, open_stream, visit_stops
 from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.roadmap import Roadmap
 from camera_node.robot.arm.viewpoint_tour import PathError
 from camera_node.robot.calibration import ArmStopped, CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array
-from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 
 
 class ArmMover:
-    """Brings the hand of a scenario's arm to poses. Asks first, as ``drive-arm`` does, unless ``agreed_to``
-    or the arm is simulated; speed and floor are those of its ``path``. Raises ScenarioError, ArmError, and
-    CalibrationError where the answer is no."""
+    """Moves the hand of a scenario's arm to given poses, with speed and floor of its ``path``. Asks the
+    operator first, unless ``agreed_to`` or the arm is simulated. Raises ScenarioError, ArmError, and
+    CalibrationError if the answer is no."""
 
     def __init__(self, scenario: Scenario, config: ArmConfig, agreed_to: bool) -> None:
-        path = config.path or PathConfig()
+        self._path = config.path or PathConfig()
         self._model, self._base = arm_model(scenario, config), base_matrix(config)
-        self._floor_m, self._pace = path.floor_m, DriveLimits.of(config, path)
         self._visited: list[Array] = []
         self._stream = open_stream(config)
         try:
@@ -45,21 +39,21 @@ class ArmMover:
             raise
 
     def __call__(self, hand: Array) -> None:
-        """Bring the hand to ``hand`` (4, 4) in base, at rest. Raises PathError for a pose that cannot be
-        reached, and ArmStopped."""
+        """Move the hand to ``hand`` (4, 4) in base. Raises PathError if it cannot be reached, and
+        ArmStopped."""
         try:
-            at, _ = self._stream.at(WallClock().now_ns(), 0.0)
+            at = self._stream.now()
             if self._stream.trouble:
                 raise ArmError(self._stream.trouble)
             stops = self._route(at, hand)
             control = connect_control(self._stream.host)
             try:
-                visit_stops(control, self._stream, stops, self._pace, threading.Event())
+                visit_stops(control, self._stream, stops, self._path, threading.Event())
             except ArmError:
                 # Keep the library's object: its destructor would wait for an arm that may be gone.
                 ctypes.pythonapi.Py_IncRef(ctypes.py_object(control))
                 raise
-        except (ArmError, PoseGapError) as error:
+        except ArmError as error:
             raise ArmStopped(str(error)) from None
         self._visited += [at, *stops]
 
@@ -69,9 +63,9 @@ class ArmMover:
     def _route(self, at: Array, hand: Array) -> list[Array]:
         there = [p.joints for p in self._model.inverse(hand, at) if not p.singular]
         places = [0] * len(there) + [1] * len(self._visited)
-        roadmap = Roadmap(self._model, self._base, [*there, *self._visited], places, self._floor_m)
-        way = roadmap.shortest_path(np.asarray(at), {0})
-        if way is None:
+        roadmap = Roadmap(self._model, self._base, [*there, *self._visited], places, self._path.floor_m)
+        steps = roadmap.shortest_path(at, {0})
+        if steps is None:
             why = "without coming near itself or the floor" if there else "at all"
             raise PathError(f"the arm does not get there {why}: another pose will be proposed")
-        return [joints for joints, _ in way]
+        return [joints for joints, _ in steps]

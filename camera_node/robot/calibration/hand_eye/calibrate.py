@@ -1,4 +1,4 @@
-"""Hand-eye calibration of samples or streams by every method, with uncertainty and warnings."""
+"""Hand-eye calibration from samples or streams by every method, with uncertainty and warnings."""
 
 from __future__ import annotations
 
@@ -29,19 +29,21 @@ ALL_METHODS = (*METHODS, REFINED)
 _GOOD_POSES = 10
 _LARGE_RESIDUAL_DEG, _LARGE_RESIDUAL_MM = 3.0, 20.0
 _MISMATCH_DEG = 1.0
-# Beyond these the input is wrong: inverted poses, millimetres, or poses of something else.
+# Larger values mean wrong input: inverted poses, millimetres, or poses of another body.
 _WORST_DEG, _WORST_MM, _FARTHEST_M = 15.0, 100.0, 5.0
 _ADVICE = (
     "are the poses hand in base and target in camera, not their inverses, in metres, and is the set-up right?"
 )
-# Practically exact beside any camera.
-EXACT_ARM = (1e-6, 1e-6)
+_EXACT_ARM = (1e-6, 1e-6)  # radians, metres: negligible beside the noise of any camera
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method's result. transform: None with ``error`` if there is no solution. from_refined_deg, _mm:
-    distance from the refinement's."""
+    """Result of one method.
+
+    transform, residuals: None if the method found no solution; ``error`` then says why.
+    from_refined_deg, from_refined_mm: distance from the refinement's result.
+    """
 
     method: str
     transform: Array | None
@@ -53,9 +55,15 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Calibration:
-    """transform: X (4, 4) of the method asked for. rows: every method's. left_out_deg, left_out_mm: deviation
-    over leaving out samples in turn (``groups`` of them). exact_arm: the refinement with the arm taken as
-    exact, if the target's covariance is known. timed: of two streams. warnings: one line each."""
+    """Result of a hand-eye calibration.
+
+    method: the one asked for; transform, residuals: its X (4, 4) and residuals.
+    rows: results of every method.
+    left_out_deg, left_out_mm: deviation of X when one of ``groups`` of samples is left out (jackknife).
+    exact_arm: the refinement with the arm taken as exact, if the target's covariance is known.
+    timed: the time offset, for two streams.
+    warnings: one line each.
+    """
 
     samples: Samples
     method: str
@@ -76,7 +84,7 @@ class Calibration:
         return 0.0 if self.timed is None else self.timed.offset_s
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON for scripts: the result, its residuals, standard deviations and warnings."""
+        """The result as JSON, as ``--json`` prints it."""
         return {
             "transform": self.transform.tolist(),
             "time_offset_s": self.time_offset_s,
@@ -90,7 +98,8 @@ class Calibration:
 
 
 def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
-    """Calibrate with every method. Raises CalibrationError if the samples do not determine X."""
+    """Calibrate with every method; ``method`` names the one that gives the result. Raises CalibrationError if
+    the samples do not determine X."""
     spread = require_diversity(samples)
     return _calibration(samples, method, refine(samples), spread, None)
 
@@ -98,7 +107,7 @@ def calibrate(samples: Samples, method: str = REFINED) -> Calibration:
 def calibrate_tracks(
     hand: Track, target: Track, setup: str, method: str = REFINED, max_gap_s: float = MAX_GAP_S
 ) -> Calibration:
-    """Calibrate from two streams with an unknown time offset. Raises CalibrationError."""
+    """Calibrate from two streams with an unknown time offset; see ``calibrate``. Raises CalibrationError."""
     timed = calibrate_streams(hand, target, setup, max_gap_s)
     return _calibration(timed.samples, method, timed.refined, require_diversity(timed.samples), timed)
 
@@ -109,6 +118,7 @@ def angle_deg(a: Array, b: Array) -> float:
 
 
 def distance_mm(a: Array, b: Array) -> float:
+    """Distance between the origins of two transforms (4, 4) in metres."""
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3]) * 1e3)
 
 
@@ -120,8 +130,9 @@ def _calibration(
             x = find()
         except CalibrationError as error:
             return MethodResult(name, None, None, error=str(error))
-        away = angle_deg(refined.x, x), distance_mm(refined.x, x)
-        return MethodResult(name, x, residuals(samples, x), *away)
+        return MethodResult(
+            name, x, residuals(samples, x), angle_deg(refined.x, x), distance_mm(refined.x, x)
+        )
 
     rows = [row(name, lambda name=name: solve(samples, name)) for name in METHODS]  # type: ignore[misc]
     rows.append(row(REFINED, lambda: refined.x))
@@ -132,7 +143,7 @@ def _calibration(
     exact = None
     if samples.covariance is not None:
         start = (refined.x, refined.y)
-        exact = row("exact arm", lambda: refine(samples, start, arm_noise=EXACT_ARM).x)
+        exact = row("exact arm", lambda: refine(samples, start, arm_noise=_EXACT_ARM).x)
     left_deg, left_mm, groups = jackknife(samples, refined)
     return Calibration(
         samples, method, chosen.transform, chosen.residuals, tuple(rows), refined, left_deg, left_mm, groups,
@@ -141,17 +152,15 @@ def _calibration(
 
 
 def _require_plausible(transform: Array, off: Residuals) -> None:
-    """Raises CalibrationError for a result that cannot be right. Judged by medians, so that a few wild
-    samples among good ones do no harm."""
-    median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
-    away_m = float(np.linalg.norm(transform[:3, 3]))
-    if median_mm > _WORST_MM or median_deg > _WORST_DEG:
+    """Raise CalibrationError for a result that cannot be right. Medians ignore a few outliers."""
+    if off.median_mm > _WORST_MM or off.median_deg > _WORST_DEG:
         raise CalibrationError(
-            f"the poses do not fit together (residuals {median_mm:.0f} mm, {median_deg:.1f} degrees in the "
-            f"median): {_ADVICE}"
+            f"the poses do not fit together (residuals {off.median_mm:.0f} mm, {off.median_deg:.1f} degrees "
+            f"in the median): {_ADVICE}"
         )
-    if away_m > _FARTHEST_M:
-        raise CalibrationError(f"the camera would be {away_m:.1f} m away: {_ADVICE}")
+    distance_m = float(np.linalg.norm(transform[:3, 3]))
+    if distance_m > _FARTHEST_M:
+        raise CalibrationError(f"the camera would be {distance_m:.1f} m away: {_ADVICE}")
 
 
 def _warnings(
@@ -165,10 +174,10 @@ def _warnings(
             f"{spread.half_turns} of {spread.motions} motions turn by nearly 180 degrees, which upsets "
             "Tsai-Lenz"
         )
-    median_mm, median_deg = float(np.median(off.mm)), float(np.median(off.deg))
-    if median_mm > _LARGE_RESIDUAL_MM or median_deg > _LARGE_RESIDUAL_DEG:
+    if off.median_mm > _LARGE_RESIDUAL_MM or off.median_deg > _LARGE_RESIDUAL_DEG:
         out.append(
-            f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
+            f"residuals are large ({off.median_mm:.1f} mm, {off.median_deg:.1f} degrees in the median): "
+            f"{_ADVICE}"
         )
     mismatch = rotation_mismatch_deg(samples)
     threshold = max(_MISMATCH_DEG, 5 * float(np.median(mismatch)))

@@ -1,4 +1,4 @@
-"""Closed forms of A X = X B (4.6): Tsai-Lenz, which the thesis uses, and four others, as OpenCV has them."""
+"""Closed-form solutions of A X = X B (4.6) from OpenCV: Tsai-Lenz, which the thesis uses, and four others."""
 
 from __future__ import annotations
 
@@ -27,13 +27,16 @@ METHODS = {
 }
 # OpenCV pairs every sample with every other: more samples take seconds and gain nothing.
 MAX_CLOSED_FORM = 60
-# Random subsets to start the refinement from, so that a few wrong samples do not spoil the start.
+# Random subsets for the start of the refinement: some of them contain no outlier.
 _SUBSETS, _SUBSET_SIZE = 24, 5
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Distance of each sample's target from the mean of all, in the frame where it is at rest: (N,) each."""
+    """Distances of each sample's target from the mean of all, in the frame where it is at rest.
+
+    mm, deg: (N,) of translation and rotation.
+    """
 
     mm: Array
     deg: Array
@@ -46,13 +49,21 @@ class Residuals:
     def rms_deg(self) -> float:
         return float(np.sqrt(np.mean(self.deg**2)))
 
+    @property
+    def median_mm(self) -> float:
+        return float(np.median(self.mm))
+
+    @property
+    def median_deg(self) -> float:
+        return float(np.median(self.deg))
+
 
 def solve(samples: Samples, method: str) -> Array:
-    """X (4, 4) by one closed form. Raises CalibrationError if it finds no solution."""
+    """X (4, 4) by one of ``METHODS``. Raises CalibrationError if it finds no solution."""
     few = samples.subsample(MAX_CLOSED_FORM)
     moved, target = few.moved, few.target
     try:
-        # By keyword: by position, OpenCV would take the method for an output and run Tsai-Lenz.
+        # By keyword: as a positional argument the method would be an output, and OpenCV would run Tsai-Lenz.
         rotation, translation = cv2.calibrateHandEye(
             list(moved[:, :3, :3]), list(moved[:, :3, 3]), list(target[:, :3, :3]), list(target[:, :3, 3]),
             method=METHODS[method],
@@ -72,34 +83,34 @@ def target_at_rest(samples: Samples, x: Array) -> Array:
     return np.asarray(samples.moved @ x @ samples.target)
 
 
-def mean_transform(transforms: Array) -> Array:
+def _mean_transform(transforms: Array) -> Array:
     """Chordal mean of rotations and mean of translations."""
     rotation = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
     return transform_of(np.asarray(rotation), transforms[:, :3, 3].mean(axis=0))
 
 
 def residuals(samples: Samples, x: Array) -> Residuals:
-    """Of any X: distances of ``still`` from its mean."""
-    return residuals_from(target_at_rest(samples, x), None)
+    """Residuals of any X (4, 4)."""
+    places = target_at_rest(samples, x)
+    return _residuals_from(places, _mean_transform(places))
 
 
-def residuals_from(places: Array, center: Array | None) -> Residuals:
-    y = mean_transform(places) if center is None else center
-    turned = angles(y[:3, :3].T @ places[:, :3, :3])
-    off = np.linalg.norm(places[:, :3, 3] - y[:3, 3], axis=1)
+def _residuals_from(places: Array, center: Array) -> Residuals:
+    turned = angles(center[:3, :3].T @ places[:, :3, :3])
+    off = np.linalg.norm(places[:, :3, 3] - center[:3, 3], axis=1)
     return Residuals(off * 1e3, np.degrees(turned))
 
 
 def predicted_hand(samples: Samples, x: Array, y: Array) -> Array:
-    """(N, 4, 4): hand poses in base that X, Y and the target poses imply."""
+    """Hand poses in base (N, 4, 4) that follow from X, Y and the target poses."""
     if samples.setup == EYE_IN_HAND:
         return np.asarray(y @ inverse(samples.target) @ inverse(x))
     return np.asarray(x @ samples.target @ inverse(y))
 
 
 def robust_start(samples: Samples) -> tuple[Array, Array]:
-    """X and Y (4, 4) to refine from: of the closed forms on everything and of Park's on small subsets, the
-    one with the least median residual. The subsets are the same in every run. Raises CalibrationError."""
+    """Start of the refinement, X and Y (4, 4): the closed form with the smallest median residual, tried on
+    all samples and on small random subsets, which are the same in every run. Raises CalibrationError."""
     few = samples.subsample(MAX_CLOSED_FORM)
     rng = np.random.default_rng(0)
     subsets = []
@@ -114,8 +125,8 @@ def robust_start(samples: Samples) -> tuple[Array, Array]:
             continue
         places = target_at_rest(few, x)
         y = _median_transform(places)
-        off = residuals_from(places, y)
-        # One degree counts as the motion of a point at a third of a metre.
+        off = _residuals_from(places, y)
+        # A rotation counts as the motion of a point at a third of a metre.
         score = float(np.median(off.mm + np.deg2rad(off.deg) * 330.0))
         if best is None or score < best[0]:
             best = score, x, y
@@ -125,6 +136,6 @@ def robust_start(samples: Samples) -> tuple[Array, Array]:
 
 
 def _median_transform(places: Array) -> Array:
-    """The transform nearest to all others: a center that outliers do not move."""
+    """The transform nearest to all others, a center that is robust to outliers."""
     distance = np.linalg.norm(places[:, None, :3, :] - places[None, :, :3, :], axis=(2, 3))
     return places[int(np.argmin(np.median(distance, axis=1)))]

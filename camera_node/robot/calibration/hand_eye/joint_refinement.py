@@ -1,6 +1,6 @@
 """Joint refinement of the hand-eye calibration: robust maximum likelihood of X, Y and the arm's noise.
 
-The arm is not exact: each sample has a hand pose that differs a little from the reported one. With e_i the
+The arm is not exact: in each sample the true hand pose differs a little from the reported one. With e_i the
 six numbers by which the predicted hand differs from the reported one (rotation vector and translation, in the
 hand's axes),
 
@@ -23,25 +23,38 @@ from scipy.optimize import least_squares
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.closed_form import predicted_hand, robust_start
-from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, inverse, transform_of
+from camera_node.robot.calibration.hand_eye.samples import (
+    Array,
+    Rotation,
+    Samples,
+    inverse,
+    rotation_vectors,
+    transform_of,
+)
 
-# Of Student's t; ``calibrate accuracy`` shows the loss of efficiency on data without outliers.
+# Of Student's t. ``calibrate accuracy`` shows the loss of efficiency on data without outliers.
 _DEGREES_OF_FREEDOM = 8.0
 _ROUNDS, _INNER_ROUNDS = 12, 60
-# Radians, metres and seconds: a smaller step is far below what can be measured.
+_JACKKNIFE_GROUPS = 30
+# Radians, metres and seconds: smaller steps are far below what can be measured.
 _CONVERGED = 1e-8
 # Lower bound of the noise: perfect data would make the likelihood infinite.
 _MIN_RAD, _MIN_M = 1e-7, 1e-7
-# A sample's weight is below this if its six whitened residuals have a sum of squares above 32, as one good
-# sample in sixty thousand has.
+# A sample's weight is lower if its six whitened residuals have a sum of squares above 32. This happens to one
+# good sample in sixty thousand.
 OUTLIER_WEIGHT = 0.35
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """x, y: (4, 4). covariance: (6, 6) of x: rotation (radians, camera axes), translation (metres).
-    arm_noise_rad, arm_noise_m: the arm's noise, estimated or given. weights: (N,), about 1 for a good sample.
-    offset_s, offset_std_s: of the time offset, where velocities were given."""
+    """Result of the refinement.
+
+    x, y: (4, 4).
+    covariance: (6, 6) of x: rotation (radians, camera axes) and translation (metres).
+    arm_noise_rad, arm_noise_m: the arm's noise, estimated or given.
+    weights: (N,), about 1 for a good sample.
+    offset_s, offset_std_s: time offset and its deviation, if velocities were given.
+    """
 
     x: Array
     y: Array
@@ -73,11 +86,14 @@ def refine(
     velocity: Array | None = None,
     weights: Array | None = None,
 ) -> Refinement:
-    """Refine from ``start`` (X, Y), or from ``robust_start``.
+    """Maximize the likelihood of X and Y.
 
-    arm_noise: (radians, metres), fixed instead of estimated; near zero takes the arm as exact, which makes
-    sense only with a covariance of the target. velocity: (N, 6) of the hand in its own axes (rad/s, m/s); the
-    time offset is then refined too. weights: (N,), fixed instead of estimated. Raises CalibrationError.
+    start: X and Y (4, 4) to begin with; None: those of ``robust_start``.
+    arm_noise: (radians, metres), fixed instead of estimated. Near zero takes the arm as exact, which makes
+        sense only if the target's covariance is known.
+    velocity: (N, 6) of the hand in its own axes (rad/s, m/s), to refine the time offset too.
+    weights: (N,), fixed instead of estimated.
+    Raises CalibrationError.
     """
     x, y = start if start is not None else robust_start(samples)
     offset_s = 0.0
@@ -85,7 +101,7 @@ def refine(
         x, y = _converge_start(samples, x, y)
     noise = np.array(arm_noise or _robust_scale(_residuals(samples, x, y)))
     for _ in range(_ROUNDS):
-        # Step, noise and weights are all solved on the linearized problem, which is cheap.
+        # Step, noise and weights are solved together on the linearized problem, which is cheap.
         e, jacobian = _residuals(samples, x, y), _jacobian(samples, x, y, velocity)
         if velocity is not None:
             e = e - velocity * offset_s
@@ -107,8 +123,8 @@ def refine(
 def cramer_rao_bound(
     samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]
 ) -> tuple[float, float]:
-    """Cramer-Rao bound of X at the truth, with Y unknown too: degrees and mm, each the root of the summed
-    variances of three numbers."""
+    """Cramer-Rao bound of X at the truth, with Y unknown too: degrees and mm, each the root of the sum of
+    three variances. arm_noise: (radians, metres)."""
     covariance = np.linalg.inv(sample_information(samples, x, y, arm_noise).sum(axis=0))
     return (
         float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
@@ -117,16 +133,16 @@ def cramer_rao_bound(
 
 
 def sample_information(samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]) -> Array:
-    """(N, 12, 12): Fisher information of each sample on X and Y (rotation, translation of each)."""
+    """Fisher information (N, 12, 12) of each sample on X and Y (rotation and translation of each)."""
     covariances = _covariances(_target_covariance(samples, x, y), len(samples), np.array(arm_noise))
     slopes = _whitener(covariances) @ _jacobian(samples, x, y, None)
     return np.asarray(np.swapaxes(slopes, 1, 2) @ slopes)
 
 
-def jackknife(samples: Samples, found: Refinement, groups: int = 30) -> tuple[float, float, int]:
-    """Jackknife deviations of X in degrees and mm (roots of summed variances), and the number of groups.
-    Samples are left out one by one, or in ``groups`` stretches of the recording if there are more."""
-    parts = np.array_split(np.arange(len(samples)), min(groups, len(samples)))
+def jackknife(samples: Samples, found: Refinement) -> tuple[float, float, int]:
+    """Jackknife deviations of X in degrees and mm (roots of summed variances), and the number of groups: one
+    per sample, or at most 30 stretches of the recording."""
+    parts = np.array_split(np.arange(len(samples)), min(_JACKKNIFE_GROUPS, len(samples)))
     rotations, shifts = [], []
     for part in parts:
         kept = np.setdiff1d(np.arange(len(samples)), part)
@@ -134,7 +150,7 @@ def jackknife(samples: Samples, found: Refinement, groups: int = 30) -> tuple[fl
             samples.take(kept), (found.x, found.y), (found.arm_noise_rad, found.arm_noise_m),
             weights=found.weights[kept],
         )  # fmt: skip
-        rotations.append(Rotation.from_matrix(found.x[:3, :3].T @ again.x[:3, :3]).as_rotvec())
+        rotations.append(rotation_vectors(found.x[:3, :3].T @ again.x[:3, :3]))
         shifts.append(again.x[:3, 3] - found.x[:3, 3])
     factor = (len(parts) - 1) / len(parts)
     spread = [np.sqrt(factor * ((v - v.mean(axis=0)) ** 2).sum()) for v in map(np.array, (rotations, shifts))]
@@ -149,8 +165,7 @@ def _retract(transform: Array, step: Array) -> Array:
 def _residuals(samples: Samples, x: Array, y: Array) -> Array:
     """(N, 6): predicted minus reported hand (rotation vector, translation), in the hand's axes."""
     off = inverse(samples.hand) @ predicted_hand(samples, x, y)
-    turns = np.asarray(Rotation.from_matrix(off[:, :3, :3]).as_rotvec())
-    return np.concatenate([turns, off[:, :3, 3]], axis=1)
+    return np.concatenate([rotation_vectors(off[:, :3, :3]), off[:, :3, 3]], axis=1)
 
 
 def _jacobian(samples: Samples, x: Array, y: Array, velocity: Array | None) -> Array:

@@ -26,13 +26,16 @@ from freshfield import files, scenario
 from freshfield.geometry import Pinhole, se3_inverse
 
 if TYPE_CHECKING:
-    from camera_node.robot.arm.joint_states import ArmStream
     from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 
 
 def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None, setup: str) -> Calibration:
-    """Run a session with a scenario's camera. Ctrl-C ends it with what there is. Raises CalibrationError,
-    ScenarioError."""
+    """Run a session with a scenario's camera and calibrate from its samples. Ctrl-C ends the session early.
+
+    board, lens: the target, and a lens that replaces the camera's own.
+    setup: eye-in-hand or eye-to-hand.
+    Raises CalibrationError and ScenarioError.
+    """
     if not args.want_mm > 0 or (args.seconds is not None and not args.seconds > 0):
         raise CalibrationError("--want-mm, --seconds: expected positive numbers")
     loaded = live_camera.load_scenario(args)
@@ -80,7 +83,7 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
         if args.drive and arm is not None:
             mover = _open_arm(loaded, arm, args.yes)
         if tracks is not None and arm is not None:
-            stream = _follow(loaded, arm, tracks)
+            stream = follow_arm(loaded, arm, tracks)
         guide(
             source, config.codec, lens, session, pace, show, hands,
             move=mover, to_base=to_base, tracks=tracks, first=live_camera.first_tick(source),
@@ -114,16 +117,10 @@ def _create_writable(folder: Path) -> None:
         raise CalibrationError(f"--tracks: {folder}: {error.strerror}") from None
 
 
-def _follow(loaded: scenario.Scenario, arm: ArmConfig, tracks: StreamRecorder) -> ArmStream:
-    try:
-        return follow_arm(loaded, arm, tracks)
-    except ValueError as error:
-        raise CalibrationError(str(error)) from None
-
-
 def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> ArmMover:
-    """Connect to the arm; from now on a termination signal stops a move first. Raises CalibrationError,
+    """Connect to the arm. From now on a termination signal stops a move first. Raises CalibrationError and
     ScenarioError."""
+    from camera_node.robot.arm.drive import stop_signals
     from camera_node.robot.arm.joint_states import ArmError
     from camera_node.robot.calibration.hand_eye.arm_mover import ArmMover
 
@@ -131,15 +128,15 @@ def _open_arm(loaded: scenario.Scenario, arm: ArmConfig, agreed_to: bool) -> Arm
         mover = ArmMover(loaded, arm, agreed_to)
     except ArmError as error:
         raise CalibrationError(str(error)) from None
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
+    for number in stop_signals():
+        if number != signal.SIGINT:
             signal.signal(number, signal.default_int_handler)
     return mover
 
 
 def _to_base(loaded: scenario.Scenario, arm: ArmConfig, camera: str) -> Array:
-    """Base-from-world (4, 4): the arm reports poses in the world, the calibration needs them in its base.
-    Raises CalibrationError, ScenarioError."""
+    """Base-from-world (4, 4), because the arm's poses are in the world and the calibration needs them in its
+    base. Raises CalibrationError."""
     from camera_node.robot.arm.camera_poses import base_matrix
 
     if camera not in arm.cameras or arm.cameras[camera] is not None:
@@ -163,15 +160,17 @@ def guide(
     tracks: StreamRecorder | None = None,
     first: int = 0,
 ) -> HandEyeStep | None:
-    """Offer the source's shots to the session until it has enough, ``pace`` ends it, or a recording has been
-    seen once. Returns the last step.
+    """Offer the source's shots to the session until it has enough, ``pace`` ends it, or a recording ends.
 
     lens: replaces the source's own.
+    show: called with every image, its step and the session.
     hands: hand poses by time since the first shot; None: the shots' poses are the hand's.
-    move: brings the hand to a pose (4, 4), ValueError if it cannot; None: an operator moves it.
+    move: moves the hand to a pose (4, 4), ValueError if it cannot; None: an operator moves it.
     to_base: base-from-world (4, 4), if the hand's poses are in the world.
     tracks: records the target poses and decides when there is enough.
-    first: first tick of the source."""
+    first: first tick of the source.
+    Returns the last step.
+    """
     step, begin_ns = None, None
     for tick, shot, image in live_camera.read_shots(source, codec, pace, first):
         t_ns = shot.captured_ns
@@ -206,5 +205,5 @@ def _move_to_next_pose(session: HandEyeSession, step: HandEyeStep, move: Callabl
         return
     try:
         move(wanted)
-    except ValueError as error:  # the hand stays, so the next image is rejected and another pose proposed
+    except ValueError as error:  # the hand stays, so the next image is rejected and another pose is proposed
         live_camera.report_skipped(error)

@@ -1,7 +1,7 @@
 """The next hand pose of a guided session, by greedy A-optimal design.
 
-The information of a sample depends on the poses alone, so it is known before the sample is taken. Many target
-poses before the camera are drawn at random, and the one that lowers the variance of X most is proposed.
+The information of a sample depends on the poses alone, so it is known in advance. Of many random target poses
+in front of the camera, the one that lowers the variance of X most is proposed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from freshfield.geometry import so3_exp
 
 _CANDIDATES = 120
 MAX_TILT_DEG = 50.0
-# A rotation of X is weighed by the motion it causes at this distance from the camera.
+# A rotation of X is weighted by the motion that it causes at this distance from the camera.
 _LEVER_M = 0.3
 # Offset of the target's middle from the image's, as a share of its distance.
 _OFF_MIDDLE = 0.08
@@ -26,8 +26,12 @@ _FIRST_TURN_DEG = 15.0
 
 @dataclass(frozen=True)
 class Proposal:
-    """hand: (4, 4) in base. target: (4, 4) in camera, as expected there. std_mm: of X with that sample added,
-    at the present estimate of the arm's noise."""
+    """A proposed pose.
+
+    hand: (4, 4) in base.
+    target: (4, 4) in camera, as expected there.
+    std_mm: standard deviation of X with that sample added, at the current estimate of the arm's noise.
+    """
 
     hand: Array
     target: Array
@@ -44,8 +48,12 @@ def propose_pose(
     new_deg: float = 8.0,
 ) -> Proposal:
     """The best of 120 random target poses: at distances already seen, tilted by up to 50 degrees, with any
-    roll. Preferred are hands rotated by at least ``new_deg`` from earlier ones and not much farther out.
-    noise: of the arm (radians, metres). middle: (3,) of the target, in its axes."""
+    roll. Hands rotated by at least ``new_deg`` from earlier ones, and not much farther out, are preferred.
+
+    x, y: (4, 4), the current estimates of X and Y.
+    noise: of the arm (radians, metres).
+    middle: (3,) of the target, in its axes.
+    """
     targets = _candidate_targets(samples, middle, rng)
     hands = predicted_hand(Samples(targets, targets, samples.setup), x, y)
     reach = np.linalg.norm(samples.hand[:, :3, 3], axis=1).max() * 1.05
@@ -63,8 +71,8 @@ def propose_pose(
 
 
 def initial_pose(start: Array, taken: int) -> Array:
-    """(4, 4): hand pose while X is unknown: that of the first sample, rotated by 15 degrees about x, y and z
-    in turn, then by -15, so that the target hardly leaves the image."""
+    """Hand pose (4, 4) to propose while X is unknown: that of the first sample, rotated by 15 degrees about
+    x, y and z in turn, then by -15, so that the target stays in the image."""
     turn = np.zeros(3)
     turn[taken % 3] = np.deg2rad(_FIRST_TURN_DEG) * (1 if taken // 3 % 2 == 0 else -1)
     out = start.copy()
@@ -73,7 +81,7 @@ def initial_pose(start: Array, taken: int) -> Array:
 
 
 def describe_motion(now: Array, wanted: Array) -> str:
-    """Instruction for an operator: from a hand pose (4, 4) to another, in the hand's own axes."""
+    """Instruction to an operator to move the hand from one pose (4, 4) to another, in its own axes."""
     step = inverse(now) @ wanted
     chord = step[:3, :3]
     vector = np.array([chord[2, 1] - chord[1, 2], chord[0, 2] - chord[2, 0], chord[1, 0] - chord[0, 1]])
@@ -86,7 +94,7 @@ def describe_motion(now: Array, wanted: Array) -> str:
 
 
 def _candidate_targets(samples: Samples, middle: Array, rng: np.random.Generator) -> Array:
-    """(N, 4, 4) random targets whose middle (3,) is near that of the image, at distances already seen."""
+    """Random targets (N, 4, 4) whose middle (3,) is near that of the image, at distances already seen."""
     depths = (samples.target @ np.append(middle, 1.0))[:, 2]
     out = []
     for _ in range(_CANDIDATES):

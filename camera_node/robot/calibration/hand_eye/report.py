@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import numpy as np
 import yaml
 
+from camera_node.robot import tables
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, MAX_OFFSET_S
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.calibrate import Calibration, MethodResult
 from camera_node.robot.calibration.hand_eye.closed_form import target_at_rest
-from camera_node.robot.calibration.hand_eye.samples import Rotation, rotation_vectors
+from camera_node.robot.calibration.hand_eye.samples import rotation_vectors
 from freshfield import files
 
 _BLUE, _RED, _GREY = "#0072B2", "#D55E00", "#999999"
@@ -52,7 +52,7 @@ def show(found: Calibration) -> str:
 
 
 def to_yaml(found: Calibration) -> str:
-    """The YAML that ``hand_eye_mount.read_hand_eye`` reads, with details of the calibration."""
+    """The YAML file that ``hand_eye_mount.read_hand_eye`` reads, with details of the calibration."""
     answer = found.to_dict()
     warnings = answer.pop("warnings")
     data = {
@@ -70,7 +70,7 @@ def to_yaml(found: Calibration) -> str:
 
 
 def write_yaml(found: Calibration, path: Path) -> None:
-    """Write ``to_yaml``. Raises CalibrationError, also for an offset that the node would refuse."""
+    """Write ``to_yaml``. Raises CalibrationError, also for a time offset that the node would refuse."""
     if abs(found.time_offset_s) >= MAX_OFFSET_S:
         raise CalibrationError(
             f"--out: {path} is not written: the node would refuse a time offset of "
@@ -83,14 +83,10 @@ def write_yaml(found: Calibration, path: Path) -> None:
 
 
 def plot(found: Calibration, path: Path) -> None:
-    """Plot residuals, motion axes and each pose's target position. Raises CalibrationError."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise CalibrationError("--plot needs matplotlib (pip install 'freshfield[calibrate]')") from None
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    """Plot residuals, rotation axes and each pose's target position. Raises CalibrationError."""
+    plt = tables.pyplot()
+    if plt is None:
+        raise CalibrationError("--plot needs matplotlib (pip install 'freshfield[calibrate]')")
     figure, (bars, ball, places) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     count = np.arange(1, len(found.samples) + 1)
     bars.bar(count, found.residuals.mm, color=_BLUE)
@@ -102,8 +98,8 @@ def plot(found: Calibration, path: Path) -> None:
     right.set_ylabel("residual (degrees, dots)")
 
     rotation = found.samples.subsample(40).moved[:, :3, :3]
-    pairs = list(itertools.combinations(range(len(rotation)), 2))
-    turns = rotation_vectors(np.array([rotation[i].T @ rotation[j] for i, j in pairs]))
+    first, second = np.triu_indices(len(rotation), 1)
+    turns = rotation_vectors(np.swapaxes(rotation[first], 1, 2) @ rotation[second])
     angle = np.linalg.norm(turns, axis=1)
     axes = turns / np.maximum(angle, 1e-12)[:, None]
     axes *= np.where(axes[:, 2:] < 0, -1.0, 1.0)  # an axis and its opposite are one
@@ -136,5 +132,4 @@ def _row(row: MethodResult) -> str:
 
 
 def _turn(found: Calibration) -> str:
-    vector = np.asarray(Rotation.from_matrix(found.transform[:3, :3]).as_rotvec())
-    return f"({', '.join(f'{v:.5f}' for v in vector)}) rad"
+    return f"({', '.join(f'{v:.5f}' for v in rotation_vectors(found.transform[:3, :3]))}) rad"

@@ -21,19 +21,24 @@ from camera_node.robot.calibration import CalibrationError
 Array = NDArray[np.float64]
 
 MIN_POSES = 3
-# The axis of a smaller rotation is mostly noise; one nearer than the margin to half a turn has two axes.
+# The axis of a smaller rotation is mostly noise. The sign of the axis is lost within the margin of half a
+# turn.
 MIN_TURN_DEG, HALF_TURN_MARGIN_DEG = 5.0, 10.0
 # Axes within a cone of about this half angle leave the translation along them undetermined.
 MIN_SPREAD_DEG = 8.0
-# Samples whose pairs are examined: 80 have 3160 pairs.
-_MAX_SAMPLES = 80
+_MAX_SAMPLES = 80  # have 3160 pairs
 
 
 @dataclass(frozen=True)
 class Samples:
-    """hand: (N, 4, 4) hand in base. target: (N, 4, 4) target in camera. covariance: (N, 6, 6) of the target's
-    rotation (radians, about the target's own axes) and translation (metres, camera axes); None: exact.
-    names: for messages."""
+    """Samples of one setup.
+
+    hand: (N, 4, 4) hand in base.
+    target: (N, 4, 4) target in camera.
+    covariance: (N, 6, 6) of the target's rotation (radians, about its own axes) and translation (metres,
+        camera axes); None: exact.
+    names: for messages.
+    """
 
     hand: Array
     target: Array
@@ -55,43 +60,44 @@ class Samples:
 
     @property
     def moved(self) -> Array:
-        """G_i, (N, 4, 4): the hand in base, or base in hand."""
+        """G_i (N, 4, 4): hand in base, or base in hand."""
         return self.hand if self.setup == EYE_IN_HAND else inverse(self.hand)
 
     def name(self, index: int) -> str:
         return self.names[index] if self.names else f"pose {index + 1}"
 
     def take(self, chosen: Sequence[int] | NDArray[np.intp]) -> Samples:
+        """The samples with these indices."""
         at = np.asarray(chosen, dtype=np.intp)
-        return replace(
-            self,
-            hand=self.hand[at],
-            target=self.target[at],
-            covariance=None if self.covariance is None else self.covariance[at],
-            names=tuple(self.names[i] for i in at) if self.names else (),
-        )
+        covariance = None if self.covariance is None else self.covariance[at]
+        names = tuple(self.names[i] for i in at) if self.names else ()
+        return replace(self, hand=self.hand[at], target=self.target[at], covariance=covariance, names=names)
 
     def subsample(self, most: int) -> Samples:
-        """At most that many samples, evenly spaced over the recording."""
-        if len(self) <= most:
-            return self
-        return self.take(np.linspace(0, len(self) - 1, most).round().astype(np.intp))
+        """At most ``most`` samples, evenly spaced over the recording."""
+        return self if len(self) <= most else self.take(evenly_spaced(len(self), most))
+
+
+def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
+    """At most ``most`` of ``count`` indices, evenly spaced."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
 
 
 @dataclass(frozen=True)
 class Diversity:
-    """Whether the motions between the samples determine X. motions: all pairs. usable: those with neither
-    too small a rotation nor nearly half a turn. axis_spread_deg: angle of the usable motions' axes from
-    parallel (35 if uniform). reason: why no calibration is possible, or None. missing: the axis (3,), in the
-    hand's or the base's axes, with the least rotation about it."""
+    """Whether the motions between the samples determine X.
+
+    motions: number of all pairs.
+    half_turns: number of rotations by nearly half a turn, which do not count.
+    axis_spread_deg: angle by which the axes of the other rotations deviate from parallel (35 if uniform).
+    reason: why no calibration is possible, or None.
+    """
 
     motions: int
-    usable: int
     half_turns: int
     largest_turn_deg: float
     axis_spread_deg: float
     reason: str | None
-    missing: Array
 
 
 def inverse(transforms: Array) -> Array:
@@ -114,13 +120,13 @@ def transform_of(rotation: Array, translation_m: Array) -> Array:
 
 
 def rotation_vectors(rotations: Array) -> Array:
-    """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
+    """Rotation vectors (..., 3) of one or N rotation matrices (..., 3, 3)."""
     return np.asarray(Rotation.from_matrix(rotations).as_rotvec(), dtype=np.float64)
 
 
 def angles(rotations: Array) -> Array:
-    """Angles (N,) in radians of rotation matrices (N, 3, 3), from the chord: cheaper than a rotation vector
-    and exact for small angles (near half a turn it loses half of the digits)."""
+    """Angles (N,) in radians of rotation matrices (N, 3, 3), from the chord: cheaper than rotation vectors
+    and exact for small angles, but with half of the digits near half a turn."""
     chord = np.linalg.norm(rotations - np.eye(3), axis=(-2, -1)) / np.sqrt(8.0)
     return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
 
@@ -128,9 +134,8 @@ def angles(rotations: Array) -> Array:
 def diversity(samples: Samples) -> Diversity:
     """Examine the motions between all pairs of samples (of at most 80)."""
     chosen = samples.subsample(_MAX_SAMPLES)
-    nothing = np.array([0.0, 0.0, 1.0])
     if len(chosen) < 2:
-        return Diversity(0, 0, 0, 0.0, 0.0, _too_few(len(samples)), nothing)
+        return Diversity(0, 0, 0.0, 0.0, _too_few(len(samples)))
     first, second = np.triu_indices(len(chosen), 1)
     rotation = chosen.moved[:, :3, :3]
     turns = rotation_vectors(np.swapaxes(rotation[first], 1, 2) @ rotation[second])
@@ -140,10 +145,8 @@ def diversity(samples: Samples) -> Diversity:
     axes = turns[usable] / np.linalg.norm(turns[usable], axis=1, keepdims=True)
     # The mean of u u^T treats axes u and -u as one. Its second eigenvalue is sin^2 of the half angle of the
     # fan in which the axes lie, and 1/3 if they are uniform.
-    values, vectors = np.linalg.eigh(axes.T @ axes / max(1, len(axes)))
-    axis_spread_deg = (
-        float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0))))) if len(axes) else 0.0
-    )
+    values = np.linalg.eigh(axes.T @ axes / max(1, len(axes)))[0]
+    axis_spread_deg = float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0)))))
     if len(samples) < MIN_POSES:
         reason: str | None = _too_few(len(samples))
     elif usable.sum() >= 2 and axis_spread_deg >= MIN_SPREAD_DEG:
@@ -164,10 +167,7 @@ def diversity(samples: Samples) -> Diversity:
             f"the hand has hardly turned (by {angles_deg.max():.1f} degrees at most, {MIN_TURN_DEG:g} are "
             "needed): moving without turning says nothing about the translation; turn it by 20 to 90 degrees"
         )
-    return Diversity(
-        len(angles_deg), int(usable.sum()), int(half.sum()), float(angles_deg.max()), axis_spread_deg, reason,
-        vectors[:, 0] if len(axes) else nothing,
-    )  # fmt: skip
+    return Diversity(len(angles_deg), int(half.sum()), float(angles_deg.max()), axis_spread_deg, reason)
 
 
 def require_diversity(samples: Samples) -> Diversity:
@@ -179,11 +179,9 @@ def require_diversity(samples: Samples) -> Diversity:
 
 
 def rotation_mismatch_deg(samples: Samples) -> Array:
-    """(N,): median over the other samples of | angle of A_ij - angle of B_ij |. Both angles are equal for
-    any X (4.6), so a large value means a wrong detection or pairing."""
-    chosen = np.arange(len(samples))
-    if len(chosen) > _MAX_SAMPLES:
-        chosen = np.linspace(0, len(samples) - 1, _MAX_SAMPLES).round().astype(np.intp)
+    """Median (N,) over the other samples of | angle of A_ij - angle of B_ij |. Both angles are equal for any
+    X (4.6), so a large value means a wrong detection or pairing."""
+    chosen = evenly_spaced(len(samples), _MAX_SAMPLES)
     hand, target = samples.hand[:, :3, :3], samples.target[:, :3, :3]
     out = np.empty(len(samples))
     for i in range(len(samples)):

@@ -1,5 +1,5 @@
-"""A guided hand-eye calibration: takes images and hand poses, and says what to do next and when to stop. The
-caller provides camera, arm and clock."""
+"""A guided hand-eye calibration: collects images and hand poses, and tells what to do next and when to stop.
+The caller provides camera, arm and clock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from freshfield.geometry import Pinhole
 MIN_POSES, GOOD_SPREAD_DEG = 10, 15.0
 # A pose rotated by less from a kept one adds little information.
 NEW_DEG = 8.0
-# Largest motion between two frames: above it, errors of a few milliseconds in the stamps would matter.
+# Largest motion between two frames at rest: for more, stamps that are a few milliseconds off would matter.
 STILL_MM, STILL_DEG = 0.5, 0.1
 _MIN_TO_SOLVE = 4
 KEPT, MOVING = "kept", "hand moving"
@@ -30,8 +30,14 @@ KEPT, MOVING = "kept", "hand moving"
 
 @dataclass(frozen=True)
 class HandEyeStep:
-    """Result of one image. outcome: ``kept``, or why not. count: samples kept. std_mm, std_deg: of the
-    calibration so far, None while there is none. enough: whether to stop. advice: what to do next."""
+    """Result of one image.
+
+    outcome: ``kept``, or why not.
+    count: number of samples kept.
+    std_mm, std_deg: standard deviations of the current calibration, if there is one.
+    enough: whether to stop.
+    advice: what to do next.
+    """
 
     outcome: str
     count: int
@@ -51,8 +57,9 @@ class HandEyeStep:
 class HandEyeSession:
     """Collects samples until the standard deviation of the translation is at most ``want_mm``.
 
-    moving: take images while the hand moves (its poses must be exact in time), else only at rest.
-    before: samples of an earlier session to continue. kept: called with all samples after each new one.
+    moving: also take images while the hand moves; its poses must then be exact in time.
+    before: samples of an earlier session to continue.
+    kept: called with all samples after each new one.
     """
 
     def __init__(
@@ -85,8 +92,8 @@ class HandEyeSession:
         new = to_samples(self._seen, self._hands, names, self._setup)
         if self._before is None:
             return new
-        hand, target = (np.concatenate(p) for p in ((self._before.hand, new.hand),
-                                                    (self._before.target, new.target)))  # fmt: skip
+        hand = np.concatenate([self._before.hand, new.hand])
+        target = np.concatenate([self._before.target, new.target])
         return Samples(hand, target, self._setup)
 
     def offer(self, image: NDArray[np.uint8], lens: Pinhole, hand: Array) -> HandEyeStep:
@@ -113,9 +120,9 @@ class HandEyeSession:
         return self._step(KEPT, self._advice())
 
     def next_hand_pose(self) -> Array | None:
-        """Hand pose (4, 4) for the next sample, the same until one is kept or rejected: first rotated a
-        little about each axis, then where the variance falls most. None until the target has been seen.
-        Reach and collisions are not considered."""
+        """Hand pose (4, 4) for the next sample, the same until a sample is kept or the pose rejected: first
+        small rotations about each axis, then where the variance falls most. None until the target has been
+        seen. Reach and collisions are not considered."""
         if not self._seen:
             return None
         if self._wanted is None:
@@ -131,7 +138,7 @@ class HandEyeSession:
         return self._wanted
 
     def reject_pose(self) -> None:
-        """Propose another pose: this one cannot be reached, or gave no sample."""
+        """Propose another pose next, because this one cannot be reached or gave no sample."""
         self._rejected += 1
         self._wanted = None
 
@@ -180,27 +187,27 @@ class HandEyeSession:
 
 
 def preview(image: NDArray[np.uint8], corners: Corners | None, step: HandEyeStep) -> NDArray[np.uint8]:
-    """The image (H + 40, W, 3) RGB with the corners that were found, and the step below it."""
-    said = f"{step.count} poses", f"{step.outcome}: {step.advice}"
-    return draw_corners(to_gray(image), corners, said, step.outcome == KEPT)
+    """The image as (H + 40, W, 3) RGB, with the corners that were found, and the step below it."""
+    lines = f"{step.count} poses", f"{step.outcome}: {step.advice}"
+    return draw_corners(to_gray(image), corners, lines, step.outcome == KEPT)
 
 
 def draw_corners(
-    plain: NDArray[np.uint8], corners: Corners | None, said: tuple[str, str], kept: bool
+    plain: NDArray[np.uint8], corners: Corners | None, lines: tuple[str, str], kept: bool
 ) -> NDArray[np.uint8]:
-    """A gray picture as (H + 40, W, 3) RGB, its corners circled, two lines below it."""
+    """A gray image as (H + 40, W, 3) RGB, with circles at its corners and two lines of text below it."""
     out = np.zeros((plain.shape[0] + 40, max(plain.shape[1], 320), 3), dtype=np.uint8)
     out[: plain.shape[0], : plain.shape[1]] = plain[..., None]
     if corners is not None:
         for x, y in corners.pixels:
             cv2.circle(out, (round(x - 0.5), round(y - 0.5)), 4, (0, 158, 115), 1, cv2.LINE_AA)
     color = (0, 158, 115) if kept else (213, 94, 0)
-    for line, text in enumerate(said):
+    for line, text in enumerate(lines):
         at = (6, plain.shape[0] + 15 + 17 * line)
         cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
     return out
 
 
 def _motion(a: Array, b: Array) -> float:
-    """Distance of two hand poses in units of the largest that counts as standing still."""
+    """Motion between two hand poses, as a multiple of the largest that counts as at rest."""
     return max(distance_mm(a, b) / STILL_MM, angle_deg(a, b) / STILL_DEG)

@@ -5,26 +5,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
-from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
-from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, inverse, transform_of
-from camera_node.robot.calibration.targets import GrayImage, Target
-from camera_node.synthetic.lighting import Light
-from camera_node.synthetic.placement import Part
-from camera_node.synthetic.render import CameraRenderer, World
-from camera_node.synthetic.shapes import Quad
-from camera_node.synthetic.textures import Plain
-from freshfield.geometry import Pinhole, look_at, se3_inverse, so3_exp
+from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, inverse, transform_of
+from freshfield.geometry import look_at, so3_exp
 
 # The arm's noise that the project's figures are given for (issue: simulated UR3e).
 ARM_RAD, ARM_M = 0.002, 0.0005
 REACH_M = 0.5
-
-_PLATE_MARGIN_M = 0.02
 
 
 def _rigid(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> Array:
@@ -70,22 +59,6 @@ def add_noise(poses: Array, rng: np.random.Generator, rad: float, metres: float)
     return transform_of(poses[:, :3, :3] @ turns, poses[:, :3, 3] + shifts)
 
 
-def samples(
-    count: int,
-    rng: np.random.Generator,
-    rad: float = ARM_RAD,
-    metres: float = ARM_M,
-    setup: str = EYE_IN_HAND,
-) -> Samples:
-    """Samples with arm noise. For eye-to-hand, hand and base change places: X is the same (4, 4), then the
-    camera in the base."""
-    hands = random_hands(count, rng)
-    targets = observed_targets(hands)
-    if setup != EYE_IN_HAND:
-        hands = inverse(hands)
-    return Samples(add_noise(hands, rng, rad, metres), targets, setup)
-
-
 @dataclass(frozen=True)
 class Sweep:
     """A hand that sweeps over the target along incommensurate sines, so that the motion never repeats.
@@ -111,46 +84,3 @@ class Sweep:
         roll = 0.6 * np.sin(0.71 * u + 0.3) + 0.25 * np.sin(1.93 * u)
         slope, azimuth = np.hypot(x, y), np.arctan2(y, x)
         return np.array([_camera(*row) for row in zip(azimuth, slope, distance_m, roll)]).reshape(-1, 4, 4)
-
-
-def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> GrayImage:
-    """Render (H, W) the target on a white plate on a table, by the project's ray caster."""
-    width, height = target.size_m
-    picture = target.draw(max(256, round(width / 0.0002)))
-    # The caster's rectangle is seen from +z and has y up; a target's z goes into the paper and its y down.
-    flip = _rigid((np.pi, 0.0, 0.0), (width / 2, height / 2, 0.0))
-    parts = []
-    for depth_m, margin_m, texture in (
-        (0.0, 0.0, _ImageTexture(picture, width, height)),
-        (0.0005, _PLATE_MARGIN_M, Plain((0.95, 0.95, 0.95))),
-        (0.001, 0.6, Plain((0.45, 0.42, 0.40))),
-    ):
-        below = flip.copy()
-        below[2, 3] = depth_m
-        parts.append(Part(Quad((width / 2 + margin_m, height / 2 + margin_m)), texture, below, False))
-    lamp = (width / 2, height / 2, -1.0)
-    light = Light(np.array([lamp]), 0.2, 2.0, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7), (1.0, 1.0, 1.0))
-    world = World(tuple(parts), (), light, (0.5, 0.5, 0.5))
-    image = CameraRenderer(world, lens, camera_in_target, supersample).image(0.0)
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
-def camera_in_target(hand: Array) -> Array:
-    """(4, 4) for ``render``, of a hand in base."""
-    return np.asarray(se3_inverse(TARGET_IN_BASE) @ hand @ CAMERA_IN_HAND)
-
-
-@dataclass(frozen=True)
-class _ImageTexture:
-    """Texture of a gray image on a rectangle, with linear interpolation."""
-
-    pixels: GrayImage
-    width_m: float
-    height_m: float
-
-    def __call__(self, uv: Array) -> Array:
-        rows, columns = self.pixels.shape
-        x = (uv[0] / self.width_m + 0.5) * columns - 0.5
-        y = (0.5 - uv[1] / self.height_m) * rows - 0.5
-        gray = map_coordinates(self.pixels.astype(np.float32), [y, x], order=1, mode="nearest")
-        return np.repeat(gray[None] / 255.0, 3, axis=0)

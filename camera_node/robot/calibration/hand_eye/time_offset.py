@@ -1,8 +1,8 @@
 """The time offset between an arm's clock and a camera's, estimated from their motion.
 
 For any X, hand and target rotate by the same angles (4.6), so their angular speeds are one signal on two
-clocks. Their cross-correlation gives the offset to a fraction of a sample, over any range of offsets. The
-offset is then refined with X and Y in one likelihood (``refine``), by means of the hand's velocity.
+clocks. Their cross-correlation gives the offset to a fraction of a sample, over any range of offsets.
+``refine`` then estimates the offset together with X and Y, by means of the hand's velocity.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ from camera_node.robot.calibration.hand_eye.samples import (
     Array,
     Rotation,
     Samples,
+    evenly_spaced,
     require_diversity,
+    rotation_vectors,
     transform_of,
 )
 
-# Most samples to refine with: neighboring ones add little information.
-MAX_SAMPLES = 400
+# Most samples to refine with. Neighboring ones add little information.
+_MAX_SAMPLES = 400
 _STEP_S = 0.01
-# Window of the angular speed: a shorter one shows pose noise, a longer one smooths the motion away.
+# Window of the angular speed. A shorter one shows pose noise, a longer one smooths the motion away.
 _WINDOW_S = 0.25
 _MIN_CORRELATION, _RIVAL = 0.5, 0.97
 _MIN_OVERLAP_S = 2.0
@@ -38,9 +40,14 @@ _ROUNDS, _SETTLED_S = 10, 1e-6
 
 @dataclass(frozen=True)
 class StreamCalibration:
-    """samples: paired at the estimated offset. refined: X, Y and their uncertainty. offset_s: hand's stamp
-    minus camera's of one instant. std_s: from the likelihood. correlation: of the angular speeds at the
-    coarse offset. unpaired: target poses without a hand pose near enough in time."""
+    """Result of two streams.
+
+    samples: paired at the estimated offset.
+    refined: X, Y and their uncertainty.
+    offset_s, std_s: the hand's stamp of an instant minus the camera's, and its standard deviation.
+    coarse_s, correlation: offset from the angular speeds, and their correlation there.
+    unpaired: number of target poses without a hand pose near enough in time.
+    """
 
     samples: Samples
     refined: Refinement
@@ -54,11 +61,17 @@ class StreamCalibration:
 def calibrate_streams(
     hand: Track, target: Track, setup: str, max_gap_s: float = MAX_GAP_S
 ) -> StreamCalibration:
-    """Time offset and hand-eye calibration from two streams. Raises CalibrationError with the reason."""
+    """Time offset and hand-eye calibration from two streams.
+
+    hand, target: hand in base, and target in camera.
+    setup: eye-in-hand or eye-to-hand.
+    max_gap_s: largest distance in time between a target pose and the nearest hand pose.
+    Raises CalibrationError.
+    """
     coarse_s, correlation = coarse_offset(hand, target)
     offset_s, start = coarse_s, None
     for _ in range(_ROUNDS):
-        samples, velocity, unpaired = paired(hand, target, offset_s, setup, max_gap_s)
+        samples, velocity, unpaired = _paired(hand, target, offset_s, setup, max_gap_s)
         require_diversity(samples)
         found = refine(samples, start, velocity=velocity)
         start = (found.x, found.y)
@@ -117,35 +130,36 @@ def coarse_offset(hand: Track, target: Track) -> tuple[float, float]:
     return starts_s + (lag + fraction) * _STEP_S, float(score[best])
 
 
-def paired(
+def _paired(
     hand: Track, target: Track, offset_s: float, setup: str, max_gap_s: float
 ) -> tuple[Samples, Array, int]:
-    """Samples at the target's stamps, the hand's velocity there (N, 6) in its own axes, and how many stamps
-    had no hand pose within the bound."""
+    """Samples at the target's stamps, the hand's velocity there (N, 6) in its own axes, and the number of
+    stamps without a hand pose within ``max_gap_s``."""
     at = target.times_ns + round(offset_s * 1e9)
     half = round(_HALF_S * 1e9)
-    now, before, after = (interpolated(hand, at + d, max_gap_s) for d in (0, -half, half))
+    now, before, after = (_interpolated(hand, at + d, max_gap_s) for d in (0, -half, half))
     good = np.flatnonzero(now[1] & before[1] & after[1])
     unpaired = len(at) - len(good)
-    if len(good) > MAX_SAMPLES:
-        good = good[np.linspace(0, len(good) - 1, MAX_SAMPLES).round().astype(np.intp)]
+    good = good[evenly_spaced(len(good), _MAX_SAMPLES)]
     poses, early, late = now[0][good], before[0][good], after[0][good]
-    turns = Rotation.from_matrix(np.swapaxes(early[:, :3, :3], 1, 2) @ late[:, :3, :3]).as_rotvec()
+    turns = rotation_vectors(np.swapaxes(early[:, :3, :3], 1, 2) @ late[:, :3, :3])
     shifts = (np.swapaxes(poses[:, :3, :3], 1, 2) @ (late[:, :3, 3:] - early[:, :3, 3:]))[..., 0]
     names = tuple(f"{(int(target.times_ns[i]) - int(target.times_ns[0])) / 1e9:.2f} s" for i in good)
     samples = Samples(poses, target.poses[good], setup, names=names)
     return samples, np.concatenate([turns, shifts], axis=1) / (2 * _HALF_S), unpaired
 
 
-def interpolated(track: Track, at_ns: NDArray[np.int64], max_gap_s: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Poses (N, 4, 4) by slerp and straight lines, and whether each is within the bound of a sample."""
+def _interpolated(
+    track: Track, at_ns: NDArray[np.int64], max_gap_s: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Poses (N, 4, 4) by slerp and straight lines, and whether each is within ``max_gap_s`` of a sample."""
     times = track.times_ns
     after = np.clip(np.searchsorted(times, at_ns), 1, len(times) - 1)
     before = after - 1
     share = np.clip((at_ns - times[before]) / (times[after] - times[before]), 0.0, 1.0)
     gap = np.minimum(np.abs(at_ns - times[before]), np.abs(times[after] - at_ns))
     a, b = track.poses[before], track.poses[after]
-    turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).as_rotvec()
+    turns = rotation_vectors(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3])
     rotation = a[:, :3, :3] @ Rotation.from_rotvec(turns * share[:, None]).as_matrix()
     shift = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
     inside = (at_ns >= times[0]) & (at_ns <= times[-1]) & (gap <= max_gap_s * 1e9)
@@ -153,7 +167,7 @@ def interpolated(track: Track, at_ns: NDArray[np.int64], max_gap_s: float) -> tu
 
 
 def _angular_speed(track: Track) -> Array:
-    """Radians a second every ``_STEP_S`` from the first stamp on; NaN where a gap is in the window."""
+    """Angular speed (radians per second) every ``_STEP_S`` from the first stamp on; NaN near a gap."""
     start, end = int(track.times_ns[0]), int(track.times_ns[-1])
     count = int((end - start) / 1e9 / _STEP_S)
     if count > 10_000_000:
@@ -162,15 +176,15 @@ def _angular_speed(track: Track) -> Array:
         )
     at = start + np.arange(count, dtype=np.int64) * round(_STEP_S * 1e9)
     half = round(_WINDOW_S / 2 * 1e9)
-    # In a gap no longer than the window, the speed's mean over the gap is near enough.
-    (a, there), (b, too) = (interpolated(track, at + d, _WINDOW_S / 2) for d in (-half, half))
+    # In a gap no longer than the window, the mean speed over the gap is good enough.
+    (a, a_known), (b, b_known) = (_interpolated(track, at + d, _WINDOW_S / 2) for d in (-half, half))
     turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).magnitude()
-    return np.where(there & too, turns / _WINDOW_S, np.nan)
+    return np.where(a_known & b_known, turns / _WINDOW_S, np.nan)
 
 
 def _masked_correlation(a: Array, b: Array) -> tuple[Array, Array]:
-    """Pearson's correlation of a[k + lag] with b[k] over what both have, and how many those are, for lags
-    -(len(b) - 1) to len(a) - 1."""
+    """Pearson's correlation of a[k + lag] with b[k] over the samples that are known in both, and their
+    number, for lags -(len(b) - 1) to len(a) - 1."""
     ma, mb = (~np.isnan(v) for v in (a, b))
     a, b = (np.where(m, v - v[m].mean(), 0.0) for v, m in ((a, ma), (b, mb)))
     ma, mb = ma.astype(np.float64), mb.astype(np.float64)
@@ -183,6 +197,6 @@ def _masked_correlation(a: Array, b: Array) -> tuple[Array, Array]:
     sum_a, sum_b = cross(a, mb), cross(ma, b)
     top = cross(a, b) - sum_a * sum_b / n
     below = (cross(a * a, mb) - sum_a**2 / n) * (cross(ma, b * b) - sum_b**2 / n)
-    # Where nothing varies, rounding of the transforms leaves values just above zero.
+    # If nothing varies, rounding of the transforms leaves values just above zero.
     level = 1e-9 * max(float((a * a).sum() * (b * b).sum()), 1e-300)
     return np.where(below > level, top / np.sqrt(np.maximum(below, level)), -1.0), count

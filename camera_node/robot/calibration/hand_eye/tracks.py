@@ -1,7 +1,7 @@
-"""Records the two streams of a guided calibration for the time offset: hand poses and detected target poses.
+"""Records both streams of a guided calibration: hand poses and detected target poses.
 
-Each keeps its own stamps: ``time_offset`` estimates the offset between them (camera delay, transport of the
-joint states) from the motion. The files are those that ``--hand`` and ``--target`` read.
+Each keeps its own stamps, and ``time_offset`` estimates the offset between them (camera delay, transport of
+the joint states) from the motion. ``--hand`` and ``--target`` read the files.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from freshfield.scenario import Scenario
 
 HAND_FILE, TARGET_FILE = "hand.csv", "target.csv"
-# Motion with the target in sight: the offset's deviation falls with the square root of its duration.
+# Motion with the target in sight. The offset's deviation falls with the square root of its duration.
 MIN_SECONDS = 10.0
-_GAP_NS = 125_000_000  # largest gap between two detections: the motion in a longer one is unknown
+_GAP_NS = 125_000_000  # longest gap between two detections that counts as motion
 _HEADER = "t,x,y,z,qx,qy,qz,qw"
 
 
 class StreamRecorder:
-    """Poses (4, 4) by stamp (ns). One thread may add hands, another targets."""
+    """Records poses (4, 4) with their stamps (ns). One thread may add hands while another adds targets."""
 
     def __init__(self) -> None:
         self._hands: list[tuple[int, Array]] = []
@@ -57,8 +57,8 @@ class StreamRecorder:
         return self._seen_ns / 1e9
 
     def with_stream_advice(self, step: HandEyeStep) -> HandEyeStep:
-        """The step with advice for recording streams. ``std_mm`` is not used: the unknown offset counts as
-        noise in it."""
+        """The step with advice for recording streams. ``std_mm`` does not count, because it contains the
+        unknown offset."""
         varied = step.count >= MIN_POSES and step.diversity.axis_spread_deg >= GOOD_SPREAD_DEG
         if not varied:
             return step
@@ -68,15 +68,15 @@ class StreamRecorder:
         return replace(step, enough=False, advice=left)
 
     def hand(self) -> Track:
-        """Raises CalibrationError for fewer than two."""
+        """The hand's stream. Raises CalibrationError for fewer than two poses."""
         return _track(list(self._hands), "joint states")
 
     def target(self) -> Track:
-        """Raises CalibrationError for fewer than two."""
+        """The target's stream. Raises CalibrationError for fewer than two poses."""
         return _track(self._targets, "sightings of the target")
 
     def write(self, folder: Path) -> None:
-        """``hand.csv`` and ``target.csv``. Raises CalibrationError."""
+        """Write ``hand.csv`` and ``target.csv``. Raises CalibrationError."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
             for name, rows in ((HAND_FILE, list(self._hands)), (TARGET_FILE, self._targets)):
@@ -87,18 +87,20 @@ class StreamRecorder:
 
 def follow_arm(scenario: Scenario, config: ArmConfig, tracks: StreamRecorder) -> ArmStream:
     """Record the scenario's arm into ``tracks``, as hand poses in its base, until the stream is stopped.
-    Raises ScenarioError, ArmError."""
+    Raises CalibrationError."""
     from camera_node.robot.arm.camera_poses import arm_model
     from camera_node.robot.arm.joint_states import ArmStream
     from freshfield.clock import WallClock
 
-    model = arm_model(scenario, config)
-
-    def each(t_ns: int, joints: Array) -> None:
+    def add_hand(t_ns: int, joints: Array) -> None:
         tracks.add_hand(t_ns, model.forward(joints))
 
-    stream = ArmStream(config.host, WallClock(), config.frequency_hz, on_sample=each)
-    stream.start()
+    try:
+        model = arm_model(scenario, config)
+        stream = ArmStream(config.host, WallClock(), config.frequency_hz, on_sample=add_hand)
+        stream.start()
+    except ValueError as error:
+        raise CalibrationError(str(error)) from None
     return stream
 
 

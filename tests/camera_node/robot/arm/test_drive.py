@@ -180,10 +180,11 @@ def test_an_arm_that_stands_still_on_the_way_is_not_waited_for(monkeypatch):
         stream = ArmStream(host, WallClock(), 50.0, max_gap_ms=5000.0, stale_s=5.0)
         stream.start()
         control = driving.connect_control(host)
+        stream.stale_s = 0.3
         try:
             goal = np.array(HOME_RAD) + np.deg2rad([0, 0, 30, 0, 0, 0])  # where nobody has sent it
             with pytest.raises(ArmError, match=r"stands still, 30.0 degrees from its goal"):
-                driving._wait_until_arrived(stream, control, goal, threading.Event(), 0.3)
+                driving._wait_until_arrived(stream, control, goal, threading.Event())
         finally:
             control.stopScript()
             stream.stop()

@@ -73,7 +73,7 @@ def test_joints_come_with_their_times():
     with simulated_arm(host), running(host, clock, max_gap_ms=1000.0) as stream:
         joints, gap_ns = stream.at(clock.now_ns(), WITHIN_S)
         assert np.allclose(joints, HOME_RAD) and gap_ns < 1_000_000_000
-        wait_until(lambda: stream.status()["samples"] > 20)
+        wait_until(lambda: stream.received > 20)
         assert stream.trouble == "" and stream.connections == 1
         hand = HandPoses(stream, UR3E, np.eye(4), WITHIN_S)
         assert np.allclose(hand.at(clock.now_ns()).pose.matrix(), UR3E.forward(HOME_RAD), atol=1e-12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,13 +12,22 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye import simulated
-from camera_node.robot.calibration.targets import parse_target
-from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole
+from camera_node.robot.calibration.hand_eye.samples import Array, Samples, inverse, transform_of
+from camera_node.robot.calibration.targets import GrayImage, Target, parse_target
+from camera_node.synthetic.lighting import Light
+from camera_node.synthetic.placement import Part
+from camera_node.synthetic.render import CameraRenderer, World
+from camera_node.synthetic.shapes import Quad
+from camera_node.synthetic.textures import Plain
+from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, se3_inverse, so3_exp
 
 BOARD = "charuco:7x5:24mm:18mm"
 LENS = Pinhole.from_fov(320, 240, 65.0)
+_PLATE_MARGIN_M = 0.02
 
 
 @lru_cache(maxsize=1)
@@ -25,7 +35,7 @@ def taken(count: int = 12) -> tuple[list[np.ndarray], np.ndarray]:
     """Gray pictures, and the hand's true poses (N, 4, 4)."""
     hands = simulated.random_hands(count, np.random.default_rng(3))
     board = parse_target(BOARD)
-    return [simulated.render(board, LENS, simulated.camera_in_target(h), 2) for h in hands], hands
+    return [render(board, LENS, camera_in_target(h), 2) for h in hands], hands
 
 
 def write_scenario(
@@ -49,3 +59,62 @@ def write_scenario(
     source = {"kind": "transforms", "data": str(folder / "transforms.json"), "fps": 500, "codec": "png"}
     file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
     return file
+
+
+def noisy_samples(
+    count: int,
+    rng: np.random.Generator,
+    rad: float = simulated.ARM_RAD,
+    metres: float = simulated.ARM_M,
+    setup: str = EYE_IN_HAND,
+) -> Samples:
+    """Samples with arm noise. For eye-to-hand, hand and base change places: X is the same (4, 4), then the
+    camera in the base."""
+    hands = simulated.random_hands(count, rng)
+    targets = simulated.observed_targets(hands)
+    if setup != EYE_IN_HAND:
+        hands = inverse(hands)
+    return Samples(simulated.add_noise(hands, rng, rad, metres), targets, setup)
+
+
+def render(target: Target, lens: Pinhole, camera_in_target: Array, supersample: int = 3) -> GrayImage:
+    """Render (H, W) the target on a white plate on a table, by the project's ray caster."""
+    width, height = target.size_m
+    picture = target.draw(max(256, round(width / 0.0002)))
+    # The caster's rectangle is seen from +z and has y up; a target's z goes into the paper and its y down.
+    flip = transform_of(so3_exp((np.pi, 0.0, 0.0)), np.array([width / 2, height / 2, 0.0]))
+    parts = []
+    for depth_m, margin_m, texture in (
+        (0.0, 0.0, _ImageTexture(picture, width, height)),
+        (0.0005, _PLATE_MARGIN_M, Plain((0.95, 0.95, 0.95))),
+        (0.001, 0.6, Plain((0.45, 0.42, 0.40))),
+    ):
+        below = flip.copy()
+        below[2, 3] = depth_m
+        parts.append(Part(Quad((width / 2 + margin_m, height / 2 + margin_m)), texture, below, False))
+    lamp = (width / 2, height / 2, -1.0)
+    light = Light(np.array([lamp]), 0.2, 2.0, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7), (1.0, 1.0, 1.0))
+    world = World(tuple(parts), (), light, (0.5, 0.5, 0.5))
+    image = CameraRenderer(world, lens, camera_in_target, supersample).image(0.0)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def camera_in_target(hand: Array) -> Array:
+    """(4, 4) for ``render``, of a hand in base."""
+    return np.asarray(se3_inverse(simulated.TARGET_IN_BASE) @ hand @ simulated.CAMERA_IN_HAND)
+
+
+@dataclass(frozen=True)
+class _ImageTexture:
+    """Texture of a gray image on a rectangle, with linear interpolation."""
+
+    pixels: GrayImage
+    width_m: float
+    height_m: float
+
+    def __call__(self, uv: Array) -> Array:
+        rows, columns = self.pixels.shape
+        x = (uv[0] / self.width_m + 0.5) * columns - 0.5
+        y = (0.5 - uv[1] / self.height_m) * rows - 0.5
+        gray = map_coordinates(self.pixels.astype(np.float32), [y, x], order=1, mode="nearest")
+        return np.repeat(gray[None] / 255.0, 3, axis=0)

@@ -19,6 +19,7 @@ from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance
 from camera_node.robot.calibration.hand_eye.samples import inverse
 from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import Pose
+from tests.camera_node.robot.calibration.pictures import noisy_samples
 from tests.conftest import data_dir
 
 X = simulated.CAMERA_IN_HAND
@@ -31,7 +32,7 @@ def hand_eye(*arguments) -> int:
 @pytest.fixture
 def pairs(tmp_path):
     file = tmp_path / "pairs.json"
-    file.write_text(json.dumps(pairs_json(simulated.samples(15, np.random.default_rng(1)))))
+    file.write_text(json.dumps(pairs_json(noisy_samples(15, np.random.default_rng(1)))))
     return file
 
 
@@ -59,7 +60,7 @@ def test_json_is_the_answer_and_what_it_is_worth_and_nothing_else_is_printed(pai
 
 def test_scripts_are_warned_too(tmp_path, capsys):
     few = tmp_path / "few.json"
-    few.write_text(json.dumps(pairs_json(simulated.samples(6, np.random.default_rng(1)))))
+    few.write_text(json.dumps(pairs_json(noisy_samples(6, np.random.default_rng(1)))))
     assert hand_eye("--pairs", few, "--json") == 0
     said = capsys.readouterr()
     assert "6 poses: 10 to 20 well spread ones" in json.loads(said.out)["warnings"][0]
@@ -68,7 +69,7 @@ def test_scripts_are_warned_too(tmp_path, capsys):
 
 @pytest.mark.parametrize("wrong", ["inverted", "millimetres"])
 def test_nonsense_is_refused_and_not_an_answer(wrong, tmp_path, capsys):
-    good = simulated.samples(15, np.random.default_rng(1))
+    good = noisy_samples(15, np.random.default_rng(1))
     hand, target = good.hand.copy(), good.target.copy()
     if wrong == "inverted":
         target = inverse(target)
@@ -108,7 +109,7 @@ def test_the_table_the_file_and_the_picture(pairs, tmp_path, capsys):
 
 
 def test_eye_to_hand(tmp_path, capsys):
-    samples = simulated.samples(15, np.random.default_rng(2), setup=EYE_TO_HAND)
+    samples = noisy_samples(15, np.random.default_rng(2), setup=EYE_TO_HAND)
     (tmp_path / "pairs.json").write_text(json.dumps(pairs_json(samples)))
     assert hand_eye("--pairs", tmp_path / "pairs.json", "--eye-to-hand", "--out", tmp_path / "eye.yaml") == 0
     assert "camera in base" in capsys.readouterr().out
@@ -164,7 +165,7 @@ def test_mistakes_are_one_line(tmp_path, capsys, pairs):
     assert "--camera ID: say which" in fails("--live", "room", "--board", "qr:60mm")
     flat = [[matrix[:3] for matrix in pair] for pair in json.loads(pairs.read_text())]
     (tmp_path / "flat.json").write_text(json.dumps(flat))
-    assert "pair 1: expected [hand in base, target in camera], 4 x 4 each: got 3 x 4" in fails(
+    assert "pair 1: expected [hand in base, target in camera]: expected 4 x 4 numbers" in fails(
         "--pairs", tmp_path / "flat.json"
     )
     assert "--method: expected one of tsai" in fails("--pairs", pairs, "--method", "magic")
@@ -251,6 +252,7 @@ def test_visps_poses_are_rotation_vectors(tmp_path):
 
 def test_the_study_prints_its_tables(tmp_path, capsys):
     from camera_node.robot.calibration import accuracy_study
+    from camera_node.robot.tables import write_csv
 
     tables = {
         "pairing": accuracy_study.pairing(1.0, (8.0, 100.0), (0.25,)),
@@ -267,9 +269,9 @@ def test_the_study_prints_its_tables(tmp_path, capsys):
     assert all(r["trials"] == 2 and r["rms_mm_std"] > 0 and r["rms_deg_std"] > 0 for r in tables["poses"])
     assert all(r["error_ms"] < 1.0 and not r["failed"] for r in tables["offset"])
     for name, rows in tables.items():
-        accuracy_study.write_csv(name, rows, tmp_path / "out")
+        write_csv(tmp_path / "out" / f"{name}.csv", rows)
         assert accuracy_study.format_table(name, rows).count("\n") == len(rows) + 2
-    accuracy_study.plot(tables, tmp_path / "out" / "accuracy.png")
+    accuracy_study.plot(tables["pairing"], tables["poses"], tmp_path / "out" / "accuracy.png")
     assert (tmp_path / "out" / "pairing.csv").read_text().count("\n") == 7
     assert cv2.imread(str(tmp_path / "out" / "accuracy.png")) is not None
 

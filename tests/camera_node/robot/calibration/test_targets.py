@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg
 from camera_node.robot.calibration.hand_eye.samples import inverse
 from camera_node.robot.calibration.targets import Corners, estimate_pose, parse_target
 from freshfield.geometry import Pinhole, look_at, so3_exp
+from tests.camera_node.robot.calibration.pictures import render
 
 LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001))
 # Where a picture's own origin lies in its target's axes: a chessboard's is its first inner corner.
@@ -41,7 +41,7 @@ def cameras(target) -> list[np.ndarray]:
 def test_a_rendered_target_is_found_where_it_is(spelling, deg, mm):
     target = parse_target(spelling)
     for camera in cameras(target):
-        picture = simulated.render(target, LENS, camera, 2)
+        picture = render(target, LENS, camera, 2)
         corners = target.find(picture)
         assert corners is not None
         found = estimate_pose(corners, LENS)

@@ -22,7 +22,6 @@ from camera_node.robot.teleop import sinks
 from camera_node.robot.teleop.command import teleop_config
 from camera_node.robot.teleop.network_stylus import encode
 from camera_node.robot.teleop.teleoperator import Command
-from freshfield.clock import WallClock
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import (
     own_address,
@@ -140,9 +139,9 @@ def test_an_arm_that_goes_silent_ends_it_with_one_line(tmp_path):
 
 def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
     control, stream = MagicMock(), MagicMock(host="10.0.0.1", trouble="")
-    stream.at.return_value = HOME, 0
+    stream.now.return_value = HOME
     monkeypatch.setattr(sinks, "connect_control", lambda host: control)
-    sink, still = sinks.ServoSink(stream, WallClock(), 0.01), Command(HOME, np.zeros(6), "holding")
+    sink, still = sinks.ServoSink(stream, 0.01), Command(HOME, np.zeros(6), "holding")
     sink.send(0.0, still)
     assert control.servoJ.call_count == 1
     stream.trouble = "arm at 10.0.0.1: safety: protective stop"

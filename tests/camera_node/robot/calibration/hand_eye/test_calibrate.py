@@ -17,6 +17,7 @@ from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_b
 from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, inverse, rotation_mismatch_deg
 from camera_node.robot.calibration.targets import parse_target
 from freshfield.geometry import so3_exp
+from tests.camera_node.robot.calibration.pictures import noisy_samples
 from tests.conftest import data_dir
 
 X, Y = simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE
@@ -26,14 +27,14 @@ SETUPS = (EYE_IN_HAND, EYE_TO_HAND)
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_closed_form_is_exact_on_exact_samples(method, setup):
-    exact = simulated.samples(12, np.random.default_rng(1), 0.0, 0.0, setup)
+    exact = noisy_samples(12, np.random.default_rng(1), 0.0, 0.0, setup)
     np.testing.assert_allclose(solve(exact, method), X, atol=2e-6)
     assert residuals(exact, X).rms_mm < 1e-9
 
 
 @pytest.mark.parametrize("setup", SETUPS)
 def test_the_refinement_is_exact_on_exact_samples(setup):
-    found = refine(simulated.samples(8, np.random.default_rng(2), 0.0, 0.0, setup))
+    found = refine(noisy_samples(8, np.random.default_rng(2), 0.0, 0.0, setup))
     np.testing.assert_allclose(found.x, X, atol=1e-8)
     np.testing.assert_allclose(found.y, Y, atol=1e-8)
     assert found.std_mm < 1e-3 and np.isfinite(found.covariance).all()
@@ -71,21 +72,21 @@ def test_the_said_deviation_is_the_real_one():
     """Over trials, the errors' mean square is what the covariance and the leaving out promise."""
     mm, std = [], []
     for trial in range(24):
-        found = refine(simulated.samples(20, np.random.default_rng([9, trial])))
+        found = refine(noisy_samples(20, np.random.default_rng([9, trial])))
         mm.append(distance_mm(found.x, X))
         std.append(found.std_mm)
     assert np.sqrt(np.mean(np.square(mm))) == pytest.approx(np.sqrt(np.mean(np.square(std))), rel=0.3)
 
 
 def test_the_arms_noise_is_found():
-    found = [refine(simulated.samples(30, np.random.default_rng([3, k]))) for k in range(6)]
+    found = [refine(noisy_samples(30, np.random.default_rng([3, k]))) for k in range(6)]
     assert np.mean([f.arm_noise_m for f in found]) == pytest.approx(0.0005, rel=0.1)
     assert np.mean([f.arm_noise_rad for f in found]) == pytest.approx(0.002, rel=0.1)
 
 
 @pytest.mark.parametrize("setup", SETUPS)
 def test_a_few_wrong_samples_are_found_and_hardly_count(setup):
-    good = simulated.samples(20, np.random.default_rng(5), setup=setup)
+    good = noisy_samples(20, np.random.default_rng(5), setup=setup)
     bad = good.target.copy()
     bad[[3, 11, 17]] = simulated.add_noise(bad[[3, 11, 17]], np.random.default_rng(6), 0.3, 0.08)
     spoilt = Samples(good.hand, bad, setup)
@@ -97,7 +98,7 @@ def test_a_few_wrong_samples_are_found_and_hardly_count(setup):
 
 
 def test_same_samples_same_answer_bit_for_bit():
-    samples = simulated.samples(15, np.random.default_rng(4))
+    samples = noisy_samples(15, np.random.default_rng(4))
     np.testing.assert_array_equal(calibrate(samples).transform, calibrate(samples).transform)
 
 
@@ -123,7 +124,7 @@ def test_the_targets_uncertainty_counts_where_it_is_known():
 
 
 def test_pairs_go_out_and_come_back(tmp_path):
-    samples = simulated.samples(6, np.random.default_rng(0))
+    samples = noisy_samples(6, np.random.default_rng(0))
     file = tmp_path / "pairs.json"
     file.write_text(json.dumps(pairs_json(samples)))
     again = read_pairs(file, EYE_IN_HAND)
@@ -148,13 +149,13 @@ def test_pairs_that_are_none(tmp_path, text, message):
 
 
 def test_poses_given_the_wrong_way_round_are_refused():
-    good = simulated.samples(12, np.random.default_rng(5))
+    good = noisy_samples(12, np.random.default_rng(5))
     with pytest.raises(CalibrationError, match=r"do not fit together .* not their inverses"):
         calibrate(Samples(inverse(good.hand), good.target))
 
 
 def test_poses_that_fit_badly_are_warned_about():
-    bad = simulated.samples(12, np.random.default_rng(5), 0.1, 0.02)
+    bad = noisy_samples(12, np.random.default_rng(5), 0.1, 0.02)
     assert any("residuals are large" in warning for warning in calibrate(bad).warnings)
 
 

@@ -41,7 +41,7 @@ from freshfield.clock import WallClock
 from freshfield.geometry import Pose
 from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde, simulated_arm
-from tests.camera_node.robot.calibration.pictures import BOARD, LENS, taken
+from tests.camera_node.robot.calibration.pictures import BOARD, LENS, camera_in_target, render, taken
 
 X = simulate.CAMERA_IN_HAND
 
@@ -192,7 +192,7 @@ class OnArm:
     def read(self, content):
         t_ns = self._clock.now_ns()
         hand = UR3E.forward(self._truth.joints(t_ns))
-        picture = simulate.render(parse_target(BOARD), LENS, simulate.camera_in_target(hand), 1)
+        picture = render(parse_target(BOARD), LENS, camera_in_target(hand), 1)
         image = cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB)
         return Shot(image, Pose.from_matrix(hand), LENS, 0, t_ns + self._late_ns)
 

@@ -20,7 +20,14 @@ from camera_node.robot.calibration.hand_eye.session import HandEyeSession, previ
 from camera_node.robot.calibration.targets import parse_target
 from camera_node.sources.base import Shot
 from freshfield.geometry import Pose
-from tests.camera_node.robot.calibration.pictures import BOARD, LENS, taken, write_scenario
+from tests.camera_node.robot.calibration.pictures import (
+    BOARD,
+    LENS,
+    camera_in_target,
+    render,
+    taken,
+    write_scenario,
+)
 from tests.conftest import data_dir
 
 X = simulated.CAMERA_IN_HAND
@@ -101,7 +108,7 @@ class Cell:
 
     def read(self, content: int) -> Shot:
         if self._seen is None or self._seen[0] != self.hand.tobytes():
-            picture = simulated.render(parse_target(BOARD), LENS, simulated.camera_in_target(self.hand), 2)
+            picture = render(parse_target(BOARD), LENS, camera_in_target(self.hand), 2)
             noisy = simulated.add_noise(self.hand[None], np.random.default_rng(content), 1e-4, 2e-4)[0]
             shot = Shot(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB), Pose.from_matrix(noisy), LENS)
             self._seen = self.hand.tobytes(), shot

@@ -9,13 +9,12 @@ import yaml
 
 from camera_node.cli import main
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.hand_eye.simulated import render
 from camera_node.robot.calibration.lens.session import GOOD_COVERED, GOOD_F, GOOD_PICTURES, LensSession
 from camera_node.robot.calibration.targets import parse_target
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, so3_exp
-from tests.camera_node.robot.calibration.pictures import BOARD, write_scenario
+from tests.camera_node.robot.calibration.pictures import BOARD, render, write_scenario
 from tests.camera_node.sources.devices.mjpeg import NetworkCamera
 
 LENS = Pinhole.from_fov(640, 480, 65.0)
