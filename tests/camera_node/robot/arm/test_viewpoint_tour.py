@@ -128,10 +128,7 @@ def test_a_tour_out_of_reach_says_what_to_change():
 
 def cell(**changed):
     arm = {"host": "127.0.0.2", "cameras": {"hand": None}, **changed}
-    data = {
-        "cameras": {"ids": ["hand", "still"]},
-        "source": {"kind": "world", "scene": "tile", "arm": arm},
-    }
+    data = {"cameras": {"ids": ["hand", "still"]}, "source": {"kind": "world", "scene": "tile", "arm": arm}}
     return parse(data, CELL.path)
 
 

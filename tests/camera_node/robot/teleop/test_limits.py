@@ -24,11 +24,7 @@ def stop_way(v: float, change: float, dt: float) -> float:
     return way
 
 
-@given(
-    room=st.floats(0.0, 20.0),
-    acceleration=st.floats(0.05, 40.0),
-    rate_hz=st.floats(20.0, 500.0),
-)
+@given(room=st.floats(0.0, 20.0), acceleration=st.floats(0.05, 40.0), rate_hz=st.floats(20.0, 500.0))
 def test_the_fastest_speed_stops_exactly_within_the_room(room, acceleration, rate_hz):
     dt = 1.0 / rate_hz
     limits = JointLimits([0.0], [1.0], 1e9, acceleration, dt)
