@@ -18,52 +18,45 @@ def add_commands(commands: Any) -> None:
     simulate = commands.add_parser(
         "simulate-arm", help="a simulated UR controller that real client programs connect to",
         description="Serves the ports of a Universal Robots controller whose arm is simulated: state and "
-        "registers (30004), dashboard (29999), programs (30001-30003). Of a program's commands it knows "
-        "moveJ, servoJ, servoStop, speedJ, speedStop, stopJ, setWatchdog, kickWatchdog and stopScript; "
-        "others (moveL, forceMode, getForwardKinematics, ...), and what a real arm refuses, stop the program "
+        "registers (30004), dashboard (29999), programs (30001-30003). It executes the commands moveJ, "
+        "servoJ, servoStop, speedJ, speedStop, stopJ, setWatchdog, kickWatchdog and stopScript. Others "
+        "(moveL, forceMode, getForwardKinematics, ...), and those that a real arm refuses, stop the program "
         "with a warning.",
     )  # fmt: skip
     add = simulate.add_argument
     add("scenario", nargs="?", help="take address, robot and calibration from this scenario's source.arm")
     add(
         "--host", metavar="ADDRESS",
-        help="address to serve at (default 127.0.0.2); clients know the ports by heart, so a second arm "
-        "needs a second address, such as 127.0.0.3",
+        help="address to serve at (default 127.0.0.2); the ports are fixed, so a second arm needs a second "
+        "address, such as 127.0.0.3",
     )  # fmt: skip
     add("--robot", choices=ROBOTS, default=ROBOTS[0], help="which arm (default %(default)s)")
     add("--calibration", type=Path, metavar="FILE", help="a robot's own calibration.conf")
-    add("--joints", metavar="DEG,...", help="where it stands at first: six angles in degrees")
+    add("--joints", metavar="DEG,...", help="initial joint angles: six, in degrees")
     add("--drift-ppm", type=float, default=0.0, metavar="PPM", help="how much too fast its clock runs")
     add("--noise-rad", type=float, default=0.0, metavar="RAD", help="noise of its encoders, one sigma")
     add("--seed", type=int, default=0, metavar="N", help="of that noise")
 
     drive = commands.add_parser(
-        "drive-arm", help="take the camera on an arm round its target",
+        "drive-arm", help="move the camera on an arm around its target",
         description="Moves the arm of a scenario along the viewpoints of its source.arm.path, there and "
         "back, until Ctrl-C. Prints the joint angles first, and asks before it moves a real arm.",
     )  # fmt: skip
-    drive.add_argument("scenario", help="a scenario whose source.arm has a path")
-    drive.add_argument(
-        "--rounds", type=int, default=0, metavar="N", help="tours to make (default 0: on and on)"
-    )
-    drive.add_argument(
-        "--show",
-        action="store_true",
-        help="print what would be driven from where the arm stands, and do not move",
-    )
-    drive.add_argument(
-        "--joints", metavar="DEG,...", help="of --show: from there instead, six angles in degrees"
-    )
-    drive.add_argument("--yes", action="store_true", help="the arm's space is clear: do not ask")
+    add = drive.add_argument
+    add("scenario", help="a scenario whose source.arm has a path")
+    add("--rounds", type=int, default=0, metavar="N", help="number of tours (default 0: without end)")
+    add("--show", action="store_true", help="print the tour from the arm's joint angles, and do not move")
+    add("--joints", metavar="DEG,...", help="with --show: from these angles instead, six in degrees")
+    add("--yes", action="store_true", help="the arm's space is clear: do not ask")
 
     _add_teleop(commands)
 
 
 TELEOP = """\
 Moves the arm of a scenario as an operator moves a stylus, while its clutch is pressed: scaled, filtered, and
-within limits of workspace, joints, speed, acceleration and distance between the arm's parts at every tick,
-whatever the stylus does. With no message for watchdog_ms the arm comes to rest. Limits and scale are keys of
-the scenario's source.arm.teleop.
+at every tick within limits of workspace, joints, speed, acceleration and distance between the arm's parts.
+Without a message for watchdog_ms the arm comes to rest. Limits and scale are keys of the scenario's
+source.arm.teleop.
 
   camera-node simulate-arm cell &                                   an arm on this machine
   camera-node teleop cell --stylus keyboard                         keys are listed when it starts
@@ -71,12 +64,12 @@ the scenario's source.arm.teleop.
   camera-node teleop cell --stylus network:7010                     a driver sends what the stylus does
   camera-node teleop cell --stylus network:7010 --dry-run path.csv  no arm: joints a tick, to a file
 
-A network stylus sends UDP datagrams of JSON to the port, 50 to 1000 a second:
+A network stylus sends UDP datagrams of JSON to the port, 50 to 1000 per second:
 
   {"t_ns": 1234567890, "p": [x, y, z], "q": [w, x, y, z], "clutch": true}
 
-t_ns: when it was measured (any clock); p: metres, z up; q: orientation; clutch: follow while true, once it
-has been false. For a 3D Systems Touch: p = [x, -z, y] / 1000 of HD_CURRENT_TRANSFORM, clutch from
+t_ns: time of the measurement (any clock); p: metres, z up; q: orientation; clutch: follow while true, after
+it was false once. For a 3D Systems Touch: p = [x, -z, y] / 1000 of HD_CURRENT_TRANSFORM, clutch from
 HD_CURRENT_BUTTONS.
 """
 

@@ -1,8 +1,9 @@
-"""A camera in the synthetic world that a simulated arm carries (thesis 4.2, 4.3).
+"""A camera in the synthetic world, carried by a simulated arm (thesis 4.2, 4.3).
 
-It sees the world from where the arm really was when the frame was taken, which the simulated controller
-knows; the pose that goes with the frame is what a bench would make of it: joint states with their own stamps,
-paired by time, forward kinematics and the hand-eye calibration. Where the two differ, that is the pose error.
+It renders from the arm's true joints at the frame's instant, which the simulated controller knows. The
+frame's
+pose is computed as on a real bench: joint states with their own stamps, paired by time, forward kinematics
+and hand-eye calibration. The difference of both is the pose error.
 """
 
 from __future__ import annotations
@@ -32,19 +33,18 @@ from freshfield.scenario import Scenario, ScenarioError
 Array = NDArray[np.float64]
 
 _TIMEOUT_S = 1.0
-_MAX_OFFSET_NS = 2 * round(STEP_S * 1e9)  # between what is asked for and what the arm answers for
+_MAX_OFFSET_NS = 2 * round(STEP_S * 1e9)  # between the requested instant and the arm's answer
 
 
 class TruthClient:
-    """Where a simulated arm's joints really were at an instant; connects when asked, and anew when lost."""
+    """True joint angles of a simulated arm. Connects at the first request, and again after a failure."""
 
     def __init__(self, host: str) -> None:
         self.host = host
         self._socket: socket.socket | None = None
 
     def joints(self, t_ns: int) -> Array:
-        """Joint angles (6,) at ``t_ns``. Raises PoseGapError where nobody knows: no answer, or one for
-        another instant."""
+        """Joint angles (6,) at ``t_ns``. Raises PoseGapError without an answer for this instant."""
         try:
             if self._socket is None:
                 self._socket = socket.create_connection((self.host, TRUTH_PORT), _TIMEOUT_S)
@@ -77,7 +77,7 @@ class TruthClient:
 
 
 class HandCamera(Source):
-    """One camera on the hand. mount: flange-from-camera, base: world-from-base (4, 4), as they really are."""
+    """One camera on the hand. base: true world-from-base (4, 4). mount: true flange-from-camera (4, 4)."""
 
     def __init__(
         self,
@@ -99,11 +99,11 @@ class HandCamera(Source):
         self._arm, self._base, self._mount = arm, base, mount
 
     def read(self, content: int) -> Shot:
-        """Cast what the camera sees at the tick's instant. Raises PoseGapError."""
+        """Render the image at the tick's instant. Raises PoseGapError."""
         t_ns = content * 10**9 * self.fps.denominator // self.fps.numerator
-        place = self._base @ self._arm.forward(self._truth.joints(t_ns)) @ self._mount
+        true_pose = self._base @ self._arm.forward(self._truth.joints(t_ns)) @ self._mount
         paired = self._poses.at(t_ns)
-        view = self._scene.view(self._lens, place)
+        view = self._scene.view(self._lens, true_pose)
         image = view.image((t_ns % round(self._scene.period_s * 1e9)) * 1e-9)
         if self._effects.image:
             image = self._effects.apply(image, content, t_ns * 1e-9)
@@ -111,7 +111,7 @@ class HandCamera(Source):
         return Shot(image, pose, self.intrinsics, paired.gap_ns)
 
     def close(self) -> None:
-        """Let go of the arm."""
+        """Disconnect from the arm."""
         if isinstance(self._poses, Closable):
             self._poses.close()
         self._truth.close()
@@ -123,10 +123,8 @@ def open_hand_cameras(
     frames: Mapping[str, FrameCache],
     effects: Mapping[str, Effects | None],
 ) -> dict[str, Source]:
-    """The cameras of ``frames`` (those on the hand) with their poses from the arm, which is connected to.
-
-    Raises ScenarioError, or ArmError where there is no arm.
-    """
+    """Connect to the arm and open the cameras of ``frames``, which are on its hand. Raises ScenarioError and
+    ArmError."""
     for camera in frames:
         made = effects.get(camera)
         if made is not None and made.exposure:

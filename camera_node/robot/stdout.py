@@ -1,4 +1,4 @@
-"""Keeps what libraries print off standard output."""
+"""Keeps the output of libraries off standard output."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _libc = ctypes.CDLL(None)
 
 @contextlib.contextmanager
 def only_python_output() -> Iterator[None]:
-    """Send what is written to file descriptor 1 to standard error, except Python's own ``print``: ur_rtde,
-    for one, writes there from threads of its own when it reconnects."""
+    """Redirect file descriptor 1 to standard error, except for Python's own ``print``. ur_rtde, for example,
+    writes there from its own threads when it reconnects."""
     ours = sys.stdout
     ours.flush()
     _libc.fflush(None)
@@ -27,13 +27,13 @@ def only_python_output() -> Iterator[None]:
     finally:
         sys.stdout.flush()
         sys.stdout = ours
-        _libc.fflush(None)  # what C or C++ still hold goes where it belongs
+        _libc.fflush(None)  # write the buffers of C and C++ before the descriptor changes
         os.dup2(kept, 1)
         os.close(kept)
 
 
 def _descriptor(stream: object) -> int | None:
-    """File descriptor of a stream; None where it is no file."""
+    """File descriptor of a stream; None if it is not a file."""
     try:
         return int(stream.fileno())  # type: ignore[attr-defined]
     except (AttributeError, OSError):

@@ -134,12 +134,10 @@ class ArmModel:
         base = self.nominal_model
         found: list[Posture] = []
         for q in _closed_form(base, wanted, float(start[5])):
-            solution: Array | None = q
-            if self.nominal is not None:
-                solution = self.refine(wanted, q)
-            elif not _reaches(self.forward(q), wanted):
-                solution = None
-            placed = None if solution is None else self._unwrap_near(solution, start)
+            solution = q if self.nominal is None else self.refine(wanted, q)
+            if solution is None or not _reaches(self.forward(solution), wanted):
+                continue
+            placed = self._unwrap_near(solution, start)
             if placed is None or any(np.abs(placed - p.joints).max() < 1e-7 for p in found):
                 continue
             found.append(Posture(placed, self.singularities(placed)))

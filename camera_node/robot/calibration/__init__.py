@@ -1,6 +1,6 @@
-"""Calibration of a camera's lens and of its place on an arm (thesis 4.3), and what it is worth.
+"""Calibration of a camera's lens and of its pose on an arm (thesis 4.3), with its uncertainty.
 
-Nothing here runs in a node that streams: the node loads the files that these commands write.
+A node that streams runs none of this. It loads the files that these commands write.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ WANT_MM = 0.5  # a guided session ends when the standard deviation of the transl
 
 
 class CalibrationError(ValueError):
-    """The data do not determine a calibration; the message says why and what to do."""
+    """The data do not determine a calibration. The message says why and what to do."""
 
 
 class ArmStopped(Exception):
-    """The arm of a session stopped and cannot be moved on; the message says why."""
+    """The arm of a session stopped and cannot move again. The message says why."""

@@ -165,10 +165,10 @@ def _proposed_hands(count: int, rng: np.random.Generator) -> tuple[Samples, Samp
     middle = (inverse(simulated.TARGET_IN_BASE) @ np.append(simulated.TARGET_MIDDLE, 1.0))[:3]
     while len(hands) < count:
         so_far = Samples(hands, simulated.observed_targets(hands))
-        next_hand = propose_pose(
+        proposed = propose_pose(
             so_far, simulated.CAMERA_IN_HAND, simulated.TARGET_IN_BASE, _NOISE, middle, rng
-        ).hand
-        hands = np.concatenate([hands, next_hand[None]])
+        )
+        hands = np.concatenate([hands, proposed[None]])
     return _samples(hands, rng)
 
 

@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     lens.add_argument(
         "--live", metavar="SCENARIO",
-        help="instead, guided, with its --camera: where to show the target next, and when it is enough",
+        help="instead, a guided session with its --camera: tells where to show the target, and when to stop",
     )  # fmt: skip
     _add_board(lens, required=True)
     lens.add_argument("--camera", default="cam00", metavar="ID", help="its name in the file (%(default)s)")
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     lens.add_argument("--json", action="store_true", help="print what --out writes")
     live = _add_live_group(lens)
-    live("--moving", action="store_true", help="take pictures while the target moves too: short exposures")
+    live("--moving", action="store_true", help="also take pictures while the target moves: short exposures")
     target = what.add_parser("target", help="a picture of a target, to print", epilog=EXAMPLES,
                              formatter_class=raw)  # fmt: skip
     target.add_argument("board", metavar="SPEC", help="see hand-eye --board")
@@ -96,8 +96,8 @@ def _add_live_group(parser: argparse.ArgumentParser) -> Callable[..., Any]:
     """Add the options of every guided session. Returns what adds further ones to their group."""
     live = parser.add_argument_group("with --live").add_argument
     live("--data", type=Path, metavar="DIR", help="data sets' folder (else $FRESHFIELD_DATA)")
-    live("--preview", type=Path, metavar="FILE.png", help="what is seen, drawn again and again")
-    live("--seconds", type=float, metavar="S", help="end after so long with what there is")
+    live("--preview", type=Path, metavar="FILE.png", help="the newest picture with its corners, replaced")
+    live("--seconds", type=float, metavar="S", help="end the session after so long")
     return live
 
 
@@ -120,28 +120,28 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     _add_board(parser, required=False)
     add("--lens", type=Path, metavar="FILE",
         help="calibration JSON or ViSP's XML (default: the folder's XML, the live camera's own)")
-    add("--eye-to-hand", action="store_true", help="the camera stands, the hand holds the target")
+    add("--eye-to-hand", action="store_true", help="the camera stands still, the hand holds the target")
     add("--method", default=DEFAULT_METHOD, metavar="NAME",
-        help="whose answer is given: tsai, park, horaud, andreff, daniilidis or refined (default)")
+        help="gives the result: tsai, park, horaud, andreff, daniilidis or refined (default)")
     add("--max-gap-ms", type=float, metavar="MS",
-        help=f"of streams: what is farther from a hand pose is not used (default {MAX_GAP_S * 1e3:g})")
+        help=f"largest time from a target pose to a hand pose of a stream (default {MAX_GAP_S * 1e3:g})")
     add("--json", action="store_true",
         help="print {transform, time_offset_s, residual_mm, residual_deg, method, std_mm, std_deg, warnings}")
     add("--out", type=Path, metavar="FILE.yaml", help="for the node (source.trajectory.hand_eye)")
-    add("--plot", type=Path, metavar="FILE.png", help="residuals, axes of the turns, scatter of the target")
+    add("--plot", type=Path, metavar="FILE.png", help="residuals, rotation axes, scatter of the target")
     live = _add_live_group(parser)
     live("--camera", metavar="ID", help="of the scenario")
     live("--want-mm", type=float, metavar="MM",
          help=f"enough when the standard deviation is below this (default {WANT_MM:g})")
-    live("--moving", action="store_true", help="take pictures while the hand moves too; with an arm, the "
+    live("--moving", action="store_true", help="also take pictures while the hand moves; with an arm, the "
          "time offset between its stamps and the camera's is estimated from the motion")
-    live("--drive", action="store_true", help="once it has seen the target, the scenario's arm goes by "
-         "itself where it is wanted, as fast as source.arm.path says and above its floor_m; asks first")
-    live("--yes", action="store_true", help="of --drive: the arm's space is clear: do not ask")
+    live("--drive", action="store_true", help="once the target was seen, the scenario's arm moves to the "
+         "proposed poses, with the speed and floor_m of source.arm.path; asks first")
+    live("--yes", action="store_true", help="with --drive: the arm's space is clear: do not ask")
     live("--tracks", type=Path, metavar="DIR",
          help="with --moving and an arm: keeps both streams, hand.csv and target.csv, for --hand, --target")
     live("--samples", type=Path, metavar="FILE",
-         help="keeps each sample as --pairs reads it; goes on with those that are there")
+         help="keeps each sample as --pairs reads it; continues with those of an earlier session")
 # fmt: on
 
 
@@ -222,8 +222,8 @@ def _calibrate(args: argparse.Namespace) -> Calibration:
         from camera_node.robot.calibration.hand_eye.live import calibrate_live
 
         return calibrate_live(args, board, lens, setup)
-    samples, measured = files.read_visp_folder(args.folder, board, lens, setup, _print_progress)
-    for name, why in measured.unused.items():
+    samples, unused = files.read_visp_folder(args.folder, board, lens, setup, _print_progress)
+    for name, why in unused.items():
         _note(f"{name}: {why}")
     return hand_eye.calibrate(samples, args.method)
 

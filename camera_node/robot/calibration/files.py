@@ -19,7 +19,7 @@ from camera_node.pose.providers import TrajectoryError, read_samples
 from camera_node.robot.arm.hand_eye_mount import rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
-from camera_node.robot.calibration.targets import Target, TargetPose, estimate_pose, to_gray
+from camera_node.robot.calibration.targets import Corners, Target, TargetPose, estimate_pose
 from camera_node.sources.datasets.records import DatasetError
 from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, so3_exp
@@ -31,7 +31,12 @@ _MIN_PIXEL_NOISE = 0.02
 
 @dataclass(frozen=True)
 class Track:
-    """A stream of poses. times_ns: (N,) increasing. poses: (N, 4, 4). counts: stamps sorted or dropped."""
+    """A stream of poses.
+
+    times_ns: (N,), increasing.
+    poses: (N, 4, 4).
+    counts: what was sorted or dropped.
+    """
 
     times_ns: NDArray[np.int64]
     poses: Array
@@ -39,7 +44,8 @@ class Track:
 
 
 def read_pairs(file: Path, setup: str) -> Samples:
-    """A JSON list of [end-effector in base, target in camera], each 4 x 4. Raises CalibrationError."""
+    """Samples from a JSON list of [end-effector in base, target in camera], each 4 x 4. Raises
+    CalibrationError."""
     try:
         data = json.loads(file.read_text())
     except OSError as error:
@@ -67,8 +73,8 @@ def pairs_json(samples: Samples) -> list[list[list[list[float]]]]:
 
 
 def read_track(file: Path) -> Track:
-    """Poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), header optional, sorted by stamp where
-    needed. Raises CalibrationError."""
+    """Read poses ``t,x,y,z,qx,qy,qz,qw`` (seconds, metres), with or without a header, and sort them by stamp.
+    Raises CalibrationError."""
     try:
         times, poses = read_samples(file)
     except TrajectoryError as error:
@@ -80,7 +86,8 @@ def read_track(file: Path) -> Track:
 
 
 def read_visp_pose(file: Path) -> Array:
-    """(4, 4) of ViSP's YAML: rows 6, cols 1, data [tx ty tz, theta u] in metres and radians."""
+    """Pose (4, 4) from ViSP's YAML: rows 6, cols 1, data [tx ty tz, theta u] in metres and radians. Raises
+    CalibrationError."""
     try:
         data = yaml.safe_load(file.read_text())
         values = np.array(data["data"], dtype=np.float64).ravel()
@@ -97,8 +104,8 @@ def read_visp_pose(file: Path) -> Array:
 
 
 def read_lens(file: Path) -> Pinhole:
-    """A lens from a calibration JSON of one camera (``camera-node calibrate intrinsics``) or ViSP's camera
-    XML. Raises CalibrationError."""
+    """Read a lens from a calibration JSON of one camera (``camera-node calibrate intrinsics``) or from ViSP's
+    camera XML. Raises CalibrationError."""
     if file.suffix.lower() != ".xml":
         try:
             cameras = load_calibration(file)
@@ -129,16 +136,7 @@ def read_lens(file: Path) -> Pinhole:
         ) from None
 
 
-@dataclass(frozen=True)
-class Detections:
-    """seen: target poses by image name. unused: the reason, by name, for every other image."""
-
-    seen: dict[str, TargetPose]
-    unused: dict[str, str]
-
-
-def read_gray_image(file: Path) -> np.ndarray:
-    """Gray (H, W). Raises CalibrationError."""
+def _read_gray_image(file: Path) -> NDArray[np.uint8]:
     picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CalibrationError(f"{file}: cannot be read as a picture")
@@ -155,34 +153,36 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(found, key=lambda f: (_number(f) is None, _number(f) or 0, f.name))
 
 
-def detect_target(
-    files: Sequence[Path], target: Target, lens: Pinhole, progress: Callable[[int], None] = lambda done: None
-) -> Detections:
-    """Find the target in images taken through ``lens``. Raises CalibrationError if a size differs from it."""
-    seen: dict[str, TargetPose] = {}
+def find_corners(
+    files: Sequence[Path], target: Target, size: tuple[int, int] | None, progress: Callable[[int], None]
+) -> tuple[dict[str, Corners], dict[str, str], tuple[int, int]]:
+    """Find the target in images.
+
+    size: width and height of every image in pixels; None: those of the first one.
+    progress: called with the number of images done.
+    Returns the corners by image name, the reason for every image without them, and the size. Raises
+    CalibrationError.
+    """
+    found: dict[str, Corners] = {}
     unused: dict[str, str] = {}
     for k, file in enumerate(files):
-        picture = to_gray(read_gray_image(file))
-        if picture.shape != (lens.height, lens.width):
-            raise CalibrationError(
-                f"{file}: is {picture.shape[1]} x {picture.shape[0]}, the lens was calibrated at "
-                f"{lens.width} x {lens.height}"
-            )
+        picture = _read_gray_image(file)
+        height, width = picture.shape
+        size = size or (width, height)
+        if (width, height) != size:
+            raise CalibrationError(f"{file}: is {width} x {height}, expected {size[0]} x {size[1]}")
         corners = target.find(picture)
         if corners is None:
             unused[file.name] = f"{target.name} not found"
         else:
-            try:
-                seen[file.name] = estimate_pose(corners, lens)
-            except CalibrationError as error:
-                unused[file.name] = str(error)
+            found[file.name] = corners
         progress(k + 1)
-    return Detections(seen, unused)
+    return found, unused, size or (0, 0)
 
 
-def pixel_noise(seen: Sequence[TargetPose]) -> float:
-    """Standard deviation (pixels) of a corner coordinate from all reprojections, less six degrees of freedom
-    an image."""
+def _pixel_noise(seen: Sequence[TargetPose]) -> float:
+    """Standard deviation (pixels) of a corner coordinate, from all reprojections with six degrees of freedom
+    fitted per image."""
     squares = sum(s.error_px**2 * len(s.corners.points) for s in seen)
     freedom = sum(2 * len(s.corners.points) - 6 for s in seen)
     return max(float(np.sqrt(squares / max(freedom, 1))), _MIN_PIXEL_NOISE)
@@ -191,8 +191,11 @@ def pixel_noise(seen: Sequence[TargetPose]) -> float:
 def to_samples(
     seen: Sequence[TargetPose], hands: Sequence[Array], names: Sequence[str], setup: str
 ) -> Samples:
-    """Samples with the target's covariance from its corners' noise."""
-    noise = pixel_noise(seen)
+    """Samples with the target's covariance from the noise of its corners.
+
+    seen, hands, names: target poses, hand poses in base (4, 4), and names for messages.
+    """
+    noise = _pixel_noise(seen)
     return Samples(
         _stacked(list(hands)), _stacked([s.pose for s in seen]), setup,
         np.array([s.unit_covariance * noise**2 for s in seen]).reshape(-1, 6, 6), tuple(names),
@@ -200,14 +203,14 @@ def to_samples(
 
 
 def read_visp_folder(
-    folder: Path,
-    target: Target,
-    lens: Pinhole | None,
-    setup: str,
-    progress: Callable[[int], None] = lambda done: None,
-) -> tuple[Samples, Detections]:
-    """Pictures ``*-N.png`` with poses ``*_N.yaml`` of the hand, matched by number; without ``lens``,
-    the folder's XML is read. Raises CalibrationError."""
+    folder: Path, target: Target, lens: Pinhole | None, setup: str, progress: Callable[[int], None]
+) -> tuple[Samples, dict[str, str]]:
+    """Samples from pictures ``*-N.png`` with poses ``*_N.yaml`` of the hand, matched by number.
+
+    lens: None reads the folder's XML file.
+    progress: see ``find_corners``.
+    Returns the reason for every unused image too, by name. Raises CalibrationError.
+    """
     if lens is None:
         lenses = sorted(folder.glob("*.xml"))
         if len(lenses) != 1:
@@ -222,13 +225,16 @@ def read_visp_folder(
         raise CalibrationError(
             f"{folder}: no picture has a pose file of its number (NAME_3.yaml, NAME-3.png)"
         )
-    found = detect_target(paired, target, lens, progress)
-    unused = {f.name: "no pose file of its number" for f in files if _number(f) not in poses}
-    found = Detections(found.seen, {**found.unused, **unused})
-    used = [f for f in paired if f.name in found.seen]
-    hands = [read_visp_pose(poses[_number(f)]) for f in used]
-    names = [f.name for f in used]
-    return to_samples([found.seen[n] for n in names], hands, names, setup), found
+    found, unused, _ = find_corners(paired, target, (lens.width, lens.height), progress)
+    seen: dict[str, TargetPose] = {}
+    for name, corners in found.items():
+        try:
+            seen[name] = estimate_pose(corners, lens)
+        except CalibrationError as error:
+            unused[name] = str(error)
+    unused |= {f.name: "no pose file of its number" for f in files if _number(f) not in poses}
+    hands = [read_visp_pose(poses[_number(f)]) for f in paired if f.name in seen]
+    return to_samples(list(seen.values()), hands, list(seen), setup), unused
 
 
 def _number(file: Path) -> int | None:

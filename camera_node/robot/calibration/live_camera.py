@@ -1,11 +1,9 @@
-"""Shared by both ``calibrate ... --live`` commands: a scenario's camera, its images in time, the display."""
+"""The scenario's camera, its images and the progress display of both ``calibrate ... --live`` commands."""
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import os
-import secrets
 import shutil
 import sys
 import time
@@ -21,14 +19,14 @@ from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.session import KEPT
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.registry import open_sources
-from freshfield import payload, scenario
+from freshfield import files, payload, scenario
 from freshfield.clock import WallClock
 
 Image = NDArray[np.uint8]
 
 
 def load_scenario(args: argparse.Namespace) -> scenario.Scenario:
-    """The scenario ``--live``, which must have ``--camera``. Raises CalibrationError, ScenarioError."""
+    """The scenario ``--live``, which must have ``--camera``. Raises CalibrationError and ScenarioError."""
     loaded = scenario.load(args.live)
     if args.camera not in loaded.cameras:
         raise CalibrationError(f"--camera: {loaded.path} has {', '.join(loaded.cameras)}, got {args.camera}")
@@ -44,15 +42,20 @@ def open_source(loaded: scenario.Scenario, config: SourceConfig, args: argparse.
 
 
 def first_tick(source: Source) -> int:
-    """Tick to begin with: a source that never repeats follows the time of day, as in a node."""
+    """First tick to read. A source that never repeats follows the time of day, as in a node."""
     return 0 if source.contents is not None else round(WallClock().now_ns() * source.fps / 10**9)
 
 
 def read_shots(
     source: Source, codec: str, pace: Callable[[int], bool], first: int
 ) -> Iterator[tuple[int, Shot, Image]]:
-    """(tick, shot, decoded image) until ``pace`` ends it or a recording has been seen once. A shot that
-    cannot be read is reported and skipped."""
+    """Read (tick, shot, decoded image) until ``pace`` returns False or a recording ends. A shot that cannot
+    be read is reported and skipped.
+
+    codec: of images that are encoded.
+    pace: called with the number of ticks so far.
+    first: tick to begin with.
+    """
     for tick in itertools.count():
         if (source.contents is not None and tick >= source.contents) or not pace(tick):
             return
@@ -68,7 +71,7 @@ def read_shots(
 
 
 class Pace:
-    """Waits for the time of each tick; False once ``seconds`` have passed. Late ticks do not wait."""
+    """Waits for the time of each tick. Returns False once ``seconds`` have passed."""
 
     def __init__(self, fps: float, seconds: float | None) -> None:
         self._fps, self._seconds = fps, seconds
@@ -87,7 +90,7 @@ def report_skipped(error: Exception) -> None:
 
 
 def report_step(outcome: str, line: str) -> None:
-    """Print a step: all of them in place on a terminal, elsewhere only those that kept an image."""
+    """Print a step: on a terminal every one, on the same line; elsewhere only those that kept an image."""
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns - 1
         print(f"\r{line[:width]:{width}}", end="\n" if outcome == KEPT else "", file=sys.stderr)
@@ -100,6 +103,4 @@ def write_image(path: Path, image: Image) -> None:
     done, data = cv2.imencode(path.suffix or ".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not done:
         raise OSError(f"{path}: not a kind of picture")
-    part = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
-    part.write_bytes(data.tobytes())
-    os.replace(part, path)
+    files.write_bytes(path, data.tobytes())

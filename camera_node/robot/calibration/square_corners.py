@@ -1,9 +1,9 @@
-"""Refine the corners of a dark square on white by fitting lines to its sides.
+"""Refines the corners of a dark square on white by fitting lines to its sides.
 
 Gradient-based corner refinement is made for saddle points such as those of a chessboard. At the outer corner
 of a square it ends a quarter to half a pixel inside, which puts a tag of 80 mm 1 mm farther away at 20 cm.
 Here each side is a line through the points where gray is half way between dark and light, and the corners are
-the intersections: within a tenth of a pixel on rendered tags.
+the intersections. On rendered tags they are right to a tenth of a pixel.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Along a side, as shares of its length: the ends belong to the corners.
+# Positions along a side, as shares of its length. The ends are left out because of the corners.
 _SHARES = np.linspace(0.06, 0.94, 64)
 _MIN_SAMPLES = 10
 _ROUNDS = 2
@@ -23,8 +23,8 @@ _STEP_PX = 0.25
 
 
 def square_corners(picture: NDArray[np.uint8], corners: Array) -> Array:
-    """Refined corners (4, 2), pixel centers at whole numbers; ``corners`` unchanged if a side cannot be seen.
-    Where a side is dark in part only, as in a QR code, those parts are used."""
+    """Refined corners (4, 2), with pixel centers at whole numbers; ``corners`` themselves if a side is not
+    visible. If only parts of a side are dark, as in a QR code, those parts are used."""
     better = corners
     for _ in range(_ROUNDS):
         lines = [_side(picture, better, k) for k in range(4)]
@@ -35,7 +35,7 @@ def square_corners(picture: NDArray[np.uint8], corners: Array) -> Array:
             return corners
         better = np.array(meets)
     reach = _reach(corners)
-    # Far from the detector's corners, a side was mistaken for another line.
+    # Far from the detector's corners, another line was mistaken for a side.
     return better if np.abs(better - corners).max() <= 2 * reach else corners
 
 
@@ -61,7 +61,7 @@ def _side(picture: NDArray[np.uint8], corners: Array, k: int) -> tuple[Array, Ar
         return None
     half = (inside + outside) / 2
     light = gray >= half[:, None]
-    # The last dark place on the way out.
+    # The outermost dark position.
     last = len(depth) - 1 - np.argmax(~light[:, ::-1], axis=1)
     seen &= (last < len(depth) - 1) & ~light[:, 0]
     rows = np.flatnonzero(seen)

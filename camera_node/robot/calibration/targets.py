@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,7 +37,8 @@ _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
 
 @dataclass(frozen=True)
 class Corners:
-    """pixels: (N, 2), corner origin as everywhere in this project. points: (N, 3) in the target's axes."""
+    """Corners of a target. pixels: (N, 2), in this project's corner origin. points: (N, 3) in the target's
+    axes."""
 
     pixels: Array
     points: Array
@@ -44,9 +46,14 @@ class Corners:
 
 @dataclass(frozen=True)
 class TargetPose:
-    """pose: (4, 4) target in camera. error_px: rms of the reprojection. unit_covariance: (6, 6) of rotation
-    (radians, target axes) and translation (metres, camera axes) for one pixel of noise in each coordinate of
-    a corner. corners: those it was estimated from."""
+    """Pose of a target in one image.
+
+    pose: (4, 4) target in camera.
+    error_px: root mean square of the reprojection errors.
+    unit_covariance: (6, 6) of rotation (radians, target axes) and translation (metres, camera axes) for one
+        pixel of noise in each coordinate of a corner.
+    corners: those that it was estimated from.
+    """
 
     pose: Array
     error_px: float
@@ -56,9 +63,15 @@ class TargetPose:
 
 @dataclass(frozen=True)
 class Target:
-    """name: as the user spelled it. size_m: width and height of the drawing. find: corners in a gray image,
-    or None. draw: drawing of a given width in pixels, exact at multiples of ``modules`` (its width in
-    modules). pattern_m: width and height without the white border."""
+    """A calibration target.
+
+    name: its SPEC.
+    size_m: width and height of the drawing.
+    find: returns the corners in a gray image, or None.
+    draw: returns a drawing of a given width in pixels, exact at multiples of ``modules`` (its width in
+        modules).
+    pattern_m: width and height without the white border.
+    """
 
     name: str
     size_m: tuple[float, float]
@@ -69,18 +82,12 @@ class Target:
 
 
 def parse_target(spelling: str) -> Target:
-    """The target of a SPEC such as those above. Raises CalibrationError with examples."""
+    """The target of a SPEC (see above). Raises CalibrationError."""
     kind, *rest = spelling.split(":")
-    makers: dict[str, Callable[..., Target]] = {
-        "charuco": _charuco,
-        "chessboard": _chessboard,
-        "apriltag": _apriltag,
-        "qr": _qr,
-    }
     try:
-        if kind not in makers:
+        if kind not in _MAKERS:
             raise ValueError(f"no kind {kind!r}")
-        return makers[kind](spelling, *rest)
+        return _MAKERS[kind](spelling, *rest)
     except (TypeError, ValueError, AttributeError) as error:
         why = f" ({error})" if isinstance(error, ValueError) else ""
         raise CalibrationError(f"target {spelling!r}: expected for example {SPELLINGS}{why}") from None
@@ -120,7 +127,7 @@ def opencv_lens(lens: Pinhole) -> tuple[Array, Array]:
 
 
 def to_gray(image: NDArray[np.uint8]) -> GrayImage:
-    """(H, W) of a gray, RGB or RGBA picture."""
+    """Gray (H, W) of a gray, RGB or RGBA image."""
     if image.ndim == 2:
         return image
     code = cv2.COLOR_RGBA2GRAY if image.shape[2] == 4 else cv2.COLOR_RGB2GRAY
@@ -128,7 +135,7 @@ def to_gray(image: NDArray[np.uint8]) -> GrayImage:
 
 
 def _inverse_right_jacobian(vector: Array) -> Array:
-    """(3, 3): inverse right Jacobian of SO(3), the derivative of a rotation vector by rotations about the
+    """Inverse right Jacobian (3, 3) of SO(3): the derivative of a rotation vector by rotations about the
     body's own axes. The tangent of the half angle keeps it exact at half a turn, where targets often are."""
     angle = float(np.linalg.norm(vector))
     k = np.array([[0, -vector[2], vector[1]], [vector[2], 0, -vector[0]], [-vector[1], vector[0], 0]])
@@ -213,8 +220,7 @@ def _apriltag(name: str, family: str, number: str, size: str) -> Target:
         at = [] if numbers is None else np.flatnonzero(numbers.ravel() == wanted)
         if len(at) != 1:  # absent, or ambiguous because the tag appears twice
             return None
-        corners = pixels[int(at[0])].reshape(4, 2).astype(np.float64)
-        return Corners(square_corners(picture, corners) + 0.5, _square(side))
+        return _refined_square(picture, pixels[int(at[0])], side)
 
     def draw(width: int) -> GrayImage:
         return np.asarray(cv2.aruco.generateImageMarker(dictionary, wanted, width), dtype=np.uint8)
@@ -230,8 +236,7 @@ def _qr(name: str, size: str, *text: str) -> Target:
         said, pixels, _ = detector.detectAndDecode(picture)
         if not said or pixels is None or (wanted and said != wanted):
             return None
-        corners = pixels.reshape(4, 2).astype(np.float64)
-        return Corners(square_corners(picture, corners) + 0.5, _square(side))
+        return _refined_square(picture, pixels, side)
 
     code = cv2.QRCodeEncoder.create().encode(wanted or "freshfield")
     # Remove the encoder's quiet zone of two modules: it does not belong to the code's size.
@@ -244,8 +249,14 @@ def _qr(name: str, size: str, *text: str) -> Target:
     return Target(name, (side, side), find, draw, len(code), (side, side))
 
 
-def _square(side: float) -> Array:
-    return np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], dtype=np.float64)
+_MAKERS: dict[str, Callable[..., Target]] = {
+    "charuco": _charuco, "chessboard": _chessboard, "apriltag": _apriltag, "qr": _qr,
+}  # fmt: skip
+
+
+def _refined_square(picture: GrayImage, pixels: NDArray[Any], side: float) -> Corners:
+    points = np.array([[0, 0, 0], [side, 0, 0], [side, side, 0], [0, side, 0]], dtype=np.float64)
+    return Corners(square_corners(picture, pixels.reshape(4, 2).astype(np.float64)) + 0.5, points)
 
 
 def _mean_level(picture: GrayImage, at: Array) -> float:

@@ -57,8 +57,7 @@ class Controller:
         self.arm = arm
         self.motion = JointMotion(arm, joints)
         self.inputs: dict[str, Any] = {}
-        self.output_int = [0] * 48
-        self.output_double = [0.0] * 48
+        self.answer = 0
         self.digital_out = 0
         self.runtime_state = STOPPED
         self.steps = 0
@@ -103,7 +102,7 @@ class Controller:
         return round(self._start_ns + position * STEP_NS), (1.0 - part) * a + part * b
 
     def values(self) -> dict[str, Any]:
-        """Current values of the output variables. Each call draws new encoder noise."""
+        """Current values of the output variables that are not zero. Each call draws new encoder noise."""
         m = self.motion
         q = m.q + self._rng.normal(0.0, self._noise_rad, 6) if self._noise_rad > 0.0 else m.q
         flange = self.arm.forward(q)
@@ -121,21 +120,20 @@ class Controller:
             "speed_scaling": 1.0, "target_speed_fraction": 1.0,
             "actual_main_voltage": 48.0, "actual_robot_voltage": 48.0, "actual_joint_voltage": (48.0,) * 6,
             "actual_digital_output_bits": self.digital_out,
-            **{f"output_int_register_{k}": v for k, v in enumerate(self.output_int)},
-            **{f"output_double_register_{k}": v for k, v in enumerate(self.output_double)},
+            "output_int_register_0": self.answer,
         }  # fmt: skip
 
     def start_program(self) -> None:
         """Start the program that a client has uploaded."""
         self.stop_program()
-        self.runtime_state, self.output_int[0] = PLAYING, READY
+        self.runtime_state, self.answer = PLAYING, READY
         self.inputs.clear()
 
     def stop_program(self) -> None:
         """Stop the program and bring the arm to rest."""
         self.motion.stop()
         self.runtime_state, self._busy, self._watchdog_steps = STOPPED, False, None
-        self.output_int[0] = 0
+        self.answer = 0
 
     def write_inputs(self, given: dict[str, Any]) -> None:
         """Take a client's input registers, and execute their command."""
@@ -146,7 +144,7 @@ class Controller:
         command = int(given["input_int_register_0"])
         self._watchdog_reset_step = self.steps
         if command == NO_COMMAND:
-            self.output_int[0] = READY
+            self.answer = READY
         elif command == STOP_SCRIPT:
             self.stop_program()
         elif command == SERVO_J:
@@ -180,7 +178,7 @@ class Controller:
     def _finish(self) -> None:
         self._busy = False
         if self.runtime_state == PLAYING:
-            self.output_int[0] = DONE
+            self.answer = DONE
 
     def fault(self, why: str) -> None:
         """Stop the program, as a controller does after a command that it cannot execute."""

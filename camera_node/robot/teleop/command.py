@@ -138,12 +138,9 @@ def _run_loop(
                 next_s, late = now_s, late + 1
             else:
                 stop_requested.wait(next_s - now_s)
+        _come_to_rest(operator, sink, period_s)
     except (ArmError, OSError) as error:
-        print(f"camera-node: {error}", file=sys.stderr)
-        status = 1
-    try:
-        _come_to_rest(operator, sink, period_s, send=status == 0)
-    except (ArmError, OSError) as error:
+        operator.stop()
         print(f"camera-node: {error}", file=sys.stderr)
         status = 1
     finally:
@@ -153,12 +150,10 @@ def _run_loop(
     return status
 
 
-def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float, send: bool) -> None:
+def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float) -> None:
     for _ in range(round(_LONGEST_STOP_S / period_s)):
         begun_s = time.monotonic()
         command, at_rest = operator.stop()
-        if not send:
-            return  # the sink has failed and can only be closed
         sink.send(operator.ticks * period_s, command)
         if at_rest:
             return
@@ -168,7 +163,7 @@ def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float, send: boo
 def _status_line(operator: Teleoperator) -> str:
     x, y, z = operator.arm.forward(operator.limiter.q)[:3, 3]
     counts = operator.mapping.counts
-    refused = [f"{name} {n}" for name, n in vars(operator.limiter.refused).items() if n]
+    refused = [f"{name} {n}" for name, n in operator.limiter.refused.items() if n]
     held = f", held by {', '.join(refused)}" if refused else ""
     return (
         f"{operator.state}: flange at {x:.3f} {y:.3f} {z:.3f} m, {counts.taken} messages, "

@@ -8,7 +8,7 @@ past its own parts; with damped least squares it stops there.
 from __future__ import annotations
 
 import importlib.util
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,18 +31,7 @@ _BARRIER_GAIN_PER_S = 2.0
 _PACKAGES = ("pink", "pinocchio", "coal", "daqp")
 
 
-class Solver(Protocol):
-    """failed: number of ticks without a solution."""
-
-    name: str
-    failed: int
-
-    def speeds(self, q: Array, target: Array) -> Array:
-        """Joint speeds (6,), rad/s, from joints ``q`` (6,) towards ``target``, base-from-flange (4, 4)."""
-        ...
-
-
-def make_solver(arm: ArmModel, config: TeleopConfig) -> Solver:
+def make_solver(arm: ArmModel, config: TeleopConfig) -> DampedLeastSquares | PinkSolver:
     """The solver named in a scenario. Raises TeleopError if it is pink and not installed."""
     missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     if config.solver == "dls" or (config.solver == "auto" and missing):
@@ -62,7 +51,10 @@ def commanded_twist(arm: ArmModel, q: Array, target: Array, config: TeleopConfig
 
 
 class DampedLeastSquares:
-    """``v = J^T (J J^T + damping^2)^-1 twist`` (Wampler 1986), scaled down to the joints' speed limit."""
+    """``v = J^T (J J^T + damping^2)^-1 twist`` (Wampler 1986), scaled down to the joints' speed limit.
+
+    failed: number of ticks without a solution.
+    """
 
     name = "dls"
 
@@ -71,7 +63,7 @@ class DampedLeastSquares:
         self.failed = 0
 
     def speeds(self, q: Array, target: Array) -> Array:
-        """See ``Solver``."""
+        """Joint speeds (6,), rad/s, from joints ``q`` (6,) towards ``target``, base-from-flange (4, 4)."""
         wanted = commanded_twist(self._arm, q, target, self._config)
         left, values, right = np.linalg.svd(self._arm.jacobian(q))
         damping = _DAMPING * max(0.0, 1.0 - (float(values[-1]) / _DAMPING_THRESHOLD) ** 2)
@@ -122,7 +114,7 @@ class PinkSolver:
         self.failed = 0
 
     def speeds(self, q: Array, target: Array) -> Array:
-        """See ``Solver``; zero if the program has no solution (counted)."""
+        """See ``DampedLeastSquares``. Zero if the program has no solution (counted)."""
         self._configuration.update(q)
         # The task tries to reach its target in one tick, so the target is one tick's step away.
         step = commanded_twist(self._arm, q, target, self._config) * self._dt_s

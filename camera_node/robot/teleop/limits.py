@@ -17,8 +17,6 @@ smaller steps are tried, and finally the stop that was checked with the tick bef
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -85,21 +83,13 @@ class JointLimits:
         return fastest
 
 
-@dataclass
-class Refusals:
-    """Numbers of ticks in which a limit reduced the speeds, by limit, or the wanted speeds were invalid
-    (unsound)."""
-
-    box: int = 0
-    floor: int = 0
-    speed: int = 0
-    near: int = 0
-    unsound: int = 0
-
-
 class Limiter:
     """Joints ``q`` (6,) and speeds ``v`` (6,) that keep every limit of a TeleopConfig. The arm starts at rest
-    at ``joints`` (6,). Raises TeleopError if these break a limit."""
+    at ``joints`` (6,). Raises TeleopError if these break a limit.
+
+    refused: numbers of ticks in which a limit reduced the speeds, or the wanted speeds were invalid
+        (unsound).
+    """
 
     def __init__(self, arm: ArmModel, config: TeleopConfig, joints: ArrayLike) -> None:
         self.config, self.dt_s = config, 1.0 / config.rate_hz
@@ -108,7 +98,7 @@ class Limiter:
         speed = min(config.speed_rad_s, *arm.speed_rad_s)
         self.joint_limits = JointLimits(low, high, speed, config.acceleration_rad_s2, self.dt_s)
         self.shape = CapsuleModel(arm, config.tool_m, config.tool_radius_m)
-        self.refused = Refusals()
+        self.refused = dict.fromkeys(("box", "floor", "speed", "near", "unsound"), 0)
         self._low_m = np.array(config.workspace_low_m) + _ROUNDING
         self._high_m = np.array(config.workspace_high_m) - _ROUNDING
         self.q: Array = np.array(joints, dtype=np.float64)
@@ -120,7 +110,7 @@ class Limiter:
         (6,)."""
         speeds = np.asarray(wanted, dtype=np.float64)
         if speeds.shape != (6,) or not np.isfinite(speeds).all():
-            self.refused.unsound += 1
+            self.refused["unsound"] += 1
             speeds = np.zeros(6)
         limits = self.joint_limits
         asked, stopping = limits.clamp(self.q, self.v, speeds), limits.stopping(self.v)
@@ -132,7 +122,7 @@ class Limiter:
                 chosen = tried
                 break
             if k == 0:
-                setattr(self.refused, violated, getattr(self.refused, violated) + 1)
+                self.refused[violated] += 1
         self.q, self.v = self.q + chosen * self.dt_s, chosen
         return self.q.copy(), self.v.copy()
 

@@ -38,15 +38,6 @@ class MessageCounts:
 
 
 @dataclass
-class _ClutchReference:
-    """References of (4.1): pose (4, 4) of the hand, position (3,) and rotation (3, 3) of the stylus."""
-
-    hand: Array
-    position: Array
-    rotation: Array
-
-
-@dataclass
 class Mapping:
     """Turns samples into targets. target: base-from-flange (4, 4), or None to stay."""
 
@@ -61,7 +52,8 @@ class Mapping:
         self._scale = np.array(self.config.scale)
         self._low, self._high = np.array(self.config.workspace_low_m), np.array(self.config.workspace_high_m)
         self._filter = OneEuro(self.config.filter_hz, self.config.filter_hz_s_m)
-        self._reference: _ClutchReference | None = None
+        # Hand pose (4, 4), and position (3,) and rotation (3, 3) of the stylus, when the clutch was pressed.
+        self._reference: tuple[Array, Array, Array] | None = None
         self._last: tuple[int, Array, Array] | None = None
         # A clutch that is held in the first message does not count: it must be released once.
         self._released = False
@@ -112,15 +104,15 @@ class Mapping:
         position, quaternion = self._filter(position, quaternion, dt_s)
         rotation = quaternion_to_matrix(quaternion)
         if self._reference is None:
-            self._reference = _ClutchReference(hand.copy(), position.copy(), rotation)
+            self._reference = hand.copy(), position.copy(), rotation
             self.counts.engaged += 1
-        reference = self._reference
-        target = reference.hand.copy()
-        moved = reference.hand[:3, 3] + self._scale * (self._axes @ (position - reference.position))
+        hand_0, position_0, rotation_0 = self._reference
+        target = hand_0.copy()
+        moved = hand_0[:3, 3] + self._scale * (self._axes @ (position - position_0))
         # The target stays inside the box and returns from its wall together with the stylus.
         target[:3, 3] = np.clip(moved, self._low, self._high)
         if self.config.orientation:
-            turn = self._axes @ rotation @ reference.rotation.T @ self._axes.T
+            turn = self._axes @ rotation @ rotation_0.T @ self._axes.T
             # Products of rotations drift; the conversion to a quaternion keeps them rigid.
-            target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ reference.hand[:3, :3]
+            target[:3, :3] = quaternion_to_matrix(matrix_to_quaternion(turn)) @ hand_0[:3, :3]
         self.target = target

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +21,6 @@ _MAX_LAG_RAD = 0.35
 HEADER = "t_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m,state"
 
 
-class Sink(Protocol):
-    """Takes one command per tick. Raises ArmError or OSError if it cannot continue."""
-
-    def send(self, t_s: float, command: Command) -> None: ...
-
-    def close(self) -> None: ...
-
-
 class TrajectoryFile:
     """A CSV file with a line per tick: time, joints, position of the flange in the base's axes, state."""
 
@@ -38,7 +30,7 @@ class TrajectoryFile:
         self._file.write(HEADER + "\n")
 
     def send(self, t_s: float, command: Command) -> None:
-        """See ``Sink``."""
+        """Write the command of time ``t_s``. Raises OSError."""
         flange = self._arm.forward(command.joints)[:3, 3]
         numbers = ",".join(f"{v:.9f}" for v in (*command.joints, *flange))
         self._file.write(f"{t_s:.4f},{numbers},{command.state}\n")
@@ -59,7 +51,7 @@ class ServoSink:
         self._control: Any = connect_control(stream.host)
 
     def send(self, t_s: float, command: Command) -> None:
-        """See ``Sink``."""
+        """Send the command. Raises ArmError."""
         del t_s
         # An arm that was stopped must get no target: its program would jump there when it is released.
         lag_rad = float(np.abs(joints_in_motion(self._stream) - command.joints).max())
@@ -81,3 +73,7 @@ class ServoSink:
         with contextlib.suppress(RuntimeError):
             self._control.servoStop(STOP_RAD_S2)
             self._control.stopScript()
+
+
+Sink = ServoSink | TrajectoryFile
+"""What teleoperation sends its commands to."""

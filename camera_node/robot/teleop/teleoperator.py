@@ -90,7 +90,7 @@ class Teleoperator:
             "ticks": self.ticks,
             "state": self.state,
             "messages": vars(self.mapping.counts),
-            "refused": vars(self.limiter.refused),
+            "refused": self.limiter.refused,
             "solver": self.solver.name,
             "unsolved": self.solver.failed,
         }

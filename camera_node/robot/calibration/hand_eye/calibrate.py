@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -77,7 +77,7 @@ class Calibration:
     diversity: Diversity
     exact_arm: MethodResult | None = None
     timed: StreamCalibration | None = None
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
 
     @property
     def time_offset_s(self) -> float:
@@ -153,10 +153,11 @@ def _calibration(
 
 def _require_plausible(transform: Array, off: Residuals) -> None:
     """Raise CalibrationError for a result that cannot be right. Medians ignore a few outliers."""
-    if off.median_mm > _WORST_MM or off.median_deg > _WORST_DEG:
+    median_mm, median_deg = off.medians
+    if median_mm > _WORST_MM or median_deg > _WORST_DEG:
         raise CalibrationError(
-            f"the poses do not fit together (residuals {off.median_mm:.0f} mm, {off.median_deg:.1f} degrees "
-            f"in the median): {_ADVICE}"
+            f"the poses do not fit together (residuals {median_mm:.0f} mm, {median_deg:.1f} degrees in the "
+            f"median): {_ADVICE}"
         )
     distance_m = float(np.linalg.norm(transform[:3, 3]))
     if distance_m > _FARTHEST_M:
@@ -174,10 +175,10 @@ def _warnings(
             f"{spread.half_turns} of {spread.motions} motions turn by nearly 180 degrees, which upsets "
             "Tsai-Lenz"
         )
-    if off.median_mm > _LARGE_RESIDUAL_MM or off.median_deg > _LARGE_RESIDUAL_DEG:
+    median_mm, median_deg = off.medians
+    if median_mm > _LARGE_RESIDUAL_MM or median_deg > _LARGE_RESIDUAL_DEG:
         out.append(
-            f"residuals are large ({off.median_mm:.1f} mm, {off.median_deg:.1f} degrees in the median): "
-            f"{_ADVICE}"
+            f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}"
         )
     mismatch = rotation_mismatch_deg(samples)
     threshold = max(_MISMATCH_DEG, 5 * float(np.median(mismatch)))

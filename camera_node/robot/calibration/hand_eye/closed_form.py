@@ -50,12 +50,9 @@ class Residuals:
         return float(np.sqrt(np.mean(self.deg**2)))
 
     @property
-    def median_mm(self) -> float:
-        return float(np.median(self.mm))
-
-    @property
-    def median_deg(self) -> float:
-        return float(np.median(self.deg))
+    def medians(self) -> tuple[float, float]:
+        """Medians of mm and deg."""
+        return float(np.median(self.mm)), float(np.median(self.deg))
 
 
 def solve(samples: Samples, method: str) -> Array:

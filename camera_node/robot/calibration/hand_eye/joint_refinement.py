@@ -67,12 +67,11 @@ class Refinement:
 
     @property
     def std_deg(self) -> float:
-        """Root of the summed variances about three axes."""
-        return float(np.degrees(np.sqrt(np.trace(self.covariance[:3, :3]))))
+        return _deviations(self.covariance)[0]
 
     @property
     def std_mm(self) -> float:
-        return float(np.sqrt(np.trace(self.covariance[3:6, 3:6])) * 1e3)
+        return _deviations(self.covariance)[1]
 
     @property
     def outliers(self) -> list[int]:
@@ -123,13 +122,15 @@ def refine(
 def cramer_rao_bound(
     samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]
 ) -> tuple[float, float]:
-    """Cramer-Rao bound of X at the truth, with Y unknown too: degrees and mm, each the root of the sum of
-    three variances. arm_noise: (radians, metres)."""
-    covariance = np.linalg.inv(sample_information(samples, x, y, arm_noise).sum(axis=0))
-    return (
-        float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
-        float(np.sqrt(np.trace(covariance[3:6, 3:6])) * 1e3),
-    )
+    """Cramer-Rao bound of X in degrees and mm at the truth, with Y unknown too. arm_noise: (radians,
+    metres)."""
+    return _deviations(np.linalg.inv(sample_information(samples, x, y, arm_noise).sum(axis=0)))
+
+
+def _deviations(covariance: Array) -> tuple[float, float]:
+    """Degrees and mm, each the root of the sum of three variances."""
+    turn, shift = (np.sqrt(np.trace(covariance[k : k + 3, k : k + 3])) for k in (0, 3))
+    return float(np.degrees(turn)), float(shift * 1e3)
 
 
 def sample_information(samples: Samples, x: Array, y: Array, arm_noise: tuple[float, float]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import sys
 import tempfile
@@ -78,28 +79,25 @@ def calibrate_live(args: argparse.Namespace, board: Target, lens: Pinhole | None
     session = HandEyeSession(board, setup, args.want_mm, args.moving, before, keep)
     pace = live_camera.Pace(float(source.fps), args.seconds)
     tracks = StreamRecorder() if args.moving and to_base is not None else None
-    stream = mover = None
+    mover = None
     try:
-        if args.drive and arm is not None:
-            mover = _open_arm(loaded, arm, args.yes)
-        if tracks is not None and arm is not None:
-            stream = follow_arm(loaded, arm, tracks)
-        guide(
-            source, config.codec, lens, session, pace, show, hands,
-            move=mover, to_base=to_base, tracks=tracks, first=live_camera.first_tick(source),
-        )  # fmt: skip
+        with contextlib.ExitStack() as stack:
+            stack.callback(source.release)
+            if args.drive and arm is not None:
+                mover = _open_arm(loaded, arm, args.yes)
+                stack.callback(mover.close)
+            if tracks is not None and arm is not None:
+                stack.callback(follow_arm(loaded, arm, tracks).stop)
+            guide(
+                source, config.codec, lens, session, pace, show, hands,
+                move=mover, to_base=to_base, tracks=tracks, first=live_camera.first_tick(source),
+            )  # fmt: skip
     except KeyboardInterrupt:
         print("\nstopped; what there is:", file=sys.stderr)
     except ArmStopped as error:
         print(f"\n{error}; what there is:", file=sys.stderr)
     except OSError as error:
         raise CalibrationError(f"--samples or --preview cannot be written: {error}") from None
-    finally:
-        if stream is not None:
-            stream.stop()
-        if mover is not None:
-            mover.close()
-        source.release()
     if tracks is None:
         return calibrate(session.samples(), args.method)
     if args.tracks is not None:

@@ -6,7 +6,7 @@ in front of the camera, the one that lowers the variance of X most is proposed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,20 +24,6 @@ _OFF_MIDDLE = 0.08
 _FIRST_TURN_DEG = 15.0
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """A proposed pose.
-
-    hand: (4, 4) in base.
-    target: (4, 4) in camera, as expected there.
-    std_mm: standard deviation of X with that sample added, at the current estimate of the arm's noise.
-    """
-
-    hand: Array
-    target: Array
-    std_mm: float
-
-
 def propose_pose(
     samples: Samples,
     x: Array,
@@ -46,13 +32,14 @@ def propose_pose(
     middle: Array,
     rng: np.random.Generator,
     new_deg: float = 8.0,
-) -> Proposal:
-    """The best of 120 random target poses: at distances already seen, tilted by up to 50 degrees, with any
-    roll. Hands rotated by at least ``new_deg`` from earlier ones, and not much farther out, are preferred.
+) -> Array:
+    """Hand pose (4, 4) in base for the best of 120 random target poses, at distances already seen, tilted by
+    up to 50 degrees, with any roll.
 
     x, y: (4, 4), the current estimates of X and Y.
     noise: of the arm (radians, metres).
     middle: (3,) of the target, in its axes.
+    new_deg: hands rotated by at least this from earlier ones, and not much farther out, are preferred.
     """
     targets = _candidate_targets(samples, middle, rng)
     hands = predicted_hand(Samples(targets, targets, samples.setup), x, y)
@@ -66,8 +53,7 @@ def propose_pose(
     added = sample_information(Samples(hands, targets, samples.setup), x, y, noise)
     variances = np.linalg.inv(before + added)[:, :6, :6].diagonal(axis1=1, axis2=2)
     cost = variances[:, 3:].sum(axis=1) + _LEVER_M**2 * variances[:, :3].sum(axis=1)
-    best = int(np.argmin(cost))
-    return Proposal(hands[best], targets[best], float(np.sqrt(variances[best, 3:].sum()) * 1e3))
+    return np.asarray(hands[np.argmin(cost)])
 
 
 def initial_pose(start: Array, taken: int) -> Array:

@@ -51,8 +51,14 @@ def show(found: Calibration) -> str:
     return "\n".join([*lines, *(f"note: {warning}" for warning in found.warnings)])
 
 
-def to_yaml(found: Calibration) -> str:
-    """The YAML file that ``hand_eye_mount.read_hand_eye`` reads, with details of the calibration."""
+def write_yaml(found: Calibration, path: Path) -> None:
+    """Write the file that ``hand_eye_mount.read_hand_eye`` reads, with details of the calibration. Raises
+    CalibrationError, also for a time offset that the node would refuse."""
+    if abs(found.time_offset_s) >= MAX_OFFSET_S:
+        raise CalibrationError(
+            f"--out: {path} is not written: the node would refuse a time offset of "
+            f"{found.time_offset_s:.0f} s: give both streams on clocks with one beginning"
+        )
     answer = found.to_dict()
     warnings = answer.pop("warnings")
     data = {
@@ -66,18 +72,9 @@ def to_yaml(found: Calibration) -> str:
         "arm_noise_deg": float(np.degrees(found.refined.arm_noise_rad)),
         "warnings": warnings,
     }
-    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
-
-
-def write_yaml(found: Calibration, path: Path) -> None:
-    """Write ``to_yaml``. Raises CalibrationError, also for a time offset that the node would refuse."""
-    if abs(found.time_offset_s) >= MAX_OFFSET_S:
-        raise CalibrationError(
-            f"--out: {path} is not written: the node would refuse a time offset of "
-            f"{found.time_offset_s:.0f} s: give both streams on clocks with one beginning"
-        )
+    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
     try:
-        files.write_text(path, to_yaml(found))
+        files.write_text(path, text)
     except OSError as error:
         raise CalibrationError(f"--out: {path}: {error.strerror}") from None
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import WANT_MM, CalibrationError
-from camera_node.robot.calibration.files import pixel_noise, to_samples
+from camera_node.robot.calibration.files import to_samples
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, distance_mm
 from camera_node.robot.calibration.hand_eye.joint_refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.next_pose import describe_motion, initial_pose, propose_pose
@@ -134,18 +134,13 @@ class HandEyeSession:
                     self.samples(), found.x, found.y, (found.arm_noise_rad, found.arm_noise_m),
                     self._seen[0].corners.points.mean(axis=0),
                     np.random.default_rng([len(self._seen), self._rejected]), NEW_DEG,
-                ).hand  # fmt: skip
+                )  # fmt: skip
         return self._wanted
 
     def reject_pose(self) -> None:
         """Propose another pose next, because this one cannot be reached or gave no sample."""
         self._rejected += 1
         self._wanted = None
-
-    @property
-    def pixel_noise(self) -> float | None:
-        """Standard deviation of the corners in pixels, None before the first sample."""
-        return pixel_noise(self._seen) if self._seen else None
 
     def _solve(self) -> None:
         samples = self.samples()

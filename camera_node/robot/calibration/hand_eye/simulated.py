@@ -1,4 +1,4 @@
-"""A simulated camera on a hand over a target, with known truth, to measure calibration and pairing.
+"""A simulated hand with a camera over a target, with known truth, to measure calibration and pairing.
 Everything is within half a metre of the base, as on the table of a UR3e."""
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, inverse, transform_of
 from freshfield.geometry import look_at, so3_exp
 
-# The arm's noise that the project's figures are given for (issue: simulated UR3e).
+# The arm's noise in the project's results.
 ARM_RAD, ARM_M = 0.002, 0.0005
 REACH_M = 0.5
 
@@ -20,14 +20,15 @@ def _rigid(turn: tuple[float, float, float], shift: tuple[float, float, float]) 
     return transform_of(so3_exp(turn), np.array(shift))
 
 
-# Camera in hand, and target in base: lying on the table, its picture upwards (z into the table).
+# The target lies on the table with its pattern upwards, so its z points into the table.
 CAMERA_IN_HAND = _rigid((0.02, -0.03, 1.55), (0.055, -0.035, 0.045))
 TARGET_IN_BASE = _rigid((np.pi, 0.0, 0.0), (0.14, 0.02, 0.0))
 TARGET_MIDDLE = (0.22, -0.04, 0.0)
 
 
 def random_hands(count: int, rng: np.random.Generator, tilt_deg: float = 50.0) -> Array:
-    """(N, 4, 4) hand in base, the camera looking at the target from all sides, turned about its axis."""
+    """Hands in base (N, 4, 4), with the camera looking at the target from all sides and with any roll.
+    tilt_deg: largest angle of view from the vertical."""
     out: list[Array] = []
     while len(out) < count:
         azimuth, slope = rng.uniform(-np.pi, np.pi), np.deg2rad(tilt_deg) * np.sqrt(rng.uniform())
@@ -48,7 +49,7 @@ def _camera(azimuth: float, slope: float, distance_m: float, roll: float) -> Arr
 
 
 def observed_targets(hands: Array) -> Array:
-    """(N, 4, 4) target in camera, exact."""
+    """Exact targets in camera (N, 4, 4)."""
     return np.asarray(inverse(CAMERA_IN_HAND) @ inverse(hands) @ TARGET_IN_BASE)
 
 
@@ -61,9 +62,9 @@ def add_noise(poses: Array, rng: np.random.Generator, rad: float, metres: float)
 
 @dataclass(frozen=True)
 class Sweep:
-    """A hand that sweeps over the target along incommensurate sines, so that the motion never repeats.
+    """A hand that moves over the target along incommensurate sines, so that the motion never repeats.
 
-    speed_m_per_s: mean speed of the camera. The path is the same at every speed.
+    speed_m_per_s: mean speed of the camera, along the same path at every speed.
     """
 
     speed_m_per_s: float = 0.1
@@ -72,11 +73,11 @@ class Sweep:
     _NATURAL_M_PER_S = 0.1036
 
     def hands(self, t_s: NDArray[np.float64]) -> Array:
-        """(N, 4, 4) hand in base at instants (N,)."""
+        """Hand in base (N, 4, 4) at instants (N,)."""
         return np.asarray(self.cameras(t_s) @ inverse(CAMERA_IN_HAND))
 
     def cameras(self, t_s: NDArray[np.float64]) -> Array:
-        """(N, 4, 4) camera in base."""
+        """Camera in base (N, 4, 4) at instants (N,)."""
         u = np.asarray(t_s) * (self.speed_m_per_s / self._NATURAL_M_PER_S)
         x = 0.55 * np.sin(0.61 * u) + 0.22 * np.sin(1.37 * u + 0.4)
         y = 0.50 * np.sin(0.83 * u + 1.1) + 0.20 * np.sin(1.73 * u)

@@ -23,8 +23,8 @@ _GRAB_S = 1.0
 
 
 def calibrate_live(args: argparse.Namespace, board: Target) -> LensCalibration:
-    """Run a session with a scenario's camera. Ctrl-C ends it with what there is. Raises CalibrationError,
-    ScenarioError."""
+    """Run a session with a scenario's camera and calibrate from its images. Ctrl-C ends the session early.
+    Raises CalibrationError and ScenarioError."""
     if args.seconds is not None and not args.seconds > 0:
         raise CalibrationError("--seconds: expected a positive number")
     loaded = live_camera.load_scenario(args)
@@ -48,7 +48,7 @@ def calibrate_live(args: argparse.Namespace, board: Target) -> LensCalibration:
 def _images(
     loaded: Scenario, config: SourceConfig, args: argparse.Namespace
 ) -> Generator[live_camera.Image, None, None]:
-    """Images (H, W, 3) uint8 RGB, until time is over or a recording has been seen once."""
+    """Images (H, W, 3) uint8 RGB, until time is over or a recording ends."""
     if isinstance(config, LiveConfig):
         yield from _camera_images(config, args)
         return
@@ -62,7 +62,7 @@ def _images(
 
 
 def _camera_images(config: LiveConfig, args: argparse.Namespace) -> Generator[live_camera.Image, None, None]:
-    """From the camera's feed: a source would require the lens, which is not known yet."""
+    """Images from the camera's feed, because a source would require the lens, which is not known yet."""
     fps = rate(config.fps or DEFAULT_FPS)
     try:
         feed = open_feed(args.camera, config, fps, WallClock())

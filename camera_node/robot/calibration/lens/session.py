@@ -1,5 +1,5 @@
-"""A guided calibration of a lens: takes images, and says where to show the target next and when there is
-enough. The caller provides camera and clock."""
+"""A guided calibration of a lens: collects images, and tells where to show the target next and when to stop.
+The caller provides camera and clock."""
 
 from __future__ import annotations
 
@@ -21,16 +21,23 @@ from camera_node.robot.calibration.lens.solve import (
 from camera_node.robot.calibration.targets import Corners, Target, to_gray
 
 GOOD_PICTURES, GOOD_COVERED, GOOD_TILT_DEG, GOOD_F = 10, 0.8, 30.0, 0.003
-# Shares of the image's width: corner motion that still counts as at rest, and that makes an image new.
+# Corner motion as a share of the image's width: the largest at rest, and the smallest that makes an image
+# new.
 STILL, NEW = 0.003, 0.06
 _ROWS, _COLUMNS = ("top", "middle", "bottom"), ("left", "middle", "right")
 
 
 @dataclass(frozen=True)
 class LensStep:
-    """Result of one image. outcome: ``kept``, or why not. count: images kept. covered: share of the image
-    area in which corners were seen. lens: so far, or None. enough: whether to stop. advice: what to do
-    next."""
+    """Result of one image.
+
+    outcome: ``kept``, or why not.
+    count: number of images kept.
+    covered: share of the image area in which corners were seen.
+    lens: current calibration, if there is one.
+    enough: whether to stop.
+    advice: what to do next.
+    """
 
     outcome: str
     count: int
@@ -55,9 +62,8 @@ class LensStep:
 
 
 class LensSession:
-    """Collects images until the focal length is known to .3 %, from at least 10 that cover .8 of the image
-    area, with the target tilted by 30 degrees between them. moving: take images during motion too, else only
-    when target and camera are at rest."""
+    """Collects at least 10 images that cover 0.8 of the image area, with the target tilted by 30 degrees
+    between them, until the focal length is known to 0.3 %. moving: also take images during motion."""
 
     def __init__(self, target: Target, moving: bool = False) -> None:
         self._target, self._moving = target, moving
@@ -70,7 +76,7 @@ class LensSession:
         """Found in the last image."""
 
     def lens(self) -> LensCalibration:
-        """From all that is kept. Raises CalibrationError."""
+        """Calibrate from all kept images. Raises CalibrationError."""
         return calibrate(self._kept, self._size, {})
 
     def offer(self, image: NDArray[np.uint8]) -> LensStep:
@@ -101,13 +107,14 @@ class LensSession:
         return self._step(KEPT, self._advice())
 
     def preview(self, image: NDArray[np.uint8], step: LensStep) -> NDArray[np.uint8]:
-        """The image (H + 40, W, 3) RGB with its corners, dots at earlier corners, and the step below it."""
-        said = f"{step.count} pictures, {100 * step.covered:.0f} % covered", f"{step.outcome}: {step.advice}"
+        """The image as (H + 40, W, 3) RGB, with its corners, dots at earlier corners, and the step below
+        it."""
+        lines = f"{step.count} pictures, {100 * step.covered:.0f} % covered", f"{step.outcome}: {step.advice}"
         shown = to_gray(image).copy()
         for kept in self._kept.values():
             for x, y in kept.pixels:
                 cv2.circle(shown, (round(x - 0.5), round(y - 0.5)), 2, 255, -1)
-        return draw_corners(shown, self.corners, said, step.outcome == KEPT)
+        return draw_corners(shown, self.corners, lines, step.outcome == KEPT)
 
     @property
     def _enough(self) -> bool:
@@ -144,7 +151,7 @@ class LensSession:
 
 
 def _distance(a: Corners, b: Corners) -> float:
-    """Mean distance (pixels) of the corners that both have; infinite where these are less than half."""
+    """Mean distance (pixels) of the common corners; infinite if these are less than half."""
     at = dict(zip(map(tuple, a.points.tolist()), a.pixels))
     pairs = [(at[key], pixel) for key, pixel in zip(map(tuple, b.points.tolist()), b.pixels) if key in at]
     if 2 * len(pairs) < max(len(a.points), len(b.points)):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import read_gray_image
+from camera_node.robot.calibration.files import find_corners
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.targets import Corners, Target, opencv_lens
 from freshfield.geometry import Pinhole
@@ -22,17 +22,22 @@ MIN_VIEWS = 4
 MIN_TILT_DEG = 10.0
 MIN_CORNERS = 6
 _OUTLIER = 4.0
-# Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver runs away beyond them if
+# Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver diverges beyond them if
 # the images do not determine a lens.
 _SHORTEST, _LONGEST = 0.2, 8.0
 
 
 @dataclass(frozen=True)
 class LensCalibration:
-    """pinhole: this project's (corner origin). std: deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2.
-    error_px: root mean square of the reprojection. views: by picture, its own. tilt_deg: largest angle
-    between the target's tilts in two views. covered: share of a 6 x 6 grid over the image in which corners
-    were seen. unused: reason by image."""
+    """Result of a lens calibration.
+
+    pinhole: in this project's convention (corner origin).
+    std: deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2.
+    error_px: root mean square of the reprojection errors; views: the same by image.
+    tilt_deg: largest angle between the target's tilts in two views.
+    covered: share of a 6 x 6 grid over the image in which corners were seen.
+    unused: reason for every unused image.
+    """
 
     pinhole: Pinhole
     std: tuple[float, ...]
@@ -43,7 +48,7 @@ class LensCalibration:
     unused: Mapping[str, str]
 
     def calibration(self, camera: str) -> dict[str, Any]:
-        """An entry of the calibration JSON that the video source and --lens read."""
+        """The calibration JSON that the video source and --lens read."""
         matrix, distortion = opencv_lens(self.pinhole)
         return {
             camera: {
@@ -75,33 +80,22 @@ class LensCalibration:
 
 
 def calibrate_folder(
-    files: Sequence[Path], target: Target, progress: Callable[[int], None] = lambda done: None
+    files: Sequence[Path], target: Target, progress: Callable[[int], None]
 ) -> LensCalibration:
-    """Calibrate from image files. Raises CalibrationError."""
-    found: dict[str, Corners] = {}
-    unused: dict[str, str] = {}
-    size: tuple[int, int] | None = None
-    for k, file in enumerate(files):
-        picture = read_gray_image(file)
-        this = picture.shape[1], picture.shape[0]
-        if size is not None and this != size:
-            raise CalibrationError(f"{file}: is {this[0]} x {this[1]}, the others {size[0]} x {size[1]}")
-        size = this
-        corners = target.find(picture)
-        if corners is None:
-            unused[file.name] = f"{target.name} not found"
-        else:
-            found[file.name] = corners
-        progress(k + 1)
-    if size is None:
-        raise CalibrationError("no pictures")
+    """Calibrate from image files; see ``find_corners``. Raises CalibrationError."""
+    found, unused, size = find_corners(files, target, None, progress)
     return calibrate(found, size, unused)
 
 
 def calibrate(
     views: Mapping[str, Corners], size: tuple[int, int], unused: Mapping[str, str]
 ) -> LensCalibration:
-    """Calibrate from corners by image name. Raises CalibrationError if they do not determine a lens."""
+    """Calibrate from corners by image name.
+
+    size: width and height of the images in pixels.
+    unused: reasons for images without corners.
+    Raises CalibrationError if the corners do not determine a lens.
+    """
     usable = {n: c for n, c in views.items() if len(c.points) >= MIN_CORNERS}
     dropped = {n: f"only {len(c.points)} corners" for n, c in views.items() if n not in usable}
     unused = {**unused, **dropped}
@@ -157,7 +151,7 @@ def _solve(
 
 
 def coverage_grid(views: Iterable[Corners], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(6, 6) cells of the image, rows first: those in which corners were seen."""
+    """Cells (6, 6) of the image, rows first, in which corners were seen."""
     cells = np.zeros((6, 6), dtype=np.bool_)
     for corners in views:
         at = np.clip(corners.pixels / size * 6, 0, 5).astype(int)

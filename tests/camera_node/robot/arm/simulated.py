@@ -1,4 +1,4 @@
-"""A simulated controller in a process of its own, as the client library needs it."""
+"""A simulated controller in a process of its own, as the client library needs it; the scenario ``cell``."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from camera_node.robot.hand_camera import TruthClient
 from freshfield.clock import WallClock
+from freshfield.scenario import load
 
 _numbers = itertools.count(1)
 
@@ -32,17 +36,32 @@ def require_ur_rtde() -> None:
         pytest.importorskip(module, reason="needs ur-rtde: pip install -e '.[ur]'")
 
 
+def write_cell(folder: Path, host: str, path: dict[str, Any] | None = None, **arm: Any) -> Path:
+    """The scenario ``cell`` with its arm at ``host`` and other keys of ``source.arm`` and its path."""
+    data = yaml.safe_load(load("cell").path.read_text())
+    data["source"]["arm"] |= {"host": host, "cameras": {"hand": None}, **arm}
+    data["source"]["arm"]["path"] |= path or {}
+    file = folder / "cell.yaml"
+    file.write_text(yaml.safe_dump(data))
+    return file
+
+
+def start_cli(*words: object) -> subprocess.Popen[str]:
+    """A ``camera-node`` command in a process of its own."""
+    command = [sys.executable, "-m", "camera_node.cli", *map(str, words)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
 @contextlib.contextmanager
 def simulated_arm(host: str, *options: str) -> Iterator[subprocess.Popen[str]]:
     """``camera-node simulate-arm`` at ``host``, from when it serves until the block ends."""
-    command = [sys.executable, "-m", "camera_node.cli", "simulate-arm", "--host", host, *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = start_cli("simulate-arm", "--host", host, *options)
     try:
         for _ in range(600):
             with contextlib.suppress(OSError), socket.create_connection((host, 30004), 1.0):
                 break
             if process.poll() is not None:
-                pytest.fail(f"simulate-arm ended: {process.communicate()[0]}")
+                pytest.fail(f"simulate-arm ended: {process.communicate()}")
             time.sleep(0.05)
         yield process
     finally:

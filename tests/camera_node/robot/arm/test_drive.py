@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 
@@ -27,35 +25,27 @@ from tests.camera_node.robot.arm.simulated import (
     own_address,
     require_ur_rtde,
     simulated_arm,
+    start_cli,
     wait_until_moving,
+    write_cell,
 )
+
+PATH = {"azimuths_deg": [-150, -120], "elevations_deg": [60], "rolls_deg": [0], "speed_rad_s": 3.0,
+        "acceleration_rad_s2": 20.0}  # fmt: skip
 
 
 @pytest.fixture
 def cell(tmp_path):
     """A cell with a short and fast path: its file, its address."""
-    data = yaml.safe_load(load("cell").path.read_text())
-    arm = data["source"]["arm"]
-    arm["host"] = own_address()
-    arm["cameras"] = {"hand": None}
-    arm["path"] |= {
-        "azimuths_deg": [-150, -120],
-        "elevations_deg": [60],
-        "rolls_deg": [0],
-        "speed_rad_s": 3.0,
-    }
-    arm["path"]["acceleration_rad_s2"] = 20.0
-    file = tmp_path / "cell.yaml"
-    file.write_text(yaml.safe_dump(data))
-    return file, arm["host"]
+    require_ur_rtde()
+    host = own_address()
+    return write_cell(tmp_path, host, PATH), host
 
 
-def real(file):
+def real(cell, **path):
     """The same cell, its arm taken for a real one: no patience, and questions."""
-    data = yaml.safe_load(file.read_text())
-    data["source"]["arm"]["simulated"] = False
-    file.write_text(yaml.safe_dump(data))
-    return file
+    file, host = cell
+    return write_cell(file.parent, host, PATH | path, simulated=False)
 
 
 def near(file):
@@ -81,11 +71,10 @@ def shown(text):
 
 
 def drive(file, *options):
-    command = [sys.executable, "-m", "camera_node.cli", "drive-arm", str(file), *options]
     # Under nohup a hang-up is ignored, and whoever is started ignores it, too.
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        return start_cli("drive-arm", file, *options)
     finally:
         signal.signal(signal.SIGHUP, before)
 
@@ -98,7 +87,6 @@ def stops_of(file):
 
 
 def test_a_round_visits_every_viewpoint_and_ends(cell):
-    require_ur_rtde()
     file, host = cell
     with simulated_arm(host):
         truth, clock = TruthClient(host), WallClock()
@@ -118,7 +106,6 @@ def test_a_round_visits_every_viewpoint_and_ends(cell):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_stops_the_arm_where_it_is(cell, number):
-    require_ur_rtde()
     file, host = cell
     with simulated_arm(host):
         truth = TruthClient(host)
@@ -131,10 +118,9 @@ def test_a_signal_stops_the_arm_where_it_is(cell, number):
 
 @pytest.mark.slow
 def test_an_arm_that_vanishes_ends_the_drive_with_one_line(cell):
-    require_ur_rtde()
     file, host = cell
     with simulated_arm(host, near(file)) as arm:
-        process = drive(real(file), "--yes")
+        process = drive(real(cell), "--yes")
         wait_until_moving(TruthClient(host), process)
         arm.kill()
         assert process.wait(30.0) == 1
@@ -143,14 +129,10 @@ def test_an_arm_that_vanishes_ends_the_drive_with_one_line(cell):
 
 def test_a_drive_that_is_killed_leaves_no_arm_moving(cell):
     """The controller's own watchdog misses it."""
-    require_ur_rtde()
     file, host = cell
-    data = yaml.safe_load(file.read_text())
-    data["source"]["arm"]["path"]["speed_rad_s"] = 0.1  # the first move takes many seconds
-    file.write_text(yaml.safe_dump(data))
     with simulated_arm(host, near(file)):
         truth = TruthClient(host)
-        process = drive(real(file), "--yes")
+        process = drive(real(cell, speed_rad_s=0.1), "--yes")  # the first move takes many seconds
         wait_until_moving(truth, process)
         process.kill()
         process.communicate()
@@ -159,7 +141,6 @@ def test_a_drive_that_is_killed_leaves_no_arm_moving(cell):
 
 
 def test_a_program_that_is_stopped_at_the_pendant_ends_the_drive(cell):
-    require_ur_rtde()
     file, host = cell
     with simulated_arm(host):
         truth = TruthClient(host)
@@ -191,20 +172,17 @@ def test_an_arm_that_stands_still_on_the_way_is_not_waited_for(monkeypatch):
 
 
 def test_a_first_move_through_half_the_bench_is_refused(cell):
-    require_ur_rtde()
-    file, host = cell
-    with simulated_arm(host, "--joints=-20,-90,90,-90,90,0"):
-        process = drive(real(file), "--yes")
+    with simulated_arm(cell[1], "--joints=-20,-90,90,-90,90,0"):
+        process = drive(real(cell), "--yes")
         said = process.communicate(timeout=20)
         assert process.returncode == 2
         assert "the first move would turn a joint by" in said[1] and "with the pendant" in said[1]
 
 
 def test_a_real_arm_is_asked_about_first(cell):
-    require_ur_rtde()
     file, host = cell
     with simulated_arm(host, near(file)):
-        process = drive(real(file))
+        process = drive(real(cell))
         said = process.communicate(timeout=20)
         assert "say that its space is clear with --yes" in said[1]
         assert process.returncode == 2
@@ -214,19 +192,7 @@ def test_a_real_arm_is_asked_about_first(cell):
         assert f"the first move turns a joint by {first_deg:.0f}" in said[0] and 0 < first_deg <= 30
 
 
-def test_what_is_shown_is_what_would_be_driven(cell):
-    require_ur_rtde()
-    file, host = cell
-    with simulated_arm(host):
-        process = drive(file, "--show")
-        said = process.communicate(timeout=20)[0]
-        assert process.returncode == 0 and at_rest(TruthClient(host), 0.3)
-    np.testing.assert_allclose(shown(said), np.rad2deg(stops_of(file)), atol=0.006)
-    assert "stands at     0.00   -90.00" in said
-
-
 def test_the_tour_is_shown_without_an_arm(cell, capsys):
-    require_ur_rtde()
     file, host = cell
     assert main(["drive-arm", str(file), "--show"]) == 0
     said = capsys.readouterr()

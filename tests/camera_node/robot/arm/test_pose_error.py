@@ -5,32 +5,21 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-import subprocess
-import sys
 
 import cv2
 import pytest
-import yaml
 
 from camera_node.robot.arm import pose_error as measuring
 from camera_node.robot.arm.pose_error import PoseError, by_gap_and_speed, by_rate, format_gaps, measure
 from camera_node.robot.hand_camera import TruthClient
-from freshfield.scenario import load
 from tests.camera_node.robot.arm.simulated import (
     own_address,
     require_ur_rtde,
     simulated_arm,
+    start_cli,
     wait_until_moving,
+    write_cell,
 )
-
-
-def cell(folder, host):
-    data = yaml.safe_load(load("cell").path.read_text())
-    data["source"]["arm"] |= {"host": host, "cameras": {"hand": None}}
-    data["source"]["arm"]["path"] |= {"speed_rad_s": 1.5, "acceleration_rad_s2": 4.0}
-    file = folder / "cell.yaml"
-    file.write_text(yaml.safe_dump(data))
-    return str(file)
 
 
 def made():
@@ -52,11 +41,8 @@ def test_a_gap_and_a_speed_have_the_error_of_their_own(tmp_path):
         assert row["gap_ms_from"] <= row["gap_ms"] < row["gap_ms_to"]
         assert row["m_per_s_from"] <= row["m_per_s"] < row["m_per_s_to"]
     table = format_gaps(rows).splitlines()
-    assert (
-        len(table) == 2 + 6
-        and "6.000 / 0.600" in table[-1]
-        and table[-1].split()[:4] == ["16", "to", "32", "ms"]
-    )
+    assert len(table) == 2 + 6
+    assert "6.000 / 0.600" in table[-1] and table[-1].split()[:4] == ["16", "to", "32", "ms"]
     measuring.write(by_rate(errors), rows, tmp_path)
     with (tmp_path / "gaps.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(rows)
@@ -74,13 +60,11 @@ def test_a_standing_arm_has_no_error_whatever_the_pairing(tmp_path, capsys):
     require_ur_rtde()
     host = own_address()
     with simulated_arm(host):
-        assert measuring.main([cell(tmp_path, host), "--seconds", "0.6", "--json"]) == 0
+        assert measuring.main([str(write_cell(tmp_path, host)), "--seconds", "0.6", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["speed"]["most_m_per_s"] == 0.0 and found["gaps"] == []
-    assert {(row["pairing"], row["rate_hz"]) for row in found["rates"]} >= {
-        ("interpolated", 125.0),
-        ("nearest", 20.0),
-    }
+    kinds = {(row["pairing"], row["rate_hz"]) for row in found["rates"]}
+    assert kinds >= {("interpolated", 125.0), ("nearest", 20.0)}
     assert all(row["p95_mm"] < 1e-9 and row["instants"] >= 1 for row in found["rates"])
 
 
@@ -88,13 +72,12 @@ def test_a_standing_arm_has_no_error_whatever_the_pairing(tmp_path, capsys):
 def test_a_moving_arms_nearest_pose_is_off_by_gap_times_speed(tmp_path):
     require_ur_rtde()
     host = own_address()
-    file = cell(tmp_path, host)
+    file = write_cell(tmp_path, host, {"speed_rad_s": 1.5, "acceleration_rad_s2": 4.0})
     with simulated_arm(host):
-        command = [sys.executable, "-m", "camera_node.cli", "drive-arm", file]
-        driver = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        driver = start_cli("drive-arm", file)
         try:
             wait_until_moving(TruthClient(host), driver)
-            rows = by_gap_and_speed(measure(file, 15.0))
+            rows = by_gap_and_speed(measure(str(file), 15.0))
         finally:
             driver.kill()
             driver.communicate()

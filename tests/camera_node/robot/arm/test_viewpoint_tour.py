@@ -77,10 +77,8 @@ def test_a_way_is_the_shortest_of_those_that_are_free():
     way = roadmap.shortest_path(home, {2})
     assert [place for _, place in way] == [1, 2]  # 2.8 rad are too far for one go, and shorter than 3
     np.testing.assert_allclose([joints for joints, _ in way], [steps[1], steps[3]])
-    assert (
-        roadmap.shortest_path(home, {7}) is None
-        and Roadmap(UR3E, BASE, [], [], -1.0).shortest_path(home, {0}) is None
-    )
+    assert roadmap.shortest_path(home, {7}) is None
+    assert Roadmap(UR3E, BASE, [], [], -1.0).shortest_path(home, {0}) is None
     # A whole turn is not gone round: the same posture from the other side is nearer.
     assert roadmap.shortest_path(np.array([2 * np.pi - 2.0, *home[1:]]), {0})[0][0][0] > np.pi
     under = Roadmap(UR3E, BASE, steps, [0, 1, 2, 2], 5.0)
@@ -149,7 +147,6 @@ def test_where_the_base_stands():
         ({"robot": "ur99"}, "arm: robot is 'ur99', expected one of ur3e"),
         ({"frequency_hz": 1000}, "frequency_hz is 1000, expected 10 to 500"),
         ({"host": "192.168.56.101", "simulated": True}, "simulated: host is 192.168.56.101"),
-        ({"cameras": {}}, "cameras: expected at least one camera"),
         ({"pairing": "guessed"}, "pairing is 'guessed'"),
         ({"path": {"radius_m": -1}}, "radius_m above 0"),
         ({"hosts": "x"}, "arm.hosts: unknown key"),
@@ -164,21 +161,15 @@ def test_a_wrong_arm_is_refused_by_key(changed, says):
     "changed, says",
     [
         ({"cameras": {"nobody": None}}, "arm.cameras: 'nobody' is not one of the scenario's cameras"),
-        (
-            {"cameras": {"hand": "no-such-file.yaml"}},
-            r"arm.cameras.hand: .*no-such-file.yaml: cannot be read",
-        ),
+        ({"cameras": {"hand": "no-such.yaml"}}, r"arm.cameras.hand: .*no-such.yaml: cannot be read"),
+        ({"cameras": {}}, "cameras: expected at least one camera"),
+        ({"calibration": "no-such.conf"}, r"source.arm.calibration: .*no-such.conf: cannot be read"),
     ],
 )
-def test_a_wrong_mount_is_refused_by_camera(changed, says):
+def test_a_wrong_file_is_refused_by_name(changed, says):
     scenario = cell(**changed)
     with pytest.raises(ScenarioError, match=says):
         load_hand_eyes(scenario, source_config(scenario).arm, scenario.cameras)
-
-
-def test_a_wrong_calibration_of_the_robot_is_refused():
-    scenario = cell(calibration="no-such.conf")
-    with pytest.raises(ScenarioError, match=r"source.arm.calibration: .*no-such.conf: cannot be read"):
         arm_model(scenario, source_config(scenario).arm)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a ChArUco board through a camera on a simulated hand: rendered once for all tests."""
+"""Input of calibrations with known truth: pictures of a ChArUco board, samples, pose files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from camera_node.synthetic.placement import Part
 from camera_node.synthetic.render import CameraRenderer, World
 from camera_node.synthetic.shapes import Quad
 from camera_node.synthetic.textures import Plain
-from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, se3_inverse, so3_exp
+from freshfield.geometry import OPENGL_TO_OPENCV, Pinhole, Pose, se3_inverse, so3_exp
 
 BOARD = "charuco:7x5:24mm:18mm"
 LENS = Pinhole.from_fov(320, 240, 65.0)
@@ -59,6 +59,16 @@ def write_scenario(
     source = {"kind": "transforms", "data": str(folder / "transforms.json"), "fps": 500, "codec": "png"}
     file.write_text(yaml.safe_dump({"cameras": {"ids": ["eye"]}, "source": source}))
     return file
+
+
+def write_poses(file: Path, times_ns: NDArray[np.int64], poses: Array) -> None:
+    """Poses (N, 4, 4) with their stamps (N,) as ``--hand`` and ``--target`` read them."""
+    lines = ["t,x,y,z,qx,qy,qz,qw"]
+    for t_ns, matrix in zip(times_ns, poses):
+        pose = Pose.from_matrix(matrix)
+        w, x, y, z = pose.quaternion
+        lines.append(",".join(map(repr, [int(t_ns) / 1e9, *pose.translation_m, x, y, z, w])))
+    file.write_text("\n".join(lines) + "\n")
 
 
 def noisy_samples(

@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import threading
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -19,15 +18,16 @@ from camera_node.robot.arm.joint_states import ArmError
 from camera_node.robot.arm.kinematics import UR3E
 from camera_node.robot.hand_camera import TruthClient
 from camera_node.robot.teleop import sinks
-from camera_node.robot.teleop.command import teleop_config
 from camera_node.robot.teleop.network_stylus import encode
 from camera_node.robot.teleop.teleoperator import Command
-from freshfield.scenario import load
+from freshfield.clock import WallClock
 from tests.camera_node.robot.arm.simulated import (
     own_address,
     require_ur_rtde,
     simulated_arm,
+    start_cli,
     wait_until_moving,
+    write_cell,
 )
 from tests.camera_node.robot.teleop.checks import HOME, sample
 from tests.conftest import ROOT
@@ -63,18 +63,10 @@ class Sender(threading.Thread):
         self.join()
 
 
-def cell(folder: Path, host: str, teleop: str = "") -> Path:
-    text = (ROOT / "deploy/scenarios/cell.yaml").read_text().replace("127.0.0.2", host)
-    mount = ROOT / "deploy/lab/hand-eye-example.yaml"
-    text = text.replace("../lab/hand-eye-example.yaml", str(mount))
-    path = folder / "cell.yaml"
-    path.write_text(text.replace("    path:\n", f"    teleop: {{{teleop}}}\n    path:\n") if teleop else text)
-    return path
-
-
 def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
     port, file = free_port(), tmp_path / "path.csv"
-    scenario = cell(tmp_path, "127.0.0.2", "solver: dls, speed_rad_s: 0.5, scale: [1, 2, 1]")
+    teleop = {"solver": "dls", "speed_rad_s": 0.5, "scale": [1, 2, 1]}
+    scenario = write_cell(tmp_path, "127.0.0.2", teleop=teleop)
     with Sender(port):
         status = main(
             ["teleop", str(scenario), "--stylus", f"network:{port}", "--seconds", "2", "--dry-run", str(file),
@@ -97,18 +89,13 @@ def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
 def test_the_real_library_moves_a_simulated_controller(tmp_path, capsys):
     require_ur_rtde()
     host, port = own_address(), free_port()
+    file = write_cell(tmp_path, host, teleop={"solver": "dls"})
     with simulated_arm(host), Sender(port):
-        command = [
-            sys.executable, "-m", "camera_node.cli", "teleop", str(cell(tmp_path, host, "solver: dls")),
-            "--stylus", f"network:{port}", "--seconds", "3", "--json",
-        ]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-        assert done.returncode == 0, done.stderr
-        summary = json.loads(done.stdout)
-        assert summary["messages"]["engaged"] >= 1
-        with socket.create_connection((host, 30010)) as truth:
-            truth.sendall(b"9223372036854775807\n")
-            joints = np.array(json.loads(truth.makefile().readline())["q"])
+        process = start_cli("teleop", file, "--stylus", f"network:{port}", "--seconds", 3, "--json")
+        out, said = process.communicate(timeout=60)
+        assert process.returncode == 0, said
+        assert json.loads(out)["messages"]["engaged"] >= 1
+        joints = TruthClient(host).joints(WallClock().now_ns())
     assert np.abs(joints - HOME).max() > 1e-3, "the arm has moved"
 
 
@@ -116,14 +103,9 @@ def test_the_real_library_moves_a_simulated_controller(tmp_path, capsys):
 def test_an_arm_that_goes_silent_ends_it_with_one_line(tmp_path):
     require_ur_rtde()
     host, port = own_address(), free_port()
-    file = cell(tmp_path, host, "solver: dls")
-    file.write_text(file.read_text().replace("simulated: true", "simulated: false"))  # patience as on a bench
-    command = [
-        sys.executable, "-m", "camera_node.cli", "teleop", str(file), "--stylus", f"network:{port}",
-        "--yes", "--json",
-    ]  # fmt: skip
+    file = write_cell(tmp_path, host, teleop={"solver": "dls"}, simulated=False)  # patience as on a bench
     with simulated_arm(host) as arm, Sender(port):
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        process = start_cli("teleop", file, "--stylus", f"network:{port}", "--yes", "--json")
         wait_until_moving(TruthClient(host), process)
         arm.send_signal(signal.SIGSTOP)
         try:
@@ -152,7 +134,7 @@ def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
 
 def test_an_arm_that_is_not_there_is_one_line_and_moves_nothing(tmp_path, capsys):
     require_ur_rtde()
-    scenario = cell(tmp_path, own_address())
+    scenario = write_cell(tmp_path, own_address())
     assert main(["teleop", str(scenario), "--stylus", f"network:{free_port()}"]) == 2
     assert "nothing listens on port 30004" in capsys.readouterr().err
 
@@ -160,27 +142,20 @@ def test_an_arm_that_is_not_there_is_one_line_and_moves_nothing(tmp_path, capsys
 @pytest.mark.parametrize(
     "section, part",
     [
-        ("speed_rad_s: 99", "source.arm.teleop: speed_rad_s: expected 0.001 to 6.28"),
-        ("scale: [1, 0, 1]", "source.arm.teleop: scale"),
-        ("sped: 1", "source.arm.teleop.sped"),
-        ("acceleration_rad_s2: 0.06", "too low to come to rest"),
-        ("workspace_low_m: [0, 0, 1]", "workspace_low_m must be below"),
-        ("solver: best", "solver: expected one of"),
+        ({"speed_rad_s": 99}, "source.arm.teleop: speed_rad_s: expected 0.001 to 6.28"),
+        ({"scale": [1, 0, 1]}, "source.arm.teleop: scale"),
+        ({"sped": 1}, "source.arm.teleop.sped"),
+        ({"acceleration_rad_s2": 0.06}, "too low to come to rest"),
+        ({"workspace_low_m": [0, 0, 1]}, "workspace_low_m must be below"),
+        ({"solver": "best"}, "solver: expected one of"),
     ],
 )
 def test_wrong_settings_are_one_line(tmp_path, capsys, section, part):
-    scenario = cell(tmp_path, "127.0.0.2", section)
+    scenario = write_cell(tmp_path, "127.0.0.2", teleop=section)
     out = str(tmp_path / "x.csv")
     assert main(["teleop", str(scenario), "--stylus", f"network:{free_port()}", "--dry-run", out]) == 2
     said = capsys.readouterr().err
     assert part in said and said.count("\n") == 1
-
-
-def test_the_settings_of_a_scenario_without_a_section_are_the_defaults():
-    from camera_node.robot.simulated_controller.command import require_arm
-
-    scenario = load("cell")
-    assert teleop_config(scenario, require_arm(scenario)).rate_hz == 125.0
 
 
 def test_a_node_that_streams_imports_nothing_of_teleoperation():

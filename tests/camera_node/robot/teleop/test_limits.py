@@ -64,19 +64,6 @@ def test_all_joints_change_in_proportion_so_that_the_hand_keeps_its_direction():
     assert first[0] == pytest.approx(0.02)
 
 
-@pytest.mark.parametrize("direction", range(6))
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_pushing_one_way_for_ever_ends_at_rest_inside(direction, sign):
-    config = TeleopConfig(rate_hz=50.0)
-    limiter = Limiter(UR3E, config, HOME)
-    wanted = np.zeros(6)
-    wanted[direction] = sign * 100.0
-    for _ in range(1200):
-        joints, speeds = limiter.step(wanted)
-    assert np.abs(speeds).max() < 1e-6
-    assert np.abs(joints - HOME).max() > 0.05, "it did move before"
-
-
 @pytest.mark.parametrize("wanted", [np.full(6, np.nan), [np.inf] * 6, np.zeros(5), None])
 def test_what_is_no_speed_is_a_stop_and_counted(wanted):
     limiter = Limiter(UR3E, TeleopConfig(), HOME)
@@ -84,7 +71,7 @@ def test_what_is_no_speed_is_a_stop_and_counted(wanted):
     before = np.abs(limiter.v).max()
     for _ in range(5):
         limiter.step(wanted)
-    assert limiter.refused.unsound == 5
+    assert limiter.refused["unsound"] == 5
     assert np.abs(limiter.v).max() < before
 
 

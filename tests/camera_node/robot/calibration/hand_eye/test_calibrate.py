@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import pairs_json, read_pairs, read_visp_folder
+from camera_node.robot.calibration.files import read_pairs, read_visp_folder
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, angle_deg, calibrate, distance_mm
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, residuals, solve
 from camera_node.robot.calibration.hand_eye.joint_refinement import cramer_rao_bound, refine
-from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, inverse, rotation_mismatch_deg
+from camera_node.robot.calibration.hand_eye.samples import Samples, diversity, rotation_mismatch_deg
 from camera_node.robot.calibration.targets import parse_target
-from freshfield.geometry import so3_exp
 from tests.camera_node.robot.calibration.pictures import noisy_samples
 from tests.conftest import data_dir
 
@@ -53,19 +50,14 @@ def errors(trials: int, count: int, find) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.sqrt(np.mean(np.square(v), axis=0)) for v in (found, least))
 
 
-def test_with_noise_on_the_arm_the_refinement_is_near_the_bound():
-    """15 poses; thirty trials tell nothing finer than a quarter, the slow test below does."""
-    found, least = errors(30, 15, lambda s: refine(s).x)
-    assert np.all(found < 1.25 * least) and np.all(found > 0.75 * least)
-
-
-@pytest.mark.slow
-def test_within_a_tenth_of_the_cramer_rao_bound():
-    """15 poses, arm noise .5 mm and .002 rad an axis, six hundred trials."""
-    found, least = errors(600, 15, lambda s: refine(s).x)
-    assert np.all(found < 1.10 * least)
-    tsai, _ = errors(600, 15, lambda s: solve(s, "tsai"))
-    assert np.all(found < tsai)
+@pytest.mark.parametrize(("trials", "excess"), [(30, 1.25), pytest.param(600, 1.10, marks=pytest.mark.slow)])
+def test_with_noise_on_the_arm_the_refinement_is_near_the_bound(trials, excess):
+    """15 poses, arm noise .5 mm and .002 rad an axis. Thirty trials are exact to a quarter only."""
+    found, least = errors(trials, 15, lambda s: refine(s).x)
+    assert np.all(found < excess * least) and np.all(found > 0.75 * least)
+    if trials == 600:
+        tsai, _ = errors(600, 15, lambda s: solve(s, "tsai"))
+        assert np.all(found < tsai)
 
 
 def test_the_said_deviation_is_the_real_one():
@@ -123,15 +115,6 @@ def test_the_targets_uncertainty_counts_where_it_is_known():
     assert mean[0] < 0.8 * mean[1]
 
 
-def test_pairs_go_out_and_come_back(tmp_path):
-    samples = noisy_samples(6, np.random.default_rng(0))
-    file = tmp_path / "pairs.json"
-    file.write_text(json.dumps(pairs_json(samples)))
-    again = read_pairs(file, EYE_IN_HAND)
-    np.testing.assert_allclose(again.hand, samples.hand, atol=1e-12)
-    np.testing.assert_allclose(again.target, samples.target, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -148,49 +131,20 @@ def test_pairs_that_are_none(tmp_path, text, message):
         read_pairs(file, EYE_IN_HAND)
 
 
-def test_poses_given_the_wrong_way_round_are_refused():
-    good = noisy_samples(12, np.random.default_rng(5))
-    with pytest.raises(CalibrationError, match=r"do not fit together .* not their inverses"):
-        calibrate(Samples(inverse(good.hand), good.target))
-
-
 def test_poses_that_fit_badly_are_warned_about():
     bad = noisy_samples(12, np.random.default_rng(5), 0.1, 0.02)
     assert any("residuals are large" in warning for warning in calibrate(bad).warnings)
 
 
-def test_half_turns_alone_are_called_what_they_are():
-    hand = np.tile(np.eye(4), (4, 1, 1))
-    hand[1:, :3, :3] = [so3_exp(turn) for turn in 0.99 * np.pi * np.eye(3)]
-    with pytest.raises(CalibrationError, match=r"^all turns are near 180 degrees"):
-        calibrate(Samples(hand, hand))
-
-
-# --- real data -------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def franka():
+def test_the_refinement_finds_a_real_arms_noise():
     folder = data_dir("handeye_visp_franka")
-    samples, measured = read_visp_folder(folder, parse_target("chessboard:9x6:23.6mm"), None, EYE_IN_HAND)
-    return samples, measured, np.loadtxt(folder / "expected_eMc.txt")
-
-
-def test_park_lands_on_the_published_answer(franka):
-    samples, measured, published = franka
-    assert len(samples) == 8 and not measured.unused
-    assert all(seen.error_px < 0.6 for seen in measured.seen.values())
-    park = solve(samples, "park")
-    assert angle_deg(park, published) < 0.1 and distance_mm(park, published) < 1.0
-    assert residuals(samples, park).rms_mm == pytest.approx(5.4, abs=0.05)
-    assert residuals(samples, park).rms_deg == pytest.approx(0.456, abs=0.001)
-
-
-def test_the_refinement_takes_the_arm_for_what_it_is(franka):
-    samples, _, published = franka
+    board = parse_target("chessboard:9x6:23.6mm")
+    samples, unused = read_visp_folder(folder, board, None, EYE_IN_HAND, lambda done: None)
+    assert len(samples) == 8 and not unused
+    published = np.loadtxt(folder / "expected_eMc.txt")
     found = calibrate(samples)
     assert angle_deg(found.transform, published) < 0.2 and distance_mm(found.transform, published) < 1.0
-    # This arm is off by millimetres: whoever believes it exactly lands degrees away.
+    # This arm is off by millimetres: a calibration that takes it as exact is degrees away.
     assert 1e-3 < found.refined.arm_noise_m < 1e-2
     assert found.exact_arm is not None and found.exact_arm.from_refined_deg > 1.0
     assert {row.method for row in found.rows} == set(ALL_METHODS)

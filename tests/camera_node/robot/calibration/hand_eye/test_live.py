@@ -103,19 +103,23 @@ def test_what_it_saves_is_what_the_node_takes_it_for(setup, tmp_path, monkeypatc
         assert distance_mm(place, base @ X) < 0.6
 
 
-def test_a_camera_that_is_calibrated_already_has_no_hands_poses(tmp_path, capsys):
-    file = scenario(tmp_path, "eye.yaml")
-    assert main(["calibrate", "hand-eye", "--live", str(file), "--camera", "eye", "--board", BOARD]) == 2
-    assert "source.arm.cameras: set eye: null for the calibration" in capsys.readouterr().err
-
-
-def test_tracks_need_an_arm_and_motion(tmp_path, capsys):
-    options = ["--live", str(scenario(tmp_path)), "--camera", "eye", "--board", BOARD]
-    assert main(["calibrate", "hand-eye", *options, "--tracks", str(tmp_path)]) == 2
-    assert "--tracks: goes with --moving" in capsys.readouterr().err
-    (tmp_path / "file").write_text("")
-    assert main(["calibrate", "hand-eye", *options, "--moving", "--tracks", str(tmp_path / "file")]) == 2
-    assert "--tracks: " in capsys.readouterr().err, "before the camera is opened"
+@pytest.mark.parametrize(
+    ("camera", "options", "message"),
+    [
+        ("eye.yaml", [], "source.arm.cameras: set eye: null for the calibration"),
+        (None, ["--tracks", "."], "--tracks: goes with --moving"),
+        (None, ["--moving", "--tracks", "/dev/null"], "--tracks: /dev/null"),  # before the camera is opened
+        (None, ["--yes"], "--yes: goes with --drive"),
+        # An arm is driven only where its surroundings are known.
+        (None, ["--drive", "--moving"], "--drive: goes with"),
+        (None, ["--drive", "--eye-to-hand"], "--drive: goes with"),
+        (None, ["--drive", "--hand", "hand.csv"], "--drive: goes with"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(camera, options, message, tmp_path, capsys):
+    words = ["--live", str(scenario(tmp_path, camera)), "--camera", "eye", "--board", BOARD]
+    assert main(["calibrate", "hand-eye", *words, *options]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_the_cameras_own_stamps_are_kept_with_what_was_seen():
@@ -307,15 +311,6 @@ def test_a_real_arm_is_not_moved_before_somebody_agrees(tmp_path, monkeypatch, c
         said = capsys.readouterr()
         assert "Is its space clear" in said.err and "nothing was moved" in said.err and not said.out
         np.testing.assert_allclose(TruthClient(host).joints(WallClock().now_ns()), begin, atol=1e-5)
-
-
-@pytest.mark.parametrize("more", [["--moving"], ["--eye-to-hand"], ["--hand", "hand.csv"]])
-def test_an_arm_is_driven_only_where_its_surroundings_are_known(tmp_path, capsys, more):
-    words = ["--live", str(scenario(tmp_path)), "--camera", "eye", "--board", BOARD]
-    assert main(["calibrate", "hand-eye", *words, "--drive", *more]) == 2
-    assert "--drive: goes with" in capsys.readouterr().err
-    assert main(["calibrate", "hand-eye", *words, "--yes"]) == 2
-    assert "--yes: goes with --drive" in capsys.readouterr().err
 
 
 @pytest.mark.slow

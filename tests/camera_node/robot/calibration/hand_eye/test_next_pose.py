@@ -1,4 +1,4 @@
-"""Proposed poses: the target stays in the picture, the promise is kept, and fewer are needed."""
+"""Proposed poses: the target stays in the image, and fewer poses are needed."""
 
 from __future__ import annotations
 
@@ -26,19 +26,17 @@ def known(count: int, seed: int, setup: str = EYE_IN_HAND) -> Samples:
 
 @pytest.mark.parametrize("setup", [EYE_IN_HAND, EYE_TO_HAND])
 @pytest.mark.parametrize("seed", range(5))
-def test_the_target_is_seen_and_the_promise_is_kept(seed, setup):
+def test_the_target_is_seen_and_the_bound_falls(seed, setup):
     samples = known(5, seed, setup)
-    found = propose_pose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(seed))
-    # What the camera will see follows from where the hand will be, and the other way round.
-    moved = found.hand if setup == EYE_IN_HAND else inverse(found.hand)
-    np.testing.assert_allclose(moved @ X @ found.target, Y, atol=1e-9)
-    at = found.target @ np.append(MIDDLE, 1.0)
-    assert 0.1 < at[2] < 0.4 and np.all(np.abs(at[:2]) < 0.1 * at[2])
-    assert found.target[2, 2] > np.cos(np.deg2rad(MAX_TILT_DEG)) - 1e-9  # faces the camera
-    hands, targets = np.append(samples.hand, [found.hand], 0), np.append(samples.target, [found.target], 0)
-    with_it = Samples(hands, targets, setup)
-    assert cramer_rao_bound(with_it, X, Y, NOISE)[1] == pytest.approx(found.std_mm, rel=1e-6)
-    assert found.std_mm < 0.85 * cramer_rao_bound(samples, X, Y, NOISE)[1]
+    hand, again = (propose_pose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(seed)) for _ in range(2))
+    np.testing.assert_array_equal(hand, again)
+    target = inverse(X) @ (inverse(hand) if setup == EYE_IN_HAND else hand) @ Y
+    middle = target @ np.append(MIDDLE, 1.0)
+    assert 0.1 < middle[2] < 0.4 and np.all(np.abs(middle[:2]) < 0.1 * middle[2])
+    assert target[2, 2] > np.cos(np.deg2rad(MAX_TILT_DEG)) - 1e-9  # faces the camera
+    more = Samples(np.append(samples.hand, [hand], 0), np.append(samples.target, [target], 0), setup)
+    before = cramer_rao_bound(samples, X, Y, NOISE)[1]
+    assert cramer_rao_bound(more, X, Y, NOISE)[1] < 0.85 * before
 
 
 def test_eight_planned_poses_are_worth_fifteen_of_chance():
@@ -47,12 +45,6 @@ def test_eight_planned_poses_are_worth_fifteen_of_chance():
     ]
     chance = [cramer_rao_bound(known(15, k), X, Y, NOISE) for k in range(8)]
     assert np.mean(planned, axis=0)[1] < 1.05 * np.mean(chance, axis=0)[1]
-
-
-def test_same_seed_same_proposal():
-    samples = known(5, 1)
-    a, b = (propose_pose(samples, X, Y, NOISE, MIDDLE, np.random.default_rng(3)) for _ in range(2))
-    np.testing.assert_array_equal(a.hand, b.hand)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from camera_node.cli import main
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, read_hand_eye
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.files import read_lens, read_pairs, read_visp_pose
+from camera_node.robot.calibration.files import read_pairs
 from camera_node.robot.calibration.hand_eye import simulated
 from camera_node.robot.calibration.hand_eye.calibrate import angle_deg, calibrate, distance_mm
 from camera_node.robot.calibration.hand_eye.live import guide
@@ -26,9 +26,9 @@ from tests.camera_node.robot.calibration.pictures import (
     camera_in_target,
     render,
     taken,
+    write_poses,
     write_scenario,
 )
-from tests.conftest import data_dir
 
 X = simulated.CAMERA_IN_HAND
 
@@ -51,7 +51,6 @@ def test_it_waits_for_stillness_keeps_what_is_new_and_says_when_there_is_enough(
     found = calibrate(session.samples())
     assert distance_mm(found.transform, X) < 3 * steps[-1].std_mm
     assert angle_deg(found.transform, X) < 0.1
-    assert 0.01 < session.pixel_noise < 0.2
     picture = preview(pictures[-1], session.corners, steps[-1])
     assert picture.shape == (LENS.height + 40, LENS.width, 3)
 
@@ -76,22 +75,6 @@ def test_an_earlier_session_is_gone_on_with():
     step = second.offer(pictures[6], LENS, hands[6])
     assert (step.outcome, step.count) == ("kept", 7)
     assert distance_mm(calibrate(second.samples()).transform, X) < 1.0
-
-
-def test_real_pictures_replayed():
-    """The Franka's eight pictures as an operator would have taken them."""
-    folder = data_dir("handeye_visp_franka")
-    lens = read_lens(folder / "franka_camera.xml")
-    session = HandEyeSession(parse_target("chessboard:9x6:23.6mm"), EYE_IN_HAND, want_mm=3.0, moving=True)
-    for k in range(1, 9):
-        hand = read_visp_pose(folder / f"franka_pose_rPe_{k}.yaml")
-        step = session.offer(cv2.imread(str(folder / f"franka_image-{k}.png")), lens, hand)
-        assert step.outcome == "kept"
-    # This arm is off by millimetres: eight poses are not enough, and it says so.
-    assert not step.enough and 1.0 < step.std_mm < 6.0
-    published = np.loadtxt(folder / "expected_eMc.txt")
-    found = calibrate(session.samples(), "park").transform
-    assert angle_deg(found, published) < 0.1 and distance_mm(found, published) < 1.0
 
 
 class Cell:
@@ -148,17 +131,8 @@ def scenario(tmp_path):
 def test_live_from_the_command_line(scenario, tmp_path, capsys):
     base = ["calibrate", "hand-eye", "--live", str(scenario), "--board", BOARD, "--camera"]
     out, samples, seen = tmp_path / "hand.yaml", tmp_path / "kept.json", tmp_path / "seen.png"
-    arguments = [
-        *base,
-        "eye",
-        "--moving",
-        "--out",
-        str(out),
-        "--samples",
-        str(samples),
-        "--preview",
-        str(seen),
-    ]
+    files = ["--out", str(out), "--samples", str(samples), "--preview", str(seen)]
+    arguments = [*base, "eye", "--moving", *files]
     assert main([*arguments, "--json"]) == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
@@ -176,13 +150,8 @@ def test_live_from_the_command_line(scenario, tmp_path, capsys):
 def test_hand_poses_from_a_file_by_time(scenario, tmp_path, capsys):
     """The same pictures, their poses from the side: one of them too far in time from any."""
     _, hands = taken()
-    lines = ["t,x,y,z,qx,qy,qz,qw"]
-    for k, hand in enumerate(hands):
-        pose = Pose.from_matrix(hand)
-        w, x, y, z = pose.quaternion
-        if k != 4:
-            lines.append(",".join(map(repr, [k / 500, *pose.translation_m, x, y, z, w])))
-    (tmp_path / "hand.csv").write_text("\n".join(lines))
+    known = np.delete(np.arange(len(hands)), 4)
+    write_poses(tmp_path / "hand.csv", known * 2_000_000, hands[known])
     arguments = ["--live", str(scenario), "--camera", "eye", "--board", BOARD, "--moving", "--json",
                  "--hand", str(tmp_path / "hand.csv"), "--max-gap-ms", "1"]  # fmt: skip
     assert main(["calibrate", "hand-eye", *arguments]) == 0

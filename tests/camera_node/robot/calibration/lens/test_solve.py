@@ -98,7 +98,8 @@ def test_from_pictures_to_a_file_that_the_node_reads(tmp_path, capsys):
 
 def test_real_pictures():
     folder = data_dir("handeye_visp_franka")
-    found = calibrate_folder(list_images(folder), parse_target("chessboard:9x6:23.6mm"))
+    board = parse_target("chessboard:9x6:23.6mm")
+    found = calibrate_folder(list_images(folder), board, lambda done: None)
     published = read_lens(folder / "franka_camera.xml")
     assert len(found.views) == 8 and found.error_px < 0.4
     # The published lens has no distortion; ours, which has, differs by a hundredth.
