@@ -35,7 +35,7 @@ class Shape(Protocol):
         ...
 
     def bounding_sphere(self) -> tuple[Array, float]:
-        """Centre (3,) and radius of a sphere around the shape, local axes."""
+        """Center (3,) and radius of a sphere around the shape, local axes."""
         ...
 
 

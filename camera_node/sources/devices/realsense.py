@@ -169,7 +169,7 @@ def lens(camera: str, intrinsics: Any) -> Pinhole:
             f"{camera}: lens model {intrinsics.model} is not supported: calibrate the camera and name "
             "the file in source.calibration"
         )
-    # Colour streams of the D400 come straightened; their coefficients describe the inverse, and are zero.
+    # Color streams of the D400 come straightened; their coefficients describe the inverse, and are zero.
     distortion = [] if straight and not any(intrinsics.coeffs) else list(intrinsics.coeffs)
     if straight and distortion:
         raise CameraError(
