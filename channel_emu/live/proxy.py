@@ -33,7 +33,7 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import EventKind, Link
 from channel_emu.model.trace import Trace, TraceWriter
-from freshfield.clock import Clock, WallClock
+from freshfield.clock import WallClock
 from freshfield.transport import CLIENT_OPTIONS, Transport
 
 log = logging.getLogger("channel-emu")
@@ -110,10 +110,9 @@ class Proxy(grpc.GenericRpcHandler):
         seed: int,
         options: ProxyOptions,
         hook: Hook | None = None,
-        clock: Clock | None = None,
     ) -> None:
         self.options = options
-        self.clock = clock or WallClock()
+        self.clock = WallClock()
         self.origin_ns = self.clock.now_ns()
         """The clock's reading at the channel's instant zero."""
         self.channel = Channel(config, seed)

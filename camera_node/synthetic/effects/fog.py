@@ -38,17 +38,6 @@ class FogParameters(EffectParameters):
             raise ValueError(f"airlight must be three shares within 0 to 1, got {list(self.airlight)}")
 
 
-@dataclass(frozen=True)
-class FogMedium:
-    """Implements lighting.Medium. extinction_per_m: the extinction coefficient beta."""
-
-    extinction_per_m: float
-    airlight: tuple[float, float, float]
-
-    def transmittance(self, distance_m: Array) -> NDArray[np.float32]:
-        return np.exp(-self.extinction_per_m * distance_m).astype(np.float32)
-
-
 class Fog:
     """Rendered ahead; free while streaming. A scene's background is all fog."""
 
@@ -56,8 +45,13 @@ class Fog:
     Parameters = FogParameters
 
     def __init__(self, parameters: FogParameters, rng: np.random.Generator) -> None:
-        extinction_per_m = -math.log(parameters.contrast_threshold) / parameters.visibility_m
-        self._medium = FogMedium(extinction_per_m, parameters.airlight)
+        self.airlight = parameters.airlight
+        # Koschmieder's extinction coefficient beta.
+        self.extinction_per_m = -math.log(parameters.contrast_threshold) / parameters.visibility_m
 
     def extend(self, scene: Scene) -> Scene:
-        return scene.with_world(dataclasses.replace(scene.world, medium=self._medium))
+        return scene.with_world(dataclasses.replace(scene.world, medium=self))
+
+    def transmittance(self, distance_m: Array) -> NDArray[np.float32]:
+        """See ``lighting.Medium``."""
+        return np.exp(-self.extinction_per_m * distance_m).astype(np.float32)
