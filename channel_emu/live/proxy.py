@@ -105,11 +105,7 @@ class Proxy(grpc.GenericRpcHandler):
     """``start``, then ``stop``; or ``run`` until told. Must be made with an event loop running."""
 
     def __init__(
-        self,
-        config: ChannelConfig,
-        seed: int,
-        options: ProxyOptions,
-        hook: Hook | None = None,
+        self, config: ChannelConfig, seed: int, options: ProxyOptions, hook: Hook | None = None
     ) -> None:
         self.options = options
         self.clock = WallClock()

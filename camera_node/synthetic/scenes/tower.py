@@ -74,11 +74,7 @@ def build(params: Params) -> Scene:
         params=params,
         cameras=build_rig(_ANGLES_DEG, _MAST, _RADIUS_M, params.count, pinhole(params), outward=True),
         target=_MAST,
-        world=World(
-            (*_shell(), *_mast(), *_workshop()),
-            _moving_bodies(params, walk, drawn),
-            light,
-        ),
+        world=World((*_shell(), *_mast(), *_workshop()), _moving_bodies(params, walk, drawn), light),
         bounds=np.array([[-_HALF_M, -_HALF_M, 0.0], [_HALF_M, _HALF_M, _HEIGHT_M]]),
         period_s=walk.period_s,
         moving=not walk.still,
