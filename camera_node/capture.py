@@ -28,8 +28,8 @@ class EncodedShot:
 class ShotCache:
     """Compressed shots by (camera, content), up to ``max_bytes``. Nothing is evicted.
 
-    Shots come round in a fixed order, so the oldest is the one that is needed next: a full cache that keeps
-    what it has still serves its share of every round.
+    Shots repeat in a fixed order, so the oldest is the one that is needed next: a full cache that keeps what
+    it has still serves its share of every round.
     """
 
     def __init__(self, max_bytes: int) -> None:

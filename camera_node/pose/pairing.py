@@ -67,7 +67,7 @@ class PairingCounts:
 
     duplicates: samples with a known stamp (the first is kept); conflicting: those of them with another value.
     reordered: samples older than the newest, inserted at their place. stale: samples too old to be kept.
-    restarts: how often the sender's clock was seen to begin anew. paired, refused: instants asked for.
+    restarts: how often the sender's clock was seen to be set back. paired, refused: instants asked for.
     """
 
     samples: int = 0
@@ -95,7 +95,7 @@ class SampleBuffer(Generic[T]):
     max_gap_ns: an instant farther than this from every sample is refused and counted.
     keep_ns: samples this much older than the newest are dropped.
     restart_after: so many stale samples in a row, each newer than the one before, mean that the sender's
-        clock was set back or that a wild stamp had emptied the buffer; the buffer begins anew with them.
+        clock was set back or that a wrong stamp had emptied the buffer; they then replace its contents.
     """
 
     def __init__(

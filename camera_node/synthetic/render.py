@@ -225,7 +225,7 @@ class CameraRenderer:
         moving: Sequence[PlacedParts],
     ) -> Array:
         """Draw one moving body over ``colors`` (N, 3), which belong to the rays from index ``low`` on.
-        Returns the distance (N,) that each ray is free now."""
+        Returns the distance (N,) to the nearest surface so far along each ray."""
         directions = self._directions[:, low : low + len(colors)]
         chosen = rays_near_sphere(self._origin, directions, *placed.bounding_sphere())
         if not chosen.size:
