@@ -160,7 +160,8 @@ def read_section(cls: type[T], mapping: Any, where: str) -> T:
     if not isinstance(mapping, dict):
         raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
     hints = typing.get_type_hints(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    given = sorted(dataclasses.fields(cls), key=lambda f: bool(f.kw_only))  # type: ignore[arg-type]
+    fields = {f.name: f for f in given if f.init}  # as messages list them: what a base adds comes last
     _refuse_unknown(mapping, tuple(fields), f"{where}.")
     values = {key: _convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
     for name, spec in fields.items():

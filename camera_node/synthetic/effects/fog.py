@@ -30,7 +30,6 @@ class FogParameters(EffectParameters):
     visibility_m: float = bounded(20.0, 0.01, 1e6)
     contrast_threshold: float = bounded(0.02, 1e-6, 0.5)
     airlight: tuple[float, float, float] = (0.76, 0.78, 0.80)
-    in_truth: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

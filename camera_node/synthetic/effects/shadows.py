@@ -32,7 +32,6 @@ class ShadowsParameters(EffectParameters):
 
     opacity: float = bounded(1.0, 0.0, 1.0)
     light_points: int = bounded(0, 0, 1000)
-    in_truth: bool = False
 
 
 class Shadows:
