@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from channel_emu.model.chain import Chain
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import ChannelConfig, per_state
+from channel_emu.model.config import LAWS, ChannelConfig, per_state
 from channel_emu.model.counter_rng import stream_key
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.nanoseconds import NEVER_NS
@@ -25,7 +25,6 @@ from channel_emu.virtual.kernels import chain_path, link_service, shared_service
 from channel_emu.virtual.link_run import LinkRun, camera_period_ms, name_ranks
 from freshfield.machine_load import usable_cores
 
-_LAWS = ("none", "exponential", "deterministic", "gamma", "lognormal", "trace")
 # Virtual time of all cameras together below which a thread pool costs more than it saves.
 _MIN_THREADED_NS = 300 * 10**9
 
@@ -145,7 +144,7 @@ def _work(config: ChannelConfig, channel: Channel, name: str, count: int) -> NDA
     parameter = float(service.shape or service.sigma or 0.0)
     delays_ms = np.array(service.delays_ms or [0.0])
     key = _key(channel.seed, name, "channel.service")
-    return work.draw(count, _LAWS.index(service.law), parameter, delays_ms, key)
+    return work.draw(count, LAWS.index(service.law), parameter, delays_ms, key)
 
 
 def _service_means(config: ChannelConfig) -> tuple[NDArray[np.float64], bool]:
