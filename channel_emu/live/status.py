@@ -25,7 +25,10 @@ def snapshot(
     priority: str,
     final: bool,
 ) -> dict[str, Any]:
-    """The status as plain values.
+    """The status as plain values, at the channel's instant ``now_ns``.
+
+    flows: of all cameras. stats: of all links together. rejected: frames refused here, by reason.
+    priority: see ``priority.raise_priority``. final: the emulator is ending.
 
     ``state`` and ``series`` are those of the shared chain; with a chain for each camera, ``by_camera`` has
     its state. ``counts`` are over all cameras; ``broken`` counts frames that a reset or an absent edge broke.
