@@ -73,7 +73,7 @@ def _shell() -> list[Part]:
         tx.Noise(tx.Plain((0.86, 0.85, 0.83)), 0.8, 0.03, seed=4),
         [(-0.9, 1.3, -1.1, 1.1, (1.0, 0.99, 0.95))], soft=0.06,
     )  # fmt: skip
-    walls = {"north": brick, "west": paper, "east": stripes, "south": plaster}
+    walls: dict[str, tx.Texture] = {"north": brick, "west": paper, "east": stripes, "south": plaster}
     return room_shell(3.0, 3.0, walls, boards, ceiling, glow=0.5)
 
 

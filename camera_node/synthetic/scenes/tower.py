@@ -148,7 +148,7 @@ def _shell() -> list[Part]:
         tx.Noise(tx.Plain((0.80, 0.79, 0.76)), 0.9, 0.06, seed=45),
         [(-5, 5, y - 0.12, y + 0.12, (0.50, 0.36, 0.24)) for y in (-3.6, -1.2, 1.2, 3.6)], soft=0.06,
     )  # fmt: skip
-    walls = {"north": brick, "west": tiles, "east": steel, "south": plaster}
+    walls: dict[str, tx.Texture] = {"north": brick, "west": tiles, "east": steel, "south": plaster}
     return room_shell(_HALF_M, _HEIGHT_M, walls, floor, beams, glow=0.4)
 
 
