@@ -28,8 +28,8 @@ class EncodedShot:
 class ShotCache:
     """Compressed shots by (camera, content), up to ``max_bytes``. Nothing is evicted.
 
-    Shots come round in a fixed order, so the oldest is the one that is needed next: a full cache that keeps
-    what it has still serves its share of every round.
+    Shots repeat in a fixed order, so the oldest is the one that is needed next: a full cache that keeps what
+    it has still serves its share of every round.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -41,27 +41,20 @@ class ShotCache:
     def get(self, camera: str, content: int) -> EncodedShot | None:
         return self._shots.get((camera, content))
 
-    def put(self, camera: str, content: int, shot: EncodedShot) -> bool:
-        """Keep a shot; False if it would not fit."""
+    def put(self, camera: str, content: int, shot: EncodedShot) -> None:
+        """Keep a shot if it fits."""
         with self._lock:
-            if (camera, content) in self._shots:
-                return True
-            if self.bytes + len(shot.payload) > self.max_bytes:
-                return False
-            self._shots[camera, content] = shot
-            self.bytes += len(shot.payload)
-            return True
+            fits = self.bytes + len(shot.payload) <= self.max_bytes
+            if fits and (camera, content) not in self._shots:
+                self._shots[camera, content] = shot
+                self.bytes += len(shot.payload)
 
 
 class Camera:
     """A source with the scenario's codec and the process's cache behind it."""
 
     def __init__(
-        self,
-        source: Source,
-        config: SourceConfig,
-        cache: ShotCache,
-        clock_error: ClockError | None = None,
+        self, source: Source, config: SourceConfig, cache: ShotCache, clock_error: ClockError | None = None
     ) -> None:
         self.name = source.camera
         self.fps = source.fps
@@ -92,12 +85,17 @@ class Camera:
 
         Raises ValueError if the source has no such shot or it cannot be sent, OSError if its file is gone.
         """
-        shot = self.cached(tick)
+        return self.shot(self.source.content(tick))
+
+    def shot(self, content: int) -> EncodedShot:
+        """One of the source's shots, from the cache or else made; a shot that repeats is kept while there is
+        room. Raises as ``capture``."""
+        if self.source.contents is None:
+            return self._encode(content)
+        shot = self._cache.get(self.name, content)
         if shot is None:
-            content = self.source.content(tick)
             shot = self._encode(content)
-            if self.source.contents is not None:
-                self._cache.put(self.name, content, shot)
+            self._cache.put(self.name, content, shot)
         return shot
 
     def fits(self) -> bool:
@@ -106,17 +104,10 @@ class Camera:
         if contents is None:
             return False
         try:
-            shot = self._cache.get(self.name, 0) or self._encode(0)
+            shot = self.shot(0)
         except (ValueError, OSError):
             return False
-        self._cache.put(self.name, 0, shot)
         return self._cache.bytes + (contents - 1) * len(shot.payload) <= self._cache.max_bytes
-
-    def fill(self, content: int) -> bool:
-        """Make one shot before it is due; False if the cache is full. Raises as ``capture``."""
-        if self._cache.get(self.name, content) is not None:
-            return True
-        return self._cache.put(self.name, content, self._encode(content))
 
     def _encode(self, content: int) -> EncodedShot:
         shot = self.source.read(content)

@@ -27,8 +27,8 @@ class SourceConfig:
     """Keys of every kind.
 
     fps: captures a second (default: the recording's own, 15 for a world, 10 for photos). codec: jpeg, png
-    or zstd. quality: of jpeg, 1 to 100; color is not subsampled from 90 up. effects: name -> parameters;
-    what is not listed is not imported.
+    or zstd. quality: of jpeg, 1 to 100; color is not subsampled from 90 up. effects: name -> parameters,
+    or null; what is not listed is not imported.
     """
 
     kind: str
@@ -44,11 +44,6 @@ class SourceConfig:
             raise ValueError(f"codec is {self.codec!r}, expected one of {', '.join(CODECS)}")
         if not 1 <= self.quality <= 100:
             raise ValueError(f"quality is {self.quality}, expected 1 to 100")
-
-    @property
-    def effect_parameters(self) -> dict[str, dict[str, Any]]:
-        """Effects with their parameters; a bare name in the file means no parameters."""
-        return {name: dict(parameters or {}) for name, parameters in self.effects.items()}
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def run_checks(name: str | None, to: str | None, data: Path | None, out: Path) -> Iterator[CheckResult]:
-    """The findings, as they come."""
+    """The results, as they come.
+
+    name: scenario file, or the name of a shipped one; None checks only what every scenario needs.
+    to: HOST:PORT of the next hop; None leaves the network out.
+    data: folder of the data sets. out: where runs will be written.
+    """
     yield _check("python", _python)
     yield _check("clock", _clock)
     yield _check("disk", lambda: _disk(out))

@@ -42,6 +42,7 @@ def _doc(model: type) -> str:
 
 def _keys(model: Any, leave_out: list[str] | None = None) -> list[str]:
     fields = [f for f in dataclasses.fields(model) if f.name not in (leave_out or [])]
+    fields.sort(key=lambda f: bool(f.kw_only))  # what every effect has comes last
     return [f"    {f.name:22} {_default(f)}" for f in fields]
 
 

@@ -1,4 +1,4 @@
-"""The one place where a captured frame waits to be sent, and the record of what became of every frame."""
+"""The one place where a captured frame waits to be sent, and the counts of all frames' outcomes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from freshfield.ledger import Ledger
 
 
 class Outbox:
-    """One camera's newest unsent frame. Counts what became of every frame and writes it to the ledger.
+    """One camera's newest unsent frame. Counts every frame's events and writes them to the ledger.
 
     counts: captured, replaced, sent, broken, and one entry for each outcome of an answer.
     """

@@ -27,7 +27,7 @@ def prepare(cameras: Sequence[Camera], stopped: Callable[[], bool]) -> None:
             if stopped():
                 return
             try:
-                camera.fill(content)
+                camera.shot(content)
             except (ValueError, OSError):
                 continue  # counted when the capture is due
         camera.source.release()

@@ -36,7 +36,7 @@ OPTIONS: tuple[tuple[str, tuple[tuple[str, str], ...], tuple[tuple[str, str], ..
     ),
     ("appearance", (("nerfacto", "room, gains"),), (("nerfacto", "room"),)),
     (
-        "view-dependent colour",
+        "view-dependent color",
         (("ngp", "lego"), ("ngp", "kitchen"), ("splat", "lego"), ("splat", "kitchen")),
         (("ngp", "tile"), ("ngp", "room"), ("splat", "tile"), ("splat", "room")),
     ),

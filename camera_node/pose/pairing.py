@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.pose.providers import PairedPose, PoseGapError, locate
-from freshfield.geometry import Pose, se3_inverse, so3_exp, so3_log
+from freshfield.geometry import Pose, cross_matrix, se3_inverse, so3_exp, so3_log
 
 T = TypeVar("T")
 Interpolate = Callable[[T, T, float], T]
@@ -52,7 +52,7 @@ def _left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
         a, b = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
     else:
         a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    k = np.array([[0.0, -omega[2], omega[1]], [omega[2], 0.0, -omega[0]], [-omega[1], omega[0], 0.0]])
+    k = cross_matrix(omega)
     return np.eye(3) + a * k + b * (k @ k)
 
 
@@ -67,7 +67,7 @@ class PairingCounts:
 
     duplicates: samples with a known stamp (the first is kept); conflicting: those of them with another value.
     reordered: samples older than the newest, inserted at their place. stale: samples too old to be kept.
-    restarts: how often the sender's clock was seen to begin anew. paired, refused: instants asked for.
+    restarts: how often the sender's clock was seen to be set back. paired, refused: instants asked for.
     """
 
     samples: int = 0
@@ -95,7 +95,7 @@ class SampleBuffer(Generic[T]):
     max_gap_ns: an instant farther than this from every sample is refused and counted.
     keep_ns: samples this much older than the newest are dropped.
     restart_after: so many stale samples in a row, each newer than the one before, mean that the sender's
-        clock was set back or that a wild stamp had emptied the buffer; the buffer begins anew with them.
+        clock was set back or that a wrong stamp had emptied the buffer; they then replace its contents.
     """
 
     def __init__(

@@ -49,7 +49,7 @@ class Source(ABC):
         not available; others may still be."""
 
     def prepare(self, stopped: Callable[[], bool]) -> None:  # noqa: B027
-        """Do ahead what makes ``read`` fast. Takes as long as it takes, or until ``stopped()``."""
+        """Render or decode ahead, so that ``read`` is fast. Returns when that is done, or ``stopped()``."""
 
     def release(self) -> None:  # noqa: B027
         """Free what making shots needs (decoders, renderers). ``read`` gets it again."""

@@ -6,9 +6,10 @@ whole, by its least uncertain offset."""
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from fractions import Fraction
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -117,14 +118,8 @@ def _in_order(
     name: str, frames: Sequence[SessionFrame], times_ns: Sequence[int]
 ) -> tuple[list[SessionFrame], list[int]]:
     """The frames whose time is after that of the one before: an edge would refuse the others."""
-    kept: list[int] = []
-    out: list[SessionFrame] = []
-    for frame, t_ns in zip(frames, times_ns):
-        if not kept or t_ns > kept[-1]:
-            kept.append(t_ns)
-            out.append(frame)
-    if len(out) < len(frames):
-        log.warning(
-            "%s: %d frames do not follow the one before in time: left out", name, len(frames) - len(out)
-        )
-    return out, kept
+    newest_before = [-math.inf, *accumulate(times_ns, max)]
+    kept = [k for k, t_ns in enumerate(times_ns) if t_ns > newest_before[k]]
+    if left_out := len(frames) - len(kept):
+        log.warning("%s: %d frames do not follow the one before in time: left out", name, left_out)
+    return [frames[k] for k in kept], [times_ns[k] for k in kept]

@@ -24,7 +24,7 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
 
     try:
         effects = load_effects(
-            config.effect_parameters,
+            config.effects,
             lambda name: scenario.rng(f"effect {name}", camera),
             held_out=camera in scenario.held_out,
         )

@@ -13,8 +13,8 @@ PosedCameras = dict[str, tuple[Pinhole, Array]]
 def on_sphere(
     target: ArrayLike, radius_m: float, azimuth_deg: float, elevation_deg: float, outward: bool = False
 ) -> Array:
-    """Camera-to-world (4, 4) looking at ``target``, or away from it; azimuth 0 is on its -y side, 90 on its
-    +x side."""
+    """Camera-to-world (4, 4) at ``radius_m`` from ``target``, looking at it, or ``outward``, away from it.
+    Azimuth 0 is on its -y side, 90 on its +x side; elevation 90 is above it."""
     a, e = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
     away = np.array([np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), np.sin(e)])
     target = np.asarray(target, dtype=np.float64)

@@ -77,13 +77,11 @@ def measure_scenes(size: Size, frames: int, within_s: float) -> list[dict[str, A
     return rows
 
 
-def measure_effects(
-    size: Size, frames: int, within_s: float, scene_name: str = "room", supersample: int = 1
-) -> list[dict[str, Any]]:
+def measure_effects(size: Size, frames: int, within_s: float) -> list[dict[str, Any]]:
     """A row for each of CASES, and one for no effect: added ms a frame, paid ahead or while streaming.
     setup_ms: once for each camera, if the effect needs its own renderer. rms_counts: difference of a faster
     case's frames to those with default parameters."""
-    scene = make_scene(scene_name, {"width": size[0], "height": size[1], "supersample": supersample})
+    scene = make_scene("room", {"width": size[0], "height": size[1], "supersample": 1})
     _prepared(scene)  # the first call of everything takes longer
     plain, _ = _prepared(scene.with_world(scene.world))
     image = plain.image(0.0)

@@ -157,8 +157,7 @@ class FrameCache:
 
     def _stored(self, index: int) -> bytes:
         frame = self._wrapped(index)
-        data = self._memory.get(frame)
-        return self._get_or_render(frame)[0] if data is None else data
+        return self._memory.get(frame) or self._get_or_render(frame)[0]
 
     def _get_or_render(self, frame: int) -> tuple[bytes, bool]:
         """A frame's bytes, now in memory, and whether it was rendered."""

@@ -19,6 +19,8 @@ Vector = tuple[float, float, float]
 # 0.6 s holds 9 frames at 15 a second, 15 at 25, 18 at 30 and 20 at one every 30 ms.
 PERIOD_UNIT_S = 0.6
 MAX_SPEED_M_PER_S = 8.0
+_STANCE = 0.5  # share of a gait cycle for which a foot stands
+_PATH_SAMPLES = 120
 
 
 def phase_of(t_s: float, period_s: float) -> float:
@@ -41,14 +43,14 @@ def smoothstep(x: float) -> float:
     return x * x * (3.0 - 2.0 * x)
 
 
-def footstep_phase(phase: float, cycles: int, offset: float, stance: float = 0.5) -> tuple[float, float]:
+def footstep_phase(phase: float, cycles: int, offset: float) -> tuple[float, float]:
     """A foot's position on the path (a phase) while the body is at ``phase``, and the progress of its swing
-    (0 while it stands). In each of ``cycles`` gait cycles a loop the foot rests for a share ``stance`` at the
+    (0 while it stands). In each of ``cycles`` gait cycles a loop the foot rests for a share _STANCE at the
     position that the body passes at mid-stance, then swings smoothly to the next."""
     x = phase * cycles + offset
     whole = math.floor(x)
-    swing = max(0.0, (x - whole - stance) / (1.0 - stance))
-    at = whole + 0.5 * stance + smoothstep(swing)
+    swing = max(0.0, (x - whole - _STANCE) / (1.0 - _STANCE))
+    at = whole + 0.5 * _STANCE + smoothstep(swing)
     return (at - offset) / cycles, swing
 
 
@@ -109,7 +111,7 @@ def _cross(a: Array, b: Array) -> Array:
     )
 
 
-def mean_path_m(points_at: Callable[[float], Array], samples: int = 120) -> float:
+def mean_path_m(points_at: Callable[[float], Array]) -> float:
     """Metres that the points (M, 3) = points_at(phase) travel in one loop, averaged over the points."""
-    p = np.stack([points_at(k / samples) for k in range(samples)])
+    p = np.stack([points_at(k / _PATH_SAMPLES) for k in range(_PATH_SAMPLES)])
     return float(np.linalg.norm(np.diff(p, axis=0, append=p[:1]), axis=2).sum(axis=0).mean())

@@ -145,7 +145,7 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
 
     # Wave with the right hand while the path faces the cameras (-y), smoothly blended in and out.
     wave = motion.smoothstep((-fy + 0.05) / 0.8)
-    hello = math.sin(2 * gait)
+    wave_side = math.sin(2 * gait)
     for name, sign in (("l", -1.0), ("r", 1.0)):
         shoulder = _offset(chest, (0.205 * sign, shoulder_axis), (0.05, up))
         a = 0.55 * swing * sign
@@ -154,7 +154,7 @@ def bones(walk: Walk, phase: float) -> tuple[Array, Array, Array]:
         lower = _direction((-math.cos(b), up), (math.sin(b), forward), (0.04 * sign, right))
         if sign > 0 and wave > 0.0:
             raised = _direction((0.25, up), (0.9, right), (0.25, forward))
-            waving = _direction((1.0, up), (0.55 * hello + 0.1, right), (0.2, forward))
+            waving = _direction((1.0, up), (0.55 * wave_side + 0.1, right), (0.2, forward))
             # Through the side: a straight blend from hanging to raised would pass through the zero vector.
             keep, via = (1 - wave) ** 2, 2 * wave * (1 - wave)
             upper = _direction((keep, upper), (via, right), (wave * wave, raised))

@@ -16,10 +16,10 @@ from camera_node.synthetic.render import Image
 from camera_node.synthetic.scene import SCENES, Scene, make_scene
 
 
-def contact_sheet(scene: Scene, t_s: float, columns: int = 0) -> Image:
-    """All cameras side by side, named, uint8 RGB; as square as it gets unless ``columns`` is given."""
+def contact_sheet(scene: Scene, t_s: float) -> Image:
+    """All cameras side by side, named, uint8 RGB; as square as it gets."""
     names = list(scene.cameras)
-    columns = columns or math.ceil(math.sqrt(len(names)))
+    columns = math.ceil(math.sqrt(len(names)))
     rows = math.ceil(len(names) / columns)
     height, width = scene.params.height, scene.params.width
     gap = max(1, width // 64)

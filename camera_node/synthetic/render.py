@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.synthetic.contact_shadows import contact_shadow
 from camera_node.synthetic.lighting import (
     Light,
     Medium,
@@ -164,7 +165,7 @@ class CameraRenderer:
         if self.world.shadows is not None:
             self._shadow_static(self.world.shadows, moving, colors, low)
         for body, placed in zip(self.world.moving_bodies, moving):  # before any of them hides the floor
-            self._shadow_contact(body, placed, colors, low)
+            self._darken_floor(body, placed, colors, low)
         for placed in moving:
             limit = self._draw(placed, colors, limit, transmittance, low, moving)
         return self._to_image(self._through_medium(colors, transmittance))
@@ -200,31 +201,10 @@ class CameraRenderer:
         self._floor = hit[on_floor]
         self._floor_points = np.ascontiguousarray(points[:, on_floor])
 
-    def _shadow_contact(self, body: MovingBody, placed: PlacedParts, colors: Colors, low: int) -> None:
-        """Darken the floor by the share of its sky that each contact sphere covers, r^2 cos / d^2."""
-        if not body.contact:
-            return
+    def _darken_floor(self, body: MovingBody, placed: PlacedParts, colors: Colors, low: int) -> None:
         part = slice(*np.searchsorted(self._floor, (low, low + len(colors))))
-        floor, points = self._floor[part], self._floor_points[:, part]
-        if not floor.size:
-            return
-        spheres = np.array([[*placed.matrices[k, :3, 3], r] for k, r in body.contact])
-        middle, reach = spheres[:, :2].mean(axis=0), 0.8
-        dx, dy = points[0] - middle[0], points[1] - middle[1]
-        away2 = (dx * dx + dy * dy) / reach**2
-        near = np.flatnonzero(away2 < 1.0)
-        if not near.size:
-            return
-        p = points[:, near]
-        covered = np.zeros(near.size)
-        for x, y, z, r in spheres:
-            # A sphere half sunk in the floor would cover more than all of it: lift it to rest on it.
-            h = np.maximum(z - p[2], r)
-            d2 = (p[0] - x) ** 2 + (p[1] - y) ** 2 + h * h
-            covered += r * r * h / (d2 * np.sqrt(d2))
-        # The window makes the truncation at ``reach`` invisible.
-        shadow = np.minimum(covered, 0.75) * (1.0 - away2[near])
-        colors[floor[near] - low] *= (1.0 - shadow).astype(np.float32)[:, None]
+        near, left = contact_shadow(body, placed, self._floor_points[:, part])
+        colors[self._floor[part][near] - low] *= left[:, None]
 
     def _shadow_static(
         self, shadows: ShadowModel, moving: Sequence[PlacedParts], colors: Colors, low: int
@@ -245,7 +225,7 @@ class CameraRenderer:
         moving: Sequence[PlacedParts],
     ) -> Array:
         """Draw one moving body over ``colors`` (N, 3), which belong to the rays from index ``low`` on.
-        Returns the distance (N,) that each ray is free now."""
+        Returns the distance (N,) to the nearest surface so far along each ray."""
         directions = self._directions[:, low : low + len(colors)]
         chosen = rays_near_sphere(self._origin, directions, *placed.bounding_sphere())
         if not chosen.size:

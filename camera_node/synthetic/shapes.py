@@ -35,7 +35,7 @@ class Shape(Protocol):
         ...
 
     def bounding_sphere(self) -> tuple[Array, float]:
-        """Centre (3,) and radius of a sphere around the shape, local axes."""
+        """Center (3,) and radius of a sphere around the shape, local axes."""
         ...
 
 
@@ -239,9 +239,7 @@ class RoundCone:
         along, d2 = self._along(z), self._d2
         body = (along > 0.0) & (along < d2)
         center = np.where(along >= d2, self.length, 0.0)
-        normal = np.stack(
-            [x, y, np.where(body, z - self.length * along / d2, z - center)],
-        )
+        normal = np.stack([x, y, np.where(body, z - self.length * along / d2, z - center)])
         return normalize(normal), np.stack([np.arctan2(y, x) / (2 * np.pi), z])
 
     def bounding_sphere(self) -> tuple[Array, float]:

@@ -198,7 +198,7 @@ def log_likelihood(model: TwoStateModel, lines: Sequence[Timeline]) -> float:
     total = 0.0
     for line in lines:
         emissions, scale = _emissions(model, line)
-        total += hmm_kernels.log_likelihood(_UNIFORM, _propagators(model, line), emissions) + scale
+        total += hmm_kernels.forward(_UNIFORM, _propagators(model, line), emissions)[0] + scale
     return float(total)
 
 

@@ -23,10 +23,11 @@ from grpc_reflection.v1alpha import reflection
 from channel_emu.live.camera_flow import CameraFlow
 from channel_emu.live.live_link import ServedCall
 from channel_emu.live.proxy import Proxy
-from channel_emu.live.status import StatusFile, snapshot
+from channel_emu.live.status import snapshot
 from channel_emu.live.upstream import PUSH
 from channel_emu.live.wire import WireError, damage_payload, header_of
 from channel_emu.model.counter_rng import stream_key
+from freshfield.files import write_json
 from freshfield.frame import valid_id
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_STREAMS_PER_CAMERA
@@ -67,7 +68,6 @@ class FrameStream:
     def attach(self, proxy: Proxy) -> Mapping[str, grpc.RpcMethodHandler]:
         self._proxy = proxy
         self._ledger = Ledger(self._out, "emulator", "channel", proxy.origin_ns)
-        self._status = StatusFile(self._out / "channel.json")
         self._exchange = proxy.service_channel.unary_unary(_EXCHANGE)
         self._warn_at_ns = proxy.origin_ns + _WARN_AFTER_NS
         for camera in self.cameras:
@@ -107,14 +107,14 @@ class FrameStream:
             if not any(flow.upstream.connected for flow in self.flows.values()):
                 log.warning("no answer from the edge at %s yet; frames are broken until it is there",
                             self._proxy.options.to)  # fmt: skip
-        await asyncio.to_thread(self._status.write, self._snapshot())
+        await asyncio.to_thread(self._write_status, self._snapshot())
 
     def close(self) -> None:
         """Close ledger and status, each even if the other fails."""
         try:
             self._ledger.close(self._proxy.clock.now_ns())
         finally:
-            self._status.write(self._snapshot(final=True))
+            self._write_status(self._snapshot(final=True))
 
     @property
     def pending(self) -> int:
@@ -178,6 +178,10 @@ class FrameStream:
         except grpc.aio.AioRpcError as error:
             await context.abort(error.code(), f"edge: {error.details()}")
             raise AssertionError("abort raises") from None
+
+    def _write_status(self, state: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError):  # a full disk costs a status, not the emulator
+            write_json(self._out / "channel.json", state)
 
     def _snapshot(self, final: bool = False) -> dict[str, Any]:
         return snapshot(

@@ -16,7 +16,7 @@ _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 SWITCH_INTERVAL_S = 0.0005
 """The event loop takes the interpreter's lock back from another thread after this long at most
 (``sys.setswitchinterval``)."""
-# A thread that asks for short slices is let in sooner when it wakes (Linux 6.12 and later).
+# A thread that asks for short slices is scheduled sooner when it wakes (Linux 6.12 and later).
 _SLICE_NS = 100_000
 
 

@@ -33,7 +33,7 @@ from channel_emu.model.channel import Channel
 from channel_emu.model.config import ChannelConfig
 from channel_emu.model.link import EventKind, Link
 from channel_emu.model.trace import Trace, TraceWriter
-from freshfield.clock import Clock, WallClock
+from freshfield.clock import WallClock
 from freshfield.transport import CLIENT_OPTIONS, Transport
 
 log = logging.getLogger("channel-emu")
@@ -105,15 +105,10 @@ class Proxy(grpc.GenericRpcHandler):
     """``start``, then ``stop``; or ``run`` until told. Must be made with an event loop running."""
 
     def __init__(
-        self,
-        config: ChannelConfig,
-        seed: int,
-        options: ProxyOptions,
-        hook: Hook | None = None,
-        clock: Clock | None = None,
+        self, config: ChannelConfig, seed: int, options: ProxyOptions, hook: Hook | None = None
     ) -> None:
         self.options = options
-        self.clock = clock or WallClock()
+        self.clock = WallClock()
         self.origin_ns = self.clock.now_ns()
         """The clock's reading at the channel's instant zero."""
         self.channel = Channel(config, seed)

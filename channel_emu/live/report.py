@@ -1,4 +1,4 @@
-"""What became of the messages that passed the links: counts, ages and delays, for a program or a person."""
+"""Outcomes, ages and delays of the messages that passed the links, for a program or a person."""
 
 from __future__ import annotations
 

@@ -1,11 +1,9 @@
-"""The emulator's status, written twice a second to ``OUT/channel.json`` and replaced atomically."""
+"""The emulator's status, which ``frame_stream`` writes to ``OUT/channel.json`` twice a second."""
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from channel_emu.live.camera_flow import CameraFlow
@@ -13,23 +11,9 @@ from channel_emu.live.histogram import Histogram
 from channel_emu.live.live_link import DelayStats
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import EventKind
-from freshfield.files import write_json
 
 _SERIES_S = 60.0
 _SERIES_MOST = 600
-
-
-class StatusFile:
-    """Readers see the old file or the new one, never a part of one."""
-
-    def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.path = path
-
-    def write(self, state: dict[str, Any]) -> None:
-        """On a full disk the status is not written; the emulator goes on."""
-        with contextlib.suppress(OSError):
-            write_json(self.path, state)
 
 
 def snapshot(
@@ -41,7 +25,10 @@ def snapshot(
     priority: str,
     final: bool,
 ) -> dict[str, Any]:
-    """The status as plain values.
+    """The status as plain values, at the channel's instant ``now_ns``.
+
+    flows: of all cameras. stats: of all links together. rejected: frames refused here, by reason.
+    priority: see ``priority.raise_priority``. final: the emulator is ending.
 
     ``state`` and ``series`` are those of the shared chain; with a chain for each camera, ``by_camera`` has
     its state. ``counts`` are over all cameras; ``broken`` counts frames that a reset or an absent edge broke.

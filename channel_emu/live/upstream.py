@@ -89,7 +89,7 @@ class Upstream:
                 await self._channel.channel_ready()
                 answered = await self._session()
             except STREAM_ENDED as error:
-                self._say(error)
+                self._log_trouble(error)
             finally:
                 self._end()
             failures = 0 if answered else failures + 1
@@ -109,12 +109,12 @@ class Upstream:
                 # The stream itself may still be open: asking how it ended would take forever.
                 error = task.exception()
                 if isinstance(error, DecodeError):
-                    self._say("the edge sent bytes that are no answer")
+                    self._log_trouble("the edge sent bytes that are no answer")
                     return False
                 if error is not None and not isinstance(error, STREAM_ENDED):
                     raise error
             code, details = await call.code(), await call.details()
-            self._say(f"{code.name}: {details}" if details else code.name)
+            self._log_trouble(f"{code.name}: {details}" if details else code.name)
             return reader.done() and not reader.cancelled() and reader.result()
         finally:
             self.connected = False
@@ -167,8 +167,8 @@ class Upstream:
         for frame in ended:
             self._broken(frame)
 
-    def _say(self, trouble: Any) -> None:
-        """Say what broke, once per kind of trouble and not once per attempt."""
+    def _log_trouble(self, trouble: Any) -> None:
+        """Log what broke, once per kind of trouble and not once per attempt."""
         if isinstance(trouble, grpc.aio.AioRpcError):
             trouble = f"{trouble.code().name}: {trouble.details()}"
         if str(trouble) != self._trouble:

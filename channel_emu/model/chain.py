@@ -155,23 +155,23 @@ class Chain:
             # the probability to stay for one more.
             self.sojourn_rate = np.log1p(-leave) if self.slot_ns else leave
         # Cumulative jump probabilities; the last possible target gets 1 exactly, so rounding cannot miss it.
-        self.jumps = np.where(np.arange(self.states) >= self._last_targets(off)[:, None], 1.0, jumps)
+        last = np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])
+        self.jumps = np.where(np.arange(self.states) >= last[:, None], 1.0, jumps)
         self._jump_lists = self.jumps.tolist()
         self._sojourn_rates = [float(r) for r in self.sojourn_rate]
         self.white = not self.slot_ns and self._is_white()
         self.initial = self._draw_initial() if initial is None else initial
         self._starts = [0]
         self._visited = [self.initial]
-        self._number = (
-            0  # of the last sojourn: the pair of this number gives its length and the jump at its end
-        )
+        # Of the last sojourn: the random pair of this number gives its length and the jump at its end.
+        self._number = 0
         self._until = self._sojourn_end(0, self.initial)
         self._spent_ns = [0] * self.states  # in the forgotten part of the path
 
     def segment(self, at_ns: int) -> tuple[int, int]:
         """State at ``at_ns`` and the end of its sojourn (NEVER_NS if it has none)."""
         if self.white:
-            return self._white_noise_state(at_ns), at_ns + 1
+            return int(self._rng.uniform(at_ns) >= self.shares[0]), at_ns + 1
         if self._until <= at_ns:
             self._extend(at_ns)
         starts = self._starts
@@ -271,10 +271,3 @@ class Chain:
             f"followed (two-state chains faster than {WHITE_RATE_PER_MS:g} a ms are treated as noise); or "
             "sample it at slot boundaries (sampled: slots)"
         )
-
-    def _white_noise_state(self, at_ns: int) -> int:
-        return 0 if self._rng.uniform(at_ns) < self.shares[0] else 1
-
-    @staticmethod
-    def _last_targets(off: NDArray[np.float64]) -> NDArray[np.intp]:
-        return np.array([np.flatnonzero(row)[-1] if row.any() else i for i, row in enumerate(off)])

@@ -271,6 +271,7 @@ def channel_from_mapping(mapping: Any, where: str = "channel") -> ChannelConfig:
 
 
 def per_state(value: float | list[float]) -> list[float]:
+    """A value as a list: one entry a state, or one for all."""
     return list(value) if isinstance(value, list) else [value]
 
 

@@ -12,6 +12,8 @@ import math
 
 import numpy as np
 
+from freshfield.scenario import seed_sequence
+
 _MULTIPLY_0, _MULTIPLY_1 = 0xD2511F53, 0xCD9E8D57
 _WEYL_0, _WEYL_1 = 0x9E3779B9, 0xBB67AE85
 _WORD = 0xFFFFFFFF
@@ -34,19 +36,16 @@ def _unit(low: int, high: int) -> float:
 
 
 def stream_key(seed: int, camera: str, purpose: str) -> tuple[int, int]:
-    """The key of one camera's stream for one purpose. Seeds are whole numbers from 0 to 2^63 - 1.
-
-    It depends on the camera's name, not on its place in a list, so cameras are independent of each other.
-    """
+    """The key of one camera's stream for one purpose, from ``freshfield.scenario.seed_sequence``. Seeds are
+    whole numbers from 0 to 2^63 - 1."""
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed: expected a whole number from 0 to 2^63 - 1, got {seed}")
-    words = [seed & _WORD, seed >> 32, *_words(purpose), *_words(camera)]
-    low, high = np.random.SeedSequence(words).generate_state(2, np.uint32)
+    low, high = seed_sequence(seed, purpose, camera).generate_state(2, np.uint32)
     return int(low), int(high)
 
 
 class CounterRng:
-    """One stream: ``pair(n)`` are two independent rng in (0, 1) for number ``n``.
+    """One stream: ``pair(n)`` are two independent uniforms in (0, 1) for number ``n``.
 
     ``attempt`` indexes further pairs of the same number, for rejection sampling.
     """
@@ -66,8 +65,3 @@ class CounterRng:
     def exponential(self, n: int) -> float:
         """Unit-mean exponential number ``n``."""
         return -math.log(self.pair(n)[0])
-
-
-def _words(text: str) -> list[int]:
-    data = text.encode()
-    return [len(data), *(int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4))]

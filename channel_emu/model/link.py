@@ -138,11 +138,6 @@ class Link:
         self.server.add(self)
 
     @property
-    def queue_limit(self) -> int:
-        """Most frames waiting (fcfs) or in service (parallel); more are dropped_busy."""
-        return self.server.queue_limit
-
-    @property
     def in_flight(self) -> int:
         return len(self._serving) + len(self.waiting) + (self._unsampled is not None)
 

@@ -19,4 +19,5 @@ def saturating_round(span_ns: float) -> int:
 
 
 def saturating_add(instant_ns: int, span_ns: int) -> int:
+    """The instant ``span_ns`` later, at most NEVER_NS."""
     return min(instant_ns + span_ns, NEVER_NS)

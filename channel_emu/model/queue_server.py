@@ -53,6 +53,7 @@ class QueueServer:
     """Chooses among its links; each link decides the outcome of its own frames."""
 
     def __init__(self, order: str = "fcfs", queue_limit: int = 1024) -> None:
+        """queue_limit: most frames waiting (fcfs) or in service (parallel); more are dropped_busy."""
         if order not in ORDERS:
             raise ValueError(f"order {order!r} is not one of {', '.join(ORDERS)}")
         self.order = order
@@ -66,10 +67,6 @@ class QueueServer:
         self.now_ns = 0
         self.links: list[QueuedLink] = []
         self._tickets = 0
-
-    @property
-    def shared(self) -> bool:
-        return len(self.links) > 1
 
     def add(self, link: QueuedLink) -> None:
         """Links are kept in the order of their cameras' names, in whatever order they are added."""

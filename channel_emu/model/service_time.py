@@ -20,10 +20,12 @@ WorkSampler = Callable[[int], float]
 
 
 def exponential(rng: CounterRng) -> WorkSampler:
+    """Exponential of mean one."""
     return rng.exponential
 
 
 def deterministic() -> WorkSampler:
+    """Always one: the mean delay itself."""
     return lambda number: 1.0
 
 

@@ -19,13 +19,12 @@ import numpy as np
 from channel_emu.model.chain import two_state_generator
 from channel_emu.model.closed_forms import drop_new_age_ms, slotted_drop_new_age_ms
 from channel_emu.model.config import ChannelConfig, channel_from_mapping
-from channel_emu.virtual.benchmark import periodic_loop
+from channel_emu.virtual.benchmark import MEAN_MS, PERIOD_MS, periodic_loop
 from channel_emu.virtual.simulate import SimulationError, simulate
 
 Rows = list[dict[str, Any]]
 
 CAMERAS = 18
-_PERIOD_MS, _MEAN_MS = 30.0, 60.0
 # (name, mu1, mu2 in 1/ms, mean delays in ms by state, period in ms, slots in ms). The fast chain switches
 # many times a period, where a grid is biased; the thesis's does not.
 CHAINS = (
@@ -48,7 +47,7 @@ def measure(quick: bool = False, seed: int = 0) -> dict[str, Rows]:
 
 def duration(repeats: int, longest_s: float, seed: int = 0) -> Rows:
     """Root mean square error of the mean age of 18 cameras, over ``repeats`` seeds, against duration."""
-    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
+    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([MEAN_MS]), PERIOD_MS)
     config = channel_from_mapping({"preset": "ch5"})
     _age(config, CAMERAS, 1.0, seed)  # compiles
     rows = []
@@ -96,15 +95,15 @@ def chain_slots(repeats: int, frames: int, seed: int = 0) -> Rows:
 def loop_slots(repeats: int, seconds: float, seed: int = 0) -> Rows:
     """The same for a loop over slots. Its ages are sampled just after deliveries, so half a slot is added to
     compare them with the time average."""
-    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
+    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([MEAN_MS]), PERIOD_MS)
     rows = []
     for slot_ms in LOOP_SLOTS_MS:
         begun = time.perf_counter()
         found = np.array([periodic_loop(CAMERAS, seconds, seed + k, slot_ms) for k in range(repeats)])
         found += slot_ms / 2
         rows.append({
-            "what": "loop over slots", "slot_ms": slot_ms, "period_ms": _PERIOD_MS,
-            "bias_exact_pct": 100 * (slotted_drop_new_age_ms(_MEAN_MS, _PERIOD_MS, slot_ms) / exact - 1),
+            "what": "loop over slots", "slot_ms": slot_ms, "period_ms": PERIOD_MS,
+            "bias_exact_pct": 100 * (slotted_drop_new_age_ms(MEAN_MS, PERIOD_MS, slot_ms) / exact - 1),
             "bias_measured_pct": 100 * (float(found.mean()) / exact - 1),
             "half_width_pct": 100 * _half_width(found) / exact,
             "camera_s_per_wall_s": repeats * seconds * CAMERAS / (time.perf_counter() - begun),
@@ -119,7 +118,7 @@ def seeds(most: int, seconds: float, seed: int = 0) -> Rows:
     A run of this length is biased, because it starts with a delivery, when the age is least. Longer runs
     remove the bias; more seeds only make it visible.
     """
-    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([_MEAN_MS]), _PERIOD_MS)
+    exact = drop_new_age_ms(np.zeros((1, 1)), np.array([MEAN_MS]), PERIOD_MS)
     config = channel_from_mapping({"preset": "ch5"})
     begun = time.perf_counter()
     found = np.array([_age(config, CAMERAS, seconds, seed + k) for k in range(most)])

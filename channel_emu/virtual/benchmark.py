@@ -25,15 +25,13 @@ FAULTS: dict[str, dict[str, Any]] = {
     "bandwidth": {"megabits_per_s": 1000.0},
 }  # fmt: skip
 _PERIOD_NS = 10**6
+PERIOD_MS, MEAN_MS = 30.0, 60.0  # of captures and delays in the thesis's chapter 5
 
 
-def periodic_loop(
-    cameras: int, seconds: float, seed: int = 0, slot_ms: float = 1.0, period_ms: float = 30.0,
-    mean_ms: float = 60.0,
-) -> float:  # fmt: skip
+def periodic_loop(cameras: int, seconds: float, seed: int = 0, slot_ms: float = 1.0) -> float:
     """Mean age in ms at slot boundaries, after deliveries, of D/M/1/0 stepped slot by slot (5.2, 5.5)."""
     draw = random.Random(seed).expovariate
-    every, rate = round(period_ms / slot_ms), slot_ms / mean_ms
+    every, rate = round(PERIOD_MS / slot_ms), slot_ms / MEAN_MS
     left, sending, newest = [0] * cameras, [0] * cameras, [0] * cameras
     links = range(cameras)
     total = 0
@@ -53,17 +51,17 @@ def periodic_loop(
     return total * slot_ms / (slots * cameras)
 
 
-def modulated_loop(cameras: int, seconds: float, seed: int = 0, slot_ms: float = 1.0) -> float:
-    """Mean age in ms at slot boundaries of the thesis's chapter 6 (6.23 to 6.27) stepped slot by slot: the
-    state drawn at each, at most one arrival a slot, delays at-start, the newest frame waits."""
+def modulated_loop(cameras: int, seconds: float, seed: int = 0) -> float:
+    """Mean age in ms at slot boundaries of the thesis's chapter 6 (6.23 to 6.27) stepped by slots of 1 ms:
+    the state drawn at each, at most one arrival a slot, delays at-start, the newest frame waits."""
     uniform = random.Random(seed).random
-    moves = -math.expm1(-2 / 30 * slot_ms) / 2  # from either state to the other
-    arrives = [-math.expm1(-slot_ms / every_ms) for every_ms in (120.0, 30.0)]
-    means = [30.0 / slot_ms, 60.0 / slot_ms]
+    moves = -math.expm1(-2 / 30) / 2  # from either state to the other
+    arrives = [-math.expm1(-1.0 / every_ms) for every_ms in (120.0, 30.0)]
+    means = [30.0, 60.0]
     left, sending, waiting, newest = [0] * cameras, [0] * cameras, [-1] * cameras, [0] * cameras
     links = range(cameras)
     state, total = 0, 0
-    slots = round(seconds * 1e3 / slot_ms)
+    slots = round(seconds * 1e3)
     for now in range(slots):
         if uniform() < moves:
             state = 1 - state
@@ -80,7 +78,7 @@ def modulated_loop(cameras: int, seconds: float, seed: int = 0, slot_ms: float =
                 sending[link], waiting[link] = waiting[link], -1
                 left[link] = math.ceil(-math.log(1.0 - uniform()) * mean)
             total += now - newest[link]
-    return total * slot_ms / (slots * cameras)
+    return total / (slots * cameras)
 
 
 LOOPS: dict[str, Callable[[int, float, int], float]] = {"ch5": periodic_loop, "ch6": modulated_loop}

@@ -6,7 +6,6 @@ GIL), and the result does not depend on the number of threads. A shared server i
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -17,15 +16,15 @@ from numpy.typing import NDArray
 
 from channel_emu.model.chain import Chain
 from channel_emu.model.channel import Channel
-from channel_emu.model.config import ChannelConfig, per_state
+from channel_emu.model.config import LAWS, ChannelConfig, per_state
 from channel_emu.model.counter_rng import stream_key
 from channel_emu.model.link import DISCIPLINES
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import ORDERS
 from channel_emu.virtual.kernels import chain_path, link_service, shared_service, work
 from channel_emu.virtual.link_run import LinkRun, camera_period_ms, name_ranks
+from freshfield.machine_load import usable_cores
 
-_LAWS = ("none", "exponential", "deterministic", "gamma", "lognormal", "trace")
 # Virtual time of all cameras together below which a thread pool costs more than it saves.
 _MIN_THREADED_NS = 300 * 10**9
 
@@ -49,7 +48,7 @@ def run(
 ) -> list[LinkRun]:
     """Every camera's run, in the order of ``names``; the arguments are those of ``simulate.simulate``."""
     if threads is None:
-        threads = _processors() if end_ns * len(names) >= _MIN_THREADED_NS else 1
+        threads = usable_cores() if end_ns * len(names) >= _MIN_THREADED_NS else 1
     shared_path = _path(channel.chain, "", channel.seed, end_ns) if channel.chain else None
     jobs = [
         partial(_prepare, config, channel, name, rank / len(names), end_ns, frame_period_ms, shared_path)
@@ -145,7 +144,7 @@ def _work(config: ChannelConfig, channel: Channel, name: str, count: int) -> NDA
     parameter = float(service.shape or service.sigma or 0.0)
     delays_ms = np.array(service.delays_ms or [0.0])
     key = _key(channel.seed, name, "channel.service")
-    return work.draw(count, _LAWS.index(service.law), parameter, delays_ms, key)
+    return work.draw(count, LAWS.index(service.law), parameter, delays_ms, key)
 
 
 def _service_means(config: ChannelConfig) -> tuple[NDArray[np.float64], bool]:
@@ -169,8 +168,3 @@ def _path(chain: Chain | None, camera: str, seed: int, end_ns: int) -> Path:
 
 def _key(seed: int, camera: str, purpose: str) -> NDArray[np.uint64]:
     return np.array(stream_key(seed, camera, purpose), np.uint64)
-
-
-def _processors() -> int:
-    known = getattr(os, "sched_getaffinity", None)
-    return len(known(0)) if known else os.cpu_count() or 1

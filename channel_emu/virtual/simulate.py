@@ -103,6 +103,7 @@ def simulate(
 
     cameras: their number (cam00, cam01, ...) or their names.
     engine: auto, python or kernel.
+    frame_bytes: size of every frame, for the bandwidth fault.
     frame_period_ms: the cameras' capture period. Without it Poisson arrivals generate the frames (arrival =
         capture, as in the thesis); with it they sample the camera's newest frame, as the live emulator does.
     slot_ms: slot of the slotted mean age (5.2).

@@ -92,11 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--port", type=_port, default=8080, help="port of the page on 127.0.0.1 (default 8080)")
     add("--data", type=Path, help="folder of recorded data, for scenarios that stream it")
     add("--seed", type=int, help="seed in place of the scenario's")
-    add(
-        "--policy",
-        metavar="NAME[:VALUE]",
-        help="in place of the scenario's: threshold:120, bandit:FILE",
-    )
+    add("--policy", metavar="NAME[:VALUE]", help="in place of the scenario's: threshold:120, bandit:FILE")
     add(
         "--learn", nargs="?", const="", metavar="REWARD[:moving]",
         help="bandit:FILE keeps learning from this reward (default: the one it was trained with)",

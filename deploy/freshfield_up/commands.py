@@ -5,7 +5,6 @@ The nodes know only the emulator's address.
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 from collections.abc import Sequence
@@ -13,21 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from freshfield.scenario import Scenario
+from freshfield_up import thread_limits
 from freshfield_up.net import LOOPBACK, free_ports
 from freshfield_up.processes import Child
 
-# Libraries start a thread for each core by default. Nodes and emulator gain nothing from these threads, which
-# would compete with the field's own pool.
-_SINGLE_THREADED = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-)
 _ARM_PORT = 30004  # RTDE, the fixed port for the state of every controller
-_EDGE_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 class MissingCommand(RuntimeError):
@@ -78,17 +67,17 @@ def process_set(
     edge_address, emulator_address = f"{LOOPBACK}:{edge_port}", f"{LOOPBACK}:{emulator_port}"
     common = ["--out", str(out), *(["--seed", str(seed)] if seed is not None else [])]
     recorded = ["--data", str(data)] if data is not None else []
-    single_threaded = _threads(_SINGLE_THREADED, 1)
+    limits = thread_limits.one_thread()
 
     def child(name: str, role: str, command: str, action: str, *arguments: str) -> Child:
         words = [program(command), action, str(scenario.path), *arguments]
-        return Child(name, role, words, out / f"log-{name}.txt", single_threaded)
+        return Child(name, role, words, out / f"log-{name}.txt", limits)
 
     edge = child(
         "edge", "the edge server", "edge-server", "run", "--listen", edge_address,
         "--page-host", LOOPBACK, "--page-port", str(page_port), *common, *recorded, *edge_options,
     )  # fmt: skip
-    edge.environment = _threads(_EDGE_THREADS, _cores())
+    edge.environment = thread_limits.all_cores()
     emulator = child(
         "emulator", "the channel emulator", "channel-emu", "run", "--listen", emulator_address,
         "--to", edge_address, *common,
@@ -121,12 +110,3 @@ def program(name: str) -> str:
             "there with: pip install -e '.[edge,embed,up]'"
         )
     return found
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _threads(variables: tuple[str, ...], count: int) -> dict[str, str]:
-    """Values for the variables that the user has not set."""
-    return {name: str(count) for name in variables if name not in os.environ}

@@ -52,19 +52,19 @@ def is_serving(address: str, timeout_s: float = 0.5) -> bool:
         return bool(reply.status == health_pb2.HealthCheckResponse.SERVING)
 
 
-def accepts(address: str, timeout_s: float = 0.5) -> bool:
+def accepts(address: str) -> bool:
     """Whether a server accepts connections at ``host:port``."""
     host, _, port = address.rpartition(":")
     try:
-        socket.create_connection((host, int(port)), timeout_s).close()
+        socket.create_connection((host, int(port)), timeout=0.5).close()
     except OSError:
         return False
     return True
 
 
-def page_answers(port: int, timeout_s: float = 1.0) -> bool:
+def page_answers(port: int) -> bool:
     """Whether the page on the loopback port answers with a document."""
-    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=1.0)
     try:
         connection.request("GET", "/")
         return connection.getresponse().status == 200

@@ -7,10 +7,11 @@ where the system does not tell, the value is None.
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 from pathlib import Path
 from typing import Any
+
+from freshfield.machine_load import usable_cores
 
 _PACKAGES = ("freshfield", "numpy", "numba", "torch", "grpcio", "opencv-contrib-python-headless")
 _PROC = Path("/proc")
@@ -29,11 +30,10 @@ def versions() -> dict[str, str | None]:
 
 def machine(proc: Path = _PROC) -> dict[str, Any]:
     """{cpu, cores (usable by this process), memory_gb, system, kernel}."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory_kb = _field(proc / "meminfo", "MemTotal")
     return {
         "cpu": _field(proc / "cpuinfo", "model name") or platform.processor() or None,
-        "cores": usable,
+        "cores": usable_cores(),
         "memory_gb": round(int(memory_kb.split()[0]) * 1024 / 1e9, 1) if memory_kb else None,
         "system": platform.system(),
         "kernel": platform.release(),

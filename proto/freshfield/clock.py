@@ -60,14 +60,14 @@ class Offset:
 
 
 class OffsetEstimator:
-    """NTP's estimate: the offset of the exchange with the shortest round trip among the last ``window``.
+    """NTP's estimate: the offset of the exchange with the shortest round trip among the last 16.
 
     The bound of an exchange grows by ``drift_ppm`` of its age, so that the estimate follows a drifting clock.
     Thread-safe.
     """
 
-    def __init__(self, window: int = 16, drift_ppm: float = 50.0) -> None:
-        self._samples: deque[tuple[int, int, int]] = deque(maxlen=window)
+    def __init__(self, drift_ppm: float = 50.0) -> None:
+        self._samples: deque[tuple[int, int, int]] = deque(maxlen=16)
         self._drift = drift_ppm * 1e-6
         self._lock = threading.Lock()
 

@@ -113,7 +113,7 @@ def so3_exp(omega: ArrayLike) -> Array:
     """Rotation matrix (3, 3) of a rotation vector (3,) in radians (Rodrigues)."""
     w = np.asarray(omega, dtype=np.float64)
     angle = float(np.linalg.norm(w))
-    k = _hat(w)
+    k = cross_matrix(w)
     if angle < _SMALL_ANGLE:
         a, b = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0
     else:
@@ -139,7 +139,8 @@ def se3_inverse(transform: ArrayLike) -> Array:
     return out
 
 
-def _hat(w: Array) -> Array:
+def cross_matrix(w: Array) -> Array:
+    """The matrix (3, 3) whose product with a vector is the cross product of ``w`` (3,) with it."""
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 

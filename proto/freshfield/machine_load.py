@@ -76,6 +76,11 @@ def outside_load(processes: Sequence[dict[str, Any]], proc: Path = _PROC) -> dic
     return {"cores": round(max(0.0, load - recent), 2), "ours": used, "method": "load average minus ours"}
 
 
+def usable_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def load_average(proc: Path = _PROC) -> float | None:
     """Load average of the last minute."""
     try:

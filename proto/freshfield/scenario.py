@@ -76,11 +76,17 @@ class Scenario:
     def rng(self, purpose: str, camera: str | None = None) -> np.random.Generator:
         """The random stream of a purpose and camera. Streams are independent: adding a camera does not change
         those of the others."""
-        return np.random.default_rng(self.seed_sequence(purpose, camera))
+        return np.random.default_rng(seed_sequence(self.seed, purpose, camera or ""))
 
-    def seed_sequence(self, purpose: str, camera: str | None = None) -> np.random.SeedSequence:
-        words = [self.seed & 0xFFFFFFFF, self.seed >> 32, *_words(purpose), *_words(camera or "")]
-        return np.random.SeedSequence(words)
+
+def seed_sequence(seed: int, purpose: str, camera: str = "") -> np.random.SeedSequence:
+    """The seeds of one camera's random stream for one purpose. It depends on the camera's name, not on its
+    place in a list, so cameras are independent of each other."""
+    words = [seed & 0xFFFFFFFF, seed >> 32]
+    for text in (purpose, camera):
+        data = text.encode()
+        words += [len(data), *(int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4))]
+    return np.random.SeedSequence(words)
 
 
 def load(path: str | Path, seed: int | None = None) -> Scenario:
@@ -154,7 +160,8 @@ def read_section(cls: type[T], mapping: Any, where: str) -> T:
     if not isinstance(mapping, dict):
         raise ScenarioError(f"{where}: expected a mapping, got {mapping!r}")
     hints = typing.get_type_hints(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    given = sorted(dataclasses.fields(cls), key=lambda f: bool(f.kw_only))  # type: ignore[arg-type]
+    fields = {f.name: f for f in given if f.init}  # as messages list them: what a base adds comes last
     _refuse_unknown(mapping, tuple(fields), f"{where}.")
     values = {key: _convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
     for name, spec in fields.items():
@@ -227,8 +234,3 @@ def _refuse_unknown(mapping: dict[Any, Any], known: tuple[str, ...], prefix: str
             near = difflib.get_close_matches(str(key), known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(known)}"
             raise ScenarioError(f"{prefix}{key}: unknown key; {hint}")
-
-
-def _words(text: str) -> list[int]:
-    data = text.encode()
-    return [len(data), *(int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4))]

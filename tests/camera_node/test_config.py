@@ -20,7 +20,7 @@ def test_what_is_given_reaches_the_scene():
     )
     assert isinstance(world, WorldConfig) and world.codec == "jpeg" and world.fps is None
     assert world.scene_parameters() == {"width": 64, "supersample": 1}
-    assert world.effect_parameters == {"sensor_noise": {}}
+    assert world.effects == {"sensor_noise": None}
 
 
 @pytest.mark.parametrize(

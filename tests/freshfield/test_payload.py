@@ -43,7 +43,7 @@ def test_jpeg_is_rgb_and_close():
     assert np.abs(back[:, 40:].astype(int) - (20, 60, 210)).max() < 6
 
 
-def test_colour_is_not_subsampled_from_quality_90_up():
+def test_color_is_not_subsampled_from_quality_90_up():
     image = np.zeros((32, 32, 3), np.uint8)
     image[:, ::2] = (255, 0, 0)
     image[:, 1::2] = (0, 0, 255)  # columns of one luma range that 4:2:0 would mix

@@ -188,37 +188,29 @@ class _Bytes:
 
     def take(self, layout: str) -> tuple:
         """The next fields, as ``struct`` names them."""
-        size = struct.calcsize("<" + layout)
-        self._need(size)
-        values = struct.unpack_from("<" + layout, self._data, self._at)
-        self._at += size
-        return values
+        return struct.unpack("<" + layout, self.read(struct.calcsize("<" + layout)))
 
     def name(self) -> str:
         """Text up to a zero byte."""
         end = self._data.find(b"\0", self._at)
-        self._need(1 if end >= 0 else len(self._data))
-        text = self._data[self._at : end]
-        self._at = end + 1
+        text = self.read((end if end >= 0 else len(self._data)) + 1 - self._at)[:-1]
         try:
             return text.decode()
         except UnicodeDecodeError:
             raise DatasetError(f"{self.file}: a name at byte {self._at - len(text) - 1} is no text") from None
 
-    def skip(self, size: int) -> None:
-        self._need(size)
-        self._at += size
+    def read(self, size: int) -> bytes:
+        begin, self._at = self._at, self._at + size
+        if self._at > len(self._data):
+            raise DatasetError(
+                f"{self.file}: ends at byte {len(self._data)}, in the middle of an entry: cut short?"
+            )
+        return self._data[begin : self._at]
 
     def done(self) -> None:
         if self._at != len(self._data):
             raise DatasetError(
                 f"{self.file}: {len(self._data) - self._at} bytes follow its last entry: no COLMAP model?"
-            )
-
-    def _need(self, size: int) -> None:
-        if size > len(self._data) - self._at:
-            raise DatasetError(
-                f"{self.file}: ends at byte {len(self._data)}, in the middle of an entry: cut short?"
             )
 
 
@@ -241,7 +233,7 @@ def _binary(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
         _, *pose, camera = data.take("I7dI")
         name = data.name()
         (points,) = data.take("Q")
-        data.skip(24 * points)  # two coordinates and the number of a point each
+        data.read(24 * points)  # two coordinates and the number of a point each
         images.append(_Image(name, camera, tuple(pose)))
     data.done()
     return lenses, images

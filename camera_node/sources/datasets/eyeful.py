@@ -138,17 +138,17 @@ def _entry(entry: dict[str, Any], where: str) -> _Entry:
     model = entry.get("distortionModel")
     if model == "RadialAndTangential" and len(d) in (0, 5):
         k1, k2, p1, p2, k3 = d or [0.0] * 5
-        bend: tuple[tuple[float, ...], tuple[float, float], bool] = (k1, k2, k3), (p1, p2), False
     elif model == "Fisheye" and len(d) in (0, 8):
         k1, k2, k3, _, _, _, p1, p2 = d or [0.0] * 8
-        bend = (k1, k2, k3), (p1, p2), True
     else:
         raise DatasetError(
             f"{where}: distortionModel {model!r} with {len(d)} coefficients; expected RadialAndTangential "
             "with 5 or Fisheye with 8"
         )
     with errors_at(where):
-        lens = Lens(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], *bend)
+        lens = Lens(
+            width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], (k1, k2, k3), (p1, p2), model == "Fisheye"
+        )
     return _Entry(name, lens, se3_inverse(transform))
 
 

@@ -73,8 +73,8 @@ class Lens:
     def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         if self.fisheye:
             r = np.hypot(x, y)
-            bend = np.where(r > 1e-9, np.arctan(r) / np.maximum(r, 1e-9), 1.0)
-            x, y = x * bend, y * bend
+            factor = np.where(r > 1e-9, np.arctan(r) / np.maximum(r, 1e-9), 1.0)
+            x, y = x * factor, y * factor
         r2 = x * x + y * y
         factor, power = np.ones_like(r2), r2
         for k in self.radial:

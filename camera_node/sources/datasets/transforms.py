@@ -36,9 +36,7 @@ _FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO")
 
 def describes(file: Path) -> bool:
     """See ``formats.Reader``."""
-    if file.suffix != ".json":
-        return False
-    data = read_json(file)
+    data = read_json(file) if file.suffix == ".json" else None
     return isinstance(data, dict) and "frames" in data
 
 

@@ -21,13 +21,7 @@ from camera_node.sources.datasets.imaging import read_image
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions, Photo, posed_photo
-from camera_node.sources.datasets.records import (
-    Dataset,
-    DatasetError,
-    PosedImage,
-    camera_to_world,
-    errors_at,
-)
+from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage, camera_to_world, errors_at
 
 ANNOTATIONS = "annots.npy"
 FILES = (ANNOTATIONS,)

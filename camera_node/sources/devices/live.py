@@ -118,7 +118,7 @@ class LiveSource(Source):
         return Shot(image, paired.pose, self.intrinsics, paired.gap_ns, captured_ns)
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """End the thread, which closes the camera."""
         atexit.unregister(self.close)
         self._stop.set()
         if self._thread.is_alive():

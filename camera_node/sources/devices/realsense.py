@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any, cast
 
@@ -127,10 +127,10 @@ class RealsenseFeed(Feed):
 
 
 class FrameClock:
-    """A frame's stamp as nanoseconds of our clock. utc: the host's, which the library stamps by."""
+    """A frame's stamp as nanoseconds of our clock."""
 
-    def __init__(self, clock: Clock, utc: Callable[[], int] = time.time_ns) -> None:
-        self._clock, self._utc = clock, utc
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
         self._device = ArrivalClock()
 
     def captured_ns(self, frame: Any) -> int:
@@ -139,7 +139,7 @@ class FrameClock:
         now_ns, stamp_ns = self._clock.now_ns(), round(frame.get_timestamp() * 1e6) - _since_exposed_ns(frame)
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return self._device.host_ns(stamp_ns, now_ns)
-        return now_ns - (self._utc() - stamp_ns)
+        return now_ns - (time.time_ns() - stamp_ns)
 
 
 def _since_exposed_ns(frame: Any) -> int:
@@ -169,7 +169,7 @@ def lens(camera: str, intrinsics: Any) -> Pinhole:
             f"{camera}: lens model {intrinsics.model} is not supported: calibrate the camera and name "
             "the file in source.calibration"
         )
-    # Colour streams of the D400 come straightened; their coefficients describe the inverse, and are zero.
+    # Color streams of the D400 come straightened; their coefficients describe the inverse, and are zero.
     distortion = [] if straight and not any(intrinsics.coeffs) else list(intrinsics.coeffs)
     if straight and distortion:
         raise CameraError(

@@ -63,7 +63,10 @@ def bounded(default: float, lowest: float, highest: float) -> Any:
 
 @dataclass(frozen=True)
 class EffectParameters:
-    """Raises ValueError, in one line, for a value outside the range of its field."""
+    """in_truth: whether the effect applies to held-out cameras as well. Raises ValueError, in one line, for a
+    value outside the range of its field."""
+
+    in_truth: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         for parameter in fields(self):

@@ -19,7 +19,6 @@ class ClockDriftParameters(EffectParameters):
     drift_ppm: float = bounded(0.0, -1e5, 1e5)
     offset_spread_ms: float = bounded(0.0, 0.0, 1e9)
     drift_spread_ppm: float = bounded(0.0, 0.0, 1e4)
-    in_truth: bool = False
 
 
 class ClockDrift:

@@ -25,7 +25,6 @@ class ExposureDriftParameters(EffectParameters):
     amplitude_stops: float = bounded(0.3, 0.0, 8.0)
     period_s: float = bounded(20.0, 0.01, 1e6)
     offset_spread_stops: float = bounded(0.1, 0.0, 8.0)
-    in_truth: bool = False
 
 
 class ExposureDrift:

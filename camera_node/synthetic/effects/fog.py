@@ -30,23 +30,11 @@ class FogParameters(EffectParameters):
     visibility_m: float = bounded(20.0, 0.01, 1e6)
     contrast_threshold: float = bounded(0.02, 1e-6, 0.5)
     airlight: tuple[float, float, float] = (0.76, 0.78, 0.80)
-    in_truth: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not all(0.0 <= c <= 1.0 for c in self.airlight):
             raise ValueError(f"airlight must be three shares within 0 to 1, got {list(self.airlight)}")
-
-
-@dataclass(frozen=True)
-class FogMedium:
-    """Implements lighting.Medium. extinction_per_m: the extinction coefficient beta."""
-
-    extinction_per_m: float
-    airlight: tuple[float, float, float]
-
-    def transmittance(self, distance_m: Array) -> NDArray[np.float32]:
-        return np.exp(-self.extinction_per_m * distance_m).astype(np.float32)
 
 
 class Fog:
@@ -56,8 +44,13 @@ class Fog:
     Parameters = FogParameters
 
     def __init__(self, parameters: FogParameters, rng: np.random.Generator) -> None:
-        extinction_per_m = -math.log(parameters.contrast_threshold) / parameters.visibility_m
-        self._medium = FogMedium(extinction_per_m, parameters.airlight)
+        self.airlight = parameters.airlight
+        # Koschmieder's extinction coefficient beta.
+        self.extinction_per_m = -math.log(parameters.contrast_threshold) / parameters.visibility_m
 
     def extend(self, scene: Scene) -> Scene:
-        return scene.with_world(dataclasses.replace(scene.world, medium=self._medium))
+        return scene.with_world(dataclasses.replace(scene.world, medium=self))
+
+    def transmittance(self, distance_m: Array) -> NDArray[np.float32]:
+        """See ``lighting.Medium``."""
+        return np.exp(-self.extinction_per_m * distance_m).astype(np.float32)

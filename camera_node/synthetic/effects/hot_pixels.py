@@ -29,7 +29,6 @@ class HotPixelsParameters(EffectParameters):
     hot_counts: float = bounded(100.0, 0.0, 1e6)
     hits_per_megapixel: float = bounded(50.0, 0.0, 1e6)
     hit_counts: float = bounded(150.0, 0.0, 1e6)
-    in_truth: bool = False
 
 
 class HotPixels:

@@ -26,7 +26,6 @@ class LensDistortionParameters(EffectParameters):
     p1: float = bounded(0.001, -1.0, 1.0)
     p2: float = bounded(-0.0005, -1.0, 1.0)
     calibrated: bool = True
-    in_truth: bool = False
 
 
 class LensDistortion:

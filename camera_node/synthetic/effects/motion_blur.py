@@ -20,7 +20,6 @@ class MotionBlurParameters(EffectParameters):
 
     exposure_ms: float = 20.0
     samples: int = bounded(5, 1, 64)
-    in_truth: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -38,7 +38,6 @@ class OccluderParameters(EffectParameters):
     sweep_deg: float = bounded(100.0, 0.0, 180.0)
     distance_share: float = bounded(0.7, 0.05, 0.95)
     thickness_share: float = bounded(0.06, 0.005, 0.3)
-    in_truth: bool = False
 
 
 class Occluder:

@@ -24,7 +24,6 @@ class PoseNoiseParameters(EffectParameters):
     rotation_deg: float = bounded(0.2, 0.0, 180.0)
     translation_bias_mm: float = bounded(0.0, 0.0, 1e5)
     rotation_bias_deg: float = bounded(0.0, 0.0, 180.0)
-    in_truth: bool = False
 
 
 class PoseNoise:

@@ -23,7 +23,6 @@ class RollingShutterParameters(EffectParameters):
     readout_ms: float = bounded(20.0, 0.0, 1000.0)
     stamped_share: float = bounded(0.5, 0.0, 1.0)
     rows_at_once: int = bounded(1, 1, 4096)
-    in_truth: bool = False
 
 
 class RollingShutter:

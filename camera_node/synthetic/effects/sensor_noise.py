@@ -20,7 +20,6 @@ class SensorNoiseParameters(EffectParameters):
 
     read_noise_counts: float = bounded(1.5, 0.0, 1e4)
     full_well_electrons: float = bounded(4000.0, 0.0, 1e12)
-    in_truth: bool = False
 
 
 class SensorNoise:

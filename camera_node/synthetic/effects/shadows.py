@@ -32,16 +32,20 @@ class ShadowsParameters(EffectParameters):
 
     opacity: float = bounded(1.0, 0.0, 1.0)
     light_points: int = bounded(0, 0, 1000)
-    in_truth: bool = False
 
 
-@dataclass(frozen=True)
-class MovingShadows:
-    """Implements lighting.ShadowModel: traces points of the light to every surface point, so that a light of
-    many points makes penumbrae."""
+class Shadows:
+    """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
+    shadows."""
 
-    opacity: float
-    light_points: int
+    kind: ClassVar[str] = "world"
+    Parameters = ShadowsParameters
+
+    def __init__(self, parameters: ShadowsParameters, rng: np.random.Generator) -> None:
+        self._p = parameters
+
+    def extend(self, scene: Scene) -> Scene:
+        return scene.with_world(dataclasses.replace(scene.world, shadows=self))
 
     def blocked_light(
         self,
@@ -50,10 +54,12 @@ class MovingShadows:
         moving: Sequence[PlacedParts],
         specular: SpecularReflection | None,
     ) -> Array:
+        """See ``lighting.ShadowModel``. Traces points of the light to every surface point, so that a light of
+        many points makes penumbrae."""
         lost = np.zeros_like(surface.albedo)
         casters = [_casters(placed) for placed in moving]
         count = len(light.points)
-        traced = min(self.light_points or count, count)
+        traced = min(self._p.light_points or count, count)
         for k in np.linspace(0, count - 1, traced).round().astype(int):
             source = light.points[k]
             ray = surface.points - source[:, None]
@@ -66,7 +72,7 @@ class MovingShadows:
             at = np.flatnonzero(hidden)
             if at.size:
                 lost[:, at] += direct_light(surface.select(at), light, source, specular)
-        return self.opacity * count / traced * lost
+        return self._p.opacity * count / traced * lost
 
 
 def _casters(placed: PlacedParts) -> PlacedParts:
@@ -89,17 +95,3 @@ def _behind(
     # A light inside the sphere may be hidden from any point.
     within = to @ ray >= np.sqrt(max(tangent2, 0.0)) * distance if tangent2 > 0.0 else True
     return np.flatnonzero(within & (visible > 0.0))
-
-
-class Shadows:
-    """Rendered ahead; free while streaming. List it ``in_truth: true`` if the field is to show the
-    shadows."""
-
-    kind: ClassVar[str] = "world"
-    Parameters = ShadowsParameters
-
-    def __init__(self, parameters: ShadowsParameters, rng: np.random.Generator) -> None:
-        self._shadows = MovingShadows(parameters.opacity, parameters.light_points)
-
-    def extend(self, scene: Scene) -> Scene:
-        return scene.with_world(dataclasses.replace(scene.world, shadows=self._shadows))

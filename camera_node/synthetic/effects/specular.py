@@ -29,7 +29,6 @@ class SpecularParameters(EffectParameters):
 
     refractive_index: float = bounded(1.5, 1.0, 50.0)
     roughness: float = bounded(0.2, 0.02, 1.0)
-    in_truth: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ class VignettingParameters(EffectParameters):
     """exponent: of the cosine of a ray's angle to the optical axis; 4: thin lens, 0: no vignetting."""
 
     exponent: float = bounded(4.0, 0.0, 64.0)
-    in_truth: bool = False
 
 
 class Vignetting:

@@ -14,10 +14,11 @@ from camera_node.synthetic import textures as tx
 from camera_node.synthetic.camera_rig import build_rig
 from camera_node.synthetic.lighting import Light
 from camera_node.synthetic.person import make_walk, walking_person
-from camera_node.synthetic.placement import Part, at, facing
+from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import MovingParams, Scene, pinhole
-from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere
+from camera_node.synthetic.scenes.shell import room_shell
+from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 
 _TARGET = (0.0, 0.75, 0.90)
 _RADIUS_M = 3.2
@@ -57,9 +58,6 @@ def build(params: Params) -> Scene:
 
 
 def _shell() -> list[Part]:
-    """Four walls, floor and ceiling, each visible from inside only."""
-    wall = Quad((3.0, 1.5))
-    wide = Quad((3.0, 3.0))
     brick = tx.Noise(tx.Brick((0.72, 0.42, 0.32), (0.86, 0.80, 0.72), 0.60, 0.30), 0.5, 0.05, seed=1)
     paper = tx.Bands(
         tx.Diamonds((0.22, 0.48, 0.50), (0.34, 0.62, 0.60), (0.95, 0.86, 0.60), 0.5, 0.6),
@@ -75,15 +73,8 @@ def _shell() -> list[Part]:
         tx.Noise(tx.Plain((0.86, 0.85, 0.83)), 0.8, 0.03, seed=4),
         [(-0.9, 1.3, -1.1, 1.1, (1.0, 0.99, 0.95))], soft=0.06,
     )  # fmt: skip
-    up = (0, 0, 1)
-    return [
-        Part(wall, brick, facing((1, 0, 0), up, (0, 3, 1.5)), casts_shadow=False),
-        Part(wall, paper, facing((0, 1, 0), up, (-3, 0, 1.5)), casts_shadow=False),
-        Part(wall, stripes, facing((0, -1, 0), up, (3, 0, 1.5)), casts_shadow=False),
-        Part(wall, plaster, facing((-1, 0, 0), up, (0, -3, 1.5)), casts_shadow=False),
-        Part(wide, boards, facing((1, 0, 0), (0, 1, 0), (0, 0, 0)), casts_shadow=False, takes_contact=True),
-        Part(wide, ceiling, facing((1, 0, 0), (0, -1, 0), (0, 0, 3)), casts_shadow=False, glow=0.5),
-    ]
+    walls: dict[str, tx.Texture] = {"north": brick, "west": paper, "east": stripes, "south": plaster}
+    return room_shell(3.0, 3.0, walls, boards, ceiling, glow=0.5)
 
 
 def _furniture() -> list[Part]:

@@ -19,7 +19,8 @@ from camera_node.synthetic.person import Walk, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import MovingParams, Scene, pinhole
-from camera_node.synthetic.shapes import Box, Cylinder, Quad, RoundCone, Sphere, capsule
+from camera_node.synthetic.scenes.shell import room_shell
+from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere, capsule
 from freshfield.geometry import Array
 
 _MAST = (0.0, 0.0, 1.70)
@@ -73,11 +74,7 @@ def build(params: Params) -> Scene:
         params=params,
         cameras=build_rig(_ANGLES_DEG, _MAST, _RADIUS_M, params.count, pinhole(params), outward=True),
         target=_MAST,
-        world=World(
-            (*_shell(), *_mast(), *_workshop()),
-            _moving_bodies(params, walk, drawn),
-            light,
-        ),
+        world=World((*_shell(), *_mast(), *_workshop()), _moving_bodies(params, walk, drawn), light),
         bounds=np.array([[-_HALF_M, -_HALF_M, 0.0], [_HALF_M, _HALF_M, _HEIGHT_M]]),
         period_s=walk.period_s,
         moving=not walk.still,
@@ -131,8 +128,6 @@ def _cart(walk: Walk, speed_m_per_s: float) -> MovingBody:
 
 
 def _shell() -> list[Part]:
-    """Four walls, floor and ceiling, each visible from inside only."""
-    wall, flat = Quad((_HALF_M, _HEIGHT_M / 2)), Quad((_HALF_M, _HALF_M))
     brick = tx.Noise(tx.Brick((0.70, 0.40, 0.30), (0.88, 0.82, 0.74), 0.80, 0.40), 0.6, 0.06, seed=41)
     tiles = tx.Bands(
         tx.Diamonds((0.26, 0.50, 0.48), (0.38, 0.64, 0.58), (0.96, 0.88, 0.62), 0.8, 0.8),
@@ -153,17 +148,8 @@ def _shell() -> list[Part]:
         tx.Noise(tx.Plain((0.80, 0.79, 0.76)), 0.9, 0.06, seed=45),
         [(-5, 5, y - 0.12, y + 0.12, (0.50, 0.36, 0.24)) for y in (-3.6, -1.2, 1.2, 3.6)], soft=0.06,
     )  # fmt: skip
-    up, h, z = (0.0, 0.0, 1.0), _HALF_M, _HEIGHT_M / 2
-    x, y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-    back, left = (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)
-    return [
-        Part(wall, brick, facing(x, up, (0, h, z)), casts_shadow=False),
-        Part(wall, tiles, facing(y, up, (-h, 0, z)), casts_shadow=False),
-        Part(wall, steel, facing(left, up, (h, 0, z)), casts_shadow=False),
-        Part(wall, plaster, facing(back, up, (0, -h, z)), casts_shadow=False),
-        Part(flat, floor, facing(x, y, (0, 0, 0)), casts_shadow=False, takes_contact=True),
-        Part(flat, beams, facing(x, left, (0, 0, _HEIGHT_M)), casts_shadow=False, glow=0.4),
-    ]
+    walls: dict[str, tx.Texture] = {"north": brick, "west": tiles, "east": steel, "south": plaster}
+    return room_shell(_HALF_M, _HEIGHT_M, walls, floor, beams, glow=0.4)
 
 
 def _mast() -> list[Part]:

@@ -7,9 +7,11 @@ A fault module has a dataclass ``Params`` (its keys in the scenario) and a class
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
-from channel_emu.model.link import Fault
+from channel_emu.model.counter_rng import CounterRng
+from channel_emu.model.link import Fault, Transit
 
 NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth")
 
@@ -28,7 +30,25 @@ def make(params: dict[str, Any], seed: int, camera: str) -> tuple[Fault, ...]:
     )
 
 
-def probability(name: str, value: float) -> None:
-    """Shared check of parameters that are probabilities. Raises ValueError."""
-    if not 0.0 <= value <= 1.0:
-        raise ValueError(f"{name}: expected a probability from 0 to 1, got {value:g}")
+@dataclass(frozen=True)
+class ChanceParams:
+    """Parameters of a ``ChanceFault``."""
+
+    probability: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.probability <= 1.0:
+            raise ValueError(f"probability: expected a probability from 0 to 1, got {self.probability:g}")
+
+
+class ChanceFault(Fault):
+    """Base of the faults that hit each frame with a probability. purpose: of the camera's random stream."""
+
+    purpose: ClassVar[str]
+
+    def __init__(self, params: Any, seed: int, camera: str) -> None:
+        self.params = params
+        self.rng = CounterRng(seed, camera, self.purpose)
+
+    def hits(self, transit: Transit) -> bool:
+        return self.rng.uniform(transit.number) < self.params.probability

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from channel_emu.model.counter_rng import CounterRng
-from channel_emu.model.faults import probability
-from channel_emu.model.link import Fault, Transit
+from channel_emu.model.faults import ChanceFault, ChanceParams
+from channel_emu.model.link import Transit
 
 
 @dataclass(frozen=True)
-class Params:
-    probability: float
+class Params(ChanceParams):
     count: int = 1
     """Bytes flipped in a damaged frame."""
 
     def __post_init__(self) -> None:
-        probability("probability", self.probability)
+        super().__post_init__()
         if not 1 <= self.count <= 1000:
             raise ValueError(f"count: expected 1 to 1000 bytes, got {self.count}")
 
 
-class Effect(Fault):
-    def __init__(self, params: Params, seed: int, camera: str) -> None:
-        self.params = params
-        self.rng = CounterRng(seed, camera, "channel.corruption")
+class Effect(ChanceFault):
+    purpose = "channel.corruption"
 
     def flips(self, transit: Transit) -> tuple[tuple[float, int], ...]:
-        if self.rng.uniform(transit.number) >= self.params.probability:
+        if not self.hits(transit):
             return ()
         pairs = (self.rng.pair(transit.number, 1 + i) for i in range(self.params.count))
         return tuple((place, 1 + int(value * 255)) for place, value in pairs)

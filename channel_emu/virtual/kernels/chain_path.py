@@ -1,4 +1,14 @@
-"""The chain's path over a whole horizon, and arrivals and work along it: ``chain.Chain`` and ``traffic``."""
+"""The chain's path over a whole horizon, and arrivals and work along it: ``chain.Chain`` and ``traffic``.
+
+Arguments of the functions here:
+
+    starts, states   the chain's path: sojourns' starts and the last one's end, int64 ns (S + 1,); states (S,)
+    rates_per_ns     float64, one entry a state or one for all
+    work             integral of the rate that is to be reached
+    key              uint64 (2,), of a random stream (``counter_rng.stream_key``)
+    hint             index of a sojourn from which a search starts
+    horizon_ns       end of the run
+"""
 
 from __future__ import annotations
 
@@ -27,8 +37,10 @@ def saturating_add(instant_ns, span_ns):
 
 @njit(cache=True, nogil=True)
 def chain_path(sojourn_rate, jumps, slot_ns, key, initial, horizon_ns):
-    """Sojourns up to the first that ends after the horizon: starts int64 (S + 1,) ending with that end, and
-    states int64 (S,). ``sojourn_rate`` (M,), ``jumps`` (M, M) and ``slot_ns`` are ``chain.Chain``'s."""
+    """(starts, states) up to the first sojourn that ends after the horizon.
+
+    sojourn_rate (M,), jumps (M, M), slot_ns, initial: the attributes of ``chain.Chain``.
+    """
     starts = np.empty(1024, np.int64)
     states = np.empty(1024, np.int64)
     starts[0], states[0] = 0, initial
@@ -147,7 +159,8 @@ def poisson_arrivals(rates_per_ns, starts, states, key, horizon_ns):
 
 @njit(cache=True, nogil=True)
 def sample_newest(offered_ns, rates_per_ns, starts, states, key):
-    """For each offered frame the arrival that samples it, or -1 where a newer frame was offered first."""
+    """For each offered frame (instants int64 ns (n,)) the arrival that samples it, or -1 where a newer frame
+    was offered first."""
     sampled = np.empty(len(offered_ns), np.int64)
     u, v = np.empty(_BLOCK), np.empty(_BLOCK)
     hint = 0

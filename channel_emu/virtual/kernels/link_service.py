@@ -21,6 +21,7 @@ DROP_NEW, NEWEST_WAITS, FCFS, LCFS_PREEMPT, PARALLEL = 0, 1, 2, 3, 4
 
 @njit(cache=True, nogil=True)
 def speeds_per_ns(means_ms):
+    """Work served in a nanosecond by state: the inverse of the mean delay, inf where that is 0."""
     speeds = np.empty(len(means_ms))
     for i in range(len(means_ms)):
         speeds[i] = 1.0 / (means_ms[i] * 1e6) if means_ms[i] > 0.0 else np.inf
@@ -31,10 +32,16 @@ def speeds_per_ns(means_ms):
 def serve(
     arrive_ns, discipline, queue_limit, work, means_ms, modulated, starts, states, horizon_ns
 ):  # fmt: skip
-    """Outcome int8, started and due int64 (-1: never) of each frame.
+    """Outcome int8, started and due int64 ns (-1: never) of each frame, each (n,).
 
-    arrive_ns: int64 (n,), ascending where not -1 (skipped). work: (n,) of ``work.draw``. means_ms: (1,) or
-    one a state. starts, states: the chain's path. Frames due after the horizon are in flight.
+    arrive_ns: int64 (n,), ascending where not -1 (skipped).
+    discipline: index into ``link.DISCIPLINES``.
+    queue_limit: most frames waiting (fcfs) or in service (parallel).
+    work: (n,) of ``work.draw``.
+    means_ms: mean delay, (1,) or one a state.
+    modulated: the work is served at the rate of each state passed through, not of the first one.
+    starts, states: the chain's path, see ``chain_path``.
+    horizon_ns: frames due later are in flight.
     """
     count = len(arrive_ns)
     outcome = np.zeros(count, np.int8)

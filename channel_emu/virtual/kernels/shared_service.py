@@ -54,11 +54,13 @@ def serve_shared(
     arrive_ns, offered_ns, camera, discipline, order, queue_limit, work, means_ms, modulated, starts, states,
     path_from, path_to, horizon_ns,
 ):  # fmt: skip
-    """Outcome int8, started and due int64 (-1: never) of each frame.
+    """Outcome int8, started and due int64 ns (-1: never) of each frame, each (n,).
 
-    Frames of all cameras (n,) in the order in which they arrive: instants int64, camera, work. Camera c's
-    chain has its path in starts[path_from[c] : path_to[c]], with one entry of ``states`` unused at its end.
-    The rest is as for ``serve.serve``.
+    arrive_ns, offered_ns, camera, work: of the frames of all cameras (n,), in the order in which they arrive.
+    order: index into ``queue_server.ORDERS``: whose waiting frame is next.
+    starts, states: all paths; camera c's is starts[path_from[c] : path_to[c]], with one entry of ``states``
+        unused at its end.
+    The rest is as for ``link_service.serve``.
     """
     count, cameras = len(arrive_ns), len(path_from)
     outcome = np.zeros(count, np.int8)

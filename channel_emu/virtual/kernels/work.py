@@ -49,7 +49,11 @@ def _gamma(number, shape, key):
 
 @njit(cache=True, nogil=True)
 def draw(count, law, parameter, delays_ms, key):
-    """Work of mean one of frames 0, 1, ..., float64 (count,); law ``trace``: the delay in ms, ``none``: 0."""
+    """Work of mean one of frames 0, 1, ..., float64 (count,); law ``trace``: the delay in ms, ``none``: 0.
+
+    law: index into ``config.LAWS``, as the constants above. parameter: shape of gamma, sigma of lognormal.
+    delays_ms: of the law trace. key: uint64 (2,), of the random stream.
+    """
     if law == LAW_EXPONENTIAL:
         return exponentials(0, count, key)
     if law == LAW_LOGNORMAL:

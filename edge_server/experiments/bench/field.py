@@ -267,7 +267,7 @@ def table(figures: dict[str, Any]) -> str:
     targets = ", ".join(str(db) for db in TARGETS_DB)
     load = "outside cores|the machine"
     tables: dict[str, list[tuple[Any, ...]]] = {
-        "scene|held-out camera from any other, degrees|mean colour dB|nearest view dB": bases,
+        "scene|held-out camera from any other, degrees|mean color dB|nearest view dB": bases,
         f"scene|representation|seeds|seconds: PSNR dB|seconds to {targets} dB|{load}": curves,
         f"scene|representation|steps/s|rays/s|samples/s|128 x 128 in ms|256 x 256 in ms|{load}": rates,
         "representation|JIT cold s|of CPU s|JIT cached s|of CPU s|peak MB|cores busy|the machine": starts,

@@ -42,7 +42,7 @@ class Option:
 
 # Another option is another line here.
 OPTIONS: tuple[Option, ...] = (
-    Option("view-dependent colour", {"harmonics": 1}, {"harmonics": 4}, ("tile", "room", "lego", "kitchen")),
+    Option("view-dependent color", {"harmonics": 1}, {"harmonics": 4}, ("tile", "room", "lego", "kitchen")),
     Option("exposure", {"exposure": False}, {"exposure": True}, ("room, gains", "room")),
     Option("contraction", {"contracted": False}, {"contracted": True}, ("room", "tile")),
     Option(

@@ -294,12 +294,12 @@ def _panel(ax: Any, metric: str, of_scene: Sequence[Sequence[Any]]) -> None:
     names = list(dict.fromkeys(name for name, *_ in of_scene))
     runs = list(dict.fromkeys(run for _, run, *_ in of_scene))
     for name, run, one, rows in of_scene:
-        colour, line = CYCLE[names.index(name) % len(CYCLE)], ("-", ":", "--", "-.")[runs.index(run) % 4]
+        color, line = CYCLE[names.index(name) % len(CYCLE)], ("-", ":", "--", "-.")[runs.index(run) % 4]
         shown = [float("nan") if v is None else v for v in one["series"].get(metric, [])]
         label = f"{name}, {run.replace('_', ' ')}"
-        ax.plot(one["series"].get("frame", []), shown, line, color=colour, label=label)
+        ax.plot(one["series"].get("frame", []), shown, line, color=color, label=label)
         if run == runs[0]:
-            ax.plot(*_fresh(rows, metric), "o", color=colour, markersize=4.5, label=f"{name}, fresh")
+            ax.plot(*_fresh(rows, metric), "o", color=color, markersize=4.5, label=f"{name}, fresh")
     name, _, _, rows = of_scene[0]
     still = _fresh(rows, f"not_updated_{metric}")
     ax.plot(*still, "x", color=GREY, markersize=4.5, label=f"{name}, never updated")
@@ -316,7 +316,7 @@ def table(figures: dict[str, Any]) -> str:
     head = (
         "scene|representation|update|updates|PSNR dB (moving)|fresh fit dB|never updated dB|"
         f"within {NEAR_DB} dB of fresh|median gap dB|gap of the first, last tenth dB|"
-        "mean colour, nearest view dB|outside cores"
+        "mean color, nearest view dB|outside cores"
     )
     rows = []
     for scene, name, run, found, of_field in _runs(figures):

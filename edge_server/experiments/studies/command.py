@@ -19,6 +19,7 @@ from edge_server.experiments.training.scheduler.setting import SEEDS_A_PURPOSE
 from edge_server.experiments.training.scheduler.trainer import TrainingError
 from edge_server.fidelity.lpips_weights import weights_folder
 from freshfield.files import write_json
+from freshfield.machine_load import usable_cores
 from freshfield.scenario import ScenarioError
 
 # name -> (module, class)
@@ -152,7 +153,7 @@ def _check(ask: Ask, jobs: int) -> None:
 def _parser() -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("edge-server study", description=DESCRIPTION, formatter_class=raw)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     add = parser.add_argument
     add("study", choices=[*STUDIES, "all", "learning"], metavar="NAME",
         help=f"{', '.join(STUDIES)}; all: those before ppo-select; learning: those from it on")  # fmt: skip

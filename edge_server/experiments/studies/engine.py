@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -29,6 +28,7 @@ from edge_server.experiments.common.worker import init_worker
 from edge_server.experiments.studies.trial import Folders, Row, Trial, run_trial
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
 from edge_server.report.machine import versions
+from freshfield.machine_load import usable_cores
 
 # Trials per task: enough to share images, few enough that Ctrl-C loses little work.
 _TRIALS_A_TASK = 6
@@ -217,8 +217,7 @@ def _tasks(wanted: dict[str, Trial]) -> list[list[str]]:
 
 
 def _threads_each(jobs: int) -> int:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // jobs)
+    return max(1, usable_cores() // jobs)
 
 
 def _end_at_once(pool: ProcessPoolExecutor) -> None:

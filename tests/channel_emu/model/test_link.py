@@ -229,7 +229,7 @@ def test_what_each_discipline_promises(story: Story) -> None:
             inside -= 1
         if e.kind is EventKind.DELIVERED:
             delivered.append(e.transit.number)
-    assert most <= (story.subject.queue_limit if discipline == "parallel" else 1)
+    assert most <= (story.subject.server.queue_limit if discipline == "parallel" else 1)
     if discipline != "parallel":
         assert delivered == sorted(delivered)
     if discipline in ("newest-waits", "lcfs-preempt"):

@@ -36,6 +36,7 @@ from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
 from edge_server.scheduler.learned.rewards import REWARDS, Reward, make_reward, without_missing_lpips
 from edge_server.scheduler.learned.state import StateLayout
 from freshfield.files import write_json
+from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario, ScenarioError, load
 
 DESCRIPTION = """\
@@ -287,7 +288,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "edge-server train-scheduler", description=DESCRIPTION, formatter_class=raw
     )
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one; it must hold a camera out")
     add("--kind", choices=ACTIONS, default="select", help="what is decided [%(default)s]")

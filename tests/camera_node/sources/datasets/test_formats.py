@@ -51,7 +51,7 @@ def shows_the_world(record, t_s=0.0):
     scene = scene.with_cameras({"here": (lens, pose), "aside": (lens, aside), "turned": (lens, turned)})
     picture = record.read().astype(float)
     off = {name: np.abs(picture - scene.render(name, t_s)).mean() for name in scene.cameras}
-    # What is left is compression, of videos at a quarter of the colours.
+    # What is left is compression, of videos at a quarter of the colors.
     assert off["here"] < 15 and 1.5 * off["here"] < min(off["aside"], off["turned"]), off
 
 

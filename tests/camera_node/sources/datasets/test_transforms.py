@@ -77,7 +77,7 @@ def test_time_and_camera_make_a_recording(tmp_path):
     assert [r.time_s for r in dataset.of("cam01")] == [0.0, 0.1, 0.2, 0.3]
 
 
-def test_alpha_is_kept_laid_on_a_colour_and_weighted_when_shrinking(tmp_path):
+def test_alpha_is_kept_laid_on_a_color_and_weighted_when_shrinking(tmp_path):
     file = write_photos(tmp_path, 1)
     rgba = np.zeros((24, 32, 4), np.uint8)
     rgba[:, :, :3] = (0, 255, 0)  # green, as BGR and as RGB, hidden where alpha is 0

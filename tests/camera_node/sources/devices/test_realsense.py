@@ -37,7 +37,7 @@ def intrinsics(model=None, coefficients=(0.0,) * 5):
 
 
 def frames(domain, stamps_ms, metadata=()):
-    """Colour frames of a software device, with these stamps and metadata (key, value)."""
+    """Color frames of a software device, with these stamps and metadata (key, value)."""
     device = rs.software_device()
     sensor = device.add_sensor("Color")
     stream = rs.video_stream()

@@ -49,7 +49,7 @@ def test_the_transmission_at_a_known_distance(distance_m, moving):
 @pytest.mark.parametrize(("visibility_m", "threshold"), [(6.0, 0.02), (40.0, 0.05)])
 def test_koschmieder_s_constant(visibility_m, threshold):
     """3.912 / visibility at 2 %, 2.996 / visibility at 5 %."""
-    haze = make(visibility_m=visibility_m, contrast_threshold=threshold)._medium
+    haze = make(visibility_m=visibility_m, contrast_threshold=threshold)
     assert haze.extinction_per_m * visibility_m == pytest.approx(
         {0.02: 3.912, 0.05: 2.996}[threshold], abs=5e-4
     )
